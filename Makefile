@@ -1,0 +1,52 @@
+# Everything a new machine needs: `make demo`, `make test`. Only Python 3.11 and make are taken for granted.
+PYTHON ?= python3.11
+VENV := .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+export SKILLS_SAMPLE_RECORDINGS ?= $(abspath $(wildcard ../shared/recordings))
+export SKILLS_PAPER_DATA ?= $(abspath $(wildcard ../shared/paper/data))
+
+.PHONY: demo test serve bench nightly lint lock clean
+
+# uv where it is present, venv and pip otherwise; either way the same versions, checked by their hashes.
+$(READY): requirements.lock pyproject.toml
+	@if command -v uv >/dev/null 2>&1; then \
+	  uv venv -q --allow-existing --python $(PYTHON) $(VENV) && \
+	  VIRTUAL_ENV=$(CURDIR)/$(VENV) uv pip sync -q --require-hashes requirements.lock && \
+	  VIRTUAL_ENV=$(CURDIR)/$(VENV) uv pip install -q --no-deps --no-build-isolation -e . ; \
+	else \
+	  $(PYTHON) -m venv $(VENV) && \
+	  $(BIN)/python -m pip install -q --require-hashes -r requirements.lock && \
+	  $(BIN)/python -m pip install -q --no-deps --no-build-isolation -e . ; \
+	fi
+	@touch $@
+
+demo: $(READY)
+	@$(BIN)/python -m skills.demo
+
+test: $(READY)
+	@$(BIN)/ruff check .
+	@$(BIN)/ruff format --check .
+	@$(BIN)/mypy
+	@$(BIN)/python -m pytest
+
+serve: $(READY)
+	@$(BIN)/skills serve --samples
+
+bench: $(READY)
+	@$(BIN)/python -m tests.bench
+
+nightly: $(READY)
+	@$(BIN)/python -m pytest -m nightly
+
+lint: $(READY)
+	@$(BIN)/ruff check --fix .
+	@$(BIN)/ruff format .
+	@$(BIN)/mypy
+
+# The lock holds versions and hashes, no addresses. Needs uv.
+lock:
+	uv pip compile pyproject.toml --group dev --python-version 3.11 --universal --generate-hashes --no-header --no-annotate -q -o requirements.lock
+
+clean:
+	rm -rf $(VENV) build

@@ -1,0 +1,5 @@
+"""`python -m skills`: the command line."""
+
+from skills.cli import app
+
+app()

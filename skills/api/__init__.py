@@ -1,0 +1,1 @@
+"""The service over HTTP: a route parses, calls one library function, and answers."""

@@ -1,0 +1,102 @@
+"""The application: our calls, with one database, one engine, and problems for answers to what goes wrong."""
+
+import secrets
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
+from anyio import to_thread
+from fastapi import FastAPI
+from starlette.datastructures import MutableHeaders
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from skills import __version__
+from skills.api.answers import Encoded
+from skills.api.problems import TOO_LARGE, answer_refusals
+from skills.api.routes import catalogue, demos, operating, plans, policies, trainings
+from skills.db.session import Database
+from skills.jobs.engine import Engine
+from skills.library.catalogue import seed_catalogue
+from skills.settings import Settings
+
+DESCRIPTION = (
+    "Suture styles as a service: a surgeon's recorded needle hand-off, discretised, learnt, certified, served, stacked "
+    "at suture points and played back in simulation. Lengths are mm. **Research use only; not a medical device.**"
+)
+
+
+def create_app(settings: Settings) -> FastAPI:
+    """Make the application; its database is migrated and its catalogue seeded when it starts."""
+
+    @asynccontextmanager
+    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        await to_thread.run_sync(prepare_database, app.state.database)
+        yield
+        await to_thread.run_sync(app.state.engine.close)
+        app.state.database.close()
+
+    app = Service(
+        title="suture-skills",
+        version=__version__,
+        description=DESCRIPTION,
+        lifespan=lifespan,
+        root_path=settings.root_path,
+        docs_url=None,  # the stock page loads its scripts from elsewhere
+        redoc_url=None,
+        max_body_size=settings.max_upload_bytes,
+        generate_unique_id_function=lambda route: route.name,
+    )
+    app.state.settings = settings
+    app.state.database = Database(settings.database_url)
+    app.state.engine = Engine(settings)
+    app.state.encoded = Encoded()
+    for part in (catalogue.router, demos.uploads, demos.router, trainings.router, policies.router, plans.router):
+        app.include_router(part)
+    app.include_router(operating.router)
+    answer_refusals(app)
+    return app
+
+
+def prepare_database(database: Database) -> None:
+    """Migrate a database, and seed its catalogue where that is empty."""
+    database.migrate()
+    with database.writing() as session:
+        seed_catalogue(session)
+
+
+class Service(FastAPI):
+    """FastAPI with `Headers` around everything, its own answers to failures included."""
+
+    def build_middleware_stack(self) -> ASGIApp:
+        """Put `Headers` outermost: middleware that is added stands inside of what answers 413 and 500."""
+        return Headers(super().build_middleware_stack())
+
+
+class Headers:
+    """Name every request, and forbid a browser to make more of an answer than it is."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self.app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass the request on, and add to the answer's headers."""
+        if scope["type"] != "http":
+            await self.app(scope, receive, send)
+            return
+
+        in_plain_text = False
+
+        async def named(message: Message) -> None:
+            nonlocal in_plain_text
+            if message["type"] == "http.response.start":
+                headers = MutableHeaders(scope=message)
+                if message["status"] == 413 and headers["content-type"] != TOO_LARGE.media_type:
+                    in_plain_text, message["headers"] = True, list(TOO_LARGE.raw_headers)
+                    headers = MutableHeaders(scope=message)
+                headers["X-Request-ID"] = secrets.token_hex(8)
+                headers["X-Content-Type-Options"] = "nosniff"
+                headers["Content-Security-Policy"] = "default-src 'self'; frame-ancestors 'none'"
+            elif in_plain_text:
+                message["body"] = TOO_LARGE.body
+            await send(message)
+
+        await self.app(scope, receive, named)

@@ -1,0 +1,96 @@
+"""What routes ask for: the database, the engine, who is asking, and an upload on its way in."""
+
+import hashlib
+import tempfile
+import time
+from collections.abc import AsyncIterator
+from typing import Annotated, Any
+
+from fastapi import Depends, Header, Path, Query, Request
+
+from skills.db.session import Database
+from skills.errors import TooLarge, UnknownFormat, UnreadableRecording
+from skills.jobs.engine import Engine
+from skills.library.recordings import MEDIA_TYPES, Upload, check_digest
+from skills.settings import Settings
+
+SLUG = r"^[a-z0-9][a-z0-9_-]{0,63}$"
+DIGEST = r"^[0-9a-f]{64}$"
+SPOOL_BYTES = 8 << 20
+LATER = {"application/zip": "bag folders", "text/plain": "JIGSAWS kinematics"}
+
+
+def _database(request: Request) -> Database:
+    database: Database = request.app.state.database
+    return database
+
+
+def _engine(request: Request) -> Engine:
+    engine: Engine = request.app.state.engine
+    return engine
+
+
+def _settings(request: Request) -> Settings:
+    settings: Settings = request.app.state.settings
+    return settings
+
+
+def _actor() -> str:
+    """Say who asks: without keys, only somebody on this machine can."""
+    return "local"
+
+
+Db = Annotated[Database, Depends(_database)]
+Jobs = Annotated[Engine, Depends(_engine)]
+Actor = Annotated[str, Depends(_actor)]
+Slug = Annotated[str, Path(pattern=SLUG)]
+Digest = Annotated[str, Path(pattern=DIGEST)]
+Limit = Annotated[int, Query(ge=1, le=200)]
+RowCursor = Annotated[int | None, Query(alias="cursor", ge=1, le=2**62)]
+SlugCursor = Annotated[str | None, Query(alias="cursor", pattern=SLUG)]
+
+
+def page(items: list[Any], limit: int, cursor: Any) -> dict[str, Any]:
+    """Write one page of a list, and where the next one starts, if there may be one."""
+    return {"items": items, "next": cursor if len(items) == limit else None}
+
+
+async def receive(
+    request: Request,
+    settings: Annotated[Settings, Depends(_settings)],
+    content_type: Annotated[str, Header()] = "",
+    content_digest: Annotated[str | None, Header(max_length=500)] = None,
+    content_encoding: Annotated[str | None, Header(max_length=100)] = None,
+    rate_hz: Annotated[float | None, Query(gt=0, le=10_000, allow_inf_nan=False)] = None,
+    frame: Annotated[str | None, Query(pattern=r"^[A-Za-z0-9_./-]{1,64}$")] = None,
+) -> AsyncIterator[Upload]:
+    """Spool the raw body to a temporary file, counting and digesting it on the way.
+
+    Raises:
+        UnknownFormat: The content type is none that is read here.
+        TooLarge: The body is over the limit.
+        UnreadableRecording: It came too slowly, or is not what its Content-Digest says.
+    """
+    media_type = content_type.partition(";")[0].strip().lower()
+    if media_type in LATER:
+        raise UnknownFormat(f"{LATER[media_type]} are not read yet; send the .mcap file or a CSV.")
+    if media_type not in MEDIA_TYPES:
+        raise UnknownFormat(f"Send the recording as the raw body with Content-Type {' or '.join(MEDIA_TYPES)}.")
+    if content_encoding not in (None, "identity"):
+        raise UnknownFormat("Send the body without Content-Encoding; MCAP compresses itself.")
+    seen, size, deadline = hashlib.sha256(), 0, time.monotonic() + settings.upload_deadline_s
+    with tempfile.SpooledTemporaryFile(max_size=SPOOL_BYTES) as file:
+        async for data in request.stream():
+            size += len(data)
+            if size > settings.max_upload_bytes:
+                raise TooLarge(f"A recording has at most {settings.max_upload_bytes} bytes; cut it.")
+            if time.monotonic() > deadline:
+                raise UnreadableRecording("The body came too slowly; send it again.")
+            seen.update(data)
+            file.write(data)
+        sha256 = seen.hexdigest()
+        vouched = check_digest(content_digest, sha256)
+        yield Upload(file, sha256, size, media_type, rate_hz, frame, vouched)  # type: ignore[arg-type]
+
+
+Incoming = Annotated[Upload, Depends(receive)]

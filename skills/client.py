@@ -1,0 +1,250 @@
+"""The typed client: every call of the service as a method.
+
+    with Client("http://127.0.0.1:8000") as client:
+        demo = client.add_demo(Path("hand-off.mcap"), surgeon="kestrel", suture="simple-running")
+        client.wait(client.train("kestrel", "simple-running", release=True))
+        policy = client.policy("kestrel", "simple-running")
+
+Answers are the JSON of the service. What it refuses is raised as `Problem`.
+"""
+
+import base64
+import hashlib
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import httpx2 as httpx
+
+from skills.errors import SkillsError
+
+Json = dict[str, Any]
+Position = Sequence[float]
+MEDIA_TYPES = {".mcap": "application/vnd.mcap", ".csv": "text/csv"}
+ENDED = ("succeeded", "failed", "cancelled")
+
+
+class Problem(SkillsError):
+    """What the service refused: its status, its kind, and what to do next."""
+
+    def __init__(self, status: int, body: Json) -> None:
+        why = "; ".join(f"{one['where']}: {one['why']}" for one in body.get("errors", ()))
+        super().__init__(f"{body.get('detail', 'The service refused.')} {why}".strip(), **body)
+        self.status = status
+        self.kind = str(body.get("type", "")).rpartition(":")[2]
+
+
+class JobFailed(SkillsError):
+    """A job that was waited for did not succeed; `job` is what became of it."""
+
+    def __init__(self, job: Json) -> None:
+        super().__init__(f"The {job['kind']} {job['state']}: {job['error'] or 'no reason was given'}")
+        self.job = job
+
+
+class Client:
+    """The service at an address, or behind any `httpx.Client` (such as one that calls the application in-process)."""
+
+    def __init__(self, server: str | httpx.Client, timeout_s: float = 60.0) -> None:
+        self.http = httpx.Client(base_url=server, timeout=timeout_s) if isinstance(server, str) else server
+
+    def __enter__(self) -> Self:
+        """Use it in a with block."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close the connections."""
+        self.http.close()
+
+    # ---- catalogue
+
+    def put_surgeon(self, surgeon: str, **about: Any) -> Json:
+        """Write a surgeon: skill_level, handedness, protocol, consent."""
+        return self._json("PUT", f"/surgeons/{surgeon}", json=about)
+
+    def surgeon(self, surgeon: str) -> Json:
+        """Look a surgeon up."""
+        return self._json("GET", f"/surgeons/{surgeon}")
+
+    def erase_surgeon(self, surgeon: str) -> None:
+        """Erase a surgeon and all that was derived from them, for good."""
+        self.send("DELETE", f"/surgeons/{surgeon}")
+
+    def suture_types(self) -> list[Json]:
+        """List the catalogue."""
+        return self._all("/suture-types")
+
+    # ---- recordings and demonstrations
+
+    def add_recording(self, recording: Path | bytes, media_type: str | None = None, **query: Any) -> Json:
+        """Store a recording: its digest, its topics and the hand-offs proposed in it."""
+        return self._upload("/recordings", recording, media_type, query)
+
+    def add_demo(
+        self, recording: Path | bytes, *, surgeon: str, suture: str, media_type: str | None = None, **query: Any
+    ) -> Json:
+        """Store a recording and one demonstration of it."""
+        return self._upload("/demos", recording, media_type, {"surgeon": surgeon, "suture": suture, **query})
+
+    def cut_demo(self, recording: str, *, surgeon: str, suture: str, **asked: Any) -> Json:
+        """Cut a demonstration out of a stored recording, named by its digest."""
+        body = {"surgeon": surgeon, "suture": suture, **_given(asked)}
+        return self._json("POST", f"/recordings/{recording}/demos", json=body)
+
+    def demos(self, surgeon: str | None = None, suture: str | None = None) -> list[Json]:
+        """List demonstrations, the newest first."""
+        return self._all("/demos", surgeon=surgeon, suture=suture)
+
+    def demo(self, demo: str) -> Json:
+        """Look a demonstration up."""
+        return self._json("GET", f"/demos/{demo}")
+
+    def demo_path(self, demo: str) -> Json:
+        """Get a demonstration's states, and its motion as it was recorded."""
+        return self._json("GET", f"/demos/{demo}/path")
+
+    def demo_recording(self, demo: str) -> bytes:
+        """Get the recording's bytes back."""
+        return self.send("GET", f"/demos/{demo}/recording").content
+
+    def withdraw_demo(self, demo: str, *, erase: bool = False) -> None:
+        """Withdraw a demonstration, or erase it and all that was derived from it."""
+        self.send("DELETE", f"/demos/{demo}", params={"erase": erase})
+
+    # ---- trainings and jobs
+
+    def train(self, surgeon: str, suture: str, **asked: Any) -> Json:
+        """Ask for a style to be trained: demos, learner, seed, release."""
+        return self._json("POST", "/trainings", json={"surgeon": surgeon, "suture": suture, **_given(asked)})
+
+    def job(self, job: str) -> Json:
+        """Look a job up."""
+        return self._json("GET", f"/jobs/{job}")
+
+    def cancel(self, job: str) -> Json:
+        """Cancel a job."""
+        return self._json("DELETE", f"/jobs/{job}")
+
+    def wait(self, job: Json, timeout_s: float = 600.0) -> Json:
+        """Wait until a job has ended, and give it back.
+
+        Raises:
+            JobFailed: It failed, was cancelled, or takes longer than `timeout_s`.
+        """
+        deadline, pause = time.monotonic() + timeout_s, 0.05
+        while job["state"] not in ENDED and time.monotonic() < deadline:
+            time.sleep(pause)
+            pause = min(0.5, pause * 1.3)
+            job = self.job(job["id"])
+        if job["state"] != "succeeded":
+            raise JobFailed(job)
+        return job
+
+    # ---- policies
+
+    def policies(self) -> list[Json]:
+        """List what is served."""
+        return self._all("/policies")
+
+    def policy(self, surgeon: str, suture: str, version: int | None = None) -> Json:
+        """Get the released policy of a style, or one of its versions."""
+        path = f"/policies/{surgeon}/{suture}"
+        return self._json("GET", path if version is None else f"{path}/versions/{version}")
+
+    def policy_arrays(self, policy: str) -> bytes:
+        """Get a policy version's arrays, an .npz with the Q values, by its digest."""
+        return self.send("GET", f"/policy-versions/{policy}", headers={"Accept": "application/x-npz"}).content
+
+    def versions(self, surgeon: str, suture: str) -> list[Json]:
+        """List the versions of a style, the newest first."""
+        return self._all(f"/policies/{surgeon}/{suture}/versions")
+
+    def release(self, surgeon: str, suture: str, version: int) -> Json:
+        """Release a version."""
+        return self._json("POST", f"/policies/{surgeon}/{suture}/versions/{version}/release")
+
+    def withdraw(self, surgeon: str, suture: str) -> None:
+        """Withdraw what is released."""
+        self.send("DELETE", f"/policies/{surgeon}/{suture}/release")
+
+    def rollout(self, surgeon: str, suture: str, start_mm: Position, version: int | None = None) -> Json:
+        """Follow a policy from a place."""
+        body = {"start_mm": list(start_mm), "version": version}
+        return self._json("POST", f"/policies/{surgeon}/{suture}/rollouts", json=body)
+
+    def next(self, surgeon: str, suture: str, position_mm: Position, phase: int | None = None) -> Json:
+        """Ask what the released policy would do at a place."""
+        body = {"position_mm": list(position_mm), "phase": phase}
+        return self._json("POST", f"/policies/{surgeon}/{suture}/next", json=body)
+
+    # ---- plans and playbacks
+
+    def plan(self, surgeon: str, suture: str, suture_points: Sequence[Mapping[str, Any]], **asked: Any) -> Json:
+        """Stack a style at suture points: version, starts_mm, arm, frame, instrument, speed_mm_s, psm_m."""
+        points = [dict(point) for point in suture_points]
+        body = {"surgeon": surgeon, "suture": suture, "suture_points": points, **_given(asked)}
+        return self._json("POST", "/plans", json=body)
+
+    def plan_of(self, plan: str) -> Json:
+        """Look a plan up."""
+        return self._json("GET", f"/plans/{plan}")
+
+    def trajectory(self, plan: str) -> Json:
+        """Get a plan's motion, sampled."""
+        return self._json("GET", f"/plans/{plan}/trajectory")
+
+    def play(self, plan: str) -> Json:
+        """Ask for a plan to be played in the simulator."""
+        return self._json("POST", "/playbacks", json={"plan": plan})
+
+    def playback(self, playback: str) -> Json:
+        """Get the simulator's verdict."""
+        return self._json("GET", f"/playbacks/{playback}")
+
+    def picture(self, playback: str) -> bytes:
+        """Get the picture of a playback, a PNG."""
+        return self.send("GET", f"/playbacks/{playback}/picture.png").content
+
+    # ---- how
+
+    def send(self, method: str, path: str, **how: Any) -> httpx.Response:
+        """Send a request, and raise what is refused.
+
+        Raises:
+            Problem: The service refused.
+        """
+        answer = self.http.request(method, path, **how)
+        if answer.is_success or answer.status_code == httpx.codes.NOT_MODIFIED:
+            return answer
+        is_problem = answer.headers.get("content-type", "").startswith("application/problem+json")
+        raise Problem(answer.status_code, answer.json() if is_problem else {"detail": answer.reason_phrase})
+
+    def _json(self, method: str, path: str, **how: Any) -> Json:
+        body: Json = self.send(method, path, **how).json()
+        return body
+
+    def _all(self, path: str, **query: Any) -> list[Json]:
+        items: list[Json] = []
+        cursor: Any = None
+        while True:
+            page = self._json("GET", path, params=_given({"limit": 200, "cursor": cursor, **query}))
+            items += page["items"]
+            cursor = page["next"]
+            if cursor is None:
+                return items
+
+    def _upload(self, path: str, recording: Path | bytes, media_type: str | None, query: Mapping[str, Any]) -> Json:
+        data = recording if isinstance(recording, bytes) else recording.read_bytes()
+        if media_type is None:
+            media_type = "application/vnd.mcap" if isinstance(recording, bytes) else MEDIA_TYPES[recording.suffix]
+        digest = base64.b64encode(hashlib.sha256(data).digest()).decode()
+        headers = {"Content-Type": media_type, "Content-Digest": f"sha-256=:{digest}:"}
+        return self._json("POST", path, content=data, headers=headers, params=_given(query))
+
+
+def _given(query: Mapping[str, Any]) -> Json:
+    return {name: value for name, value in query.items() if value is not None}

@@ -1,0 +1,27 @@
+"""Where the commands find the service: at an address, or in this very process."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+
+from skills.client import Client
+from skills.settings import Settings
+
+
+@contextmanager
+def connect(settings: Settings, *, works: bool = False) -> Iterator[Client]:
+    """Connect to the service of the settings: at SKILLS_SERVER, else to the application in this process.
+
+    In-process, jobs need a worker: `works` starts one for as long as the connection is open.
+    """
+    if settings.server:
+        with Client(settings.server) as client:
+            yield client
+        return
+    from starlette.testclient import TestClient
+
+    from skills.api.app import create_app
+    from skills.serving import working
+
+    in_process = TestClient(create_app(settings), base_url="http://skills.local")
+    with in_process as http, working(settings) if works else nullcontext():
+        yield Client(http)

@@ -1,0 +1,1 @@
+"""The database: rows are labels on values."""

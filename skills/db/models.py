@@ -1,0 +1,277 @@
+"""The tables. A row is a label on a value: who, when, from what, and the value whole in one column.
+
+Append-only (triggers of the first migration refuse changes): recordings and their chunks, demonstrations, reward maps,
+policy versions, releases, plans, playbacks, events; a demonstration and a release can be withdrawn, once. Deleting is
+left to erasure alone.
+"""
+
+from datetime import datetime
+from typing import Annotated, Any
+
+from sqlalchemy import (
+    BigInteger,
+    CheckConstraint,
+    ForeignKey,
+    Index,
+    Integer,
+    LargeBinary,
+    String,
+    UniqueConstraint,
+    text,
+)
+from sqlalchemy.orm import Mapped, mapped_column, relationship
+
+from skills.db.base import Base, now
+from skills.db.packed import Packed, stored
+from skills.style.certificate import Coverage
+from skills.style.demo import Demo
+from skills.style.grid import GridPath, GridWorld
+from skills.style.learning.q_learning import CellQLearning, PhaseQLearning, Training
+from skills.style.plan import Pass, SuturePlan, SuturePoint
+from skills.style.playback import Playback
+from skills.style.policy import Policy
+from skills.style.reward import RewardLevels, RewardMap
+
+stored(GridWorld, GridPath, RewardLevels, PhaseQLearning, CellQLearning, Training, SuturePoint, Pass)
+
+RowId = Annotated[
+    int, mapped_column(BigInteger().with_variant(Integer, "sqlite"), primary_key=True, autoincrement=True)
+]
+Sha256 = String(64)
+Slug = String(64)
+
+
+class Surgeon(Base):
+    """A surgeon, known by a pseudonym; `subject` is the random name that events use and erasure forgets."""
+
+    __tablename__ = "surgeons"
+
+    row: Mapped[RowId]
+    slug: Mapped[str] = mapped_column(Slug, unique=True)
+    subject: Mapped[str] = mapped_column(String(32), unique=True)
+    skill_level: Mapped[str | None]
+    handedness: Mapped[str | None]
+    protocol: Mapped[str | None]
+    consent: Mapped[dict[str, Any] | None]
+    created_at: Mapped[datetime] = mapped_column(default=now)
+
+
+class Erasure(Base):
+    """Remembers that a surgeon was erased, without remembering who: a salted digest of the pseudonym."""
+
+    __tablename__ = "erasures"
+
+    row: Mapped[RowId]
+    salt: Mapped[str] = mapped_column(String(64))
+    digest: Mapped[str] = mapped_column(Sha256)
+    erased_at: Mapped[datetime] = mapped_column(default=now)
+
+
+class SutureType(Base):
+    """One kind of suture of the catalogue."""
+
+    __tablename__ = "suture_types"
+
+    slug: Mapped[str] = mapped_column(Slug, primary_key=True)
+    name: Mapped[str]
+    also_called: Mapped[list[Any]]
+    family: Mapped[str]
+    description: Mapped[str] = mapped_column(String(2000))
+
+
+class StoredRecording(Base):
+    """A raw file as it was uploaded, known by the SHA-256 of its bytes."""
+
+    __tablename__ = "recordings"
+
+    row: Mapped[RowId]
+    sha256: Mapped[str] = mapped_column(Sha256, unique=True)
+    size_bytes: Mapped[int] = mapped_column(BigInteger)
+    media_type: Mapped[str]
+    format: Mapped[str]
+    integrity: Mapped[str]
+    reading: Mapped[dict[str, Any]]  # how it was read: rate_hz and frame where the file does not say them
+    about: Mapped[dict[str, Any]]  # topics, quality, proposed hand-offs
+    created_at: Mapped[datetime] = mapped_column(default=now)
+
+
+class RecordingChunk(Base):
+    """A mebibyte of a recording."""
+
+    __tablename__ = "recording_chunks"
+
+    recording: Mapped[int] = mapped_column(ForeignKey("recordings.row"), primary_key=True)
+    number: Mapped[int] = mapped_column(primary_key=True)
+    data: Mapped[bytes] = mapped_column(LargeBinary)
+
+
+class Demonstration(Base):
+    """One hand-off cut out of a recording, as a path in its grid world."""
+
+    __tablename__ = "demonstrations"
+
+    row: Mapped[RowId]
+    sha256: Mapped[str] = mapped_column(Sha256, unique=True)
+    recording_row: Mapped[int] = mapped_column(ForeignKey("recordings.row"), index=True)
+    surgeon_row: Mapped[int] = mapped_column(ForeignKey("surgeons.row"))
+    suture: Mapped[str] = mapped_column(ForeignKey("suture_types.slug"), index=True)
+    arm: Mapped[str]
+    topic: Mapped[str]
+    frame: Mapped[str]
+    instrument: Mapped[str]
+    start_s: Mapped[float]
+    end_s: Mapped[float]
+    session: Mapped[str | None]
+    demo: Mapped[Demo] = mapped_column(Packed(Demo), deferred=True)
+    path: Mapped[GridPath] = mapped_column(Packed(GridPath), deferred=True)
+    report: Mapped[dict[str, Any]]
+    created_at: Mapped[datetime] = mapped_column(default=now)
+    withdrawn_at: Mapped[datetime | None]
+
+    recording: Mapped[StoredRecording] = relationship(lazy="joined", innerjoin=True)
+    surgeon: Mapped[Surgeon] = relationship(lazy="joined", innerjoin=True)
+    __table_args__ = (Index("ix_demonstrations_style", "surgeon_row", "suture", "row"),)
+
+
+class StoredRewardMap(Base):
+    """What Algorithm 1 wrote for a demonstration."""
+
+    __tablename__ = "reward_maps"
+
+    row: Mapped[RowId]
+    sha256: Mapped[str] = mapped_column(Sha256)
+    demonstration_row: Mapped[int] = mapped_column(ForeignKey("demonstrations.row"), unique=True)
+    map: Mapped[RewardMap] = mapped_column(Packed(RewardMap), deferred=True)
+
+
+class PolicyVersion(Base):
+    """One learnt policy of a style; `manifest` is what a client is told of it, all but the release."""
+
+    __tablename__ = "policy_versions"
+
+    row: Mapped[RowId]
+    sha256: Mapped[str] = mapped_column(Sha256, unique=True)
+    training: Mapped[str] = mapped_column(Sha256, index=True)  # identity of the training that made it
+    surgeon_row: Mapped[int] = mapped_column(ForeignKey("surgeons.row"))
+    suture: Mapped[str] = mapped_column(ForeignKey("suture_types.slug"))
+    version: Mapped[int]
+    demonstration_row: Mapped[int] = mapped_column(ForeignKey("demonstrations.row"), index=True)
+    manifest: Mapped[dict[str, Any]]
+    releasable: Mapped[bool]
+    learnt: Mapped[Policy] = mapped_column(Packed(Policy), deferred=True)
+    covered: Mapped[Coverage] = mapped_column(Packed(Coverage), deferred=True)
+    created_at: Mapped[datetime] = mapped_column(default=now)
+
+    surgeon: Mapped[Surgeon] = relationship(lazy="joined", innerjoin=True)
+    demonstration: Mapped[Demonstration] = relationship(lazy="select")
+    __table_args__ = (UniqueConstraint("surgeon_row", "suture", "version", name="uq_policy_versions_version"),)
+
+
+class Release(Base):
+    """A policy version was released; the newest of a style that is not withdrawn is what is served."""
+
+    __tablename__ = "releases"
+
+    row: Mapped[RowId]
+    policy_row: Mapped[int] = mapped_column(ForeignKey("policy_versions.row"), index=True)
+    surgeon_row: Mapped[int] = mapped_column(ForeignKey("surgeons.row"))
+    suture: Mapped[str] = mapped_column(ForeignKey("suture_types.slug"))
+    released_at: Mapped[datetime] = mapped_column(default=now)
+    released_by: Mapped[str]
+    withdrawn_at: Mapped[datetime | None]
+
+    policy: Mapped[PolicyVersion] = relationship(lazy="select")
+    __table_args__ = (Index("ix_releases_style", "surgeon_row", "suture", "row"),)
+
+
+class Plan(Base):
+    """Grid worlds stacked at suture points."""
+
+    __tablename__ = "plans"
+
+    row: Mapped[RowId]
+    sha256: Mapped[str] = mapped_column(Sha256, unique=True)
+    policy_row: Mapped[int] = mapped_column(ForeignKey("policy_versions.row"), index=True)
+    about: Mapped[dict[str, Any]]
+    plan: Mapped[SuturePlan] = mapped_column(Packed(SuturePlan), deferred=True)
+    created_at: Mapped[datetime] = mapped_column(default=now)
+
+    policy: Mapped[PolicyVersion] = relationship(lazy="joined", innerjoin=True)
+
+
+class StoredPlayback(Base):
+    """What the simulator measured on a plan, and the verdict."""
+
+    __tablename__ = "playbacks"
+
+    row: Mapped[RowId]
+    sha256: Mapped[str] = mapped_column(Sha256, unique=True)
+    plan_row: Mapped[int] = mapped_column(ForeignKey("plans.row"), index=True)
+    feasible: Mapped[bool]
+    report: Mapped[dict[str, Any]]
+    measured: Mapped[Playback] = mapped_column(Packed(Playback), deferred=True)
+    created_at: Mapped[datetime] = mapped_column(default=now)
+
+    plan: Mapped[Plan] = relationship(lazy="joined", innerjoin=True)
+
+
+class Job(Base):
+    """Work that was asked for. `identity` is the digest of its resolved inputs: one active or succeeded job each.
+
+    `attempt` counts what the engine was told; its workflow is named "<row>-<attempt>". `told_at` is when it was told.
+    """
+
+    __tablename__ = "jobs"
+
+    row: Mapped[RowId]
+    id: Mapped[str] = mapped_column(String(32), unique=True)
+    kind: Mapped[str] = mapped_column(String(20))
+    identity: Mapped[str] = mapped_column(Sha256)
+    state: Mapped[str] = mapped_column(String(10), default="queued", index=True)
+    progress: Mapped[float] = mapped_column(default=0.0)
+    request: Mapped[dict[str, Any]]
+    result: Mapped[dict[str, Any] | None]
+    error: Mapped[str | None] = mapped_column(String(2000))
+    attempt: Mapped[int] = mapped_column(default=1)
+    surgeon_row: Mapped[int | None] = mapped_column(ForeignKey("surgeons.row"), index=True)
+    asked_by: Mapped[str] = mapped_column(default="local")
+    told_at: Mapped[datetime | None]
+    created_at: Mapped[datetime] = mapped_column(default=now)
+    started_at: Mapped[datetime | None]
+    ended_at: Mapped[datetime | None]
+
+    __table_args__ = (
+        CheckConstraint("state IN ('queued', 'running', 'succeeded', 'failed', 'cancelled')", name="state"),
+        CheckConstraint("progress >= 0 AND progress <= 1", name="progress"),
+        Index(
+            "uq_jobs_identity_live",
+            "identity",
+            unique=True,
+            sqlite_where=text("state IN ('queued', 'running', 'succeeded')"),
+            postgresql_where=text("state IN ('queued', 'running', 'succeeded')"),
+        ),
+    )
+
+
+class Executor(Base):
+    """A worker process and when it last said that it lives; its `id` is never used twice."""
+
+    __tablename__ = "executors"
+
+    id: Mapped[str] = mapped_column(String(64), primary_key=True)
+    beat_at: Mapped[datetime] = mapped_column(default=now)
+
+
+class Event(Base):
+    """Who did what to what, when; people appear by their random subject only."""
+
+    __tablename__ = "events"
+
+    row: Mapped[RowId]
+    sha256: Mapped[str] = mapped_column(Sha256, unique=True)
+    at: Mapped[datetime] = mapped_column(default=now)
+    actor: Mapped[str]
+    action: Mapped[str]
+    object_kind: Mapped[str]
+    object_id: Mapped[str]
+    subject: Mapped[str | None] = mapped_column(String(32), index=True)

@@ -1,0 +1,190 @@
+"""`make demo`: the main job, end to end, over HTTP, on a database that did not exist before.
+
+Upload the sample recordings of synthetic surgeons, take the hand-offs that the service proposes, train and release,
+fetch the policies, roll them out, stack five suture points, play the plan in PyBullet; then the same with a real
+recording, where one is there. It exits with 0 only if every sample style is followed exactly, from every start, by a
+motion that the arm can make.
+"""
+
+import os
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from itertools import pairwise, product
+from pathlib import Path
+from typing import Any
+
+import httpx2 as httpx
+from rich.console import Console
+from rich.table import Table
+
+from skills.client import Client, JobFailed, Problem
+from skills.drawing import draw_styles
+from skills.samples import load_samples
+from skills.settings import settings
+
+Json = dict[str, Any]
+PICTURES = Path("build/demo")
+START_S = 60.0
+SPACING_MM = (6.0, 0.0, 0.0)  # between suture points, along the wound
+N_POINTS = 5
+SAMPLE_APPROACH = (-0.94, 0.10, -0.33)  # invented, and said so: how PSM_M would wait for the needle
+REAL_STYLE = ("recorded-psm2", "simple-running")
+
+out = Console(highlight=False, width=max(Console().width, 110))
+
+
+def main() -> int:
+    """Do the main job; the exit code."""
+    began = time.monotonic()
+    PICTURES.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix="suture-skills-") as folder, running_service(Path(folder)) as client:
+        styles = tell_styles(client)
+        report = Table("style", "states", "DTW mm", "starts", "verdict", "train s", "plan s", "play s", box=None)
+        good = [check_style(client, surgeon, suture, report) for surgeon, suture in styles]
+        out.print("\nLearnt, certified, released; stacked at five suture points; played back in PyBullet:")
+        out.print(report)
+        draw_samples(client, styles)
+        real_recording(client)
+    out.print(f"\nPictures: {PICTURES}/  ({time.monotonic() - began:.1f} s in all). Research use only.")
+    return 0 if good and all(good) else 1
+
+
+@contextmanager
+def running_service(folder: Path) -> Iterator[Client]:
+    """Start the real server on loopback, with an embedded SQLite database in a folder; stop it at the end."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    database = {"SKILLS_DATABASE_URL": f"sqlite:///{folder / 'skills.sqlite'}", "SKILLS_PORT": str(port)}
+    server = subprocess.Popen([sys.executable, "-m", "skills", "serve"], env={**os.environ, **database})
+    try:
+        with Client(f"http://127.0.0.1:{port}") as client:
+            wait_until_ready(client, server)
+            os.environ["SKILLS_SERVER"] = f"http://127.0.0.1:{port}"  # for the commands that this starts
+            yield client
+    finally:
+        server.terminate()
+        server.wait(30)
+
+
+def wait_until_ready(client: Client, server: subprocess.Popen[bytes]) -> None:
+    """Wait until the service answers."""
+    deadline = time.monotonic() + START_S
+    while time.monotonic() < deadline and server.poll() is None:
+        try:
+            client.send("GET", "/readyz")
+            return
+        except (httpx.TransportError, Problem):
+            time.sleep(0.1)
+    raise SystemExit("The service did not start.")
+
+
+def tell_styles(client: Client) -> list[tuple[str, str]]:
+    """Load the samples and say what was stored: the styles among them."""
+    stored = Table("surgeon", "suture type", "demonstration", "from - to s", "states", "crossings", "clutch", box=None)
+    styles: dict[tuple[str, str], None] = {}
+    for demo in load_samples(client):
+        report = demo["report"]
+        span = f"{demo['start_s']:.1f} - {demo['end_s']:.1f}"
+        figures = (str(report[name]) for name in ("path_states", "revisits", "clutch_presses"))
+        stored.add_row(demo["surgeon"], demo["suture"], demo["id"][:12], span, *figures)
+        styles[demo["surgeon"], demo["suture"]] = None
+    out.print("Stored, each hand-off as the service proposed it:")
+    out.print(stored)
+    return list(styles)
+
+
+def check_style(client: Client, surgeon: str, suture: str, report: Table) -> bool:
+    """Train, release, roll out, plan and play a style: whether everything is as it should be."""
+    laps = [time.monotonic()]
+    client.wait(client.train(surgeon, suture, release=True))
+    policy = client.policy(surgeon, suture)
+    laps.append(time.monotonic())
+    followed = client.rollout(surgeon, suture, policy["start_mm"])
+    plan = client.plan(surgeon, suture, suture_points(policy), psm_m={"approach": SAMPLE_APPROACH})
+    laps.append(time.monotonic())
+    playback = client.playback(client.wait(client.play(plan["id"]))["result"]["playback"])
+    laps.append(time.monotonic())
+    (PICTURES / f"{surgeon}-{suture}-playback.png").write_bytes(client.picture(playback["id"]))
+    coverage, total = policy["coverage"], followed["dtw_total_mm"]
+    report.add_row(
+        f"{surgeon} {suture}",
+        f"{policy['metrics']['exact_states']}/{policy['metrics']['path_states']}",
+        f"{total:g}",
+        f"{coverage['starts_reaching_goal']}/{coverage['n_states']}",
+        verdict(playback),
+        *(f"{after - before:.2f}" for before, after in pairwise(laps)),
+    )
+    reach_all = coverage["starts_reaching_goal"] == coverage["n_states"]
+    return bool(followed["finished"] and total == 0 and reach_all and playback["feasible"])
+
+
+def suture_points(policy: Json) -> list[Json]:
+    """Lay five suture points in a line about the policy's goal."""
+    middle = (N_POINTS - 1) / 2
+    return [
+        {"position_mm": [g + (i - middle) * d for g, d in zip(policy["goal_mm"], SPACING_MM, strict=True)]}
+        for i in range(N_POINTS)
+    ]
+
+
+def draw_samples(client: Client, styles: list[tuple[str, str]]) -> None:
+    """Draw every style with rollouts from four corners of its grid."""
+    drawn = []
+    for surgeon, suture in styles:
+        policy = client.policy(surgeon, suture)
+        grid = policy["grid"]
+        low, cell = grid["origin_mm"], grid["cell_mm"]
+        ends = [(o, o + cell * (n - 1)) for o, n in zip(low, grid["shape"], strict=True)]
+        corners = [c for c in product(*ends) if sum(a == b[0] for a, b in zip(c, ends, strict=True)) % 2]
+        rollouts = [client.rollout(surgeon, suture, corner) for corner in corners]
+        drawn.append((client.demo_path(policy["demos"][0]), policy, rollouts))
+    draw_styles(drawn, PICTURES / "styles.png")
+
+
+def real_recording(client: Client) -> None:
+    """Take a real recording through the same line, with the command that a lab would use, where one is there."""
+    folder = settings().sample_recordings
+    bag = None if folder is None else folder / "rosbag2"
+    if bag is None or not bag.is_dir():
+        out.print("\nNo real recording: set SKILLS_SAMPLE_RECORDINGS to a folder with a bag folder rosbag2/ in it.")
+        return
+    surgeon, suture = REAL_STYLE
+    client.put_surgeon(surgeon)
+    command = ["demo", "add", str(bag), "--surgeon", surgeon, "--suture", suture, "--proposal", "1", "--grid", "fit"]
+    out.print(f"\nA real recording: skills {' '.join([*command[:2], bag.name, *command[3:]])}", soft_wrap=True)
+    subprocess.run([sys.executable, "-m", "skills", *command], check=True)  # noqa: S603 - our own command
+    try:
+        result = client.wait(client.train(surgeon, suture, release=True))["result"]
+    except JobFailed as failed:
+        out.print(f"It was not learnt: {failed}")
+        return
+    policy = client.policy(surgeon, suture, result["policy_version"])
+    metrics, coverage = policy["metrics"], policy["coverage"]
+    out.print(
+        f"{metrics['exact_states']} of {metrics['path_states']} states, DTW {metrics['dtw_total_mm']:g} mm, "
+        f"{coverage['starts_reaching_goal']} of {coverage['n_states']} starts reach the goal; "
+        + ("released." if result["released"] else f"not released: {result['not_released_because']}")
+    )
+    try:
+        plan = client.plan(surgeon, suture, [{"position_mm": policy["goal_mm"]}], version=policy["version"])
+    except Problem as refused:
+        out.print(f"Not played back: {refused}", soft_wrap=True)
+        return
+    playback = client.playback(client.wait(client.play(plan["id"]))["result"]["playback"])
+    (PICTURES / "real-recording-playback.png").write_bytes(client.picture(playback["id"]))
+    out.print(f"Played back at its own place: {verdict(playback)}")
+
+
+def verdict(playback: Json) -> str:
+    """Say a playback's verdict."""
+    return "feasible" if playback["feasible"] else str(playback["report"]["failure_in_words"])
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

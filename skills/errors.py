@@ -1,0 +1,173 @@
+"""Everything that this package refuses, as one tree.
+
+    SkillsError
+    ├── BadInput                what was given is wrong, and nothing was kept
+    │   ├── BadRecording        the file: unreadable, no usable topic, mixed frames, not metres ...
+    │   ├── BadPath             the demonstration in its grid: outside it, never leaving the goal ...
+    │   ├── BadSettings         a learner, grid or request that cannot be meant
+    │   └── BadPlan             a plan or trajectory that the arm cannot follow
+    ├── NotFound                no such thing here (and what there is instead)
+    ├── Erased                  it was here and was erased for good
+    ├── Conflict                it cannot be done in the present state
+    ├── PreconditionFailed      it changed since the caller last looked
+    ├── UnknownFormat           the content is of no format that is read here
+    ├── TooLarge                over a limit of the settings
+    ├── Corrupt                 what was stored is no longer what was stored
+    ├── Busy                    the database or the queue cannot take it now
+    └── SimulationFailed        the simulator crashed, hung or answered nonsense
+
+An error is named after what is wrong, carries the offending numbers as attributes of `numbers`, and its message says
+what to do next. Only `skills.api.problems` knows which status code each one becomes.
+"""
+
+
+class SkillsError(Exception):
+    """The root; `numbers` holds the offending values, safe to show to the caller."""
+
+    def __init__(self, message: str, **numbers: object) -> None:
+        super().__init__(message)
+        self.numbers = numbers
+
+
+class BadInput(SkillsError):
+    """What was given is wrong; nothing was kept."""
+
+
+class NotFound(SkillsError):
+    """No such thing here."""
+
+
+class Erased(SkillsError):
+    """It was here and was erased for good."""
+
+
+class Conflict(SkillsError):
+    """It cannot be done in the present state."""
+
+
+class PreconditionFailed(SkillsError):
+    """It changed since the caller last looked."""
+
+
+class UnknownFormat(SkillsError):
+    """The content is of no format that is read here."""
+
+
+class TooLarge(SkillsError):
+    """Over a limit of the settings."""
+
+
+class Corrupt(SkillsError):
+    """What was stored is no longer what was stored."""
+
+
+class Busy(SkillsError):
+    """The database or the queue cannot take it now."""
+
+
+class SimulationFailed(SkillsError):
+    """The simulator crashed, hung or answered nonsense: the check did not happen."""
+
+
+# ---- recordings ------------------------------------------------------------------------------------------------
+
+
+class BadRecording(BadInput):
+    """The file cannot be used as a recording."""
+
+
+class UnreadableRecording(BadRecording):
+    """Empty, truncated or corrupt."""
+
+
+class NoUsableTopic(BadRecording):
+    """No topic or column with the pose of an arm."""
+
+
+class MixedFrames(BadRecording):
+    """Poses of one topic are given in more than one frame."""
+
+
+class BackwardStamps(BadRecording):
+    """Time runs backwards."""
+
+
+class RepeatedStamps(BadRecording):
+    """More than half of the samples carry the stamp of the sample before: the clock stood still."""
+
+
+class NotFinite(BadRecording):
+    """NaN or infinity among the numbers."""
+
+
+class NotMetres(BadRecording):
+    """A magnitude that cannot be metres of a PSM; never rescaled by guess."""
+
+
+class NotAQuaternion(BadRecording):
+    """A quaternion whose length is not one."""
+
+
+class BadColumns(BadRecording):
+    """The header of a table is unknown, doubled, incomplete or ambiguous."""
+
+
+class BadSegment(BadRecording):
+    """The part asked for is not in the recording."""
+
+
+# ---- the path in its grid ---------------------------------------------------------------------------------------
+
+
+class BadPath(BadInput):
+    """The demonstration does not make a path that can be learnt."""
+
+
+class EmptyPath(BadPath):
+    """A path without points."""
+
+
+class OutsideGrid(BadPath):
+    """Points outside the grid world."""
+
+
+class NeverLeavesGoal(BadPath):
+    """All of the path lies in its goal's cell."""
+
+
+# ---- learning ---------------------------------------------------------------------------------------------------
+
+
+class BadSettings(BadInput):
+    """Settings that cannot be meant."""
+
+
+# ---- plans and motion -------------------------------------------------------------------------------------------
+
+
+class BadPlan(BadInput):
+    """A plan that cannot be made."""
+
+
+class Unreachable(BadPlan):
+    """A pose that the arm cannot take."""
+
+
+class UnknownInstrument(BadPlan):
+    """An instrument whose constants are not known here."""
+
+
+class ImproperRotation(BadPlan):
+    """A matrix or quaternion that is no rotation."""
+
+
+class NoApproach(BadPlan):
+    """The direction in which PSM_M approaches is missing or has no length."""
+
+
+class BadSpeed(BadPlan):
+    """A speed or rate that no motion can have."""
+
+
+class NoMotion(BadPlan):
+    """A pass in which nothing moves."""

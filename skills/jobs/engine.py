@@ -1,0 +1,135 @@
+"""How both sides reach the job engine: the worker that runs it, and the service that only tells it things.
+
+The engine's inputs are the row and the attempt of a job, as plain JSON: nothing personal is kept in its tables, and
+nothing in them is ever unpickled. DBOS takes over a second to import, so it is imported where it is first needed.
+"""
+
+import logging
+import sqlite3
+from collections.abc import Callable
+from pathlib import Path
+from queue import SimpleQueue
+from threading import Thread
+from typing import TYPE_CHECKING
+
+from sqlalchemy.engine import make_url
+
+from skills.settings import Settings
+
+if TYPE_CHECKING:
+    from dbos import DBOSClient, DBOSConfig
+
+APPLICATION = "suture-skills"
+QUEUE = "jobs"
+WORKFLOW = "perform_job"
+STEPS = "1"  # the engine's "application version": to be changed with the sequence of steps in `workflows`, only then
+POLLING_S = 0.2
+FAREWELL_S = 2.0
+
+log = logging.getLogger(__name__)
+Errand = Callable[["DBOSClient", int, int], None]
+
+
+def workflow_id(row: int, attempt: int) -> str:
+    """Name the workflow of one attempt at one job; the same name can never run twice to an end."""
+    return f"{row}-{attempt}"
+
+
+def configuration(settings: Settings, executor: str) -> "DBOSConfig":
+    """Configure the engine of one worker process."""
+    from dbos import DBOSPortableJSONSerializer
+
+    return {
+        "name": APPLICATION,
+        "system_database_url": settings.engine_url,
+        "dbos_system_schema": "dbos",
+        "serializer": DBOSPortableJSONSerializer(),  # the default is pickle
+        "executor_id": executor,
+        "application_version": STEPS,
+        "log_level": "WARNING",
+        "use_listen_notify": False,  # queues poll anyway, and we send no messages
+    }
+
+
+def connect(settings: Settings) -> "DBOSClient":
+    """Open a client of the engine; it connects when it is first used."""
+    from dbos import DBOSClient, DBOSPortableJSONSerializer
+
+    prepare(settings)
+    return DBOSClient(
+        system_database_url=settings.engine_url,
+        dbos_system_schema="dbos",
+        serializer=DBOSPortableJSONSerializer(),
+        application_name=APPLICATION,
+        lazy=True,
+        retry_connection_errors=False,
+    )
+
+
+def prepare(settings: Settings) -> None:
+    """Give the engine's SQLite file a write-ahead log, which it keeps from then on: DBOS itself does not."""
+    url = make_url(settings.engine_url)
+    if url.get_backend_name() != "sqlite" or url.database is None:
+        return
+    Path(url.database).parent.mkdir(parents=True, exist_ok=True)
+    connection = sqlite3.connect(url.database)
+    try:
+        connection.execute("PRAGMA journal_mode=WAL")
+    finally:
+        connection.close()
+
+
+def tell(client: "DBOSClient", row: int, attempt: int) -> None:
+    """Tell the engine of an attempt at a job; telling it again changes nothing."""
+    client.enqueue(
+        {"queue_name": QUEUE, "workflow_name": WORKFLOW, "workflow_id": workflow_id(row, attempt)}, row, attempt
+    )
+
+
+def drop(client: "DBOSClient", row: int, attempt: int) -> None:
+    """Take an attempt back: it does not start any more, nor go on after the step it is in."""
+    client.cancel_workflow(workflow_id(row, attempt))
+
+
+class Engine:
+    """The engine as the service sees it: it is told of jobs, in the background, and may miss it.
+
+    Whatever goes wrong here is logged and let go: the row of the job is committed before, and a worker's watch tells
+    again what the engine does not know. So an answer to a request never waits for the engine, which on SQLite may be
+    locked for long and may not have been created yet.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
+        self._client: DBOSClient | None = None
+        self._errands: SimpleQueue[tuple[Errand, int, int] | None] = SimpleQueue()
+        self._thread = Thread(target=self._run, name="engine", daemon=True)  # must not hold up the exit
+        self._thread.start()
+
+    def tell(self, row: int, attempt: int) -> None:
+        """Tell of an attempt at a job, after the commit of its row."""
+        self._errands.put((tell, row, attempt))
+
+    def cancel(self, row: int, attempt: int) -> None:
+        """Drop an attempt whose job was cancelled, after the commit of that."""
+        self._errands.put((drop, row, attempt))
+
+    def close(self) -> None:
+        """Do the errands that can be done at once, and let go."""
+        self._errands.put(None)
+        self._thread.join(FAREWELL_S)
+
+    def _run(self) -> None:
+        while (errand := self._errands.get()) is not None:
+            try:
+                self._do(*errand)
+            except Exception:
+                log.info("The job engine missed a %s; the workers' watch makes up for it.", errand[0].__name__)
+                log.debug("This is why:", exc_info=True)
+        if self._client is not None:
+            self._client.destroy()
+            self._client = None
+
+    def _do(self, errand: Errand, row: int, attempt: int) -> None:
+        self._client = self._client or connect(self._settings)
+        errand(self._client, row, attempt)

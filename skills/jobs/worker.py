@@ -1,0 +1,119 @@
+"""The worker process: it runs jobs, beside the service or on its own machine, and watches over the other workers."""
+
+import logging
+import os
+import signal
+import sys
+import uuid
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from threading import Event, Thread
+from types import FrameType
+
+from dbos import DBOS
+
+from skills.db.session import Database
+from skills.jobs.engine import POLLING_S, QUEUE, configuration, connect
+from skills.jobs.lease import Leases
+from skills.jobs.watch import Watch
+from skills.jobs.workflows import Perform, Work, register
+from skills.settings import Settings
+
+ROUND_S = 0.5
+DRAIN_S = 8  # what works then is cut and done again elsewhere; containers are killed after ten
+NICENESS = 10
+
+log = logging.getLogger(__name__)
+
+
+def run_worker(settings: Settings, *, parent: int | None = None, perform: Perform | None = None) -> None:
+    """Run jobs until SIGTERM or SIGINT, or until the parent is gone; then finish what is begun, and return.
+
+    The database must have been migrated. To be called in the main thread of a process of its own, once: the engine
+    is one per process. The process ends here and now if its work does not end in time.
+
+    Args:
+        parent: The id of the process without which this one has no reason to live.
+        perform: Carries a job out; `skills.library.perform_job` unless told otherwise.
+    """
+    stop = _stopped_by_signals()
+    executor = f"{os.getpid()}-{uuid.uuid4().hex}"  # never used again: the engine would run its work twice
+    database = Database(settings.database_url)
+    client = connect(settings)
+    watch = Watch(database, client, executor, Leases(settings.lease_s), DBOS._recover_pending_workflows)
+    try:
+        watch.beat()  # before it can hold any work
+        with _engine(Work(database, settings, perform or _library()), executor, watch):
+            while not (stop.is_set() or _orphaned(parent)):
+                _survive(watch.round)
+                stop.wait(ROUND_S)
+        _go_if_cut_short(watch)
+        _survive(watch.leave)
+    finally:
+        client.destroy()
+        database.close()
+
+
+def _library() -> Perform:
+    from skills.library import perform_job  # late: it brings everything along
+
+    return perform_job
+
+
+@contextmanager
+def _engine(work: Work, executor: str, watch: Watch) -> Iterator[None]:
+    """Run the engine for as long as the block, and drain it after: no new work, and time for what is begun."""
+    register(work)
+    DBOS(config=configuration(work.settings, executor))
+    DBOS.launch()
+    DBOS.register_queue(QUEUE, worker_concurrency=work.settings.worker_threads, polling_interval_sec=POLLING_S)
+    try:
+        yield
+    finally:
+        drain = Thread(target=DBOS.destroy, kwargs={"workflow_completion_timeout_sec": DRAIN_S})
+        drain.start()
+        while drain.is_alive():  # it beats while it drains, or others would take over what it finishes
+            _survive(watch.beat)
+            drain.join(ROUND_S)
+
+
+def _survive(step: Callable[[], None]) -> None:
+    """Take a step of the watch; a database that is locked or away for a while must not end the worker."""
+    try:
+        step()
+    except Exception:
+        log.warning("The watch missed a round; the next one makes up for it.", exc_info=True)
+
+
+def _stopped_by_signals() -> Event:
+    stop = Event()
+
+    def ask(_number: int, _frame: FrameType | None) -> None:
+        stop.set()
+
+    signal.signal(signal.SIGTERM, ask)
+    signal.signal(signal.SIGINT, ask)
+    return stop
+
+
+def _orphaned(parent: int | None) -> bool:
+    return parent is not None and os.getppid() != parent
+
+
+def _go_if_cut_short(watch: Watch) -> None:
+    """End the process if a job still runs: its thread cannot be stopped, and would hold up the exit for as long."""
+    if watch.at_work():
+        log.warning("Stopped in the middle of a job; it is done again elsewhere, or after the next start.")
+        logging.shutdown()
+        os._exit(0)
+
+
+def main() -> None:
+    """Run as a child of the process whose id is the argument, out of the way of what answers requests."""
+    logging.basicConfig(level=logging.WARNING, format="%(asctime)s worker %(levelname)s %(message)s")
+    os.nice(NICENESS)
+    run_worker(Settings(), parent=int(sys.argv[1]))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,90 @@
+"""The one deletion there is: a surgeon, or one demonstration, and everything derived from it.
+
+Recordings go too, unless a demonstration that stays shares the bytes. Events stay; those of an erased surgeon name a
+random subject that no longer belongs to anybody.
+"""
+
+import secrets
+from collections.abc import Sequence
+
+from sqlalchemy import delete, select
+from sqlalchemy.orm import Session
+
+from skills.db.models import (
+    Demonstration,
+    Erasure,
+    Job,
+    Plan,
+    PolicyVersion,
+    RecordingChunk,
+    Release,
+    StoredPlayback,
+    StoredRecording,
+    StoredRewardMap,
+    Surgeon,
+)
+from skills.library.catalogue import find_surgeon, salted
+from skills.library.demos import find_demo
+from skills.library.events import record
+
+
+def erase_surgeon(session: Session, slug: str, actor: str) -> list[Job]:
+    """Erase a surgeon for good: the pseudonym answers "erased" from now on.
+
+    Returns:
+        The jobs that were deleted, so that the engine can be told to drop them.
+    """
+    surgeon = find_surgeon(session, slug)
+    of_surgeon = Demonstration.surgeon_row == surgeon.row
+    jobs = _jobs(session, surgeon)
+    _drop_jobs(session, jobs)
+    _erase(session, session.scalars(select(Demonstration).where(of_surgeon)).all())
+    record(session, actor, "erase", "surgeon", surgeon.subject, surgeon)
+    salt = secrets.token_hex(32)
+    session.add(Erasure(salt=salt, digest=salted(salt, slug)))
+    session.execute(delete(Surgeon).where(Surgeon.row == surgeon.row))
+    return jobs
+
+
+def erase_demo(session: Session, demo_sha256: str, actor: str) -> list[Job]:
+    """Erase one demonstration and what was learnt from it; the jobs that were deleted."""
+    demo = find_demo(session, demo_sha256)
+    of_demo = select(Plan.sha256).join(PolicyVersion).where(PolicyVersion.demonstration_row == demo.row)
+    plans = set(session.scalars(of_demo))
+    jobs = [
+        job
+        for job in _jobs(session, demo.surgeon)
+        if demo_sha256 in job.request.get("demos", ()) or job.request.get("plan") in plans
+    ]
+    _drop_jobs(session, jobs)
+    record(session, actor, "erase", "demonstration", demo_sha256, demo.surgeon)
+    _erase(session, [demo])
+    return jobs
+
+
+def _jobs(session: Session, surgeon: Surgeon) -> list[Job]:
+    return list(session.scalars(select(Job).where(Job.surgeon_row == surgeon.row)))
+
+
+def _drop_jobs(session: Session, jobs: Sequence[Job]) -> None:
+    session.execute(delete(Job).where(Job.row.in_([job.row for job in jobs])))
+
+
+def _erase(session: Session, demos: Sequence[Demonstration]) -> None:
+    rows = [demo.row for demo in demos]
+    recordings = {demo.recording_row for demo in demos}
+    policies = select(PolicyVersion.row).where(PolicyVersion.demonstration_row.in_(rows))
+    plans = select(Plan.row).where(Plan.policy_row.in_(policies))
+    for statement in (
+        delete(StoredPlayback).where(StoredPlayback.plan_row.in_(plans)),
+        delete(Plan).where(Plan.policy_row.in_(policies)),
+        delete(Release).where(Release.policy_row.in_(policies)),
+        delete(PolicyVersion).where(PolicyVersion.demonstration_row.in_(rows)),
+        delete(StoredRewardMap).where(StoredRewardMap.demonstration_row.in_(rows)),
+        delete(Demonstration).where(Demonstration.row.in_(rows)),
+    ):
+        session.execute(statement, execution_options={"synchronize_session": False})
+    shared = select(Demonstration.recording_row).where(Demonstration.recording_row.in_(recordings))
+    for row in recordings - set(session.scalars(shared)):
+        session.execute(delete(RecordingChunk).where(RecordingChunk.recording == row))
+        session.execute(delete(StoredRecording).where(StoredRecording.row == row))

@@ -1,0 +1,71 @@
+"""Jobs: work that was asked for, deduplicated by what was asked."""
+
+import secrets
+from collections.abc import Sequence
+from typing import Any
+
+from sqlalchemy import select, update
+from sqlalchemy.orm import Session
+
+from skills.db.base import now
+from skills.db.models import Job, Surgeon
+from skills.db.packed import canonical, sha256
+from skills.errors import Conflict, NotFound
+from skills.library.events import record
+
+LIVE = ("queued", "running", "succeeded")
+ACTIVE = ("queued", "running")
+
+
+def ask(session: Session, kind: str, request: dict[str, Any], surgeon: Surgeon, actor: str) -> tuple[Job, bool]:
+    """Ask for work, resolved in all its inputs: the job, and whether it is a new one.
+
+    An equal request that is waiting, running or done gives the same job; a failed or cancelled one gives a new one.
+    """
+    identity = sha256(canonical([kind, request]))
+    known = session.scalar(select(Job).where(Job.identity == identity, Job.state.in_(LIVE)))
+    if known is not None:
+        return known, False
+    job = Job(
+        id=secrets.token_hex(8), kind=kind, identity=identity, request=request, surgeon_row=surgeon.row, asked_by=actor
+    )
+    session.add(job)
+    session.flush()
+    record(session, actor, "ask", f"job-{kind}", job.id, surgeon)
+    return job, True
+
+
+def find_job(session: Session, job_id: str) -> Job:
+    """Find a job by its id."""
+    job = session.scalar(select(Job).where(Job.id == job_id))
+    if job is None:
+        raise NotFound("There is no such job; GET /jobs lists them.")
+    return job
+
+
+def list_jobs(session: Session, limit: int, before: int | None, state: str | None) -> Sequence[Job]:
+    """List jobs, the newest first."""
+    query = select(Job).order_by(Job.row.desc()).limit(limit)
+    if before is not None:
+        query = query.where(Job.row < before)
+    if state is not None:
+        query = query.where(Job.state == state)
+    return session.scalars(query).all()
+
+
+def cancel(session: Session, job_id: str, actor: str) -> Job:
+    """Cancel a job that is waiting or running: no result of it will be kept.
+
+    Raises:
+        Conflict: It has ended.
+    """
+    job = find_job(session, job_id)
+    ended = {"state": "cancelled", "ended_at": now()}
+    done = session.execute(
+        update(Job).where(Job.row == job.row, Job.state.in_(ACTIVE)).values(**ended).returning(Job.row)
+    )
+    if done.first() is None and job.state != "cancelled":
+        raise Conflict(f"The job has ended already: it {job.state}.")
+    session.refresh(job)
+    record(session, actor, "cancel", f"job-{job.kind}", job.id)
+    return job

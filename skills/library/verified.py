@@ -1,0 +1,65 @@
+"""Values read back from the database, each compared with the digest that its row is known by.
+
+A column is guarded by its own checksum (`skills.db.packed`); this guards what belongs together: a policy and what is
+said of it, a plan and the policy that it follows. What does not agree is refused; nothing takes its place.
+"""
+
+from typing import Any
+
+from skills.db.models import Plan, PolicyVersion
+from skills.db.packed import canonical, digest, sha256
+from skills.errors import Corrupt
+from skills.library.kept import Kept
+from skills.style.certificate import Coverage
+from skills.style.plan import SuturePlan
+from skills.style.policy import Policy
+
+_policies: Kept[str, tuple[dict[str, Any], Policy]] = Kept(32)  # by digest, with what it was taken of; a few MB each
+
+
+def learnt(version: PolicyVersion) -> Policy:
+    """Read a policy, and check that it and all that is said of it are what its digest was taken of.
+
+    Raises:
+        Corrupt: They are not.
+    """
+    manifest, policy = _policies.get(version.sha256) or (None, None)
+    if policy is None or manifest != version.manifest:  # it is the row's manifest that a client is told
+        policy = version.learnt
+        if policy_identity(version.manifest, policy) != version.sha256:
+            raise Corrupt("A stored policy is not what was certified; restore it from a backup or train it again.")
+        _policies.put(version.sha256, (version.manifest, policy))
+    return policy
+
+
+def covered(version: PolicyVersion) -> Coverage:
+    """Read the coverage of a policy that was verified.
+
+    Raises:
+        Corrupt: It is not what was certified.
+    """
+    coverage = version.covered
+    if digest(coverage) != version.manifest["coverage"]["sha256"]:
+        raise Corrupt("A stored policy's coverage is not what was certified; restore it from a backup.")
+    return coverage
+
+
+def planned(plan: Plan) -> SuturePlan:
+    """Read a plan, and check that it is what its digest was taken of.
+
+    Raises:
+        Corrupt: It is not; no arm should follow it.
+    """
+    if plan_identity(plan.policy.sha256, plan.plan) != plan.sha256:
+        raise Corrupt("A stored plan is not what was planned; restore it from a backup or plan again.")
+    return plan.plan
+
+
+def policy_identity(manifest: dict[str, Any], policy: Policy) -> str:
+    """Compute a policy version's digest: over its identity, its numbers and all that a client is told of it."""
+    return sha256(canonical([manifest, digest(policy)]))
+
+
+def plan_identity(policy_sha256: str, plan: SuturePlan) -> str:
+    """Compute a plan's digest: over the policy version it follows and its passes."""
+    return sha256(canonical([policy_sha256, digest(plan)]))

@@ -1,0 +1,96 @@
+"""Starting the service: the application in this process, its worker in a child at lower priority."""
+
+import logging
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+import uvicorn
+
+from skills.api.app import create_app, prepare_database
+from skills.client import Client
+from skills.db.session import Database
+from skills.jobs.child import start_worker_child
+from skills.samples import load_samples
+from skills.settings import Settings
+
+GRACE_S = 12  # a worker finishes what it has begun within ten
+RESTART_S = 1.0
+
+log = logging.getLogger("skills.serving")
+
+
+def prepare(settings: Settings) -> None:
+    """Migrate the database and seed its catalogue."""
+    database = Database(settings.database_url)
+    prepare_database(database)
+    database.close()
+
+
+def serve(settings: Settings, *, samples: bool = False) -> None:
+    """Serve until told to stop; the address must have been checked (`Settings.check_address`)."""
+    prepare(settings)
+    server = uvicorn.Server(
+        uvicorn.Config(
+            create_app(settings),
+            host=settings.host,
+            port=settings.port,
+            log_level="warning",
+            timeout_graceful_shutdown=GRACE_S,
+            server_header=False,
+        )
+    )
+    signal.signal(signal.SIGTERM, _leave)  # the server lets a signal through again once it has shut down
+    signal.signal(signal.SIGINT, _leave)
+    with working(settings):
+        if samples:
+            threading.Thread(target=_load, args=(server, settings), daemon=True).start()
+        server.run()
+
+
+@contextmanager
+def working(settings: Settings) -> Iterator[None]:
+    """Keep a worker at work for as long as the block; one that dies is replaced."""
+    over = threading.Event()
+
+    def watch() -> None:
+        worker = start_worker_child(settings)
+        while not over.wait(RESTART_S):
+            if worker.poll() is not None:
+                log.warning("The worker ended with %s; another one starts.", worker.returncode)
+                worker = start_worker_child(settings)
+        worker.terminate()
+        try:
+            worker.wait(GRACE_S)
+        except subprocess.TimeoutExpired:
+            worker.kill()
+
+    watcher = threading.Thread(target=watch)
+    watcher.start()
+    try:
+        yield
+    finally:
+        over.set()
+        watcher.join()
+
+
+def _leave(_signal: int, _frame: FrameType | None) -> None:
+    """End well: being told to stop is no failure."""
+    sys.exit(0)
+
+
+def _load(server: uvicorn.Server, settings: Settings) -> None:
+    """Load the samples and train them, over HTTP, once the server answers."""
+    while not server.started:
+        if server.should_exit:
+            return
+        time.sleep(0.05)
+    with Client(f"http://{settings.host}:{settings.port}") as client:
+        for demo in load_samples(client):
+            client.train(demo["surgeon"], demo["suture"], release=True)
+    print(f"The samples are loaded: http://{settings.host}:{settings.port}/policies", flush=True)

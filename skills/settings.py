@@ -1,0 +1,68 @@
+"""The one place that reads the environment: `SKILLS_*` variables into one frozen object."""
+
+from functools import cache
+from ipaddress import ip_address
+from pathlib import Path
+
+from pydantic import Field
+from pydantic_settings import BaseSettings, SettingsConfigDict
+
+from skills.errors import BadSettings
+
+MEBIBYTE = 1 << 20
+
+
+def _data_folder() -> Path:
+    return Path.home() / ".local" / "share" / "suture-skills"
+
+
+class Settings(BaseSettings):
+    """How this installation runs."""
+
+    model_config = SettingsConfigDict(env_prefix="SKILLS_", frozen=True, extra="ignore")
+
+    database_url: str = Field(default_factory=lambda: f"sqlite:///{_data_folder() / 'skills.sqlite'}")
+    host: str = "127.0.0.1"
+    port: int = Field(default=8000, ge=0, le=65535)
+    root_path: str = ""
+    server: str | None = None  # where the client finds the service; None: the application in this process
+    sample_recordings: Path | None = None
+    paper_data: Path | None = None
+
+    max_upload_bytes: int = Field(default=256 * MEBIBYTE, gt=0)
+    upload_deadline_s: float = Field(default=120.0, gt=0)
+    playback_timeout_s: float = Field(default=120.0, gt=0)
+    playback_memory_bytes: int = Field(default=1024 * MEBIBYTE, gt=0)
+    worker_threads: int = Field(default=2, ge=1, le=64)
+    lease_s: float = Field(default=2.0, gt=0)  # a worker silent for longer is taken for dead
+    job_attempts: int = Field(default=3, ge=1)
+
+    @property
+    def engine_url(self) -> str:
+        """The job engine's database: beside ours on SQLite, a schema of its own on PostgreSQL."""
+        if self.database_url.startswith("sqlite"):
+            return self.database_url.removesuffix(".sqlite") + ".jobs.sqlite"
+        return self.database_url
+
+    def check_address(self) -> None:
+        """Refuse to be reached from outside: this version has no keys.
+
+        Raises:
+            BadSettings: The address is not a loopback one.
+        """
+        host = "127.0.0.1" if self.host == "localhost" else self.host
+        try:
+            loopback = ip_address(host).is_loopback
+        except ValueError:
+            loopback = False
+        if not loopback:
+            raise BadSettings(
+                f"SKILLS_HOST={self.host} would be reached from outside, and this version has no API keys yet; "
+                "use 127.0.0.1, with an authenticating proxy in front where others need it."
+            )
+
+
+@cache
+def settings() -> Settings:
+    """Read the environment, once."""
+    return Settings()

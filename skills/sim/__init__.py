@@ -1,0 +1,1 @@
+"""The patient-side manipulator in PyBullet, in a process of its own; importing this does not need PyBullet."""

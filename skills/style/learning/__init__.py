@@ -1,0 +1,1 @@
+"""Learners: how a reward map becomes Q values."""

@@ -1,0 +1,103 @@
+"""The application in this process, its typed client, and the hands of a worker."""
+
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import httpx2 as httpx
+from sqlalchemy import select, text
+from starlette.testclient import TestClient
+
+from skills.api.app import create_app
+from skills.client import Client
+from skills.db.base import Base
+from skills.db.models import Job
+from skills.settings import Settings
+from tests import backends
+from tests.library import cases
+
+KESTREL = {"surgeon": "kestrel", "suture": cases.SUTURE}
+POLICY = f"/policies/kestrel/{cases.SUTURE}"
+CSV, MCAP = "text/csv", "application/vnd.mcap"
+GOAL_MM = [5.0, 55.0, -125.0]
+
+
+class Service:
+    """One installation: `http` asks it raw, `client` with words."""
+
+    def __init__(self, url: str, **settings: Any) -> None:
+        self.url = url
+        self.app = create_app(Settings(database_url=url, **settings))
+        self.database = self.app.state.database
+        self.http = TestClient(self.app, raise_server_exceptions=False)
+        self.client = Client(self.http)
+
+    def work(self) -> list[dict[str, Any]]:
+        """Carry all waiting jobs out, as a worker does, and look at them."""
+        with self.database.reading() as session:
+            jobs = session.scalars(select(Job).where(Job.state.in_(("queued", "running")))).all()
+        return [self.client.job(cases.work(self.database, job).id) for job in jobs]
+
+    def train(self, **asked: Any) -> dict[str, Any]:
+        """Train kestrel's style, and give the job back."""
+        job = self.client.train(**KESTREL, **asked)
+        self.work()
+        return self.client.job(job["id"])
+
+    def counts(self) -> dict[str, int]:
+        """Count the rows of every table."""
+        with self.database.reading() as session:
+            return {t: session.scalar(text(f"SELECT count(*) FROM {t}")) for t in Base.metadata.tables}
+
+    def tamper(self, *statements: str, **values: Any) -> None:
+        """Change rows as somebody with the file in his hands would, past the triggers."""
+        with self.database.writing() as session:
+            names = "SELECT name FROM sqlite_master WHERE type = 'trigger'"
+            for name in session.scalars(text(names)).all():
+                session.execute(text(f"DROP TRIGGER {name}"))
+            for statement in statements:
+                session.execute(text(statement), values)
+
+
+@contextmanager
+def serving(url: str, **settings: Any) -> Iterator[Service]:
+    service = Service(url, **settings)
+    with service.http:
+        yield service
+
+
+@cache
+def trained_file() -> Path:
+    """Make a database in which kestrel's style is learnt and released, once."""
+    folder = backends.migrated_file().parent
+    url = backends.fresh("sqlite", folder)
+    with serving(url) as service:
+        service.client.put_surgeon("kestrel", skill_level="expert")
+        service.client.add_demo(cases.hand_off(), media_type=CSV, **KESTREL)
+        job = service.train(release=True)
+        assert job["result"]["released"], job
+    return Path(url.removeprefix("sqlite:///"))
+
+
+def copy_of_trained(folder: Path) -> str:
+    shutil.copy(trained_file(), folder / "skills.sqlite")
+    return f"sqlite:///{folder / 'skills.sqlite'}"
+
+
+def assert_problem(answer: httpx.Response, status: int | range, kind: str | None = None) -> dict[str, Any]:
+    """The answer is a problem of RFC 9457, with a sentence, and says nothing of our innards."""
+    assert answer.status_code == status if isinstance(status, int) else answer.status_code in status, answer.text[:500]
+    assert answer.headers["content-type"] == "application/problem+json", answer.text[:500]
+    assert answer.headers["x-request-id"]
+    problem = answer.json()
+    assert problem["status"] == answer.status_code
+    assert problem["type"].startswith("urn:suture-skills:")
+    assert problem["title"]
+    assert problem["detail"].rstrip().endswith((".", "?", ")")), problem["detail"]
+    assert not any(word in answer.text for word in ("Traceback", "sqlalchemy", "site-packages", "SELECT ", 'File "'))
+    if kind is not None:
+        assert problem["type"] == f"urn:suture-skills:{kind}", problem
+    return problem

@@ -1,0 +1,186 @@
+"""Whatever is sent to any JSON route or put into any path, the answer is a 4xx in words, and never ours to blame."""
+
+import json
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from tests.api.service import KESTREL, POLICY, Service, assert_problem
+
+CANARY = "Zaphod-42"
+JSON = {"Content-Type": "application/json"}
+SOUND: dict[tuple[str, str], Any] = {
+    ("PUT", "/surgeons/{surgeon}"): {
+        "skill_level": "expert", "handedness": "left", "protocol": "p",
+        "consent": {"uses": ["training"], "until": "2999-01-01"},
+    },
+    ("PUT", "/suture-types/{suture}"): {"name": "n", "family": "f", "also_called": ["a"], "description": "d"},
+    ("POST", "/recordings/{recording}/demos"): {
+        **KESTREL, "arm": "PSM", "topic": "table", "start_s": 0.0, "end_s": 0.5, "grid": "fit",
+        "cell_mm": 5.0, "session": "s",
+    },
+    ("POST", "/trainings"): {
+        **KESTREL, "demos": ["0" * 64], "seed": 0, "release": True,
+        "learner": {"kind": "phase-q-learning", "alpha": 1.0, "gamma": 0.1, "max_steps": 1},
+    },
+    ("POST", "/policies/{surgeon}/{suture}/rollouts"): {"start_mm": [0.0, 50.0, -120.0], "version": 1},
+    ("POST", "/policies/{surgeon}/{suture}/next"): {"position_mm": [0.0, 50.0, -120.0], "phase": 0},
+    ("POST", "/plans"): {
+        **KESTREL, "version": 1,
+        "suture_points": [{"position_mm": [5.0, 55.0, -125.0], "rotation_xyzw": [0.0, 0.0, 0.0, 1.0]}],
+        "starts_mm": [[0.0, 50.0, -120.0]], "arm": "PSM", "frame": "PSM_base", "instrument": "400006",
+        "speed_mm_s": 20.0, "psm_m": {"approach": [-0.94, 0.1, -0.33]},
+    },
+    ("POST", "/playbacks"): {"plan": "0" * 64},
+}  # fmt: skip
+TOKENS = (
+    "NaN", "Infinity", "-Infinity", "1e400", "9" * 400, "-" + "9" * 400, '"\\ud800"', '"\\u0000"', '"a\\u0000b"', "{}",
+    '{"a": 1}', '[["b"]]', f'"{CANARY}"', '"' + "x" * 5000 + '"', "1.5e308", '"; DROP TABLE jobs; --"',
+)  # fmt: skip
+FREE_TEXT = {"name", "family", "description", "also_called", "protocol"}
+NUMBERS_ONLY = ("true", '"1"')  # where a number belongs
+WHOLE_ONLY = ("1.5", "true", '"1"', "1e400", "-1")
+BODIES = (
+    b"", b"{", b"null", b"[]", b'"text"', b"NaN", b"1", b"\xff\xfe", b"[" * 100_000,
+    b'{"a":' * 50_000, b'{"\\ud800": 1}', b'{"' + CANARY.encode() + b'": 1}', b'{"a": ' + b"9" * 10_000 + b"}",
+    b'{"x": "' + b"x" * 10_000_000 + b'"}',
+)  # fmt: skip
+SEGMENTS = (
+    "%00",
+    "%0d%0a",
+    "..",
+    "%2e%2e",
+    "%2f",
+    "a%2f..%2fb",
+    "%ff",
+    "x" * 60_000,
+    "KESTREL",
+    "-a",
+    "a b",
+    "%E2%80%AE",
+    "' OR 1=1",
+)
+
+
+def routes(service: Service) -> Iterator[tuple[str, str, dict[str, Any]]]:
+    for path, calls in service.http.get("/openapi.json").json()["paths"].items():
+        for method, call in calls.items():
+            yield method.upper(), path, call
+
+
+def filled(path: str, **parts: str) -> str:
+    known = {**KESTREL, "version": "1", "job": "0" * 16, **parts}
+    for name in [part[1:-1] for part in path.split("/") if part.startswith("{")]:
+        path = path.replace(f"{{{name}}}", known.get(name, "0" * 64))
+    return path
+
+
+def leaves(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[tuple[Any, ...], Any]]:
+    if isinstance(value, dict | list):
+        for key, part in value.items() if isinstance(value, dict) else enumerate(value):
+            yield from leaves(part, (*path, key))
+    else:
+        yield path, value
+
+
+def replaced(value: Any, path: tuple[Any, ...], new: Any) -> Any:
+    if not path:
+        return new
+    copy = value.copy()
+    copy[path[0]] = replaced(value[path[0]], path[1:], new)
+    return copy
+
+
+def tokens_for(leaf: Any) -> tuple[str, ...]:
+    if isinstance(leaf, bool):
+        return (*TOKENS, "1", "0", '"true"')
+    if isinstance(leaf, int):
+        return (*TOKENS, *WHOLE_ONLY)
+    return (*TOKENS, *NUMBERS_ONLY) if isinstance(leaf, float) else TOKENS
+
+
+@pytest.fixture
+def untouched(still: Service) -> Iterator[None]:
+    before = still.counts()
+    yield
+    assert still.counts() == before
+
+
+def test_every_route_that_takes_json_is_in_the_table_above(still: Service):
+    with_json = {
+        (method, path)
+        for method, path, call in routes(still)
+        if "application/json" in call.get("requestBody", {}).get("content", {})
+    }
+    assert with_json == set(SOUND)
+
+
+@pytest.mark.parametrize("route", SOUND, ids=" ".join)
+def test_a_body_that_is_no_request_is_refused(still: Service, untouched: None, route: tuple[str, str]):
+    for body in BODIES:
+        answer = still.http.request(route[0], filled(route[1]), content=body, headers=JSON)
+        assert_problem(answer, range(400, 500))
+        assert CANARY not in answer.text
+
+
+@pytest.mark.parametrize("route", SOUND, ids=" ".join)
+def test_a_value_of_the_wrong_kind_anywhere_is_refused(still: Service, untouched: None, route: tuple[str, str]):
+    for path, leaf in leaves(SOUND[route]):
+        for token in tokens_for(leaf):
+            if FREE_TEXT & {*path} and token.startswith('"') and "\\u" not in token and len(token) < 200:
+                continue  # any short text is good there
+            body = json.dumps(replaced(SOUND[route], path, "@@")).replace('"@@"', token)
+            answer = still.http.request(route[0], filled(route[1]), content=body, headers=JSON)
+            assert answer.status_code in range(400, 500), (path, token[:40], answer.text[:300])
+            assert_problem(answer, range(400, 500))
+            assert CANARY not in answer.text
+
+
+@pytest.mark.parametrize("route", SOUND, ids=" ".join)
+def test_an_unknown_field_is_refused_and_not_repeated(still: Service, untouched: None, route: tuple[str, str]):
+    answer = still.http.request(route[0], filled(route[1]), json=SOUND[route] | {CANARY: 1})
+    assert_problem(answer, 422, "invalid-request")
+    assert CANARY not in answer.text
+
+
+@pytest.mark.parametrize("segment", SEGMENTS, ids=lambda segment: segment[:12])
+def test_no_path_is_ours_to_blame(still: Service, untouched: None, segment: str):
+    for method, path, _ in routes(still):
+        for name in [part[1:-1] for part in path.split("/") if part.startswith("{")]:
+            if segment in ("..", "%2e%2e") and path.endswith(f"{{{name}}}"):
+                continue  # the client itself takes it for the folder above
+            answer = still.http.request(method, filled(path, **{name: segment}), json=SOUND.get((method, path)))
+            fine = (200, 404) if method == "GET" and segment == "%2f" else ()  # a list, by its path with a slash
+            assert answer.status_code in (*fine, 404, 405, 414, 415, 422), (method, path, answer.status_code)
+            assert answer.headers["x-request-id"]
+
+
+def test_every_answer_has_a_request_id_of_its_own_and_forbids_guessing(still: Service):
+    asked = [("GET", "/healthz"), ("GET", "/nothing"), ("DELETE", "/healthz"), ("GET", "/surgeons/nobody")]
+    asked += [("GET", POLICY), ("POST", "/plans"), ("GET", "/openapi.json")]
+    seen = set()
+    for method, path in asked:
+        answer = still.http.request(method, path)
+        seen.add(answer.headers["x-request-id"])
+        assert answer.headers["x-content-type-options"] == "nosniff"
+        assert "default-src 'self'" in answer.headers["content-security-policy"]
+        if answer.status_code >= 400:
+            assert_problem(answer, range(400, 500))
+    assert len(seen) == len(asked)
+
+
+def test_an_unexpected_failure_tells_a_case_number_and_nothing_else(trained: Service):
+    trained.tamper("ALTER TABLE surgeons RENAME COLUMN slug TO was_slug", "UPDATE plans SET about = 'x'")
+    for path in ("/surgeons", "/surgeons/kestrel", POLICY, "/demos"):
+        answer = trained.http.get(path)
+        assert_problem(answer, range(500, 600))
+        assert not any(word in answer.text for word in ("slug", "column", "surgeons", ".py", "sqlite"))
+
+
+def test_a_failure_in_our_code_is_500_with_a_case_number(trained: Service):
+    """A row that our own code could not have written: the JSON of a demonstration's report is cut off."""
+    trained.tamper("UPDATE demonstrations SET report = '{\"cut'")
+    problem = assert_problem(trained.http.get("/demos"), 500, "unexpected")
+    assert len(problem["case"]) == 16
+    assert "cut" not in str(problem)

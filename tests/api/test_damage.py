@@ -1,0 +1,134 @@
+"""Rows changed by hand, and what erasure leaves: nothing wrong is served, and nothing of a person stays."""
+
+from pathlib import Path
+
+import pytest
+
+from skills.library import verified
+from skills.library.kept import Kept
+from tests.api.service import CSV, KESTREL, POLICY, Service, assert_problem
+from tests.library import cases
+
+CANARY = "canary-7f3a91"
+ASKS = (
+    ("GET", POLICY, None, {}),
+    ("GET", POLICY, None, {"Accept": "application/x-npz"}),
+    ("GET", f"{POLICY}/versions/1", None, {}),
+    ("POST", f"{POLICY}/rollouts", {"start_mm": [0.0, 55.0, -125.0]}, {}),
+    ("POST", f"{POLICY}/next", {"position_mm": [0.0, 55.0, -125.0]}, {}),
+    ("POST", "/plans", KESTREL | {"suture_points": [{"position_mm": [5.0, 55.0, -125.0]}]}, {}),
+)
+
+
+@pytest.fixture(autouse=True)
+def cold(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Remember nothing of other tests, as a process that has just started."""
+    monkeypatch.setattr(verified, "_policies", Kept(32))
+
+
+def test_a_manifest_changed_after_it_was_served_is_not_served_again(trained: Service):
+    trained.http.post(f"{POLICY}/rollouts", json={"start_mm": [0.0, 55.0, -125.0]})
+    trained.tamper("UPDATE policy_versions SET manifest = replace(manifest, '\"seed\": 0', '\"seed\": 1')")
+    assert_refused(trained)
+
+
+def assert_refused(service: Service) -> None:
+    """Whatever is asked of the policy, the answer is 503 and holds no numbers of it."""
+    before = service.counts()
+    for method, path, body, headers in ASKS:
+        problem = assert_problem(service.http.request(method, path, json=body, headers=headers), 503, "corrupt")
+        assert "numbers" not in problem
+    assert service.counts() == before
+
+
+@pytest.mark.parametrize(
+    ("was", "now"),
+    [
+        ('"goal_mm": [5.0', '"goal_mm": [6.0'),
+        ('"seed": 0', '"seed": 1'),
+        ('"cell_mm": 5.0', '"cell_mm": 5.1'),
+        ('"instrument": "400006"', '"instrument": "400007"'),
+        ('"surgeon": "kestrel"', '"surgeon": "heron"'),
+        ('"dtw_total_mm": 0.0', '"dtw_total_mm": 0.1'),
+    ],
+)
+def test_a_manifest_changed_by_hand_is_never_served(trained: Service, was: str, now: str):
+    trained.tamper("UPDATE policy_versions SET manifest = replace(manifest, :was, :now)", was=was, now=now)
+    assert_refused(trained)
+
+
+def other_policy(service: Service) -> None:
+    """Learn another style, whose rows can be swapped in."""
+    service.client.add_demo(cases.hand_off((5.0, 5.0, 0.0)), media_type=CSV, **KESTREL)
+    assert service.train(seed=4)["state"] == "succeeded"
+
+
+def test_the_numbers_of_another_style_are_never_served(trained: Service):
+    other_policy(trained)
+    trained.tamper("UPDATE policy_versions SET learnt = (SELECT learnt FROM policy_versions WHERE version = 2)")
+    assert_refused(trained)
+
+
+def test_the_coverage_of_another_style_is_never_served(trained: Service):
+    trained.client.add_demo(cases.hand_off((5.0, 5.0, 0.0)), media_type=CSV, **KESTREL)
+    trained.train(learner={"kind": "cell-q-learning", "episodes": 20})
+    trained.tamper("UPDATE policy_versions SET covered = (SELECT covered FROM policy_versions WHERE version = 2)")
+    assert_problem(trained.http.get(POLICY, headers={"Accept": "application/x-npz"}), 503, "corrupt")
+
+
+def test_an_overwritten_byte_in_a_policy_is_never_served(trained: Service):
+    trained.tamper(
+        "UPDATE policy_versions SET learnt = CAST(substr(learnt, 1, 900) || x'00' || substr(learnt, 902) AS BLOB)"
+    )
+    assert_refused(trained)
+
+
+def test_a_damaged_newest_policy_does_not_bring_an_older_one_back(trained: Service):
+    trained.train(seed=2, release=True)
+    trained.tamper("UPDATE policy_versions SET manifest = replace(manifest, 'seed', 'sead') WHERE version = 2")
+    assert_problem(trained.http.get(POLICY), 503, "corrupt")
+    assert trained.client.policy(**KESTREL, version=1)["version"] == 1
+
+
+def test_a_motion_of_another_plan_is_never_served(trained: Service):
+    first, second = (trained.client.plan(**KESTREL, suture_points=[{"position_mm": [x, 55, -125]}]) for x in (5, 9))
+    trained.tamper(
+        "UPDATE plans SET plan = (SELECT plan FROM plans WHERE sha256 = :other) WHERE sha256 = :one",
+        one=first["id"], other=second["id"],
+    )  # fmt: skip
+    assert_problem(trained.http.get(f"/plans/{first['id']}/trajectory"), 503, "corrupt")
+    assert trained.http.get(f"/plans/{second['id']}/trajectory").status_code == 200
+
+
+def test_an_erased_surgeon_is_nowhere_in_the_files(service: Service):
+    """While the service goes on running: neither the pseudonym nor the recording's bytes, log included."""
+    service.client.put_surgeon(CANARY)
+    service.client.put_surgeon("heron")
+    data = cases.bag() + b""
+    table = cases.hand_off((1.25, 0.0, 0.0))
+    for one, kind in ((table, CSV), (data, None)):
+        service.client.add_demo(one, media_type=kind, surgeon=CANARY, suture=cases.SUTURE)
+    service.client.add_demo(data, surgeon="heron", suture=cases.SUTURE)
+    job = service.client.train(CANARY, cases.SUTURE, release=True)
+    service.work()
+    service.client.plan(CANARY, cases.SUTURE, [{"position_mm": [5, 55, -125]}])
+    service.client.train(CANARY, cases.SUTURE, seed=1)
+    assert CANARY.encode() in everything(service)
+    assert table[1000:1064] in everything(service)
+    service.client.erase_surgeon(CANARY)
+    left = everything(service)
+    assert CANARY.encode() not in left
+    assert table[1000:1064] not in left
+    assert_problem(service.http.get(f"/jobs/{job['id']}"), 404)
+    rows = {name: count for name, count in service.counts().items() if count}
+    assert rows.pop("events") > 0
+    assert rows.pop("suture_types") == 11
+    shared = {"recordings": 1, "recording_chunks": 1}  # heron gave the same bytes
+    assert rows == {"surgeons": 1, "erasures": 1, "demonstrations": 1, "reward_maps": 1} | shared
+    assert service.client.demo_recording(service.client.demos("heron")[0]["id"]) == data
+
+
+def everything(service: Service) -> bytes:
+    """Read the database's files, raw: the tables and the write-ahead log."""
+    folder = Path(service.url.removeprefix("sqlite:///")).parent
+    return b"".join(file.read_bytes() for file in folder.iterdir() if ".jobs" not in file.name)

@@ -1,0 +1,174 @@
+"""Recordings and demonstrations: stored once, given back exactly, withdrawn for good."""
+
+import threading
+
+import httpx2 as httpx
+import numpy as np
+import pytest
+import uvicorn
+
+from skills.client import Client, Problem
+from skills.seeds.recordings import sample_recordings
+from skills.style import paper
+from tests.api.service import CSV, KESTREL, MCAP, Service, assert_problem
+from tests.library import cases
+
+
+@pytest.fixture
+def here(service: Service) -> Service:
+    service.client.put_surgeon("kestrel")
+    return service
+
+
+def post(service: Service, path: str, data: bytes, media_type: str = CSV, **query: object) -> httpx.Response:
+    return service.http.post(path, params=query, content=data, headers={"Content-Type": media_type})
+
+
+def test_the_same_bytes_are_one_recording(here: Service):
+    first, second = (post(here, "/recordings", cases.bag(), MCAP) for _ in range(2))
+    assert (first.status_code, second.status_code) == (201, 200)
+    assert first.json() == second.json()
+    about = first.json()
+    assert first.headers["Location"] == f"/recordings/{about['sha256']}"
+    assert (about["format"], about["integrity"], about["size_bytes"]) == ("mcap", "full", len(cases.bag()))
+    assert [t["name"] for t in about["topics"]] == ["/PSM2/local/measured_cp"]
+    assert here.http.get(first.headers["Location"]).json() == about
+    assert here.counts()["recordings"] == 1
+
+
+def test_the_same_demonstration_is_stored_once(here: Service):
+    first, second = (post(here, "/demos", cases.hand_off(), **KESTREL) for _ in range(2))
+    assert (first.status_code, second.status_code) == (201, 200)
+    assert first.json() == second.json()
+    demo = first.json()
+    assert first.headers["Location"] == f"/demos/{demo['id']}"
+    assert here.http.get(first.headers["Location"]).json() == demo
+    assert demo["report"]["grid"]["chosen"] == "paper"
+    assert demo["frame"] == "PSM_base"
+    assert here.counts() | {"suture_types": 0, "events": 0} == {
+        **dict.fromkeys(here.counts(), 0), "surgeons": 1, "recordings": 1, "recording_chunks": 1,
+        "demonstrations": 1, "reward_maps": 1,
+    }  # fmt: skip
+
+
+def test_two_segments_of_one_recording_are_two_demonstrations(here: Service):
+    sample = sample_recordings()[4]
+    about = here.client.add_recording(sample.data)
+    demos = [
+        here.client.cut_demo(about["sha256"], **KESTREL, start_s=s["start_s"], end_s=s["end_s"])
+        for s in about["segments"][:2]
+    ]
+    assert demos[0]["id"] != demos[1]["id"]
+    assert {demo["recording"] for demo in demos} == {about["sha256"]}
+    assert [d["id"] for d in here.client.demos("kestrel")] == [d["id"] for d in demos[::-1]]
+    for demo, part in zip(demos, about["segments"], strict=False):
+        assert demo["start_s"] == pytest.approx(part["start_s"], abs=0.011)
+        assert demo["end_s"] == pytest.approx(part["end_s"], abs=0.011)
+
+
+def test_storing_a_demonstration_never_trains(here: Service):
+    post(here, "/demos", cases.hand_off(), **KESTREL)
+    assert here.counts()["jobs"] == 0
+
+
+def test_the_path_and_the_reward_map_are_those_of_the_paper(here: Service):
+    demo = here.client.add_demo(cases.hand_off(), media_type=CSV, **KESTREL)
+    path = here.client.demo_path(demo["id"])
+    assert path["recorded_mm"] == cases.points_mm().tolist()
+    assert path["path_mm"][0], path["path_mm"][-1] == (cases.CORNERS_MM[0], cases.CORNERS_MM[-1])
+    grid = path["grid"]
+    assert (grid["cell_mm"], grid["shape"]) == (paper.CELL_MM, [11, 11, 11])
+    steps = np.abs(np.diff(path["path_mm"], axis=0)).max(axis=1)
+    assert (steps == 5.0).all()
+    rewards = here.http.get(f"/demos/{demo['id']}/reward-map").json()
+    assert rewards["levels"] == {"goal": 10.0, "visited": 1.0, "other": 0.0, "off_grid": -1.0}
+    expected = dict.fromkeys(path["states"], 1.0) | {path["states"][-1]: 10.0}
+    assert dict(zip(rewards["states"], rewards["rewards"], strict=True)) == expected
+
+
+def test_another_grid_is_another_demonstration_of_the_same_recording(here: Service):
+    one = here.client.add_demo(cases.hand_off(), media_type=CSV, **KESTREL)
+    other = here.client.add_demo(cases.hand_off(), media_type=CSV, **KESTREL, grid="fit", cell_mm=2.5)
+    assert one["id"] != other["id"]
+    assert one["recording"] == other["recording"]
+    assert other["report"]["grid"] | {"origin_mm": 0} == {
+        "chosen": "fit", "cell_mm": 2.5, "shape": other["report"]["grid"]["shape"], "origin_mm": 0
+    }  # fmt: skip
+
+
+def test_the_same_bytes_read_in_another_way_are_refused(here: Service):
+    here.client.add_demo(cases.hand_off(), media_type=CSV, **KESTREL)
+    with pytest.raises(Problem, match="stored already") as refused:
+        here.client.add_demo(cases.hand_off(), media_type=CSV, **KESTREL, frame="PSM1_base")
+    assert refused.value.status == 409
+
+
+def large_table() -> bytes:
+    """A table of 3 MiB and a bit: four chunks."""
+    rows = 40_000
+    tip = np.tile(cases.points_mm(samples=rows // 3), (1, 1))
+    return cases.table(tip + np.random.default_rng(0).normal(0, 1e-3, tip.shape), rate_hz=1000)
+
+
+def test_a_recording_of_several_chunks_comes_back_exactly(here: Service):
+    data = large_table()
+    demo = here.client.add_demo(data, media_type=CSV, **KESTREL)
+    assert here.counts()["recording_chunks"] == -(-len(data) // 2**20) >= 3
+    answer = here.http.get(f"/demos/{demo['id']}/recording")
+    assert answer.content == data
+    assert answer.headers["content-type"].startswith(CSV)
+    assert answer.headers["content-length"] == str(len(data))
+    assert answer.headers["etag"] == f'"{demo["recording"]}"'
+
+
+@pytest.mark.parametrize("chunk", ["first", "last"])
+def test_a_damaged_recording_breaks_its_transfer_instead_of_passing_for_whole(here: Service, chunk: str):
+    """Over a real server: what the client gets is an error, not bytes."""
+    data = large_table()
+    demo = here.client.add_demo(data, media_type=CSV, **KESTREL)
+    which = "SELECT min(number)" if chunk == "first" else "SELECT max(number)"
+    here.tamper(
+        f"UPDATE recording_chunks SET data = x'00' || substr(data, 2) WHERE number = ({which} FROM recording_chunks)"
+    )
+    server = uvicorn.Server(uvicorn.Config(here.app, port=0, log_level="critical", lifespan="off"))
+    thread = threading.Thread(target=server.run)
+    thread.start()
+    while not server.started:
+        threading.Event().wait(0.01)
+    port = server.servers[0].sockets[0].getsockname()[1]
+    with Client(f"http://127.0.0.1:{port}") as client, pytest.raises(httpx.RemoteProtocolError):
+        client.demo_recording(demo["id"])
+    server.should_exit = True
+    thread.join()
+
+
+def test_withdrawing_a_demonstration_withdraws_what_rests_on_it(trained: Service):
+    demo = trained.client.demos()[0]
+    assert trained.http.delete(f"/demos/{demo['id']}").status_code == 204
+    assert trained.client.demo(demo["id"])["state"] == "withdrawn"
+    assert trained.client.policies() == []
+    assert trained.http.delete(f"/demos/{demo['id']}").status_code == 204
+    with pytest.raises(Problem, match="demonstration was withdrawn"):
+        trained.client.release(**KESTREL, version=1)
+    with pytest.raises(Problem, match="no active demonstration"):
+        trained.client.train(**KESTREL, seed=5)
+    with pytest.raises(Problem, match="withdrawn"):
+        trained.client.train(**KESTREL, demos=[demo["id"]], seed=5)
+    with pytest.raises(Problem, match="withdrawn"):
+        trained.client.add_demo(cases.hand_off(), media_type=CSV, **KESTREL)
+
+
+def test_erasing_a_demonstration_takes_what_was_learnt_from_it(trained: Service):
+    trained.client.plan(**KESTREL, suture_points=[{"position_mm": [5, 55, -125]}])
+    trained.client.withdraw_demo(trained.client.demos()[0]["id"], erase=True)
+    left = {table: rows for table, rows in trained.counts().items() if rows}
+    assert set(left) == {"surgeons", "suture_types", "events"}
+    again = trained.client.add_demo(cases.hand_off(), media_type=CSV, **KESTREL)
+    assert again["state"] == "active"
+
+
+def test_a_recording_whose_demonstration_is_unknown_is_404(service: Service):
+    for path in ("", "/recording", "/path", "/reward-map"):
+        assert_problem(service.http.get(f"/demos/{'0' * 64}{path}"), 404, "not-found")
+    assert_problem(service.http.get(f"/recordings/{'0' * 64}"), 404, "not-found")
+    assert_problem(service.http.delete(f"/demos/{'0' * 64}"), 404, "not-found")

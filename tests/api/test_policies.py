@@ -1,0 +1,236 @@
+"""Training, releasing, serving, following: what a client is told of a policy, and when it is told nothing."""
+
+import hashlib
+import io
+import threading
+import time
+
+import numpy as np
+import orjson
+import pytest
+
+from skills.client import Problem
+from skills.style.learning.q_learning import CellQLearning
+from tests import backends
+from tests.api.service import CSV, GOAL_MM, KESTREL, POLICY, Service, assert_problem, serving
+from tests.library import cases
+
+FIELDS = (
+    {"version", "sha256", "surgeon", "suture", "arm", "frame", "instrument", "grid", "start_mm", "goal_mm", "waypoints"}
+    | {"phases", "actions", "learner", "settings", "seed", "demos", "metrics", "coverage", "grid_certificate"}
+    | {"released_at", "released_by"}
+)
+NPZ = {"Accept": "application/x-npz"}
+PUBLISHED = {"kind": "cell-q-learning", "alpha": 0.1, "gamma": 0.01, "epsilon_end": 0.0, "epsilon_falls_over": 0.5}
+
+
+# ---- training
+
+
+def test_a_request_is_resolved_at_once_and_gives_one_job(trained: Service):
+    first = trained.http.post("/trainings", json=KESTREL | {"seed": 7})
+    job = first.json()
+    assert (first.status_code, job["state"], first.headers["Location"]) == (202, "queued", f"/jobs/{job['id']}")
+    assert job["request"]["demos"] == [trained.client.demos()[0]["id"]]
+    assert job["request"]["learner"]["kind"] == "phase-q-learning"
+    assert trained.http.post("/trainings", json=KESTREL | {"seed": 7}).json()["id"] == job["id"]
+    assert trained.client.train(**KESTREL, seed=8)["id"] != job["id"]
+    assert trained.client.train(**KESTREL, seed=7, release=True)["id"] != job["id"]
+    trained.work()
+    again = trained.http.post("/trainings", json=KESTREL | {"seed": 7})
+    assert (again.status_code, again.json()["id"], again.json()["state"]) == (200, job["id"], "succeeded")
+
+
+def test_after_a_failure_or_a_cancellation_the_same_request_is_a_new_job(trained: Service):
+    job = trained.client.train(**KESTREL, seed=7)
+    assert trained.client.cancel(job["id"])["state"] == "cancelled"
+    assert trained.work() == []
+    assert [v["version"] for v in trained.client.versions(**KESTREL)] == [1]
+    second = trained.client.train(**KESTREL, seed=7)
+    assert second["id"] != job["id"]
+    with trained.database.writing() as session:
+        session.get_one(cases.Job, 3).state = "failed"
+    third = trained.client.train(**KESTREL, seed=7)
+    assert third["id"] not in (job["id"], second["id"])
+    assert trained.work()[-1]["state"] == "succeeded"
+    assert trained.client.versions(**KESTREL)[0]["seed"] == 7
+    with pytest.raises(Problem, match="ended already"):
+        trained.client.cancel(third["id"])
+
+
+def test_training_does_not_release_unless_asked(service: Service):
+    service.client.put_surgeon("kestrel")
+    service.client.add_demo(cases.hand_off(), media_type=CSV, **KESTREL)
+    result = service.train()["result"]
+    assert (result["releasable"], result["released"], result["not_released_because"]) == (True, False, None)
+    problem = assert_problem(service.http.get(POLICY), 404, "not-found")
+    assert problem["numbers"]["candidates"] == [{"version": 1, "sha256": result["sha256"], "releasable": True}]
+    assert "versions/N/release" in problem["detail"]
+
+
+def test_the_events_of_a_job_tell_its_states_to_the_end(trained: Service):
+    job = trained.client.train(**KESTREL, seed=9)
+    worker = threading.Thread(target=lambda: (time.sleep(0.5), trained.work()))
+    worker.start()
+    answer = trained.http.get(f"/jobs/{job['id']}/events")
+    worker.join()
+    assert answer.headers["content-type"].startswith("text/event-stream")
+    told = [orjson.loads(line[6:]) for line in answer.text.splitlines() if line.startswith("data: ")]
+    assert (told[0]["state"], told[-1]["state"]) == ("queued", "succeeded")
+    assert told[-1] == trained.client.job(job["id"])
+    assert_problem(trained.http.get(f"/jobs/{'0' * 16}/events"), 404, "not-found")
+
+
+# ---- what is served
+
+
+def test_a_policy_has_every_field_of_the_interface(still: Service):
+    policy = still.client.policy(**KESTREL)
+    assert set(policy) >= FIELDS
+    assert (policy["version"], policy["surgeon"], policy["released_by"]) == (1, "kestrel", "local")
+    n_states = np.prod(policy["grid"]["shape"])
+    assert np.shape(policy["actions"]) == (policy["phases"], n_states)
+    assert policy["phases"] == len(policy["waypoints"]) == policy["metrics"]["path_states"]
+    assert (policy["start_mm"], policy["goal_mm"]) == (cases.CORNERS_MM[0].tolist(), GOAL_MM)
+    assert policy["coverage"]["starts_reaching_goal"] == policy["coverage"]["n_states"] == n_states
+    assert policy["metrics"]["dtw_total_mm"] == 0
+    assert policy["grid_certificate"]["refused_because"] == []
+    assert "accuracy" in policy["grid_certificate"]["note"]
+
+
+def test_the_arrays_agree_with_the_json(still: Service):
+    policy = still.client.policy(**KESTREL)
+    answer = still.http.get(POLICY, headers=NPZ)
+    assert answer.headers["content-type"] == NPZ["Accept"]
+    arrays = np.load(io.BytesIO(answer.content))
+    table = np.full(np.shape(policy["actions"]), -2)
+    table[arrays["phase"], arrays["state"]] = arrays["action"]
+    assert table.tolist() == policy["actions"]
+    live = arrays["action"] >= 0
+    assert (arrays["q"].argmax(axis=1)[live] == arrays["action"][live]).all()
+    assert arrays["waypoints"].tolist() == policy["waypoints"]
+    assert arrays["sha256"].tobytes().hex() == policy["sha256"]
+    assert int(arrays["reaches_goal"].sum()) == policy["coverage"]["starts_reaching_goal"]
+    assert still.client.policy_arrays(policy["sha256"]) == answer.content
+
+
+def test_an_etag_names_the_exact_bytes(still: Service):
+    tags = set()
+    for path, headers in ((POLICY, {}), (POLICY, NPZ), (f"{POLICY}/versions/1", {})):
+        answer = still.http.get(path, headers=headers)
+        tag = answer.headers["etag"]
+        assert tag == f'"{hashlib.sha256(answer.content).hexdigest()}"'
+        assert answer.headers["vary"] == "Accept"
+        assert still.http.get(path, headers=headers).content == answer.content
+        for match in (tag, f'"other", {tag}'):
+            unchanged = still.http.get(path, headers=headers | {"If-None-Match": match})
+            assert (unchanged.status_code, unchanged.content, unchanged.headers["etag"]) == (304, b"", tag)
+        assert still.http.get(path, headers=headers | {"If-None-Match": '"other"'}).status_code == 200
+        tags.add(tag)
+    assert len(tags) == 3
+    assert_problem(still.http.get(POLICY, headers={"Accept": "text/html"}), 415, "unknown-format")
+
+
+def test_a_release_may_ask_that_nobody_was_faster(trained: Service):
+    trained.train(seed=2)
+    tag = trained.http.get(POLICY).headers["etag"]
+    second = f"{POLICY}/versions/2/release"
+    assert_problem(trained.http.post(second, headers={"If-Match": '"other"'}), 412, "precondition-failed")
+    assert trained.client.policy(**KESTREL)["version"] == 1
+    assert trained.http.post(second, headers={"If-Match": tag}).status_code == 200
+    assert_problem(trained.http.post(f"{POLICY}/versions/1/release", headers={"If-Match": tag}), 412)
+    assert trained.http.get(POLICY, headers={"If-None-Match": tag}).json()["version"] == 2
+
+
+def test_releasing_an_older_version_rolls_back(trained: Service):
+    trained.train(seed=2, release=True)
+    assert trained.client.policy(**KESTREL)["version"] == 2
+    trained.client.release(**KESTREL, version=1)
+    assert trained.client.policy(**KESTREL)["version"] == 1
+    rows = trained.counts()["releases"]
+    trained.client.release(**KESTREL, version=1)
+    assert trained.counts()["releases"] == rows
+    assert [p["version"] for p in trained.client.policies()] == [1]
+
+
+def test_after_a_withdrawal_nothing_older_comes_back_by_itself(trained: Service):
+    trained.train(seed=2, release=True)
+    trained.client.withdraw(**KESTREL)
+    problem = assert_problem(trained.http.get(POLICY), 404, "not-found")
+    assert [c["version"] for c in problem["numbers"]["candidates"]] == [2, 1]
+    assert trained.client.policies() == []
+    assert_problem(trained.http.delete(f"{POLICY}/release"), 404)
+    assert trained.client.policy(**KESTREL, version=1)["released_at"] is None
+
+
+# ---- the gate
+
+
+def test_what_the_published_parameters_learn_is_refused_with_reasons(trained: Service):
+    assert CellQLearning.published().alpha == PUBLISHED["alpha"]
+    result = trained.train(learner=PUBLISHED, release=True)["result"]
+    assert (result["releasable"], result["released"]) == (False, False)
+    assert "do not reach the goal" in result["not_released_because"]
+    problem = assert_problem(trained.http.post(f"{POLICY}/versions/2/release"), 409, "conflict")
+    assert any("starts do not reach" in reason for reason in problem["numbers"]["reasons"])
+    assert trained.client.policy(**KESTREL)["version"] == 1
+
+
+def test_a_demonstration_in_another_frame_than_the_arms_base_is_not_released(service: Service):
+    service.client.put_surgeon("kestrel")
+    service.client.add_demo(cases.hand_off(), media_type=CSV, **KESTREL, frame="ECM")
+    result = service.train(release=True)["result"]
+    assert not result["released"]
+    assert "'ECM' is not the arm's base" in result["not_released_because"]
+
+
+# ---- following
+
+
+STARTS_MM = [(-10, 55, -135), (5, 55, -125), (-30, 25, -140), (20, 75, -90), (-11, 56, -121), (0, 50, -100)]
+
+
+@pytest.mark.parametrize("start", STARTS_MM)
+def test_next_says_step_by_step_what_a_rollout_says_at_once(still: Service, start: tuple[float, float, float]):
+    followed = still.client.rollout(**KESTREL, start_mm=start)
+    assert followed["finished"]
+    position, phase, states = list(start), None, []
+    for _ in range(200):
+        step = still.client.next(**KESTREL, position_mm=position, phase=phase)
+        states.append(step["phase"])
+        if step["done"]:
+            break
+        assert step == still.client.next(**KESTREL, position_mm=position, phase=phase)
+        assert 0 <= step["confidence"] <= 1
+        position, phase = step["next_position_mm"], step["phase"]
+    assert position == followed["path_mm"][-1] or position == list(start)
+    assert len(states) == len(followed["states"])
+    assert followed["path_mm"][-1] == GOAL_MM
+
+
+def test_off_the_path_next_points_back_to_it(still: Service):
+    off = still.client.next(**KESTREL, position_mm=[-10.0, 60.0, -135.0], phase=1)
+    assert off["correction_mm"] == [0.0, -5.0, 0.0]
+    assert still.client.next(**KESTREL, position_mm=[-10.0, 55.0, -135.0])["correction_mm"] is None
+
+
+def test_a_place_outside_the_grid_is_refused(still: Service):
+    for place in ([100.0, 50.0, -120.0], [0.0, 50.0, 9999.0]):
+        assert_problem(still.http.post(f"{POLICY}/rollouts", json={"start_mm": place}), 422, "outside-grid")
+        assert_problem(still.http.post(f"{POLICY}/next", json={"position_mm": place}), 422, "outside-grid")
+    inside = {"position_mm": GOAL_MM, "phase": 10**6}
+    assert_problem(still.http.post(f"{POLICY}/next", json=inside), 422, "outside-grid")
+    assert_problem(still.http.post(f"{POLICY}/rollouts", json={"start_mm": GOAL_MM, "version": 9}), 404)
+
+
+def test_the_service_serves_on_postgresql_too(tmp_path):
+    url = backends.fresh("postgresql", tmp_path)
+    with serving(url) as service:
+        service.client.put_surgeon("kestrel", consent={"uses": ["training"]})
+        demo = service.client.add_demo(cases.hand_off(), media_type=CSV, **KESTREL)
+        assert service.train(release=True)["result"]["released"]
+        assert service.client.rollout(**KESTREL, start_mm=STARTS_MM[0])["dtw_total_mm"] == 0
+        assert service.client.demo_recording(demo["id"]) == cases.hand_off()
+        service.client.erase_surgeon("kestrel")
+        assert_problem(service.http.get(POLICY), 410, "erased")
+    backends.drop(url)

@@ -1,0 +1,89 @@
+"""`make bench`: how fast it is, as ratios within one run, for timings vary from run to run and machine to machine."""
+
+import time
+from collections.abc import Callable
+from io import BytesIO
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from skills.recordings import read_recording
+from skills.seeds.recordings import sample_recordings
+from skills.style.certificate import certify
+from skills.style.demo import cut_demo
+from skills.style.evaluation import dtw
+from skills.style.grid import PAPER_GRID, discretize
+from skills.style.kinematics import POINTING_DOWN, forward, inverse
+from skills.style.learning import _kernels
+from skills.style.learning.q_learning import CellQLearning, PhaseQLearning
+from skills.style.policy import Policy, learn_policy
+from skills.style.reward import RewardMap, sparse_reward
+
+ROUNDS = 5
+
+
+def best_s(work: Callable[[], object], rounds: int = ROUNDS) -> float:
+    """Take the best of some rounds, in seconds of this thread's processor time; the first call only warms up."""
+    work()
+    times = []
+    for _ in range(rounds):
+        began = time.thread_time()
+        work()
+        times.append(time.thread_time() - began)
+    return min(times)
+
+
+def learning(reward: RewardMap, table: Table) -> None:
+    """Time both learners and the certificate against one pass of the certificate's own size."""
+    for learner in (PhaseQLearning(), CellQLearning()):
+        policy = learn_policy(reward, learner)
+        took, checked = best_s(lambda: learn_policy(reward, learner)), best_s(lambda: certify(policy))  # noqa: B023
+        table.add_row(f"{learner.kind}, the loop of wren", f"{took * 1e3:.1f} ms", f"{policy.training.steps} moves")
+        table.add_row("  per move", f"{took / policy.training.steps * 1e9:.1f} ns", "")
+        table.add_row("  certificate", f"{checked * 1e3:.1f} ms", f"{checked / took:.2f} of the learning")
+
+
+def compiled(reward: RewardMap, table: Table) -> None:
+    """Compare the compiled kernel with the same function as plain Python."""
+    learner = CellQLearning(episodes=20)
+    fast = best_s(lambda: learn_policy(reward, learner))
+    kept = _kernels.run_episodes_compiled
+    try:
+        _kernels.run_episodes_compiled = _kernels.run_episodes
+        with np.errstate(over="ignore"):
+            slow = best_s(lambda: learn_policy(reward, learner), rounds=1)
+    finally:
+        _kernels.run_episodes_compiled = kept
+    table.add_row("plain Python, 20 episodes", f"{slow * 1e3:.1f} ms", f"{slow / fast:.0f} x the compiled one")
+
+
+def kinematics(policy: Policy, table: Table) -> None:
+    """Time the closed form over the paper's whole grid."""
+    tips = PAPER_GRID.centres_mm(np.arange(PAPER_GRID.n_states))
+    rotations = np.broadcast_to(POINTING_DOWN, (len(tips), 3, 3))
+    joints = inverse(tips, rotations)
+    back, forth = best_s(lambda: inverse(tips, rotations)), best_s(lambda: forward(joints))
+    table.add_row("inverse kinematics, a pose", f"{back / len(tips) * 1e6:.2f} us", f"{back / forth:.1f} x forward")
+    rng = np.random.default_rng(0)
+    long = rng.normal(size=(1000, 3)), rng.normal(size=(1200, 3))
+    warped, summed = best_s(lambda: dtw(*long)), best_s(lambda: np.abs(long[0][:, None] - long[1]).sum(-1))
+    table.add_row("DTW, 1000 x 1200 points", f"{warped * 1e3:.1f} ms", f"{warped / summed:.1f} x its distances alone")
+
+
+def main() -> None:
+    """Print the table."""
+    sample = next(s for s in sample_recordings() if s.surgeon == "wren")
+    table = Table("what", "time", "in proportion", box=None)
+    read = best_s(lambda: read_recording(BytesIO(sample.data)))
+    table.add_row("reading a recording", f"{read * 1e3:.1f} ms", f"{len(sample.data) / read / 1e6:.1f} MB/s")
+    demo = cut_demo(read_recording(BytesIO(sample.data)), start_s=sample.segments[0][0], end_s=sample.segments[0][1])
+    reward = sparse_reward(discretize(demo.tip_mm, PAPER_GRID))
+    learning(reward, table)
+    compiled(reward, table)
+    kinematics(learn_policy(reward, PhaseQLearning()), table)
+    Console(width=100).print(table)
+
+
+if __name__ == "__main__":
+    main()

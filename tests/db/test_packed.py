@@ -1,0 +1,212 @@
+"""Packed values: what comes back is what was stored, whole, or it is refused."""
+
+import hashlib
+import io
+import json
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass, replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as some
+
+from skills.db import packed  # the tables declare what may be stored
+from skills.db.packed import FORMAT, Packed, digest, pack, unpack
+from skills.errors import Corrupt
+from skills.recordings import read_recording
+from skills.style.certificate import certify
+from skills.style.demo import cut_demo
+from skills.style.grid import PAPER_GRID, discretize
+from skills.style.learning.q_learning import CellQLearning, PhaseQLearning
+from skills.style.plan import SuturePoint, stack
+from skills.style.playback import Playback
+from skills.style.policy import learn_policy
+from skills.style.reward import RewardLevels, RewardMap, sparse_reward
+from tests.library.cases import bag, hand_off
+
+DEMO = cut_demo(read_recording(io.BytesIO(bag())))
+PATH = discretize(DEMO.tip_mm, PAPER_GRID)
+REWARD = sparse_reward(PATH)
+POLICY = learn_policy(REWARD, CellQLearning(episodes=10), seed=3)
+PHASED = learn_policy(REWARD, PhaseQLearning(), seed=0)
+PLAN = stack(
+    PHASED,
+    [SuturePoint((5.0, 55.0, -125.0)), SuturePoint((8.0, 55.0, -125.0), (0.0, 0.0, 0.1, 0.99498743710662))],
+    arm="PSM2",
+    frame="PSM2_base",
+    instrument="400006",
+    rotation=None,
+    approach_m=(-0.94, 0.10, -0.33),
+)
+PLAYBACK = Playback(
+    tip_mm=np.array([[1.0, np.nan, np.inf], [-0.0, 5e-324, 1e308]]),
+    rotation_xyzw=np.zeros((2, 4)),
+    joints=np.asfortranarray(np.arange(12.0).reshape(2, 6)),
+    tracking_mm=np.zeros(2),
+    clearance_pad_mm=np.zeros(2),
+    clearance_psm_m_mm=None,
+    pad_top_mm=-150.5,
+    picture_png=bytes(range(256)),
+    engine="none \u00e9 \u2603",
+    seconds_per_step=0.1 + 0.2,
+)
+VALUES = [
+    DEMO,
+    replace(DEMO, rotation_xyzw=None),
+    PATH,
+    REWARD,
+    POLICY,
+    PHASED,
+    replace(PLAN, approach_m=None),
+    PLAN,
+    certify(POLICY)[1],
+    PLAYBACK,
+]
+ARRAYS = some.arrays(
+    st.sampled_from([np.float64, np.int64, np.int8, np.bool_, np.float32]),
+    some.array_shapes(min_dims=1, max_dims=3, min_side=0, max_side=5),
+)
+
+
+def assert_same(one: object, other: object) -> None:
+    """Both are equal in every part: types, names, and every bit of every number."""
+    assert type(one) is type(other)
+    if isinstance(one, np.ndarray):
+        assert (one.dtype, one.shape) == (other.dtype, other.shape)
+        assert one.tobytes() == other.tobytes()
+    elif is_dataclass(one):
+        for field in fields(one):
+            assert_same(getattr(one, field.name), getattr(other, field.name))
+    elif isinstance(one, tuple):
+        for a, b in zip(one, other, strict=True):
+            assert_same(a, b)
+    else:
+        assert repr(one) == repr(other)
+
+
+def names_in(value: object) -> Iterator[str]:
+    if is_dataclass(value):
+        yield type(value).__name__
+        for field in fields(value):
+            yield from names_in(getattr(value, field.name))
+    elif isinstance(value, tuple):
+        for part in value:
+            yield from names_in(part)
+
+
+@pytest.mark.parametrize("value", VALUES, ids=lambda value: type(value).__name__)
+def test_every_stored_value_comes_back_bit_by_bit(value: object):
+    back = unpack(pack(value))
+    assert_same(back, value)
+    assert digest(back) == digest(value)
+
+
+def test_no_class_that_is_stored_was_left_out_above():
+    assert {name for value in VALUES for name in names_in(value)} == set(packed._VALUES)
+
+
+def test_arrays_come_back_read_only():
+    with pytest.raises(ValueError, match="read-only"):
+        unpack(pack(REWARD)).rewards[0] = 1.0
+
+
+@given(ARRAYS)
+def test_every_array_comes_back_as_it_was(array: np.ndarray):
+    assert_same(unpack(pack((array,))), (array,))
+
+
+@given(ARRAYS)
+def test_a_digest_does_not_depend_on_how_an_array_lies_in_memory(array: np.ndarray):
+    roomy = np.repeat(array, 2, axis=0)[::2]
+    backwards = np.ascontiguousarray(array[::-1])[::-1]
+    for other in (np.asfortranarray(array), roomy, backwards):
+        assert digest(other) == digest(array)
+        assert unpack(pack(other)).tobytes() == array.tobytes()
+
+
+@given(ARRAYS, st.data())
+def test_a_digest_knows_every_bit_the_shape_and_the_type(array: np.ndarray, data: st.DataObject):
+    assert digest(array) != digest(array.astype(np.complex128))
+    assert digest(array) != digest(array[None])
+    if array.size:
+        raw = bytearray(array.tobytes())
+        raw[data.draw(st.integers(0, len(raw) - 1))] ^= 1
+        assert digest(np.frombuffer(bytes(raw), array.dtype).reshape(array.shape)) != digest(array)
+
+
+def test_a_digest_is_of_the_value_and_not_of_its_compression(monkeypatch: pytest.MonkeyPatch):
+    before = digest(POLICY)
+    small = pack(POLICY)
+    monkeypatch.setattr(np, "savez_compressed", np.savez)
+    large = pack(POLICY)
+    assert len(large) > len(small)
+    assert digest(POLICY) == digest(unpack(large)) == digest(unpack(small)) == before
+
+
+def test_a_digest_tells_classes_and_fields_of_equal_numbers_apart():
+    levels = RewardLevels()
+    assert digest(levels) != digest(tuple(getattr(levels, field.name) for field in fields(levels)))
+    assert digest(SuturePoint((1.0, 2.0, 3.0))) != digest(SuturePoint((3.0, 2.0, 1.0)))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_each_of_300_flipped_bits_of_a_packed_policy_is_refused(seed: int):
+    data, rng = pack(POLICY), np.random.default_rng(seed)
+    for bit in rng.integers(0, 8 * len(data), 100).tolist():
+        damaged = bytearray(data)
+        damaged[bit // 8] ^= 1 << bit % 8
+        with pytest.raises(Corrupt):
+            unpack(bytes(damaged))
+
+
+def test_every_cut_of_a_packed_value_is_refused():
+    data = pack(RewardLevels())
+    for length in range(len(data)):
+        with pytest.raises(Corrupt):
+            unpack(data[:length])
+    with pytest.raises(Corrupt):
+        unpack(data + b"\0")
+
+
+def forged(tree: object, **arrays: np.ndarray) -> bytes:
+    """Pack what was never a value, with a checksum that agrees."""
+    out = io.BytesIO()
+    np.savez(out, tree=np.frombuffer(json.dumps(tree).encode(), np.uint8), **arrays)
+    return FORMAT + hashlib.sha256(out.getvalue()).digest() + out.getvalue()
+
+
+@pytest.mark.parametrize(
+    "tree",
+    [
+        {"value": "Popen", "of": {"args": "true"}},
+        {"value": "GridWorld", "of": {"args": "true"}},
+        {"value": "GridWorld", "of": {"origin_mm": [0, 0, 0], "cell_mm": -1.0, "shape": {"tuple": [1, 1, 1]}}},
+        {"value": "RewardMap", "of": {"path": None, "levels": None, "rewards": {"array": 7}}},
+        {"array": 0},
+        {"neither": "nor"},
+        {"dict": [1]},
+    ],
+)
+def test_what_was_never_a_value_is_refused_though_its_checksum_agrees(tree: object):
+    with pytest.raises(Corrupt):
+        unpack(forged(tree))
+
+
+def test_a_pickle_inside_is_never_read():
+    with pytest.raises(Corrupt):
+        unpack(forged({"array": 0}, a0=np.array([{}], dtype=object)))
+
+
+def test_a_column_refuses_a_value_of_another_class():
+    with pytest.raises(Corrupt, match="RewardLevels where a RewardMap"):
+        Packed(RewardMap).process_result_value(pack(RewardLevels()), None)
+    with pytest.raises(AssertionError):
+        Packed(RewardMap).process_bind_param(RewardLevels(), None)
+
+
+def test_a_class_that_was_not_declared_is_not_stored():
+    recording = read_recording(io.BytesIO(hand_off()))
+    with pytest.raises(AssertionError, match="not declared"):
+        pack(recording)

@@ -1,0 +1,143 @@
+"""What the database itself refuses, on both back ends: changing what is append-only, and rows that rest on nothing."""
+
+from collections.abc import Iterator
+
+import pytest
+from sqlalchemy import inspect, text
+from sqlalchemy.exc import DatabaseError, IntegrityError
+
+from skills.db import models
+from skills.db.base import Base, now
+from skills.db.models import Erasure, StoredPlayback
+from skills.db.session import Database
+from tests import backends
+from tests.db.test_packed import PLAYBACK
+from tests.library import cases
+
+FROZEN = (
+    "recordings",
+    "recording_chunks",
+    "reward_maps",
+    "policy_versions",
+    "plans",
+    "playbacks",
+    "events",
+    "erasures",
+)
+WITHDRAWABLE = ("demonstrations", "releases")
+FREE = {"surgeons", "suture_types", "jobs", "executors"}
+
+
+@pytest.fixture(scope="module", params=backends.BACKENDS)
+def full(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Database]:
+    """A database with at least one row in every append-only table."""
+    url = backends.fresh(request.param, tmp_path_factory.mktemp("full"))
+    database = Database(url)
+    cases.add_surgeon(database)
+    cases.add_demo(database)
+    cases.train(database, release=True)
+    plan = cases.add_plan(database)
+    with database.writing() as session:
+        session.add(StoredPlayback(sha256="0" * 64, plan_row=plan.row, feasible=True, report={}, measured=PLAYBACK))
+        session.add(Erasure(salt="0" * 64, digest="0" * 64))
+    yield database
+    database.close()
+    backends.drop(url)
+
+
+COLUMNS = [(table, column.name) for table in FROZEN for column in Base.metadata.tables[table].columns]
+KEPT = [(t, c.name) for t in WITHDRAWABLE for c in Base.metadata.tables[t].columns if c.name != "withdrawn_at"]
+
+
+def test_every_table_is_either_append_only_or_known_to_change():
+    assert {*FROZEN, *WITHDRAWABLE} | FREE == set(Base.metadata.tables)
+
+
+def test_no_column_of_an_append_only_table_can_be_updated(full: Database):
+    for table, column in COLUMNS + KEPT:
+        with full.reading() as session:
+            assert session.execute(text(f"SELECT count(*) FROM {table}")).scalar() > 0, table
+        new = "row + 1000" if column == "row" else f"(SELECT {column} FROM {table} LIMIT 1)"
+        if full.engine.dialect.name == "postgresql" and table in WITHDRAWABLE:
+            new = changed(column)
+        with pytest.raises(DatabaseError, match=f"{table} is append-only"), full.writing() as session:
+            session.execute(text(f"UPDATE {table} SET {column} = {new}"))
+
+
+def changed(column: str) -> str:
+    """Write SQL for another value of a column of a table that can be withdrawn: there an equal one is no change."""
+    if column.endswith("row"):
+        return "row + 1000"
+    if column in ("start_s", "end_s"):
+        return "start_s - 1"
+    if column.endswith("_at"):
+        return f"{column} + interval '1 second'"
+    return {"demo": "'\\x00'", "path": "'\\x00'", "report": "'{}'"}.get(column, "'other'")
+
+
+@pytest.mark.parametrize("table", WITHDRAWABLE)
+def test_it_is_withdrawn_once_and_for_good(full: Database, table: str):
+    with full.writing() as session:
+        session.execute(text(f"UPDATE {table} SET withdrawn_at = :now"), {"now": now()})
+    for again in (":now", "NULL"):
+        with pytest.raises(DatabaseError, match=f"{table} is append-only"), full.writing() as session:
+            session.execute(text(f"UPDATE {table} SET withdrawn_at = {again}"), {"now": now()} if ":" in again else {})
+
+
+def test_every_reference_to_another_table_is_enforced(full: Database):
+    with full.reading() as session:
+        references = [
+            (table, key["constrained_columns"][0])
+            for table in Base.metadata.tables
+            for key in inspect(session.connection()).get_foreign_keys(table)
+        ]
+    assert len(references) == sum(len(table.foreign_keys) for table in Base.metadata.tables.values())
+    for table, column in references:
+        copied = [c.name for c in Base.metadata.tables[table].columns if c.name != "row"]
+        nowhere = {"suture": "'nowhere'"}
+        unique = {"sha256": "'x'", "version": "9", "id": "'x'", "identity": "'x'", "number": "9"}
+        values = ", ".join(nowhere.get(c, "987654") if c == column else unique.get(c, c) for c in copied)
+        if table == "reward_maps" or (table, column) == ("recording_chunks", "recording"):
+            values = values.replace("demonstration_row", "987654")
+        copy = f"INSERT INTO {table} ({', '.join(copied)}) SELECT {values} FROM {table} LIMIT 1"
+        with pytest.raises(IntegrityError), full.writing() as session:
+            session.execute(text(copy))
+
+
+def test_what_something_rests_on_cannot_be_deleted(full: Database):
+    for table in ("recordings", "surgeons", "demonstrations", "policy_versions", "plans"):
+        with pytest.raises(IntegrityError), full.writing() as session:
+            session.execute(text(f"DELETE FROM {table}"))
+
+
+def test_row_numbers_are_never_used_twice(database: Database):
+    """The engine knows a job by its row: an erased one must not come back as another's."""
+    numbers = []
+    for name in ("one", "two"):
+        with database.writing() as session:
+            job = models.Job(id=name, kind="training", identity=name, request={})
+            session.add(job)
+            session.flush()
+            numbers.append(job.row)
+            session.execute(text("DELETE FROM jobs"))
+    assert numbers[1] > numbers[0]
+
+
+def test_one_identity_has_one_live_job_and_any_number_of_ended_ones(database: Database):
+    def add(name: str, state: str) -> None:
+        with database.writing() as session:
+            session.add(models.Job(id=name, kind="training", identity="0" * 64, request={}, state=state))
+
+    for name, state in (("1", "failed"), ("2", "cancelled"), ("3", "failed"), ("4", "queued")):
+        add(name, state)
+    for state in ("queued", "running", "succeeded"):
+        with pytest.raises(IntegrityError):
+            add("5", state)
+    with pytest.raises(IntegrityError):
+        add("6", "unheard")
+
+
+def test_every_constraint_has_a_name():
+    for table in Base.metadata.tables.values():
+        for constraint in table.constraints:
+            assert constraint.name, table.name

@@ -1,0 +1,57 @@
+"""A rollout written from the text of interface.md alone, on the JSON that the service sends, against the library's."""
+
+from itertools import product
+from typing import Any
+
+import numpy as np
+
+from skills.client import Client
+from skills.seeds.recordings import sample_recordings
+
+
+def rolled_out(policy: dict[str, Any], start: int) -> tuple[list[int], bool]:
+    """Follow the policy from a state. Nothing of ours is used: only the JSON and the rules of interface.md."""
+    nx, ny, nz = policy["grid"]["shape"]
+    waypoints, actions = policy["waypoints"], policy["actions"]
+    last = len(waypoints) - 1
+    state, phase, states = start, 0, [start]
+    if state in waypoints:
+        phase = waypoints.index(state) + 1
+        if phase == last + 1:
+            return states, True
+    while len(states) < 10_000:
+        action = actions[phase][state]
+        if action == -1:
+            return states, True
+        if action == -2:
+            return states, False
+        a, b, c = action // 9, action // 3 % 3, action % 3
+        x, y, z = state // (ny * nz) + a - 1, state // nz % ny + b - 1, state % nz + c - 1
+        if 0 <= x < nx and 0 <= y < ny and 0 <= z < nz:
+            state = (x * ny + y) * nz + z
+            if phase == 0 and state == waypoints[-1]:
+                return [*states, state], True
+            if phase == 0 and state in waypoints:
+                phase = waypoints.index(state) + 1
+            elif phase > 0 and state == waypoints[phase]:
+                if phase == last:
+                    return [*states, state], True
+                phase += 1
+        states.append(state)
+    return states, False
+
+
+def test_a_client_that_knows_only_the_interface_goes_where_the_library_goes_from_every_start(client: Client) -> None:
+    sample = next(s for s in sample_recordings() if s.surgeon == "wren")  # its path crosses itself
+    client.put_surgeon(sample.surgeon)
+    client.add_demo(sample.data, surgeon=sample.surgeon, suture=sample.suture)
+    client.wait(client.train(sample.surgeon, sample.suture, release=True))
+    policy = client.policy(sample.surgeon, sample.suture)
+    origin, cell = np.array(policy["grid"]["origin_mm"]), policy["grid"]["cell_mm"]
+    assert len(policy["waypoints"]) > len(set(policy["waypoints"]))
+    for state, ijk in enumerate(product(*map(range, policy["grid"]["shape"]))):
+        states, finished = rolled_out(policy, state)
+        answer = client.rollout(sample.surgeon, sample.suture, (origin + cell * np.array(ijk)).tolist())
+        assert (answer["states"], answer["finished"]) == (states, finished), state
+        assert finished
+    assert rolled_out(policy, policy["waypoints"][0]) == (policy["waypoints"], True)

@@ -1,0 +1,25 @@
+"""`make demo`, as a newcomer would see it."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+
+def test_the_demo_does_the_main_job_and_exits_with_0(tmp_path: Path) -> None:
+    pytest.importorskip("pybullet", reason="PyBullet has no wheel here: the demo's playback cannot run")
+    environment = os.environ | {"COLUMNS": "160"}
+    ended = subprocess.run([sys.executable, "-m", "skills.demo"], env=environment, cwd=tmp_path, capture_output=True)
+    printed = ended.stdout.decode()
+    assert ended.returncode == 0, printed + ended.stderr.decode()
+    styles = re.findall(r"^ (\w+) [a-z-]+ +(\d+)/(\d+) +0 +1331/1331 +feasible ", printed, re.MULTILINE)
+    assert {surgeon for surgeon, _, _ in styles} == {"kestrel", "heron", "wren", "plover"}
+    assert all(exact == states for _, exact, states in styles)
+    pictures = tmp_path / "build" / "demo"
+    real = bool(os.environ.get("SKILLS_SAMPLE_RECORDINGS"))
+    assert ("187 of 187 states, DTW 0 mm, 2380 of 2380 starts" if real else "No real recording:") in printed
+    assert len(list(pictures.glob("*-playback.png"))) >= len(styles)
+    assert all(picture.read_bytes().startswith(b"\x89PNG") for picture in pictures.iterdir())

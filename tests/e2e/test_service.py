@@ -1,0 +1,98 @@
+"""The service as processes: killed and started again, stopped, refused."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from skills.client import Client
+from skills.seeds.recordings import sample_recordings
+from tests.e2e.conftest import Service, running
+
+SLOW_LEARNER = {"kind": "cell-q-learning", "episodes": 300_000}  # a few seconds of work
+
+
+def test_what_was_acknowledged_survives_a_kill_and_the_training_goes_on(tmp_path: Path) -> None:
+    sample = sample_recordings()[0]
+    style = (sample.surgeon, sample.suture)
+    with running(tmp_path) as service, Client(service.url) as client:
+        client.put_surgeon(sample.surgeon)
+        demo = client.add_demo(sample.data, surgeon=sample.surgeon, suture=sample.suture)
+        job = client.train(*style, learner=SLOW_LEARNER)
+        deadline = time.monotonic() + 30
+        while client.job(job["id"])["state"] == "queued" and time.monotonic() < deadline:
+            time.sleep(0.02)
+        assert client.job(job["id"])["state"] == "running"
+        service.kill()
+        service.start()
+        assert client.demo(demo["id"])["state"] == "active"
+        assert client.demo_recording(demo["id"]) == sample.data
+        done = client.wait(client.job(job["id"]), timeout_s=60)
+        assert done["state"] == "succeeded"
+        assert [v["version"] for v in client.versions(*style)] == [1]
+        assert client.train(*style, learner=SLOW_LEARNER)["id"] == job["id"]
+
+
+def test_the_recording_comes_back_exactly_and_two_segments_are_two_demonstrations(client: Client) -> None:
+    sample = next(s for s in sample_recordings() if len(s.segments) > 1)
+    client.put_surgeon(sample.surgeon)
+    first, again = client.add_recording(sample.data), client.add_recording(sample.data)
+    assert first["id"] == again["id"]
+    parts = first["segments"][:2]
+    demos = [
+        client.cut_demo(
+            first["id"], surgeon=sample.surgeon, suture=sample.suture, start_s=p["start_s"], end_s=p["end_s"]
+        )
+        for p in parts
+    ]
+    assert len({d["id"] for d in demos}) == 2
+    assert {d["recording"] for d in demos} == {first["id"]}
+    assert all(client.demo_recording(d["id"]) == sample.data for d in demos)
+
+
+def test_a_stopped_service_exits_with_0_and_takes_its_worker_along(tmp_path: Path) -> None:
+    with running(tmp_path) as service:
+        worker = _child_of(service)
+        assert service.stop() == 0
+    deadline = time.monotonic() + 15
+    while _lives(worker) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert not _lives(worker)
+
+
+def test_a_worker_that_dies_is_replaced_and_its_job_done(tmp_path: Path) -> None:
+    sample = sample_recordings()[0]
+    with running(tmp_path) as service, Client(service.url) as client:
+        client.put_surgeon(sample.surgeon)
+        client.add_demo(sample.data, surgeon=sample.surgeon, suture=sample.suture)
+        os.kill(_child_of(service), signal.SIGKILL)
+        done = client.wait(client.train(sample.surgeon, sample.suture, release=True), timeout_s=60)
+        assert done["result"]["released"]
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.0.2.7", "example.org"])
+def test_an_address_that_others_can_reach_is_refused(tmp_path: Path, host: str) -> None:
+    environment = os.environ | {"SKILLS_HOST": host, "SKILLS_DATABASE_URL": f"sqlite:///{tmp_path / 's.sqlite'}"}
+    ended = subprocess.run([sys.executable, "-m", "skills", "serve"], env=environment, capture_output=True, text=True)
+    assert ended.returncode == 1
+    assert "SKILLS_HOST" in ended.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def _child_of(service: Service) -> int:
+    """Find the worker: the one child of the service, whichever of its threads started it."""
+    assert service.process is not None
+    tasks = Path(f"/proc/{service.process.pid}/task")
+    (child,) = [int(pid) for task in tasks.iterdir() for pid in (task / "children").read_text().split()]
+    return child
+
+
+def _lives(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False

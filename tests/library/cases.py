@@ -1,0 +1,97 @@
+"""Small hand-offs as tables and bags, and the line from one of them to a playback, called as the service calls it."""
+
+import io
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from skills.db.models import Demonstration, Job, Plan, PolicyVersion
+from skills.db.packed import sha256
+from skills.db.session import Database
+from skills.jobs.workflows import Work
+from skills.library import perform_job
+from skills.library.catalogue import put_surgeon, seed_catalogue
+from skills.library.demos import Cut, upload_demo
+from skills.library.plans import PlanRequest, plan_sutures
+from skills.library.recordings import Upload
+from skills.library.training import request_training
+from skills.recordings import write_mcap
+from skills.settings import Settings
+from skills.style.learning.q_learning import CellQLearning
+from skills.style.plan import SuturePoint
+from skills.style.recording import Motion, Recording
+
+SUTURE = "simple-running"
+PUBLISHED = CellQLearning.published()
+RATE_HZ = 50
+START_NS = 1_760_000_000_000_000_000
+CORNERS_MM = np.array([[-10, 55, -135], [-20, 60, -130], [-10, 55, -120], [5, 55, -125]], dtype=float)
+
+
+def points_mm(shift_mm: tuple[float, float, float] = (0.0, 0.0, 0.0), samples: int = 20) -> np.ndarray:
+    """Walk around three corners inside the paper's grid, seven cells in all; shape (3 samples, 3)."""
+    legs = [np.linspace(a, b, samples) for a, b in pairwise(CORNERS_MM)]
+    return np.concatenate(legs) + np.asarray(shift_mm)
+
+
+def table(tip: np.ndarray, *, unit: str = "mm", rate_hz: float = RATE_HZ, stamps_s: Any = None) -> bytes:
+    """Write positions as a CSV file."""
+    stamps = np.arange(len(tip)) / rate_hz if stamps_s is None else stamps_s
+    rows = [f"{t!r},{x!r},{y!r},{z!r}" for t, (x, y, z) in zip(np.asarray(stamps).tolist(), tip.tolist(), strict=True)]
+    return "\n".join([f"t_s,x_{unit},y_{unit},z_{unit}", *rows, ""]).encode()
+
+
+def hand_off(shift_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> bytes:
+    """Give one hand-off as a table; another shift is another recording and another path."""
+    return table(points_mm(shift_mm))
+
+
+def bag(*arms: str, tip: np.ndarray | None = None) -> bytes:
+    """Write the hand-off as the MCAP file of a dVRK, by each of the arms."""
+    tip = points_mm() if tip is None else tip
+    stamps_ns = START_NS + np.arange(len(tip)) * (10**9 // RATE_HZ)
+    down = np.tile([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0], (len(tip), 1))
+    motions = [Motion(a, f"/{a}/local/measured_cp", f"{a}_base", stamps_ns, tip, down) for a in arms or ("PSM2",)]
+    return write_mcap(Recording(format="mcap", integrity="full", motions=tuple(motions)))
+
+
+def upload(data: bytes, media_type: str = "text/csv", **how: Any) -> Upload:
+    return Upload(io.BytesIO(data), sha256(data), len(data), media_type, **how)
+
+
+def add_surgeon(database: Database, slug: str = "kestrel", **about: Any) -> None:
+    with database.writing() as session:
+        seed_catalogue(session)
+        put_surgeon(session, slug, about, "test")
+
+
+def add_demo(database: Database, data: bytes | None = None, surgeon: str = "kestrel", **cut: Any) -> Demonstration:
+    """Store one demonstration: its row."""
+    return upload_demo(database, upload(data or hand_off()), Cut(surgeon, SUTURE, **cut), "test")[0]
+
+
+def ask_training(database: Database, surgeon: str = "kestrel", **asked: Any) -> Job:
+    with database.writing() as session:
+        return request_training(session, surgeon, SUTURE, "test", **asked)[0]
+
+
+def work(database: Database, job: Job) -> Job:
+    """Carry a job out as a worker does: mark it running, perform it, or say why it failed."""
+    settled = Work(database, Settings(database_url=database.url), perform_job).try_once(job.row, job.attempt, 0)
+    assert settled, "the job failed inside the service"
+    with database.reading() as session:
+        return session.get_one(Job, job.row)
+
+
+def train(database: Database, surgeon: str = "kestrel", **asked: Any) -> PolicyVersion:
+    """Train, and give the version that came of it."""
+    job = work(database, ask_training(database, surgeon, **asked))
+    assert job.state == "succeeded", job.error
+    with database.reading() as session:
+        return session.query(PolicyVersion).filter_by(sha256=job.result["sha256"]).one()
+
+
+def add_plan(database: Database, surgeon: str = "kestrel", **asked: Any) -> Plan:
+    point = SuturePoint((5.0, 55.0, -125.0))
+    return plan_sutures(database, PlanRequest(surgeon, SUTURE, [point], **asked), "test")[0]

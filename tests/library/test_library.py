@@ -1,0 +1,183 @@
+"""The use cases on both back ends: once where it is asked at once, and nothing where it was taken back."""
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import pytest
+from sqlalchemy import func, select, text
+
+from skills.db.base import Base
+from skills.db.models import Event, Job, PolicyVersion, StoredRecording
+from skills.db.session import Database
+from skills.errors import Conflict, Corrupt, Erased
+from skills.library import jobs, releases, work
+from skills.library.catalogue import find_surgeon, put_surgeon, seed_catalogue
+from skills.library.demos import find_demo, withdraw_demo
+from skills.library.erasure import erase_surgeon
+from skills.library.policies import learnt, policy_of
+from skills.library.recordings import recording_bytes
+from tests import backends
+from tests.library import cases
+
+AT_ONCE = 8
+
+
+def at_once(what: Callable[[int], Any]) -> list[Any]:
+    with ThreadPoolExecutor(AT_ONCE) as pool:
+        return list(pool.map(what, range(AT_ONCE)))
+
+
+def counts(database: Database) -> dict[str, int]:
+    with database.reading() as session:
+        found = {
+            t: session.scalar(select(func.count()).select_from(Base.metadata.tables[t])) for t in Base.metadata.tables
+        }
+        return {table: rows for table, rows in found.items() if rows}
+
+
+def test_the_catalogue_is_seeded_once(database: Database):
+    with database.writing() as session:
+        assert seed_catalogue(session) == 0
+    assert counts(database)["suture_types"] == 11
+
+
+def test_the_same_upload_eight_times_at_once_is_one_demonstration(database: Database):
+    rows = at_once(lambda _: cases.add_demo(database).sha256)
+    assert len(set(rows)) == 1
+    found = counts(database)
+    assert (found["recordings"], found["demonstrations"], found["reward_maps"]) == (1, 1, 1)
+
+
+def test_the_same_surgeon_eight_times_at_once_is_one_surgeon(database: Database):
+    def put(_: int) -> None:
+        with database.writing() as session:
+            put_surgeon(session, "heron", {}, "test")
+
+    at_once(put)
+    assert counts(database)["surgeons"] == 2
+
+
+def test_the_same_training_eight_times_at_once_is_one_job(database: Database):
+    cases.add_demo(database)
+    assert len({job.id for job in at_once(lambda _: cases.ask_training(database))}) == 1
+    assert counts(database)["jobs"] == 1
+
+
+def test_a_job_performed_twice_makes_one_version(database: Database):
+    cases.add_demo(database)
+    job = cases.work(database, cases.ask_training(database, release=True))
+    first = job.result
+    work.perform_job(database, job.row, job.attempt, None)
+    assert cases.work(database, job).result == first
+    assert counts(database)["policy_versions"] == counts(database)["releases"] == 1
+
+
+def test_the_same_training_gives_the_same_digest_in_any_database(database: Database, tmp_path: Path):
+    other = Database(backends.fresh("sqlite", tmp_path))
+    cases.add_surgeon(other)
+    for one in (database, other):
+        cases.add_demo(one)
+    assert cases.train(database).sha256 == cases.train(other).sha256
+    other.close()
+
+
+def interrupted(monkeypatch: pytest.MonkeyPatch, meanwhile: Callable[[], None]) -> None:
+    """Let something happen after the learning and before its result is stored."""
+    train = work.MAKERS["training"]
+
+    def make(*asked: Any) -> Any:
+        store = train(*asked)
+        meanwhile()
+        return store
+
+    monkeypatch.setitem(work.MAKERS, "training", make)
+
+
+def test_a_job_cancelled_while_it_learns_leaves_no_policy(database: Database, monkeypatch: pytest.MonkeyPatch):
+    cases.add_demo(database)
+    job = cases.ask_training(database, release=True)
+
+    def cancel() -> None:
+        with database.writing() as session:
+            jobs.cancel(session, job.id, "test")
+
+    interrupted(monkeypatch, cancel)
+    assert cases.work(database, job).state == "cancelled"
+    assert {"policy_versions", "releases"}.isdisjoint(counts(database))
+
+
+def test_a_demonstration_withdrawn_while_it_is_learnt_leaves_no_policy(
+    database: Database, monkeypatch: pytest.MonkeyPatch
+):
+    demo = cases.add_demo(database)
+
+    def withdraw() -> None:
+        with database.writing() as session:
+            withdraw_demo(session, demo.sha256, "test")
+
+    interrupted(monkeypatch, withdraw)
+    job = cases.work(database, cases.ask_training(database, release=True))
+    assert (job.state, job.error) == ("failed", "The demonstration was withdrawn while it was being learnt.")
+    assert {"policy_versions", "releases"}.isdisjoint(counts(database))
+
+
+def test_a_surgeon_erased_while_the_style_is_learnt_leaves_nothing(database: Database, monkeypatch: pytest.MonkeyPatch):
+    cases.add_demo(database)
+    job = cases.ask_training(database)
+
+    def erase() -> None:
+        with database.writing() as session:
+            erase_surgeon(session, "kestrel", "test")
+
+    interrupted(monkeypatch, erase)
+    with database.writing() as session:
+        session.get_one(Job, job.row).state = "running"
+    work.perform_job(database, job.row, job.attempt, None)
+    assert set(counts(database)) == {"suture_types", "events", "erasures"}
+
+
+def test_erasure_leaves_no_row_and_events_without_a_name(database: Database):
+    cases.add_demo(database)
+    cases.train(database, release=True)
+    cases.add_plan(database)
+    with database.writing() as session:
+        subject = find_surgeon(session, "kestrel").subject
+        erase_surgeon(session, "kestrel", "test")
+    assert set(counts(database)) == {"suture_types", "events", "erasures"}
+    with database.reading() as session:
+        events = session.scalars(select(Event)).all()
+        assert not any("kestrel" in str(vars(event)) for event in events)
+        assert events[-1].action == "erase"
+        assert events[-1].subject == subject
+        with pytest.raises(Erased, match="another pseudonym"):
+            find_surgeon(session, "kestrel")
+
+
+def test_a_recording_whose_chunk_was_changed_is_not_given_back_whole(database: Database):
+    cases.add_demo(database)
+    with database.writing() as session:
+        drop = {"sqlite": "DROP TRIGGER recording_chunks_append_only"}
+        on_server = "DROP TRIGGER recording_chunks_append_only ON recording_chunks"
+        session.execute(text(drop.get(database.engine.dialect.name, on_server)))
+        session.execute(text("UPDATE recording_chunks SET data = :data"), {"data": b"other bytes"})
+    with database.reading() as session, pytest.raises(Corrupt, match="not what was stored"):
+        list(recording_bytes(session, session.scalars(select(StoredRecording)).one()))
+
+
+def test_what_was_released_is_what_was_learnt(database: Database):
+    demo = cases.add_demo(database)
+    version = cases.train(database, release=True)
+    with database.reading() as session:
+        served = policy_of(session, "kestrel", cases.SUTURE)
+        assert served.policy.sha256 == version.sha256
+        assert learnt(served.policy).path.states.tolist() == find_demo(session, demo.sha256).path.states.tolist()
+
+
+def test_a_version_that_does_not_pass_is_not_released_whatever_its_row_says(database: Database):
+    cases.add_demo(database)
+    version = cases.train(database, learner=cases.PUBLISHED)
+    with database.writing() as session, pytest.raises(Conflict, match="do not reach the goal"):
+        releases.release(session, session.get_one(PolicyVersion, version.row), "test")
+    assert "releases" not in counts(database)

@@ -1,0 +1,150 @@
+"""The way up, the way down, and the way up again, on both back ends."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from threading import Thread
+
+import pytest
+from alembic import command
+from alembic.autogenerate import compare_metadata
+from alembic.config import Config
+from alembic.runtime.migration import MigrationContext
+from alembic.script import ScriptDirectory
+from sqlalchemy import inspect, text
+
+from skills.db.base import Base
+from skills.db.session import Database, _alembic
+from skills.errors import Conflict
+from tests import backends
+from tests.library import cases
+
+NOT_OURS = "jobs_of_the_engine"
+
+
+@pytest.fixture(params=backends.BACKENDS)
+def database(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Database]:
+    """A database without any table."""
+    url = backends.blank(request.param, tmp_path)
+    database = Database(url)
+    yield database
+    database.close()
+    backends.drop(url)
+
+
+def go(database: Database, how: Callable[[Config, str], None], where: str) -> None:
+    with database.engine.execution_options(writes=True).connect() as connection:
+        config = _alembic()
+        config.attributes["connection"] = connection
+        how(config, where)
+        connection.commit()
+
+
+def tables(database: Database) -> set[str]:
+    return set(inspect(database.engine).get_table_names())
+
+
+def shape(database: Database) -> object:
+    """Everything that the database says of its tables: columns, keys, indexes, triggers."""
+    look = inspect(database.engine)
+    kind = database.engine.dialect.name
+    query = {
+        "sqlite": "SELECT name, tbl_name, sql FROM sqlite_master WHERE name NOT LIKE 'sqlite_%' ORDER BY name",
+        "postgresql": "SELECT tgname, pg_get_triggerdef(oid) FROM pg_trigger WHERE NOT tgisinternal ORDER BY tgname",
+    }[kind]
+    with database.reading() as session:
+        said = [tuple(row) for row in session.execute(text(query))]
+    columns = {t: [(c["name"], str(c["type"]), c["nullable"]) for c in look.get_columns(t)] for t in tables(database)}
+    keys = {t: sorted(str(k["name"]) for k in look.get_indexes(t) + look.get_unique_constraints(t)) for t in columns}
+    return said, columns, keys
+
+
+def test_up_makes_exactly_the_tables_of_the_models(database: Database):
+    database.migrate()
+    assert tables(database) == {*Base.metadata.tables, "alembic_version"}
+    with database.engine.connect() as connection:
+        assert compare_metadata(MigrationContext.configure(connection), Base.metadata) == []
+
+
+def test_up_down_and_up_again_is_up(database: Database):
+    database.migrate()
+    once = shape(database)
+    go(database, command.downgrade, "base")
+    assert tables(database) == {"alembic_version"}
+    database.migrate()
+    assert shape(database) == once
+
+
+def test_every_revision_goes_down_and_up_on_tables_with_rows_in_them(database: Database):
+    database.migrate()
+    cases.add_surgeon(database)
+    cases.add_demo(database)
+    cases.train(database, release=True)
+    cases.add_plan(database)
+    for script in ScriptDirectory.from_config(_alembic()).walk_revisions():
+        go(database, command.downgrade, script.down_revision or "base")
+    assert tables(database) == {"alembic_version"}
+    database.migrate()
+
+
+def test_migrating_again_changes_nothing(database: Database):
+    database.migrate()
+    cases.add_surgeon(database)
+    before = shape(database)
+    database.migrate()
+    assert shape(database) == before
+    with database.reading() as session:
+        assert session.scalar(text("SELECT count(*) FROM surgeons")) == 1
+
+
+def test_a_database_of_a_newer_version_is_refused_and_left_as_it_was(database: Database):
+    database.migrate()
+    cases.add_surgeon(database)
+    with database.writing() as session:
+        session.execute(text("UPDATE alembic_version SET version_num = '9999'"))
+    before = shape(database)
+    with pytest.raises(Conflict, match="newer version; update the code, nothing was changed"):
+        database.migrate()
+    assert shape(database) == before
+    with database.reading() as session:
+        assert session.scalar(text("SELECT version_num FROM alembic_version")) == "9999"
+        assert session.scalar(text("SELECT count(*) FROM surgeons")) == 1
+
+
+def test_a_migration_that_fails_half_way_leaves_nothing(database: Database):
+    with database.writing() as session:
+        session.execute(text("CREATE TABLE playbacks (row INTEGER)"))  # the last of the first migration's tables
+    with pytest.raises(Exception, match="already exists"):
+        database.migrate()
+    assert tables(database) - {"alembic_version"} == {"playbacks"}
+    with database.writing() as session:
+        session.execute(text("DROP TABLE playbacks"))
+    database.migrate()
+
+
+def test_tables_that_are_not_ours_are_left_alone(database: Database):
+    with database.writing() as session:
+        session.execute(text(f"CREATE TABLE {NOT_OURS} (id INTEGER)"))
+    database.migrate()
+    go(database, command.downgrade, "base")
+    assert NOT_OURS in tables(database)
+
+
+def test_two_services_that_start_together_migrate_once(database: Database):
+    others = [Database(database.url) for _ in range(3)]
+    errors: list[Exception] = []
+
+    def migrate(one: Database) -> None:
+        try:
+            one.migrate()
+        except Exception as error:
+            errors.append(error)
+
+    threads = [Thread(target=migrate, args=(one,)) for one in others]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    for one in others:
+        one.close()
+    assert errors == []
+    assert set(Base.metadata.tables) < tables(database)

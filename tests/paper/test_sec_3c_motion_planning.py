@@ -1,0 +1,104 @@
+"""Sec. III-C: the 27 actions, the three rules that end an episode, and the reward that pays for standing still."""
+
+from itertools import product
+
+import numpy as np
+import pytest
+
+from skills.errors import BadSettings
+from skills.style import paper
+from skills.style.certificate import certify
+from skills.style.grid import MOVES
+from skills.style.learning.q_learning import CellQLearning, PhaseQLearning
+from skills.style.policy import learn_policy, rollout
+from skills.style.reward import sparse_reward
+from tests.style.paths import named_path
+
+CELL = CellQLearning(episodes=300)
+PHASE = PhaseQLearning(max_steps=paper.MAX_STEPS, epsilon=1.0, max_sweeps=1)  # every state-action pair once
+
+
+def test_there_are_27_actions_in_the_order_of_their_index():
+    assert MOVES.tolist() == [list(move) for move in product((-1, 0, 1), repeat=3)]
+
+
+@pytest.mark.parametrize(
+    ("action", "move"),
+    [(0, (-1, -1, -1)), (4, (-1, 0, 0)), (12, (0, 0, -1)), (13, (0, 0, 0)), (16, (0, 1, 0)), (22, (1, 0, 0))],
+)
+def test_an_action_index_is_9a_plus_3b_plus_c(action, move):
+    assert tuple(MOVES[action]) == move
+
+
+def test_the_stop_rules_are_the_papers():
+    assert (paper.MAX_STEPS, paper.MAX_EPISODE_S) == (100, 30 * 60)
+    for learner in (CellQLearning(), PhaseQLearning()):
+        assert learner.max_episode_s == 1800
+    assert CellQLearning().max_steps == 100
+
+
+@pytest.mark.parametrize("learner", [CELL, PHASE], ids=["cell", "phase"])
+def test_an_episode_ends_at_the_goal(learner, user_reward):
+    training = learn_policy(user_reward, learner).training
+    assert 0 < training.finished < training.episodes
+
+
+@pytest.mark.parametrize("learner", [CELL, PHASE], ids=["cell", "phase"])
+def test_an_episode_ends_after_100_steps(learner, user_reward):
+    training = learn_policy(user_reward, learner).training
+    assert training.out_of_steps > 0
+    assert training.out_of_time == 0
+    assert 100 * training.out_of_steps <= training.steps <= 100 * training.episodes
+
+
+@pytest.mark.parametrize("learner", [CELL, PHASE], ids=["cell", "phase"])
+def test_an_episode_ends_when_the_arm_has_moved_for_30_minutes(learner, user_reward):
+    slow = type(learner)(**{**vars(learner), "step_s": 60.0})  # so that 30 steps take the 30 minutes
+    training = learn_policy(user_reward, slow).training
+    assert training.out_of_time > 0
+    assert training.out_of_steps == 0
+    assert 30 * training.out_of_time <= training.steps <= 30 * training.episodes
+
+
+def test_in_the_papers_state_every_episode_ends_by_one_of_the_three_rules(user_reward):
+    training = learn_policy(user_reward, CELL).training
+    assert training.finished + training.out_of_steps == training.episodes == 300
+
+
+def test_in_the_phase_state_an_episode_that_reaches_its_next_waypoint_did_not_run_out_of_steps():
+    # Each of the 27 actions once in each state: all of 4 x 3 x 3 cells in both phases, less the goal.
+    path = named_path("two cells")
+    training = learn_policy(sparse_reward(path), PhaseQLearning(max_sweeps=1)).training
+    assert training.episodes == training.steps == 2 * 35 * 27
+    onto_the_goal = 2 * 26  # from all around it, in both phases
+    joining = 25 + 1  # onto the start in phase 0: from all around it but the goal, and by staying there
+    assert training.finished == onto_the_goal
+    assert training.out_of_steps == training.episodes - onto_the_goal - joining
+
+
+@pytest.mark.parametrize("gamma", [0.9, 0.95, 1.0])
+def test_rewards_that_pay_more_for_standing_on_the_path_than_for_arriving_are_refused(user_reward, gamma):
+    # 1 / (1 - 0.9) = 10: what the paper's reward map did to its value iteration
+    with pytest.raises(BadSettings, match=r"[Ss]tanding on a visited cell pays"):
+        learn_policy(user_reward, CellQLearning(gamma=gamma))
+
+
+def test_the_published_parameters_leave_the_users_start_stranded_on_nearly_every_seed(user_reward):
+    reached = [rollout(learn_policy(user_reward, CellQLearning.published(), s), paper.USER_START_MM) for s in range(20)]
+    assert sum(one.finished for one in reached) <= 1  # measured on 200 seeds: 0.5 %
+
+
+@pytest.mark.nightly
+def test_the_published_parameters_reach_the_goal_on_fewer_than_3_seeds_in_100(user_reward):
+    reached = [
+        rollout(learn_policy(user_reward, CellQLearning.published(), s), paper.USER_START_MM) for s in range(200)
+    ]
+    assert sum(one.finished for one in reached) < 6
+
+
+def test_in_the_papers_state_the_optimal_policy_cannot_cross_itself(user_reward):
+    policy = learn_policy(user_reward, CellQLearning(), seed=1)
+    certificate, _ = certify(policy)
+    assert certificate.every_action_optimal
+    assert not certificate.demonstration_reproduced
+    assert len(np.unique(rollout(policy, paper.USER_START_MM).states)) == 10

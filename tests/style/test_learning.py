@@ -1,0 +1,198 @@
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from skills.errors import BadSettings
+from skills.style.certificate import certify
+from skills.style.learning.q_learning import MAX_SEED, CellQLearning, PhaseQLearning
+from skills.style.policy import learn_policy, rollout_from
+from skills.style.reward import RewardLevels, sparse_reward
+from tests.style.paths import follow, joins_nearest, named_path, random_path
+
+REWARD = sparse_reward(named_path("a figure of eight"))
+both_learners = pytest.mark.parametrize("learner", [CellQLearning(), PhaseQLearning()], ids=["cell", "phase"])
+
+
+# ---- whatever the path ------------------------------------------------------------------------------------------
+
+
+def test_the_random_paths_are_closed_cross_their_goal_early_oscillate_and_start_at_a_goal_that_they_cross():
+    paths = [random_path(seed) for seed in range(50)]
+    goal_visits = [int((path.states == path.goal).sum()) for path in paths]
+    assert all(path.revisits > 0 for path in paths)
+    assert sum(path.start == path.goal for path in paths) >= 20
+    assert sum(path.start != path.goal and n > 1 for path, n in zip(paths, goal_visits, strict=True)) >= 10
+    assert sum(path.start == path.goal and n > 2 for path, n in zip(paths, goal_visits, strict=True)) >= 10
+    oscillate = [
+        any(s[i : i + 2] * 3 == s[i : i + 6] for i in range(len(s))) for s in (p.states.tolist() for p in paths)
+    ]
+    assert sum(oscillate) >= 10
+    assert len({path.grid.shape for path in paths}) > 25
+
+
+def check_path(path, seeds):
+    """The demonstration exactly, every start to the goal by the nearest way onto the path, every action optimal."""
+    for seed in seeds:
+        policy = learn_policy(sparse_reward(path), PhaseQLearning(), seed)
+        assert policy.training.settled
+        assert rollout_from(policy, path.start).states.tolist() == path.states.tolist()
+        certificate, _ = certify(policy)
+        assert certificate.every_action_optimal
+        assert certificate.demonstration_reproduced
+        assert certificate.starts_reaching == certificate.starts_joining_nearest == path.grid.n_states
+        actions, waypoints = policy.table(), path.states.tolist()
+        for start in range(path.grid.n_states):  # and so says a client that knows the interface's text alone
+            states, finished = follow(actions, path.grid.shape, waypoints, start)
+            assert finished
+            assert joins_nearest(path, states)
+
+
+@pytest.mark.parametrize("number", range(50))
+def test_on_each_of_50_self_crossing_paths_every_state_and_every_start(number):
+    check_path(random_path(number), seeds=(number, number + 100))
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("number", range(200))
+def test_on_each_of_200_self_crossing_paths_every_state_and_every_start_on_20_seeds(number):
+    check_path(random_path(1_000_000 + number), seeds=range(20))
+
+
+@pytest.mark.parametrize("settings", [{"epsilon": 1.0, "max_steps": 100}, {"epsilon": 0.3, "max_steps": 7}], ids=str)
+def test_longer_episodes_learn_the_same_policy(settings):
+    short = learn_policy(REWARD, PhaseQLearning())
+    long = learn_policy(REWARD, PhaseQLearning(**settings))
+    assert long.training.steps > long.training.episodes
+    assert long.training.settled
+    assert long.q.max(axis=1) == pytest.approx(short.q.max(axis=1), rel=1e-9, abs=0)
+    assert vars(certify(long)[0]) == vars(certify(short)[0])
+
+
+def test_a_sweep_cap_that_is_too_low_is_told():
+    assert not learn_policy(REWARD, PhaseQLearning(max_sweeps=1)).training.settled
+
+
+def test_a_learner_tells_how_it_is_called():
+    assert (CellQLearning.kind, PhaseQLearning.kind) == ("cell-q-learning", "phase-q-learning")
+    published = CellQLearning.published()
+    assert (published.alpha, published.gamma, published.epsilon_falls_over) == (0.1, 0.01, 0.5)
+    assert (published.epsilon_start, published.epsilon_end, published.episodes) == (1.0, 0.0, 5000)
+
+
+# ---- the same again ---------------------------------------------------------------------------------------------
+
+
+@both_learners
+def test_the_same_seed_learns_the_same_bytes(learner):
+    first, second = (learn_policy(REWARD, learner, seed=3) for _ in range(2))
+    assert first.q.tobytes() == second.q.tobytes()
+    assert first.training == second.training
+
+
+@both_learners
+def test_two_threads_learn_the_same_bytes_as_one(learner):
+    alone = [learn_policy(REWARD, learner, seed).q.tobytes() for seed in range(6)]
+    with ThreadPoolExecutor(2) as threads:
+        together = threads.map(lambda seed: learn_policy(REWARD, learner, seed).q.tobytes(), range(6))
+        assert list(together) == alone
+
+
+def test_another_seed_learns_other_bytes():
+    learner = CellQLearning(episodes=50)
+    assert len({learn_policy(REWARD, learner, seed).q.tobytes() for seed in (0, 1, 2, MAX_SEED)}) == 4
+
+
+# ---- refused ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", [True, False, 1.0, -1, MAX_SEED + 1, "1", None, np.float64(1)], ids=repr)
+def test_a_seed_that_is_no_whole_number_from_0_is_refused(seed):
+    with pytest.raises(BadSettings, match="seed must be an integer"):
+        learn_policy(REWARD, CellQLearning(), seed)
+
+
+@pytest.mark.parametrize("learner", [CellQLearning, PhaseQLearning])
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("gamma", [0.0, 1.5, -0.1, np.nan, np.inf]),
+        ("alpha", [0.0, 1.01, -1.0, np.nan]),
+        ("max_steps", [0, -5, 1_000_001, np.nan]),
+        ("max_episode_s", [0.0, 0.2, np.nan, np.inf]),
+        ("step_s", [0.0, -1.0, np.nan, np.inf]),
+    ],
+)
+def test_settings_that_cannot_be_meant_are_refused(learner, name, values):
+    for value in values:
+        with pytest.raises(BadSettings, match=name):
+            learner(**{name: value})
+
+
+@pytest.mark.parametrize(
+    ("learner", "name"),
+    [
+        (PhaseQLearning, "epsilon"),
+        (CellQLearning, "epsilon_start"),
+        (CellQLearning, "epsilon_end"),
+        (CellQLearning, "epsilon_falls_over"),
+    ],
+)
+def test_an_epsilon_that_is_no_share_is_refused(learner, name):
+    for value in (-0.1, 1.1, np.nan):
+        with pytest.raises(BadSettings, match="epsilon"):
+            learner(**{name: value})
+
+
+def test_numbers_of_episodes_and_sweeps_are_bounded():
+    for episodes in (0, 10_000_001):
+        with pytest.raises(BadSettings, match="episodes"):
+            CellQLearning(episodes=episodes)
+    for sweeps in (0, 100_001):
+        with pytest.raises(BadSettings, match="max_sweeps"):
+            PhaseQLearning(max_sweeps=sweeps)
+
+
+def test_a_loop_that_pays_more_than_arriving_is_refused_with_what_it_pays():
+    with pytest.raises(BadSettings, match=r"pays 20 in the long run, arriving only 10: .* gamma below 0\.9"):
+        learn_policy(REWARD, CellQLearning(gamma=0.95))
+    with pytest.raises(BadSettings, match="pays 10 in the long run, arriving only 10"):
+        learn_policy(REWARD, CellQLearning(gamma=0.9))
+    with pytest.raises(BadSettings, match="gamma below 1"):
+        learn_policy(REWARD, CellQLearning(gamma=1.0))
+
+
+def test_in_the_phase_state_no_loop_pays_so_any_gamma_below_1_is_learnt():
+    policy = learn_policy(REWARD, PhaseQLearning(gamma=0.95))
+    certificate, _ = certify(policy)
+    assert certificate.every_action_optimal
+    assert certificate.demonstration_reproduced
+    assert certificate.starts_reaching == certificate.starts
+
+
+@pytest.mark.parametrize("levels", [RewardLevels(0, -1, -2, -2), RewardLevels(10, -1, -1.5, -2)], ids=str)
+def test_where_every_move_costs_something_arriving_always_pays_even_without_discount(levels):
+    reward = sparse_reward(named_path("an angle"), levels)
+    policy = learn_policy(reward, CellQLearning(gamma=1.0))
+    certificate, _ = certify(policy)
+    assert certificate.every_action_optimal
+    assert certificate.starts_reaching == certificate.starts
+
+
+def test_in_the_phase_state_moves_that_advance_nothing_must_pay_nothing():
+    reward = sparse_reward(named_path("an angle"), RewardLevels(other=-0.5))
+    with pytest.raises(BadSettings, match="`other` must be 0"):
+        learn_policy(reward, PhaseQLearning())
+
+
+def test_an_episode_time_beyond_all_measure_leaves_the_steps_as_the_only_cap():
+    learner = CellQLearning(episodes=20, max_episode_s=1e300, step_s=1e-300)
+    training = learn_policy(REWARD, learner).training
+    assert training == learn_policy(REWARD, CellQLearning(episodes=20)).training
+
+
+def test_a_time_of_one_step_ends_every_episode_after_it():
+    learner = replace(CellQLearning(episodes=40), max_episode_s=0.25)
+    training = learn_policy(REWARD, learner).training
+    assert (training.steps, training.finished + training.out_of_time, training.out_of_steps) == (40, 40, 0)

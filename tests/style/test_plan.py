@@ -1,0 +1,172 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from skills.errors import BadInput, BadPlan, ImproperRotation, NoApproach, OutsideGrid
+from skills.style.kinematics import POINTING_DOWN, matrix_of
+from skills.style.plan import MAX_PASSES, SuturePoint, pose_xyzw, rotation_of, stack
+from skills.style.policy import rollout, rollout_from
+from skills.style.trajectory import PassPath
+from tests.style.paths import learnt, named_path
+
+NAME = "through its goal"
+EXACT_MM = 1e-9
+QUARTER_ABOUT_Z = (0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5))
+
+places_mm = st.tuples(*[st.floats(-150, 150)] * 3)
+turns_xyzw = st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: np.linalg.norm(q) > 0.1)
+
+
+def stacked(points, **given_):
+    settings_ = {"arm": "PSM2", "frame": "PSM2_base", "instrument": "LND_400006", "rotation": None, **given_}
+    return stack(
+        given_.pop("policy", None) or learnt(NAME), points, **{k: v for k, v in settings_.items() if k != "policy"}
+    )
+
+
+@settings(deadline=None)
+@given(places_mm, turns_xyzw)
+def test_a_pass_is_the_demonstration_moved_as_a_rigid_body_with_its_goal_on_the_suture_point(place_mm, turn_xyzw):
+    path = named_path(NAME)
+    (one,) = stacked([SuturePoint(place_mm, turn_xyzw)]).passes
+    turned = matrix_of([turn_xyzw])[0]
+    expected = np.array([turned @ (tip - path.tip_mm[-1]) + place_mm for tip in path.tip_mm])
+    assert one.tip_mm == pytest.approx(expected, abs=EXACT_MM)
+    assert one.tip_mm[-1] == pytest.approx(place_mm, abs=EXACT_MM)
+    assert one.start_mm == pytest.approx(expected[0], abs=EXACT_MM)
+    assert one.states.tolist() == path.states.tolist()
+    assert one.rotation == pytest.approx(turned @ POINTING_DOWN, abs=1e-12)
+
+
+@settings(deadline=None)
+@given(places_mm, turns_xyzw, st.integers(0, 1000), st.tuples(*[st.floats(-2.4, 2.4)] * 3))
+def test_from_any_start_of_the_moved_grid_a_pass_is_the_rollout_from_there_moved(place_mm, turn_xyzw, start, off_mm):
+    policy, grid = learnt(NAME), named_path(NAME).grid
+    start %= grid.n_states
+    turned, goal_mm = matrix_of([turn_xyzw])[0], grid.centres_mm(policy.path.goal)
+    start_mm = turned @ (grid.centres_mm(start) + off_mm - goal_mm) + place_mm
+    (one,) = stacked([SuturePoint(place_mm, turn_xyzw)], starts_mm=[start_mm]).passes
+    moved = (rollout_from(policy, start).tip_mm - goal_mm) @ turned.T + place_mm
+    assert one.tip_mm[0] == pytest.approx(start_mm, abs=EXACT_MM)
+    assert one.tip_mm[-len(moved) :] == pytest.approx(moved, abs=EXACT_MM)
+    assert len(one.tip_mm) <= len(moved) + 1
+
+
+def test_a_quarter_turn_about_z_by_hand():
+    path = named_path("an angle")  # along x, then along y, to its goal
+    (one,) = stacked([SuturePoint((100, 200, 300), QUARTER_ABOUT_Z)], policy=learnt("an angle")).passes
+    assert one.start_mm == pytest.approx((100 + 15, 200 - 15, 300), abs=EXACT_MM)
+    assert one.tip_mm[3] == pytest.approx((100 + 15, 200, 300), abs=EXACT_MM)  # x became y
+    assert len(one.tip_mm) == len(path.states)
+
+
+def test_every_pass_has_its_own_suture_point_and_start():
+    path = named_path(NAME)
+    points = [SuturePoint((10.0 * k, 0, -120)) for k in range(3)]
+    goal_mm, far_mm = path.tip_mm[-1], path.grid.centres_mm(0)
+    there = far_mm - goal_mm + points[1].position_mm
+    plan = stacked(points, starts_mm=[None, there, None])
+    assert [tuple(one.tip_mm[-1]) for one in plan.passes] == [
+        pytest.approx(point.position_mm, abs=EXACT_MM) for point in points
+    ]
+    assert plan.passes[1].states[0] == 0
+    assert plan.passes[0].states[0] == plan.passes[2].states[0] == path.start
+    assert (plan.arm, plan.frame, plan.instrument, plan.speed_mm_s) == ("PSM2", "PSM2_base", "LND_400006", 20.0)
+
+
+def test_a_start_that_is_the_centre_of_its_cell_is_not_given_twice():
+    path = named_path(NAME)
+    given_ = stacked([SuturePoint(tuple(path.tip_mm[-1]))], starts_mm=[path.tip_mm[0]])
+    assert len(given_.passes[0].tip_mm) == len(path.states)
+    beside = stacked([SuturePoint(tuple(path.tip_mm[-1]))], starts_mm=[path.tip_mm[0] + 1])
+    assert len(beside.passes[0].tip_mm) == len(path.states) + 1
+
+
+def test_the_jaw_is_the_demonstrated_one_where_it_is_known():
+    known = matrix_of([QUARTER_ABOUT_Z])[0] @ POINTING_DOWN
+    assert stacked([SuturePoint((0, 0, -120))]).orientation == "assumed tool-down"
+    plan = stacked([SuturePoint((0, 0, -120))], rotation=known)
+    assert plan.orientation == "demonstrated"
+    assert plan.passes[0].rotation == pytest.approx(known, abs=1e-12)
+
+
+def test_with_psm_ms_approach_the_jaws_normal_ends_parallel_to_it():
+    approach_m = (0.6, 0.0, -0.8)
+    plan = stacked([SuturePoint((0, 0, -120), QUARTER_ABOUT_Z)], approach_m=approach_m)
+    normal = plan.passes[0].target_rotation[:, 0]
+    assert abs(normal @ approach_m) == pytest.approx(1, abs=1e-9)
+    assert plan.passes[0].target_rotation[:, 2] @ approach_m == pytest.approx(0, abs=1e-9)
+    assert stacked([SuturePoint((0, 0, -120))]).passes[0].target_rotation is None
+
+
+def test_a_plan_gives_the_paths_that_take_their_time():
+    plan = stacked([SuturePoint((0, 0, -120)), SuturePoint((8, 0, -120))], approach_m=(1.0, 0, 0))
+    assert all(isinstance(one, PassPath) for one in plan.pass_paths)
+    assert [one.tip_mm.tolist() for one in plan.pass_paths] == [one.tip_mm.tolist() for one in plan.passes]
+
+
+# ---- refused ----------------------------------------------------------------------------------------------------
+
+
+def test_a_start_outside_its_grid_world_is_refused_with_the_number_of_the_pass():
+    points = [SuturePoint((0, 0, -120)), SuturePoint((8, 0, -120))]
+    with pytest.raises(OutsideGrid, match="Pass 1 starts outside its grid world") as refusal:
+        stacked(points, starts_mm=[None, (500, 0, 0)])
+    assert refusal.value.numbers == {"suture_pass": 1}
+
+
+@pytest.mark.parametrize("starts_mm", [[], [None], [None, None, None]])
+def test_as_many_starts_as_points_are_wanted(starts_mm):
+    with pytest.raises(BadPlan, match="one start for each suture point"):
+        stacked([SuturePoint((0, 0, -120)), SuturePoint((8, 0, -120))], starts_mm=starts_mm)
+
+
+@pytest.mark.parametrize("count", [0, MAX_PASSES + 1])
+def test_a_plan_has_1_to_200_points(count):
+    with pytest.raises(BadPlan, match="1 to 200"):
+        stacked([SuturePoint((0, 0, -120))] * count)
+
+
+def test_a_start_from_which_the_policy_does_not_arrive_is_refused():
+    policy = learnt(NAME)
+    q = policy.q.copy()
+    q[policy.row(1, policy.path.start), 13] = 100  # it stands still at its start
+    with pytest.raises(BadPlan, match="pass 0 does not reach the goal"):
+        stacked([SuturePoint((0, 0, -120))], policy=replace(policy, q=q))
+
+
+@pytest.mark.parametrize("wrong", [(np.nan, 0, 0), (0, np.inf, 0), (0, 0)])
+def test_places_that_are_none_are_refused(wrong):
+    with pytest.raises(BadInput):
+        stacked([SuturePoint(wrong)])
+    with pytest.raises(BadInput):
+        stacked([SuturePoint((0, 0, -120))], starts_mm=[wrong])
+
+
+def test_a_turn_that_is_none_is_refused():
+    with pytest.raises(ImproperRotation):
+        stacked([SuturePoint((0, 0, -120), (0, 0, 0, 0))])
+    with pytest.raises(NoApproach):
+        stacked([SuturePoint((0, 0, -120))], approach_m=(0, 0, 0))
+
+
+# ---- rotations --------------------------------------------------------------------------------------------------
+
+
+@given(turns_xyzw)
+def test_a_rotation_written_as_a_quaternion_is_the_same_rotation(turn_xyzw):
+    rotation = rotation_of(np.array([turn_xyzw, (0, 0, 0, 1)]))
+    assert matrix_of([pose_xyzw(rotation)])[0] == pytest.approx(rotation, abs=1e-12)
+
+
+def test_a_demonstration_without_orientations_has_no_rotation():
+    assert rotation_of(None) is None
+
+
+def test_the_unturned_rollout_is_where_it_was_learnt():
+    path = named_path(NAME)
+    (one,) = stacked([SuturePoint(tuple(path.tip_mm[-1]))]).passes
+    assert one.tip_mm == pytest.approx(rollout(learnt(NAME), path.tip_mm[0]).tip_mm, abs=EXACT_MM)
