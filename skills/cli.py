@@ -5,6 +5,7 @@ that `skills --help` is quick.
 """
 
 import json
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import wraps
@@ -32,7 +33,7 @@ app.add_typer(recordings, name="recording")
 app.add_typer(demos, name="demo")
 app.add_typer(policies, name="policy")
 
-out = Console(highlight=False)
+out = Console(highlight=False, width=None if sys.stdout.isatty() else 160)  # in a pipe, digests stay whole
 err = Console(stderr=True, highlight=False)
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print the service's JSON.")]

@@ -34,6 +34,7 @@ SPACING_MM = (6.0, 0.0, 0.0)  # between suture points, along the wound
 N_POINTS = 5
 SAMPLE_APPROACH = (-0.94, 0.10, -0.33)  # invented, and said so: how PSM_M would wait for the needle
 REAL_STYLE = ("recorded-psm2", "simple-running")
+REAL_GRID = ("--grid", "fit", "--cell-mm", "2.5")  # its motion ends near the insertion's limit: 5 mm cells overstep it
 
 out = Console(highlight=False, width=max(Console().width, 110))
 
@@ -156,7 +157,7 @@ def real_recording(client: Client) -> None:
         return
     surgeon, suture = REAL_STYLE
     client.put_surgeon(surgeon)
-    command = ["demo", "add", str(bag), "--surgeon", surgeon, "--suture", suture, "--proposal", "1", "--grid", "fit"]
+    command = ["demo", "add", str(bag), "--surgeon", surgeon, "--suture", suture, "--proposal", "1", *REAL_GRID]
     out.print(f"\nA real recording: skills {' '.join([*command[:2], bag.name, *command[3:]])}", soft_wrap=True)
     subprocess.run([sys.executable, "-m", "skills", *command], check=True)  # noqa: S603 - our own command
     try:

@@ -313,7 +313,7 @@ def _out_of_reach(sample: int, tip: Floats, solutions: Floats, tool: Instrument)
     limit = float(tool.upper[joint] if value > tool.upper[joint] else tool.lower[joint])
     where = ", ".join(f"{x:.1f}" for x in tip[sample])
     return Unreachable(
-        f"Sample {sample} at ({where}) mm needs {JOINTS[joint]} {value:.4g} {UNITS[joint]}, beyond the limit "
+        f"Sample {sample} at ({where}) mm needs {JOINTS[joint]} {value:.5g} {UNITS[joint]}, beyond the limit "
         f"{limit:.4g} of the {tool.arm.name} with {tool.name}; move the point or turn the tool.",
         sample=sample,
         joint=JOINTS[joint],

@@ -151,7 +151,7 @@ def test_the_callers_file_stays_open():
 @pytest.mark.parametrize(
     "content",
     [
-        gzip.compress(b"t_s,x_m,y_m,z_m\n0,0,0,0\n"),
+        gzip.compress(b"t_s,x_m,y_m,z_m\n0,0,0,0\n", mtime=0),
         b"PK\x03\x04" + bytes(40),
         b"<!DOCTYPE html><html>, </html>",
         b'{"t_s": [0], "x_m": [1]}',
