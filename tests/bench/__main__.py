@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from io import BytesIO
 
 import numpy as np
@@ -13,12 +14,13 @@ from skills.seeds.recordings import sample_recordings
 from skills.style.certificate import certify
 from skills.style.demo import cut_demo
 from skills.style.evaluation import dtw
-from skills.style.grid import PAPER_GRID, discretize
+from skills.style.grid import PAPER_GRID, GridPath, GridWorld, discretize
 from skills.style.kinematics import POINTING_DOWN, forward, inverse
 from skills.style.learning import _kernels
 from skills.style.learning.q_learning import CellQLearning, PhaseQLearning
 from skills.style.policy import Policy, learn_policy
 from skills.style.reward import RewardMap, sparse_reward
+from tests.bench.plain_c import plain_c
 
 ROUNDS = 5
 
@@ -51,11 +53,49 @@ def compiled(reward: RewardMap, table: Table) -> None:
     kept = _kernels.run_episodes_compiled
     try:
         _kernels.run_episodes_compiled = _kernels.run_episodes
-        with np.errstate(over="ignore"):
-            slow = best_s(lambda: learn_policy(reward, learner), rounds=1)
+        slow = best_s(lambda: learn_policy(reward, learner), rounds=1)
     finally:
         _kernels.run_episodes_compiled = kept
     table.add_row("plain Python, 20 episodes", f"{slow * 1e3:.1f} ms", f"{slow / fast:.0f} x the compiled one")
+
+
+def against_c(reward: RewardMap, table: Table) -> None:
+    """Compare the paper's budget of moves with a plain C scan of the 27 actions, compiled here and now."""
+    ours = best_s(lambda: learn_policy(reward, CellQLearning()))
+    steps = learn_policy(reward, CellQLearning()).training.steps
+    table.add_row("the paper's budget, cell state", f"{ours / steps * 1e9:.1f} ns a move", f"{steps} moves")
+    scan = plain_c()
+    if scan is None:
+        table.add_row("  plain C, -O3", "no C compiler here", "")
+        return
+    theirs = best_s(lambda: scan(reward))
+    table.add_row("  plain C, -O3", f"{theirs / steps * 1e9:.1f} ns a move", f"ours takes {ours / theirs:.2f} of it")
+
+
+def two_threads(reward: RewardMap, table: Table) -> None:
+    """Learn the same styles on one thread and on two: the loops let go of the interpreter."""
+    learner, seeds = CellQLearning(episodes=50_000), range(4)
+
+    def learn_all(threads: int) -> float:
+        began = time.perf_counter()
+        with ThreadPoolExecutor(threads) as pool:
+            list(pool.map(lambda seed: learn_policy(reward, learner, seed), seeds))
+        return time.perf_counter() - began
+
+    one, two = (min(learn_all(threads) for _ in range(3)) for threads in (1, 2))
+    table.add_row("four policies, two threads", f"{two * 1e3:.0f} ms", f"{one / two:.2f} x one thread's rate")
+
+
+def sizes(table: Table) -> None:
+    """Learn a straight path through the middle of larger grids."""
+    for side, cell in ((11, 5.0), (21, 2.5), (51, 1.0)):
+        grid = GridWorld((0.0, 0.0, 0.0), cell, (side, side, side))
+        middle = side // 2
+        path = GridPath(grid, grid.states_of([(x, middle, middle) for x in range(side)]))
+        reward = sparse_reward(path)
+        took = best_s(lambda: learn_policy(reward, PhaseQLearning()), rounds=1)  # noqa: B023
+        megabytes = learn_policy(reward, PhaseQLearning()).q.nbytes / 1e6
+        table.add_row(f"phase state, {side} cells a side", f"{took * 1e3:.0f} ms", f"Q values of {megabytes:.1f} MB")
 
 
 def kinematics(policy: Policy, table: Table) -> None:
@@ -81,6 +121,9 @@ def main() -> None:
     reward = sparse_reward(discretize(demo.tip_mm, PAPER_GRID))
     learning(reward, table)
     compiled(reward, table)
+    against_c(reward, table)
+    two_threads(reward, table)
+    sizes(table)
     kinematics(learn_policy(reward, PhaseQLearning()), table)
     Console(width=100).print(table)
 

@@ -11,11 +11,9 @@ from skills.style.certificate import certify
 from skills.style.grid import MOVES
 from skills.style.learning.q_learning import CellQLearning, PhaseQLearning
 from skills.style.policy import learn_policy, rollout
-from skills.style.reward import sparse_reward
-from tests.style.paths import named_path
 
 CELL = CellQLearning(episodes=300)
-PHASE = PhaseQLearning(max_steps=paper.MAX_STEPS, epsilon=1.0, max_sweeps=1)  # every state-action pair once
+PHASE = PhaseQLearning(max_steps=paper.MAX_STEPS)
 
 
 def test_there_are_27_actions_in_the_order_of_their_index():
@@ -60,20 +58,16 @@ def test_an_episode_ends_when_the_arm_has_moved_for_30_minutes(learner, user_rew
     assert 30 * training.out_of_time <= training.steps <= 30 * training.episodes
 
 
-def test_in_the_papers_state_every_episode_ends_by_one_of_the_three_rules(user_reward):
-    training = learn_policy(user_reward, CELL).training
-    assert training.finished + training.out_of_steps == training.episodes == 300
+@pytest.mark.parametrize("learner", [CELL, PHASE], ids=["cell", "phase"])
+def test_every_episode_ends_by_one_of_the_three_rules(learner, user_reward):
+    training = learn_policy(user_reward, learner).training
+    assert training.finished + training.out_of_steps == training.episodes
 
 
-def test_in_the_phase_state_an_episode_that_reaches_its_next_waypoint_did_not_run_out_of_steps():
-    # Each of the 27 actions once in each state: all of 4 x 3 x 3 cells in both phases, less the goal.
-    path = named_path("two cells")
-    training = learn_policy(sparse_reward(path), PhaseQLearning(max_sweeps=1)).training
-    assert training.episodes == training.steps == 2 * 35 * 27
-    onto_the_goal = 2 * 26  # from all around it, in both phases
-    joining = 25 + 1  # onto the start in phase 0: from all around it but the goal, and by staying there
-    assert training.finished == onto_the_goal
-    assert training.out_of_steps == training.episodes - onto_the_goal - joining
+def test_in_the_phase_state_every_action_of_every_cell_is_tried_once(user_reward):
+    training = learn_policy(user_reward, PhaseQLearning()).training
+    assert training.steps == training.episodes == 1331 * 27
+    assert training.finished == 27  # onto the goal, from each of its 26 neighbours and from itself
 
 
 @pytest.mark.parametrize("gamma", [0.9, 0.95, 1.0])

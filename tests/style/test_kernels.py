@@ -17,37 +17,41 @@ from tests.style.paths import named_path
 GOAL, VISITED, OTHER, OFF_GRID = LEVELS = (10.0, 1.0, 0.0, -1.0)
 STAY, UP = 13, 14
 TWO_CELLS = GridPath(GridWorld((0.0, 0.0, 0.0), 5.0, (1, 1, 2)), np.array([0, 1]))
-BOTH = [
+LEARNERS = [
     CellQLearning(alpha=0.3, epsilon_start=0.9, epsilon_end=0.2, episodes=60, max_steps=30),
-    PhaseQLearning(alpha=0.5, epsilon=0.4, max_steps=20, max_sweeps=2),
+    PhaseQLearning(alpha=0.5, max_steps=3, max_sweeps=2),
 ]
 
 
-@pytest.mark.parametrize("learner", BOTH, ids=lambda learner: learner.kind)
+@pytest.mark.parametrize("learner", LEARNERS, ids=lambda learner: learner.kind)
 @pytest.mark.parametrize("name", ["two cells", "to and fro"])
-def test_the_compiled_episodes_and_the_plain_ones_agree_to_the_last_bit(monkeypatch, learner, name):
-    compiled, calls = _kernels.run_episodes_compiled, []
+def test_the_compiled_loops_and_the_plain_ones_agree_to_the_last_bit(monkeypatch, learner, name):
+    agreed: list[str] = []
+    for loop in ("run_episodes", "explore", "sweep"):
+        monkeypatch.setattr(_kernels, f"{loop}_compiled", both(loop, agreed))
+    policy = learn_policy(sparse_reward(named_path(name)), learner, seed=5)
+    assert set(agreed) == ({"run_episodes"} if isinstance(learner, CellQLearning) else {"explore", "sweep"})
+    assert policy.q.any()
+    assert policy.training.steps > policy.training.episodes // 2
 
-    def both(*arguments):
-        if len(calls) > 8:  # the first ones are enough: plain Python is slow
-            return compiled(*arguments)
-        starts = arguments[8][:400]
-        arguments = [*arguments[:8], starts, *arguments[9:12], arguments[12][:400], *arguments[13:]]
+
+def both(loop, agreed):
+    """Run a loop compiled and plain on the same numbers, and compare every array that it was given, and its answer."""
+    compiled, plain = getattr(_kernels, f"{loop}_compiled"), getattr(_kernels, loop)
+
+    def run(*arguments):
         twins = [a.copy() if isinstance(a, np.ndarray) else a for a in arguments]
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            _kernels.run_episodes(*twins)
-        compiled(*arguments)
-        q, rng, tally = arguments[0], arguments[-2], arguments[-1]
-        calls.append((q.tobytes(), rng.tobytes(), tally.tobytes()))
-        assert calls[-1] == (twins[0].tobytes(), twins[-2].tobytes(), twins[-1].tobytes())
-        return None
+            by_hand = plain(*twins)
+        answer = compiled(*arguments)
+        assert answer == by_hand
+        for array, twin in zip(arguments, twins, strict=True):
+            assert np.asarray(array).tobytes() == np.asarray(twin).tobytes()
+        agreed.append(loop)
+        return answer
 
-    monkeypatch.setattr(_kernels, "run_episodes_compiled", both)
-    policy = learn_policy(sparse_reward(named_path(name)), learner, seed=5)
-    assert calls
-    assert policy.q.any()
-    assert policy.training.steps > policy.training.episodes // 2
+    return run
 
 
 @settings(deadline=None)
@@ -62,66 +66,117 @@ def test_the_compiled_warp_and_the_plain_one_agree_to_the_last_bit(distance):
     assert costs[0] == costs[1]
 
 
-def episodes(starts, *, phased, alpha=0.5, gamma=0.5, max_steps=1, epsilon=0.0):
-    """Run given episodes on two cells, of which the second is the goal."""
-    domain = Domain(TWO_CELLS, phased)
-    q, tally, rng = np.zeros((domain.n_rows, 27)), np.zeros(3, int), np.ones(1, np.uint64)
+def episodes(starts, *, first, alpha=0.5, gamma=0.5, max_steps=1, epsilon=0.0):
+    """Run episodes in the paper's state on two cells, of which the second is the goal; `first` is best at first."""
+    q, value, best = np.zeros(2 * 27), np.zeros(2), np.zeros(2, np.int8)
+    q[first], value[0], best[0] = 1e-9, 1e-9, first
+    tally, rng = np.zeros(3, int), np.ones(1, np.uint64)
     _kernels.run_episodes_compiled(
         q,
+        value,
+        best,
         sparse_reward(TWO_CELLS).rewards,
-        domain.joins,
-        TWO_CELLS.cells,
-        domain.low,
-        domain.size,
-        domain.offset,
         np.array(TWO_CELLS.grid.shape),
         np.array(starts),
-        np.array(LEVELS),
+        np.full(len(starts), epsilon),
+        OFF_GRID,
         alpha,
         gamma,
-        np.full(len(starts), epsilon),
         max_steps,
         TWO_CELLS.goal,
-        REACH,
         rng,
         tally,
     )
-    return q, tally.tolist()
+    assert value.tolist() == q.reshape(2, 27).max(axis=1).tolist()
+    assert best.tolist() == q.reshape(2, 27).argmax(axis=1).tolist()
+    return q.reshape(2, 27), tally.tolist()
 
 
 def test_equation_1_by_hand_in_the_papers_state():
-    up, stay, off = (0, 0, UP), (0, 0, STAY), (0, 0, 0)
-    q, tally = episodes([up, up, stay, off], phased=False)
-    assert q[0, UP] == 5 + 0.5 * (GOAL - 5) == 7.5
-    assert q[0, STAY] == 0.5 * (VISITED + 0.5 * 7.5) == 2.375
-    assert q[0, 0] == 0.5 * (OFF_GRID + 0.5 * 7.5) == 1.375
+    q, tally = episodes([0, 0], first=UP)
+    assert q[0, UP] == pytest.approx(5 + 0.5 * (GOAL - 5), abs=1e-8)
+    assert tally == [2, 2, 0]
+    q, tally = episodes([0], first=STAY)
+    assert q[0, STAY] == pytest.approx(0.5 * VISITED, abs=1e-8)
+    assert tally == [1, 0, 1]
+    q, _ = episodes([0], first=0)
+    assert q[0, 0] == pytest.approx(0.5 * OFF_GRID, abs=1e-8)
     assert not q[1].any()
-    assert tally == [4, 2, 2]
+
+
+def test_an_episode_goes_on_to_the_goal_and_ends_there():
+    q, tally = episodes([0] * 3, first=STAY, max_steps=2000, epsilon=0.5)
+    assert tally[1:] == [3, 0]
+    assert q[0, UP] > 5
+
+
+def swept(rows, *, model, phases=1, alpha=0.5, gamma=0.5):
+    """Sweep once over each phase of two cells, the last one first: the Q values of some (phase, cell)."""
+    domain = Domain(TWO_CELLS, phased=True)
+    q, value = np.zeros((domain.n_rows, 27)), np.zeros(domain.n_rows)
+    for phase in (1, 0)[:phases]:
+        _kernels.sweep_compiled(
+            q,
+            value,
+            model,
+            TWO_CELLS.grid.cells_of([0, 1]),
+            sparse_reward(TWO_CELLS).rewards,
+            domain.joins,
+            TWO_CELLS.cells,
+            domain.low,
+            domain.size,
+            domain.offset,
+            domain.state_of,
+            domain.certified & ~domain.terminal,
+            phase,
+            np.array(LEVELS),
+            alpha,
+            gamma,
+            TWO_CELLS.goal,
+            REACH,
+            1e-12,
+        )
+    return q[domain.rows_of([p for p, _ in rows], [[0, 0, z] for _, z in rows])]
+
+
+def explored(max_steps=1):
+    """Try every action in both cells."""
+    model, tally = np.full((2, 27), _kernels.UNKNOWN, np.int32), np.zeros(3, int)
+    shape, rng = np.array(TWO_CELLS.grid.shape), np.ones(1, np.uint64)
+    _kernels.explore_compiled(model, shape, np.arange(54), max_steps, TWO_CELLS.goal, rng, tally)
+    return model, tally.tolist()
+
+
+def test_a_model_says_where_every_action_led():
+    model, tally = explored()
+    assert model[0, [STAY, UP]].tolist() == [0, 1]
+    assert model[1, [STAY, UP - 2]].tolist() == [1, 0]
+    assert np.count_nonzero(model == _kernels.OFF_GRID) == 54 - 4
+    assert tally == [54, 2, 52]
+
+
+def test_exploring_ends_at_the_goal_or_after_its_steps():
+    _, (steps, finished, out_of_steps) = explored(max_steps=50)
+    assert finished + out_of_steps == 54
+    assert 54 < steps < 54 * 50
 
 
 def test_equation_1_by_hand_in_the_phase_state():
-    at_start = [(1, 0, UP), (1, 0, STAY), (1, 0, 0), (0, 0, STAY), (0, 0, UP)]
-    q, tally = episodes(at_start, phased=True)
-    rows = Domain(TWO_CELLS, phased=True).rows_of([0, 1], [[0, 0, 0], [0, 0, 0]])
-    not_joined, joined = q[rows]
+    model, _ = explored()
+    joined, not_joined = swept([(1, 0), (0, 0)], model=model, phases=2)
     assert joined[UP] == 0.5 * GOAL
-    assert joined[STAY] == 0.5 * (OTHER + 0.5 * 5)  # it has left waypoint 0 behind: standing there pays nothing
-    assert joined[0] == 0.5 * (OFF_GRID + 0.5 * 5)
+    assert joined[STAY] == OTHER  # it has left waypoint 0 behind: standing there pays nothing, and goes on with nothing
+    assert joined[0] == 0.5 * OFF_GRID
     assert not_joined[STAY] == 0.5 * (VISITED + 0.5 * 5)  # joins, and goes on with what phase 1 is worth
     assert not_joined[UP] == 0.5 * GOAL
-    assert tally == [5, 2, 2]  # the one that joined ended for that reason
 
 
-def test_an_episode_goes_on_greedily_to_the_goal_after_its_given_first_action():
-    q, tally = episodes([(0, 0, UP), (0, 0, STAY)], phased=False, max_steps=100)
-    assert tally == [3, 2, 0]  # one move, then two
-    assert q[0, UP] == 7.5
-
-
-def test_of_equally_good_actions_the_first_is_taken():
-    q = np.zeros((2, 27))
-    q[1, [5, 20]] = 1
-    assert [_kernels.best_action(q, row) for row in (0, 1)] == [0, 5]
+def test_what_was_never_tried_is_not_learnt():
+    model, _ = explored()
+    model[0, UP] = _kernels.UNKNOWN
+    (joined,) = swept([(1, 0)], model=model)
+    assert joined[UP] == 0
+    assert joined[0] == 0.5 * OFF_GRID
 
 
 def test_the_random_numbers_are_those_of_xorshift64():
@@ -135,9 +190,7 @@ def test_the_random_numbers_are_those_of_xorshift64():
 
 
 def test_exploration_takes_every_action_about_equally_often():
-    # With a small alpha and next to no gamma an action's Q value counts how often it was taken.
-    alpha = 1e-6
-    q, _ = episodes([(0, 0, -1)] * 27_000, phased=False, alpha=alpha, gamma=1e-12, epsilon=1.0)
-    pays = np.full(27, OFF_GRID)
-    pays[[STAY, UP]] = VISITED, GOAL
-    assert q[0] / (alpha * pays) == pytest.approx(1000, abs=160)  # five standard deviations
+    rng = np.ones(1, np.uint64)
+    taken = np.bincount([_kernels.any_action(_kernels.next_random(rng)) for _ in range(27_000)], minlength=27)
+    assert len(taken) == 27
+    assert taken == pytest.approx(1000, abs=160)  # five standard deviations

@@ -5,24 +5,31 @@
 The paper's state is the *cell*: a demonstration that crosses itself cannot be followed then, because a cell has one
 best action. Ours adds the *phase*, how far along the demonstration one is (see `skills.style.domain`). An episode
 ends by one of the paper's three rules: at the goal, after `max_steps` moves, or when the time that the arm would have
-moved passes `max_episode_s`. In the phase state it also ends where it reaches another phase, whose values are learnt
-first, or leaves the certified domain.
+moved passes `max_episode_s`.
+
+In the phase state every move teaches all phases at once, since where a cell's action leads does not depend on the
+phase: moves are remembered as a model, and Eq. 1 is applied to the remembered moves of each phase in turn, the last one
+first (planning from a learnt model, as in Dyna-Q: Sutton 1990).
 """
 
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from math import floor, isfinite
 from typing import ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from skills.errors import BadSettings
 from skills.style import paper
-from skills.style._arrays import Floats, Ints
+from skills.style._arrays import Floats
 from skills.style.domain import REACH, Domain
 from skills.style.learning import _kernels
 from skills.style.reward import RewardLevels, RewardMap
 
+Model = NDArray[np.int32]
+
 MAX_SEED = 2**63 - 1
+SETTLED = 1e-12  # relative: a Q value that changes by less has settled
 
 
 @dataclass(frozen=True)
@@ -30,10 +37,10 @@ class PhaseQLearning:
     """Settings of Q-learning in the phase state: the default learner.
 
     The paper is silent on all but the stop rules. Moves are deterministic, so alpha 1 loses nothing; with gamma 0.1
-    the nearest waypoint is always worth most (at 0.3 some starts run for the goal and skip the path). Every
-    state-action pair of a phase starts an episode in turn, the last phase first, sweep after sweep until one changes
-    nothing: then Eq. 1 holds everywhere. Longer episodes than one move only repeat what other starts teach (measured
-    on the paper's path: 0.5 against 1.3 million moves), so that is their default here; the paper's cap is 100.
+    the nearest waypoint is always worth most (at 0.3 some starts run for the goal and skip the path). Every cell and
+    action starts an episode in an order drawn from the seed, so that all has been tried once: one move is enough for
+    that, and is the default length; after the first move an episode goes on at random. Phases are then swept until a
+    sweep changes nothing: Eq. 1 holds everywhere, whatever the seed.
     """
 
     kind: ClassVar[str] = "phase-q-learning"
@@ -41,14 +48,13 @@ class PhaseQLearning:
 
     alpha: float = 1.0
     gamma: float = 0.1
-    epsilon: float = 0.0  # after an episode's first move, which is given
     max_steps: int = 1
     max_episode_s: float = paper.MAX_EPISODE_S
     step_s: float = 0.25  # a cell of 5 mm at 20 mm/s
-    max_sweeps: int = 200
+    max_sweeps: int = 1000  # of a phase; with alpha 1 a handful is enough
 
     def __post_init__(self) -> None:
-        _check(self.alpha, self.gamma, (self.epsilon,), self.max_steps, self.max_episode_s, self.step_s)
+        _check(self.alpha, self.gamma, (), self.max_steps, self.max_episode_s, self.step_s)
         if not 1 <= self.max_sweeps <= 100_000:
             raise BadSettings("max_sweeps must lie between 1 and 100 000.", max_sweeps=self.max_sweeps)
 
@@ -89,14 +95,17 @@ class CellQLearning:
 
 
 Learner = PhaseQLearning | CellQLearning
-LEARNER_VERSION = 1  # part of a training's identity: raise it when the same settings would learn something else
+LEARNER_VERSION = 2  # part of a training's identity: raise it when the same settings would learn something else
 
 
 @dataclass(frozen=True)
 class Training:
-    """How much it took: moves of the arm, episodes by how they ended, and whether the last sweep changed nothing."""
+    """How much it took: moves of the arm, how often Eq. 1 was applied, episodes by how they ended, and whether nothing
+    changed any more at the end.
+    """
 
     steps: int
+    updates: int
     episodes: int
     finished: int
     out_of_steps: int
@@ -130,11 +139,20 @@ def learn_q(reward: RewardMap, learner: Learner, seed: int) -> tuple[Floats, Tra
     if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed <= MAX_SEED:
         raise BadSettings("The seed must be an integer from 0 to 2^63 - 1.")
     _refuse_loops(reward.levels, learner)
-    run = _Run(reward, learner, seed)
-    settled = run.every_pair(learner) if isinstance(learner, PhaseQLearning) else run.random_starts(learner)
-    steps, finished, capped = (int(n) for n in run.tally)
-    by_time = run.cap < learner.max_steps
-    return run.q, Training(steps, run.episodes, finished, 0 if by_time else capped, capped if by_time else 0, settled)
+    moves_in_time = learner.max_episode_s / learner.step_s + 1e-9  # for 0.3 / 0.1 is 2.9999...
+    cap = floor(min(learner.max_steps, moves_in_time))
+    chance = _Chance(seed)
+    if isinstance(learner, PhaseQLearning):
+        model, episodes = _explore(reward, cap, chance)
+        q, updates, settled = _plan(reward, learner, model)
+    else:
+        q, episodes, settled = _run_episodes(reward, learner, cap, chance), learner.episodes, False
+    steps, finished, capped = (int(n) for n in chance.tally)
+    if isinstance(learner, CellQLearning):
+        updates = steps  # once for each move
+    by_time = cap < learner.max_steps
+    out_of_steps, out_of_time = (0, capped) if by_time else (capped, 0)
+    return q, Training(steps, updates, episodes, finished, out_of_steps, out_of_time, settled)
 
 
 def _refuse_loops(levels: RewardLevels, learner: Learner) -> None:
@@ -156,76 +174,85 @@ def _refuse_loops(levels: RewardLevels, learner: Learner) -> None:
         )
 
 
-class _Run:
-    """One training: the arrays that the kernel works on."""
+class _Chance:
+    """What a seed decides, and what came of it: the order of starts, the kernels' random bits, and their tally."""
 
-    def __init__(self, reward: RewardMap, learner: Learner, seed: int) -> None:
-        self.reward = reward
-        self.domain = Domain(reward.path, learner.phased)
-        self.q = np.zeros((self.domain.n_rows, paper.N_ACTIONS))
-        moves_in_time = learner.max_episode_s / learner.step_s + 1e-9  # for 0.3 / 0.1 is 2.9999...
-        self.cap = floor(min(learner.max_steps, moves_in_time))
-        self.gamma, self.alpha = learner.gamma, learner.alpha
+    def __init__(self, seed: int) -> None:
         self.order = np.random.Generator(np.random.PCG64(seed))
-        self.rng = np.random.SeedSequence(seed).generate_state(1, np.uint64) | np.uint64(1)
+        self.bits = np.random.SeedSequence(seed).generate_state(1, np.uint64) | np.uint64(1)
         self.tally = np.zeros(3, np.int64)
-        self.episodes = 0
 
-    def every_pair(self, learner: PhaseQLearning) -> bool:
-        """Sweep over every state-action pair, phase by phase from the last, until a sweep changes nothing."""
-        domain = self.domain
-        live = domain.certified & ~domain.terminal
-        settled = True
-        for phase in range(domain.phases - 1, -1, -1):
-            rows = slice(domain.offset[phase], domain.offset[phase + 1])
-            states = domain.state_of[rows][live[rows]]
-            pairs = np.empty((len(states) * paper.N_ACTIONS, 3), np.int64)
-            pairs[:, 0] = phase
-            pairs[:, 1] = np.repeat(states, paper.N_ACTIONS)
-            pairs[:, 2] = np.tile(np.arange(paper.N_ACTIONS), len(states))
-            settled &= self._settle(rows, pairs, learner)
-        return settled
 
-    def _settle(self, rows: slice, pairs: Ints, learner: PhaseQLearning) -> bool:
-        epsilons = np.full(len(pairs), learner.epsilon)
+def _explore(reward: RewardMap, cap: int, chance: _Chance) -> tuple[Model, int]:
+    """Start an episode with every action in every cell: where each led, (n_states, 27), and how many episodes."""
+    grid = reward.path.grid
+    pairs = grid.n_states * paper.N_ACTIONS
+    model = np.full((grid.n_states, paper.N_ACTIONS), _kernels.UNKNOWN, np.int32)
+    starts = chance.order.permutation(pairs)
+    _kernels.explore_compiled(model, np.array(grid.shape), starts, cap, reward.path.goal, chance.bits, chance.tally)
+    return model, pairs
+
+
+def _plan(reward: RewardMap, learner: PhaseQLearning, model: Model) -> tuple[Floats, int, bool]:
+    """Apply Eq. 1 to the model, phase by phase from the last, until nothing changes: Q values, updates, settled."""
+    domain, levels = Domain(reward.path, phased=True), reward.levels
+    q, value = np.zeros((domain.n_rows, paper.N_ACTIONS)), np.zeros(domain.n_rows)
+    live = domain.certified & ~domain.terminal
+    cells, pays = reward.path.grid.cells_of(np.arange(reward.path.grid.n_states)), np.array(astuple(levels))
+    updates, settled = 0, True
+    for phase in range(domain.phases - 1, -1, -1):
+        tried = int(live[domain.offset[phase] : domain.offset[phase + 1]].sum()) * paper.N_ACTIONS
+        changed = tried
         for _ in range(learner.max_sweeps):
-            before = self.q[rows].copy()
-            self._episodes(self.order.permutation(pairs), epsilons)
-            if np.allclose(self.q[rows], before, rtol=1e-12, atol=0):
-                return True
-        return False
+            changed = _kernels.sweep_compiled(
+                q,
+                value,
+                model,
+                cells,
+                reward.rewards,
+                domain.joins,
+                reward.path.cells,
+                domain.low,
+                domain.size,
+                domain.offset,
+                domain.state_of,
+                live,
+                phase,
+                pays,
+                learner.alpha,
+                learner.gamma,
+                reward.path.goal,
+                REACH,
+                SETTLED,
+            )
+            updates += tried
+            if changed == 0:
+                break
+        settled &= changed == 0
+    return q, updates, settled
 
-    def random_starts(self, learner: CellQLearning) -> bool:
-        """Run the paper's episodes, each from a cell drawn at random; epsilon falls on a line, then stays."""
-        states = np.flatnonzero(np.arange(self.domain.n_rows) != self.reward.path.goal)
-        starts = np.full((learner.episodes, 3), -1, np.int64)
-        starts[:, 0] = 0
-        starts[:, 1] = self.order.choice(states, learner.episodes)
-        falling = np.arange(learner.episodes) / (learner.epsilon_falls_over * learner.episodes)
-        epsilons = np.interp(falling, (0.0, 1.0), (learner.epsilon_start, learner.epsilon_end))
-        self._episodes(starts, epsilons)
-        return False
 
-    def _episodes(self, starts: Ints, epsilons: Floats) -> None:
-        levels, domain = self.reward.levels, self.domain
-        self.episodes += len(starts)
-        _kernels.run_episodes_compiled(
-            self.q,
-            self.reward.rewards,
-            domain.joins,
-            domain.path.cells,
-            domain.low,
-            domain.size,
-            domain.offset,
-            np.array(domain.path.grid.shape),
-            starts,
-            np.array([levels.goal, levels.visited, levels.other, levels.off_grid]),
-            self.alpha,
-            self.gamma,
-            epsilons,
-            self.cap,
-            domain.path.goal,
-            REACH,
-            self.rng,
-            self.tally,
-        )
+def _run_episodes(reward: RewardMap, learner: CellQLearning, cap: int, chance: _Chance) -> Floats:
+    """Run the paper's episodes, each from a cell drawn at random; epsilon falls on a line, then stays."""
+    n_states, goal = reward.path.grid.n_states, reward.path.goal
+    q = np.zeros((n_states, paper.N_ACTIONS))
+    starts = chance.order.integers(n_states - 1, size=learner.episodes)
+    starts += starts >= goal  # anywhere but at the goal
+    falling = np.arange(learner.episodes) / (learner.epsilon_falls_over * learner.episodes)
+    _kernels.run_episodes_compiled(
+        q.reshape(-1),
+        np.zeros(n_states),
+        np.zeros(n_states, np.int8),
+        reward.rewards,
+        np.array(reward.path.grid.shape),
+        starts,
+        np.interp(falling, (0.0, 1.0), (learner.epsilon_start, learner.epsilon_end)),
+        reward.levels.off_grid,
+        learner.alpha,
+        learner.gamma,
+        cap,
+        goal,
+        chance.bits,
+        chance.tally,
+    )
+    return q
