@@ -129,6 +129,7 @@ def swept(rows, *, model, phases=1, alpha=0.5, gamma=0.5):
             domain.state_of,
             domain.certified & ~domain.terminal,
             phase,
+            False,
             np.array(LEVELS),
             alpha,
             gamma,

@@ -148,6 +148,7 @@ def sweep(
     states: Any,  # (rows,) int64: the state of each row
     live: Any,  # (rows,) bool: whether anything is to be learnt in it
     phase: int,
+    backwards: bool,  # whether rows are taken from the last one to the first
     levels: Any,  # (4,) float64: goal, visited, other, off_grid
     alpha: float,
     gamma: float,
@@ -158,7 +159,10 @@ def sweep(
     """Apply Eq. 1 once to every action that was tried in a phase: how many Q values changed, relatively, by more."""
     changed = 0
     last = len(low) - 1
-    for row in range(offset[phase], offset[phase + 1]):
+    first = offset[phase]
+    count = offset[phase + 1] - first
+    for i in range(count):
+        row = first + (count - 1 - i if backwards else i)
         if not live[row]:
             continue
         top = -np.inf

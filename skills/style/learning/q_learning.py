@@ -203,7 +203,7 @@ def _plan(reward: RewardMap, learner: PhaseQLearning, model: Model) -> tuple[Flo
     for phase in range(domain.phases - 1, -1, -1):
         tried = int(live[domain.offset[phase] : domain.offset[phase + 1]].sum()) * paper.N_ACTIONS
         changed = tried
-        for _ in range(learner.max_sweeps):
+        for number in range(learner.max_sweeps):
             changed = _kernels.sweep_compiled(
                 q,
                 value,
@@ -218,6 +218,7 @@ def _plan(reward: RewardMap, learner: PhaseQLearning, model: Model) -> tuple[Flo
                 domain.state_of,
                 live,
                 phase,
+                number % 2 == 1,  # to and fro, for values travel with the sweep
                 pays,
                 learner.alpha,
                 learner.gamma,
