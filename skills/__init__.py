@@ -22,6 +22,8 @@ _CONTENTS = {
     "sparse_reward": "style.reward",
     "PhaseQLearning": "style.learning.q_learning",
     "CellQLearning": "style.learning.q_learning",
+    "ValueIteration": "style.learning.value_iteration",
+    "MaxEntIRL": "style.learning.irl",
     "Policy": "style.policy",
     "learn_policy": "style.policy",
     "Certificate": "style.certificate",

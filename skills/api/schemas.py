@@ -12,7 +12,10 @@ from skills.db.base import rfc3339 as at
 from skills.library.plans import PlanRequest
 from skills.library.training import learner_of
 from skills.style.grid import GridMode
-from skills.style.learning.q_learning import MAX_SEED, CellQLearning, Learner, PhaseQLearning
+from skills.style.learning.irl import MaxEntIRL
+from skills.style.learning.learners import MAX_SEED, Learner
+from skills.style.learning.q_learning import CellQLearning, PhaseQLearning
+from skills.style.learning.value_iteration import ValueIteration
 from skills.style.plan import MAX_PASSES, SuturePoint
 
 
@@ -72,14 +75,17 @@ class DemoIn(Schema):
     session: SlugField | None = None
 
 
-def _learner(learner: type[PhaseQLearning] | type[CellQLearning]) -> Any:
+def _learner(learner: type[Learner]) -> Any:
     """Make the schema of a learner from its settings; the learner itself checks their values."""
     settings: dict[str, Any] = {f.name: (Whole if f.type is int else Number, f.default) for f in fields(learner)}
     settings["kind"] = (Literal[learner.kind], ...)
     return create_model(learner.__name__, __base__=Schema, __doc__=learner.__doc__, **settings)
 
 
-LearnerIn: Any = Annotated[_learner(PhaseQLearning) | _learner(CellQLearning), Field(discriminator="kind")]
+LearnerIn: Any = Annotated[
+    _learner(PhaseQLearning) | _learner(CellQLearning) | _learner(ValueIteration) | _learner(MaxEntIRL),
+    Field(discriminator="kind"),
+]
 
 
 class TrainingIn(Schema):

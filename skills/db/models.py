@@ -26,13 +26,14 @@ from skills.db.packed import Packed, stored
 from skills.style.certificate import Coverage
 from skills.style.demo import Demo
 from skills.style.grid import GridPath, GridWorld
-from skills.style.learning.q_learning import CellQLearning, PhaseQLearning, Training
+from skills.style.learning.learners import LEARNERS
+from skills.style.learning.q_learning import Training
 from skills.style.plan import Pass, SuturePlan, SuturePoint
 from skills.style.playback import Playback
 from skills.style.policy import Policy
 from skills.style.reward import RewardLevels, RewardMap
 
-stored(GridWorld, GridPath, RewardLevels, PhaseQLearning, CellQLearning, Training, SuturePoint, Pass)
+stored(GridWorld, GridPath, RewardLevels, *LEARNERS.values(), Training, SuturePoint, Pass)
 
 RowId = Annotated[
     int, mapped_column(BigInteger().with_variant(Integer, "sqlite"), primary_key=True, autoincrement=True)

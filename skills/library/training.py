@@ -21,14 +21,12 @@ from skills.style.certificate import Certificate, Coverage, certify
 from skills.style.demo import Demo
 from skills.style.evaluation import discretisation_rmse, measure
 from skills.style.kinematics import POINTING_DOWN, reachable
-from skills.style.learning.q_learning import LEARNER_VERSION, CellQLearning, Learner, PhaseQLearning
+from skills.style.learning.learners import LEARNER_VERSION, LEARNERS, Learner
+from skills.style.learning.q_learning import PhaseQLearning
 from skills.style.plan import rotation_of
 from skills.style.policy import Policy, learn_policy, rollout_from
 
 Store = Callable[[Session, str], dict[str, Any]]
-LEARNERS: dict[str, type[PhaseQLearning] | type[CellQLearning]] = {
-    learner.kind: learner for learner in (PhaseQLearning, CellQLearning)
-}
 CERTIFICATE_NOTE = (
     "Checked on the grid: every greedy action against exact dynamic programming, and every start by following it; "
     "the demonstrated pass against the arm's joint limits in closed form. It says nothing about the arm's accuracy. "

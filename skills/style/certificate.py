@@ -1,11 +1,7 @@
 """What is known for certain about a policy on its grid: exact values, optimal actions, and the starts that succeed.
 
-The exact values V come from dynamic programming, not from learning. Above phase 0 they follow from one distance: with
-d the Chebyshev distance to the next waypoint (at least 1: staying in its cell enters it), V = gamma^(d-1) A_p, where
-A_p = 1 + gamma V_(p+1) at that waypoint, and A of the last phase is the goal's reward. In phase 0, and in the paper's
-cell state, they are the fixed point of value iteration over the grid.
-
-It says nothing about the accuracy of the arm.
+The exact values come from dynamic programming (`skills.style.exact`), not from learning. It says nothing about the
+accuracy of the arm.
 """
 
 from dataclasses import dataclass
@@ -13,15 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from skills.errors import BadSettings
-from skills.style._arrays import Floats, Ints, frozen
+from skills.style._arrays import frozen
 from skills.style.domain import FINISHED
-from skills.style.grid import MOVES
+from skills.style.exact import Mdp, action_values, exact_values
 from skills.style.policy import Policy, rollout_from
 from skills.style.reward import sparse_reward
 
 TIE = 1e-9  # relative; two actions closer than this are equally good (a Q value carries about 1e-15 of rounding)
-MAX_SWEEPS = 100_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,9 +56,10 @@ def certify(policy: Policy) -> tuple[Certificate, Coverage]:
     """Check a policy against exact dynamic programming, and follow it from every start."""
     domain = policy.domain
     live = np.flatnonzero(domain.certified & ~domain.terminal)
-    values = exact_values(policy)
+    mdp = mdp_of(policy)
+    values = exact_values(mdp)
     greedy = policy.greedy[live].astype(np.int64)
-    achieved = action_values(policy, values, live, greedy)
+    achieved = action_values(mdp, values, live, greedy)
     best = values[live]
     optimal = achieved >= best - TIE * np.abs(best)  # written so that NaN fails
     covered = coverage(policy)
@@ -79,60 +74,9 @@ def certify(policy: Policy) -> tuple[Certificate, Coverage]:
     return certificate, covered
 
 
-def exact_values(policy: Policy) -> Floats:
-    """Work the exact value of every row out, (rows,); 0 where there is nothing more to gain.
-
-    Raises:
-        BadSettings: Value iteration has no fixed point, since the rewards pay for going round in circles.
-    """
-    domain, levels, gamma = policy.domain, policy.levels, policy.learner.gamma
-    waypoints = policy.path.cells
-    values = np.zeros(domain.n_rows)
-    arrival = levels.goal  # A_p, from the last phase down
-    for phase in range(domain.phases - 1, 0, -1):
-        rows = slice(domain.offset[phase], domain.offset[phase + 1])
-        distance = np.abs(domain.cell_of[rows] - waypoints[phase]).max(axis=1).clip(1)
-        values[rows] = gamma ** (distance - 1.0) * arrival
-        behind = max(1, int(np.abs(waypoints[phase - 1] - waypoints[phase]).max()))
-        arrival = levels.visited + gamma * gamma ** (behind - 1.0) * arrival
-    values[domain.terminal] = 0.0
-    values[: domain.offset[1]] = _phase_0_values(policy, values)
-    return values
-
-
-def _phase_0_values(policy: Policy, values: Floats) -> Floats:
-    """Iterate values over the whole grid until nothing changes, (n_states,)."""
-    domain, gamma = policy.domain, policy.learner.gamma
-    rows = np.arange(domain.offset[1])
-    outcomes = [_outcome(policy, rows, np.full(len(rows), action)) for action in range(len(MOVES))]
-    rewards, after = (np.stack(part) for part in zip(*outcomes, strict=True))
-    values = np.append(values, 0.0)  # what row -1, beyond the end, is worth
-    for _ in range(MAX_SWEEPS):
-        best = (rewards + gamma * values[after]).max(axis=0)
-        best[domain.terminal[rows]] = 0.0
-        change = np.abs(best - values[rows])
-        values[rows] = best
-        if (change <= 1e-14 * np.abs(best)).all():
-            return np.asarray(best)
-    raise BadSettings("Exact values do not settle: the rewards pay for going round in circles; take a smaller gamma.")
-
-
-def action_values(policy: Policy, values: Floats, rows: Ints, actions: Ints) -> Floats:
-    """Work out what taking an action in each row is worth, (N,), if all goes on with the given values, (rows,)."""
-    reward, after = _outcome(policy, rows, actions)
-    return np.asarray(reward + policy.learner.gamma * np.append(values, 0.0)[after])
-
-
-def _outcome(policy: Policy, rows: Ints, actions: Ints) -> tuple[Floats, Ints]:
-    """Take an action in each row: what it pays, and the row after it (-1 beyond the end), both (N,)."""
-    levels, domain = policy.levels, policy.domain
-    moves = domain.move(rows, actions)
-    pays = sparse_reward(policy.path, levels).rewards
-    reward = np.where(domain.phase_of[rows] == 0, pays[moves.state], levels.other)
-    reward[moves.advances] = levels.visited
-    reward[moves.finishes] = levels.goal
-    reward[moves.off_grid] = levels.off_grid
-    return reward, moves.row
+def mdp_of(policy: Policy) -> Mdp:
+    """State what a policy is checked against: Algorithm 1's rewards, whatever rewards it was learnt from."""
+    return Mdp(policy.domain, sparse_reward(policy.path, policy.levels), policy.learner.gamma)
 
 
 def coverage(policy: Policy) -> Coverage:

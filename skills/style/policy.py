@@ -14,7 +14,8 @@ from skills.style import paper
 from skills.style._arrays import Bytes, Floats, Ints, frozen
 from skills.style.domain import FINISHED, OUTSIDE, Domain, Moves
 from skills.style.grid import GridPath
-from skills.style.learning.q_learning import Learner, Training, learn_q
+from skills.style.learning.learners import Learner, learn_values
+from skills.style.learning.q_learning import Training
 from skills.style.reward import RewardLevels, RewardMap
 
 
@@ -76,7 +77,7 @@ def learn_policy(reward: RewardMap, learner: Learner, seed: int = 0) -> Policy:
     Raises:
         BadSettings: The seed or the levels cannot be meant.
     """
-    q, training = learn_q(reward, learner, seed)
+    q, training = learn_values(reward, learner, seed)
     return Policy(reward.path, reward.levels, learner, seed, training, q)
 
 

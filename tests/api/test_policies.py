@@ -176,6 +176,42 @@ def test_what_the_published_parameters_learn_is_refused_with_reasons(trained: Se
     assert trained.client.policy(**KESTREL)["version"] == 1
 
 
+def test_what_value_iteration_finds_is_released_without_a_move_of_the_arm(trained: Service):
+    result = trained.train(learner={"kind": "value-iteration"}, release=True)["result"]
+    assert result["released"]
+    policy = trained.client.policy(**KESTREL)
+    assert (policy["version"], policy["learner"], policy["settings"]) == (2, "value-iteration", {"gamma": 0.1})
+    assert (policy["training"]["steps"], policy["training"]["settled"]) == (0, True)
+    assert policy["actions"] == trained.client.policy(**KESTREL, version=1)["actions"]
+
+
+def test_the_papers_failed_baseline_is_learnt_and_refused_with_reasons(trained: Service):
+    result = trained.train(learner={"kind": "max-ent-irl", "iterations": 30}, release=True)["result"]
+    assert (result["releasable"], result["released"]) == (False, False)
+    assert "greedy actions are not optimal" in result["not_released_because"]
+    assert "starts do not reach the goal" in result["not_released_because"]
+    assert trained.client.policy(**KESTREL)["version"] == 1
+    assert not trained.client.rollout(**KESTREL, version=2, start_mm=[-10, 55, -135])["finished"]
+
+
+@pytest.mark.parametrize(
+    "learner",
+    [
+        {"kind": "value-iteration", "gamma": 1.0},
+        {"kind": "value-iteration", "alpha": 1.0},
+        {"kind": "max-ent-irl", "iterations": 0},
+        {"kind": "max-ent-irl", "iterations": 1e3},
+        {"kind": "max-ent-irl", "l2": -1.0},
+        {"kind": "no-such-learner"},
+    ],
+    ids=str,
+)
+def test_a_learner_with_settings_that_cannot_be_meant_is_refused_at_once(still: Service, learner: dict):
+    before = still.counts()
+    assert_problem(still.http.post("/trainings", json={**KESTREL, "learner": learner}), 422)
+    assert still.counts() == before
+
+
 def test_a_demonstration_in_another_frame_than_the_arms_base_is_not_released(service: Service):
     service.client.put_surgeon("kestrel")
     service.client.add_demo(cases.hand_off(), media_type=CSV, **KESTREL, frame="ECM")

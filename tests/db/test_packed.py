@@ -19,7 +19,9 @@ from skills.recordings import read_recording
 from skills.style.certificate import certify
 from skills.style.demo import cut_demo
 from skills.style.grid import PAPER_GRID, discretize
+from skills.style.learning.irl import MaxEntIRL
 from skills.style.learning.q_learning import CellQLearning, PhaseQLearning
+from skills.style.learning.value_iteration import ValueIteration
 from skills.style.plan import SuturePoint, stack
 from skills.style.playback import Playback
 from skills.style.policy import learn_policy
@@ -59,6 +61,8 @@ VALUES = [
     REWARD,
     POLICY,
     PHASED,
+    ValueIteration(),
+    MaxEntIRL(),
     replace(PLAN, approach_m=None),
     PLAN,
     certify(POLICY)[1],

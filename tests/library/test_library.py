@@ -18,6 +18,8 @@ from skills.library.demos import find_demo, withdraw_demo
 from skills.library.erasure import erase_surgeon
 from skills.library.policies import learnt, policy_of
 from skills.library.recordings import recording_bytes
+from skills.style.learning.irl import MaxEntIRL
+from skills.style.learning.value_iteration import ValueIteration
 from tests import backends
 from tests.library import cases
 
@@ -173,6 +175,28 @@ def test_what_was_released_is_what_was_learnt(database: Database):
         served = policy_of(session, "kestrel", cases.SUTURE)
         assert served.policy.sha256 == version.sha256
         assert learnt(served.policy).path.states.tolist() == find_demo(session, demo.sha256).path.states.tolist()
+
+
+def test_what_value_iteration_finds_may_be_released(database: Database):
+    cases.add_demo(database)
+    version = cases.train(database, learner=ValueIteration())
+    assert version.releasable
+    assert version.manifest["learner"] == "value-iteration"
+    assert version.manifest["metrics"]["dtw_total_mm"] == 0
+    with database.writing() as session:
+        releases.release(session, session.get_one(PolicyVersion, version.row), "test")
+        assert policy_of(session, "kestrel", cases.SUTURE).policy.row == version.row
+
+
+def test_what_stands_still_on_a_recovered_reward_is_kept_and_refused(database: Database):
+    cases.add_demo(database)
+    version = cases.train(database, learner=MaxEntIRL(iterations=30))
+    with database.writing() as session:
+        kept = session.get_one(PolicyVersion, version.row)
+        assert learnt(kept).learner == MaxEntIRL(iterations=30)
+        with pytest.raises(Conflict, match="actions are not optimal") as refused:
+            releases.release(session, kept, "test")
+    assert "starts do not reach the goal" in str(refused.value)
 
 
 def test_a_version_that_does_not_pass_is_not_released_whatever_its_row_says(database: Database):

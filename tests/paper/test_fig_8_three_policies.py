@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from skills.style import paper
-from skills.style.certificate import certify, coverage, exact_values
+from skills.style.certificate import certify, coverage, mdp_of
 from skills.style.evaluation import measure
+from skills.style.exact import exact_values
 from skills.style.grid import MOVES
 from skills.style.learning.q_learning import CellQLearning, PhaseQLearning
 from skills.style.policy import Rollout, learn_policy, rollout
@@ -19,7 +20,7 @@ EXACT_MM = 1e-9
 @pytest.fixture(scope="module")
 def true_values(user_reward):
     """What each state of the certified domain is worth, by dynamic programming: no seed is in it."""
-    return exact_values(learn_policy(user_reward, PhaseQLearning()))
+    return exact_values(mdp_of(learn_policy(user_reward, PhaseQLearning())))
 
 
 def is_the_demonstration(policy, true_values):

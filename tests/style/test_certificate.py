@@ -6,7 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skills.errors import BadSettings
-from skills.style.certificate import certify, coverage, exact_values
+from skills.style.certificate import certify, coverage, mdp_of
+from skills.style.exact import exact_values
 from skills.style.grid import MOVES
 from skills.style.learning.q_learning import CellQLearning
 from skills.style.policy import rollout_from
@@ -60,7 +61,7 @@ def test_exact_values_are_those_of_value_iteration_over_the_whole_product_of_pha
     _, values = values_everywhere(policy.path, gamma, phased=phased)
     inside = domain.certified
     expected = values[domain.phase_of[inside], domain.state_of[inside]]
-    assert exact_values(policy)[inside] == pytest.approx(expected, rel=1e-12, abs=0)
+    assert exact_values(mdp_of(policy))[inside] == pytest.approx(expected, rel=1e-12, abs=0)
 
 
 @every_walk
@@ -172,4 +173,4 @@ def test_rewards_that_never_settle_are_said_so():
     policy = learnt("two cells", phased=False)
     endless = replace(policy, learner=replace(CellQLearning(), gamma=1.0))
     with pytest.raises(BadSettings, match="going round in circles"):
-        exact_values(endless)
+        exact_values(mdp_of(endless))

@@ -6,7 +6,8 @@ import pytest
 
 from skills.errors import BadSettings
 from skills.style.certificate import certify
-from skills.style.learning.q_learning import MAX_SEED, CellQLearning, PhaseQLearning
+from skills.style.learning.learners import MAX_SEED
+from skills.style.learning.q_learning import CellQLearning, PhaseQLearning
 from skills.style.policy import learn_policy, rollout_from
 from skills.style.reward import RewardLevels, sparse_reward
 from tests.style.paths import follow, joins_nearest, named_path, random_path

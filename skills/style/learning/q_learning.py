@@ -24,11 +24,10 @@ from skills.style import paper
 from skills.style._arrays import Floats
 from skills.style.domain import REACH, Domain
 from skills.style.learning import _kernels
-from skills.style.reward import RewardLevels, RewardMap
+from skills.style.reward import RewardMap
 
 Model = NDArray[np.int32]
 
-MAX_SEED = 2**63 - 1
 SETTLED = 1e-12  # relative: a Q value that changes by less has settled
 
 
@@ -94,8 +93,7 @@ class CellQLearning:
         return cls(alpha=0.1, gamma=0.01, epsilon_end=0.0, epsilon_falls_over=0.5)
 
 
-Learner = PhaseQLearning | CellQLearning
-LEARNER_VERSION = 2  # part of a training's identity: raise it when the same settings would learn something else
+QLearner = PhaseQLearning | CellQLearning
 
 
 @dataclass(frozen=True)
@@ -128,17 +126,11 @@ def _check(
         raise BadSettings("step_s and max_episode_s must be finite, with 0 < step_s <= max_episode_s.")
 
 
-def learn_q(reward: RewardMap, learner: Learner, seed: int) -> tuple[Floats, Training]:
+def learn_q(reward: RewardMap, learner: QLearner, seed: int) -> tuple[Floats, Training]:
     """Learn the Q values of a reward map's domain, (rows, 27), and tell what it took.
 
     The same reward map, learner and seed give the same bytes.
-
-    Raises:
-        BadSettings: The seed is not an integer from 0 to 2^63 - 1, or arriving would not pay (see `_refuse_loops`).
     """
-    if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed <= MAX_SEED:
-        raise BadSettings("The seed must be an integer from 0 to 2^63 - 1.")
-    _refuse_loops(reward.levels, learner)
     moves_in_time = learner.max_episode_s / learner.step_s + 1e-9  # for 0.3 / 0.1 is 2.9999...
     cap = floor(min(learner.max_steps, moves_in_time))
     chance = _Chance(seed)
@@ -153,25 +145,6 @@ def learn_q(reward: RewardMap, learner: Learner, seed: int) -> tuple[Floats, Tra
     by_time = cap < learner.max_steps
     out_of_steps, out_of_time = (0, capped) if by_time else (capped, 0)
     return q, Training(steps, updates, episodes, finished, out_of_steps, out_of_time, settled)
-
-
-def _refuse_loops(levels: RewardLevels, learner: Learner) -> None:
-    """Refuse rewards under which going round in circles pays more than arriving."""
-    if isinstance(learner, PhaseQLearning):
-        if levels.other != 0:
-            raise BadSettings("In the phase state a move that advances nothing pays nothing: `other` must be 0.")
-        return  # no waypoint pays twice, so no loop does
-    if levels.visited <= 0:
-        return  # standing still never pays, and the goal is above that
-    if learner.gamma == 1:
-        raise BadSettings("With gamma 1 standing on a visited cell pays without end; take a gamma below 1.")
-    looping = levels.visited / (1 - learner.gamma)
-    if not levels.goal > looping:
-        raise BadSettings(
-            f"Standing on a visited cell pays {looping:g} in the long run, arriving only {levels.goal:g}: "
-            f"take a goal above {looping:g} or a gamma below {1 - levels.visited / levels.goal:g}.",
-            gamma=learner.gamma,
-        )
 
 
 class _Chance:
