@@ -50,5 +50,5 @@ def _draw_style(axes: Any, path: Json, policy: Json, rollouts: Sequence[Json]) -
     axes.set_ylabel("y (mm)")
     axes.set_zlabel("z (mm)")
     axes.tick_params(labelsize=7)
-    axes.set_aspect("equal")
-    axes.set_box_aspect(None, zoom=0.92)
+    spans = [abs(high - low) for low, high in (axes.get_xlim(), axes.get_ylim(), axes.get_zlim())]
+    axes.set_box_aspect(spans, zoom=0.92)  # one scale on all axes

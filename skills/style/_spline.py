@@ -1,19 +1,22 @@
 """The spline of A1: through every point of a polyline, at rest at both ends, never far from the straight moves.
 
-A clamped cubic spline whose clock is the length of the moves, in whole ticks, so that each point falls on a tick. It
-swings out of corners in proportion to the length of the moves; dividing them evenly bounds that.
+A clamped cubic spline whose clock is the way along the moves, in whole ticks, so that each point falls on a tick. The
+clock slows down in bends and towards the ends (`_ticks`): with an even speed the tightest bend, or the first of many
+short moves, would decide how slow all of the path has to be. The spline swings out of corners in proportion to the
+length of the moves; dividing them evenly bounds that.
 """
 
 from itertools import pairwise
-from math import ceil
+from math import ceil, sqrt
 
 import numpy as np
 
 from skills.errors import BadSpeed
-from skills.style._arrays import Floats
+from skills.style._arrays import Floats, Ints
 
 MAX_DEVIATION_MM = 1.25  # a quarter of the paper's cell
 PIECES_MM = (10.0, 5.0, 2.5, 1.25)
+EASE_MM = 5.0  # ours, one of the paper's cells: the way to full speed, and the radius of a bend that allows it
 MAX_SAMPLES = 1_000_000  # 200 passes at 240 Hz have three quarters of it; more is a slip of the units
 
 
@@ -30,7 +33,7 @@ def check_length(ticks: float) -> None:
 
 
 def followed(line: Floats, mm_per_tick: float) -> tuple[Floats, float]:
-    """Sample a polyline, mm, shape (K, 3), at a mean speed, in moves as long as the deviation allows.
+    """Sample a polyline, mm, shape (K, 3), at a full speed, in moves as long as the deviation allows.
 
     Returns:
         One position per tick, shape (T, 3), and how far at most one is from the straight move it belongs to, mm.
@@ -59,7 +62,7 @@ def _run(line: Floats, mm_per_tick: float) -> tuple[Floats, float]:
     if len(line) == 1:
         return line.copy(), 0.0
     lengths = np.linalg.norm(np.diff(line, axis=0), axis=1)
-    ticks = np.maximum(1, np.ceil(lengths / mm_per_tick - 1e-9)).astype(np.int64)
+    ticks = _ticks(line, lengths, mm_per_tick)
     check_length(float(ticks.sum()))
     slope = _slopes(line, ticks.astype(np.float64))
     piece = np.repeat(np.arange(len(ticks)), ticks)
@@ -77,6 +80,30 @@ def _run(line: Floats, mm_per_tick: float) -> tuple[Floats, float]:
     part = np.clip(np.einsum("ti,ti->t", tip - line[piece], along) / lengths[piece] ** 2, 0.0, 1.0)
     away = np.linalg.norm(tip - line[piece] - part[:, None] * along, axis=1)
     return np.concatenate([tip, line[-1:]]), float(away.max())
+
+
+def _ticks(line: Floats, lengths: Floats, mm_per_tick: float) -> Ints:
+    """Give each move whole ticks, (K - 1,), for a speed that is full where the way is straight.
+
+    The square of the speed, as a part of the full one's, is 0 at the ends, at most radius / `EASE_MM` in a bend, and
+    changes by at most length / `EASE_MM` in a move: so accelerations across and along the way have one bound each.
+    """
+    along = np.diff(line, axis=0) / lengths[:, None]
+    turn = np.arccos(np.einsum("ki,ki->k", along[:-1], along[1:]).clip(-1.0, 1.0))
+    radius = (lengths[:-1] + lengths[1:]) / 2 / np.maximum(turn, 1e-9)
+    square = [0.0, *(radius / EASE_MM).clip(max=1.0).tolist(), 0.0]
+    gain = (lengths / EASE_MM).tolist()
+    for i, more in enumerate(gain):
+        square[i + 1] = min(square[i + 1], square[i] + more)
+    for i in reversed(range(len(gain))):
+        square[i] = min(square[i], square[i + 1] + gain[i])
+    speed = np.sqrt(square)
+    if len(gain) == 1:  # from rest to rest: as fast as it may be half-way
+        speed += sqrt(min(gain[0] / 2, 1.0)) / 2
+    when = np.append(0.0, np.cumsum(2 * lengths / (speed[:-1] + speed[1:]))) / mm_per_tick
+    check_length(float(when[-1]))
+    ticks: Ints = np.maximum(1, np.diff(np.ceil(when - 1e-9))).astype(np.int64)
+    return ticks
 
 
 def _slopes(line: Floats, h: Floats) -> Floats:

@@ -2,7 +2,8 @@
 
 A pass moves the whole grid world so that the policy's *goal* lies at the suture point, turned about it where the point
 is turned. In the moved grid the policy is rolled out from the pass's start; what comes out is a path in the arm's
-frame. Between passes the surgeon inserts and grasps the needle by hand (M1 and M2).
+frame: through the centres of its cells, as in the paper, or, where the demonstration is given, fitted to what was
+recorded within the same cells (`smooth`). Between passes the surgeon inserts and grasps the needle by hand (M1, M2).
 """
 
 from collections.abc import Sequence
@@ -14,9 +15,11 @@ from numpy.typing import ArrayLike
 
 from skills.errors import BadPlan, OutsideGrid
 from skills.style._arrays import Floats, Ints, frozen
+from skills.style.demo import Demo
 from skills.style.kinematics import POINTING_DOWN, matrix_of, quaternion_of
 from skills.style.policy import Policy, rollout
 from skills.style.realign import realign
+from skills.style.smooth import Trace, fit_to_demo, trace
 from skills.style.trajectory import PassPath
 
 MAX_PASSES = 200
@@ -24,6 +27,7 @@ UNTURNED = (0.0, 0.0, 0.0, 1.0)
 NEGLIGIBLE_MM = 1e-9
 
 Orientation = Literal["demonstrated", "assumed tool-down"]
+PathKind = Literal["fitted", "cell centres"]
 
 
 @dataclass(frozen=True)
@@ -42,7 +46,8 @@ class Pass:
         point: The suture point.
         start_mm: Where A1 starts, shape (3,).
         states: The states of the grid world that it goes through, shape (T,).
-        tip_mm: The start (where it is not the centre of its cell) and the centres of those states, shape (K, 3).
+        tip_mm: The path, from the start to the suture point, shape (K, 3). Fitted: about four points to a cell, each
+            in one of those states, in their order. Else the start (where it is not a centre) and the states' centres.
         rotation: The jaw's [n o a] during A1, shape (3, 3).
         target_rotation: Where A2 turns it, shape (3, 3), or None where PSM_M's approach is not known.
     """
@@ -76,6 +81,7 @@ class SuturePlan:
     instrument: str
     speed_mm_s: float
     orientation: Orientation
+    path: PathKind
     approach_m: tuple[float, float, float] | None  # PSM_M's approach in the arm's frame; None: A1 alone
     passes: tuple[Pass, ...]
 
@@ -93,6 +99,7 @@ def stack(
     frame: str,
     instrument: str,
     rotation: ArrayLike | None,
+    demo: Demo | None = None,
     starts_mm: Sequence[ArrayLike | None] | None = None,
     approach_m: tuple[float, float, float] | None = None,
     speed_mm_s: float = 20.0,
@@ -106,12 +113,14 @@ def stack(
         frame: The demonstration's frame.
         instrument: The instrument that was demonstrated with.
         rotation: The jaw's [n o a] at the demonstration, shape (3, 3), held during A1; None: straight down is assumed.
+        demo: The demonstration that the policy was learnt from, to fit passes to; None: from centre to centre.
         starts_mm: Where each pass starts, in the arm's frame; None: the demonstrated start, moved with the grid.
         approach_m: PSM_M's approach in the arm's frame; None: no A2.
-        speed_mm_s: Wanted speed of the tip during A1.
+        speed_mm_s: Wanted speed of the tip during A1, where its way is straight.
 
     Raises:
-        BadPlan: No points, too many, as many starts as points not given, or a start from which the goal is not reached.
+        BadPlan: No points, too many, as many starts as points not given, a start from which the goal is not reached,
+            or another demonstration than the policy's.
         OutsideGrid: A start lies outside its pass's grid world.
     """
     if not 1 <= len(points) <= MAX_PASSES:
@@ -120,13 +129,19 @@ def stack(
     if len(starts) != len(points):
         raise BadPlan("Give one start for each suture point, or none.", points=len(points), starts=len(starts))
     jaw = POINTING_DOWN if rotation is None else frozen(rotation, np.float64, (3, 3), "rotation")
-    passes = tuple(_pass(policy, i, p, s, jaw, approach_m) for i, (p, s) in enumerate(zip(points, starts, strict=True)))
+    recorded = None if demo is None else trace(demo, policy.path)
+    passes = tuple(
+        _pass(policy, recorded, number, point, start, jaw, approach_m)
+        for number, (point, start) in enumerate(zip(points, starts, strict=True))
+    )
     seen: Orientation = "assumed tool-down" if rotation is None else "demonstrated"
-    return SuturePlan(arm, frame, instrument, speed_mm_s, seen, approach_m, passes)
+    path: PathKind = "cell centres" if recorded is None else "fitted"
+    return SuturePlan(arm, frame, instrument, speed_mm_s, seen, path, approach_m, passes)
 
 
 def _pass(
     policy: Policy,
+    recorded: Trace | None,
     number: int,
     point: SuturePoint,
     start_mm: ArrayLike | None,
@@ -138,15 +153,17 @@ def _pass(
     turned = matrix_of(np.array([point.rotation_xyzw]))[0]
     demonstrated = grid.centres_mm(policy.path.start)
     start = turned @ (demonstrated - goal) + place if start_mm is None else frozen(start_mm, np.float64, (3,), "start")
+    unmoved = demonstrated if start_mm is None else turned.T @ (start - place) + goal
     try:
-        followed = rollout(policy, demonstrated if start_mm is None else turned.T @ (start - place) + goal)
+        followed = rollout(policy, unmoved)
     except OutsideGrid as error:
         raise OutsideGrid(
             f"Pass {number} starts outside its grid world; start it nearer to its suture point.", suture_pass=number
         ) from error
     if not followed.finished:
         raise BadPlan(f"From its start pass {number} does not reach the goal.", suture_pass=number)
-    tip = (followed.tip_mm - goal) @ turned.T + place
+    path = followed.tip_mm if recorded is None else fit_to_demo(followed, recorded, unmoved).tip_mm
+    tip = (path - goal) @ turned.T + place
     if np.abs(tip[0] - start).max() > NEGLIGIBLE_MM:
         tip = np.concatenate((start[None], tip))
     held = turned @ jaw

@@ -65,17 +65,34 @@ def smoothed_speed(seconds: Floats, tip_mm: Floats) -> tuple[Floats, Floats]:
     Returns:
         Times in s and speeds in mm/s, both of shape (N,).
     """
+    grid_s, smooth = smoothed_tip(seconds, tip_mm, SMOOTHING_S)
+    if grid_s[-1] == grid_s[0]:
+        return grid_s, np.zeros(len(grid_s))
+    step_s = float(grid_s[-1] - grid_s[0]) / (len(grid_s) - 1)
+    return grid_s, np.linalg.norm(np.gradient(smooth, step_s, axis=0), axis=1)
+
+
+def smoothed_tip(seconds: Floats, tip_mm: Floats, window_s: float) -> tuple[Floats, Floats]:
+    """Return the tip averaged by a Hann window of this width on an even grid of times.
+
+    Args:
+        seconds: Shape (T,), strictly increasing, T at least 1.
+        tip_mm: Shape (T, 3).
+        window_s: The window's full width; of a movement faster than 2 / width, in Hz, little is left.
+
+    Returns:
+        Times in s, shape (N,), and positions in mm, shape (N, 3).
+    """
     duration = float(seconds[-1] - seconds[0])
     count = int(min(duration / GRID_STEP_S, GRID_LIMIT)) + 2
     grid_s = np.linspace(seconds[0], seconds[-1], count)
-    if duration == 0:
-        return grid_s, np.zeros(count)
     step_s = duration / (count - 1)
-    half = int(SMOOTHING_S / step_s / 2)
+    # Samples nanoseconds apart would ask for a window of gigabytes.
+    half = 0 if duration == 0 else int(min(window_s / step_s / 2, window_s / GRID_STEP_S))
     window = np.hanning(2 * half + 3)[1:-1]
-    even = np.stack([np.interp(grid_s, seconds, axis) for axis in tip_mm.T])
+    even = [np.interp(grid_s, seconds, axis) for axis in tip_mm.T]
     smooth = [np.convolve(np.pad(axis, half, mode="edge"), window / window.sum(), mode="valid") for axis in even]
-    return grid_s, np.linalg.norm(np.gradient(np.array(smooth), step_s, axis=1), axis=0)
+    return grid_s, np.stack(smooth, axis=1)
 
 
 def press_times(clutch: Signal) -> list[tuple[int, int | None]]:

@@ -5,9 +5,9 @@ passes the surgeon performs M1 and M2 by hand: time goes by, no samples are ours
 
 The law of motion is ours, the paper only asks for no jerky movements:
 
-* A1 is a cubic spline through the polyline's points with the chord's length as its clock, at rest at both ends. Each
-  point is passed exactly, on a tick. Between points it leaves the straight move by at most 1.25 mm, because moves are
-  divided until it does not (`_spline`). Stopping at every point would not leave it at all, but takes longer.
+* A1 is a cubic spline through the polyline's points, at rest at both ends and slower in bends. Each point is passed
+  exactly, on a tick. Between points it leaves the straight move by at most 1.25 mm, because moves are divided until it
+  does not (`_spline`). Stopping at every point would not leave it at all, but takes longer.
 * A2 turns about one axis as a minimum-jerk law, whose peak rate is 1.875 times its mean.
 * Where a joint would exceed its speed or acceleration limit, A1 or A2 of all passes is slowed until none does.
 """
@@ -82,7 +82,7 @@ class Trajectory:
         joints: Rows of `kinematics.JOINTS`, rad and mm, shape (T, 6).
         pass_index: Number of the pass, from 0, shape (T,).
         phase: `A1` or `A2`, shape (T,).
-        speed_mm_s: Mean speed along A1 after any slow-down.
+        speed_mm_s: Speed along A1 where its way is straight, after any slow-down.
         turn_rad_s: Peak rate of A2 after any slow-down.
         speed_ratio: Greatest joint speed as a part of its limit.
         acceleration_ratio: Greatest joint acceleration as a part of its limit.
@@ -155,7 +155,7 @@ def time_parametrise(
 
     Args:
         passes: The passes in order.
-        speed_mm_s: Mean speed along A1; lower where the joints' limits ask for it.
+        speed_mm_s: Speed along A1 where its way is straight; lower in bends, and lower where the joints' limits ask.
         rate_hz: Samples per second.
         instrument: Number of the instrument.
         pause_s: Seconds between passes, for M1 and M2 by hand; rounded to whole ticks, at least one.

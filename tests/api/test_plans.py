@@ -25,6 +25,7 @@ def test_every_pass_ends_on_its_suture_point(still: Service):
         assert one["states"] == policy["waypoints"]
         np.testing.assert_allclose(np.subtract(one["path_mm"], point), shape, rtol=0, atol=1e-9)
     assert (made["arm"], made["frame"], made["instrument"]) == (policy["arm"], policy["frame"], policy["instrument"])
+    assert made["path"] == "fitted"
     assert made["policy"] == {"version": 1, "sha256": policy["sha256"]}
     assert still.client.plan_of(made["id"]) == made
 

@@ -174,6 +174,11 @@ def test_a_good_demonstration_needs_no_advice():
     assert describe(cut_demo(recording(motion(line(4, 20), rotation=turn), jaw=np.zeros(401)))).advice == ()
 
 
+def test_samples_nanoseconds_apart_need_no_gigabytes():
+    demo = Demo("PSM2", "/t", "f", 0.0, 1e-9, np.array([0.0, 1e-9]), np.array([[0.0, 0, 0], [5, 0, 0]]))
+    assert describe(demo).samples == 2
+
+
 # ---- proposing segments -----------------------------------------------------------------------------------------
 
 

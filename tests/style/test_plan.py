@@ -6,9 +6,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skills.errors import BadInput, BadPlan, ImproperRotation, NoApproach, OutsideGrid
+from skills.style.demo import Demo
 from skills.style.kinematics import POINTING_DOWN, matrix_of
 from skills.style.plan import MAX_PASSES, SuturePoint, pose_xyzw, rotation_of, stack
 from skills.style.policy import rollout, rollout_from
+from skills.style.smooth import fit_to_demo, trace
 from skills.style.trajectory import PassPath
 from tests.style.paths import learnt, named_path
 
@@ -106,6 +108,44 @@ def test_a_plan_gives_the_paths_that_take_their_time():
     plan = stacked([SuturePoint((0, 0, -120)), SuturePoint((8, 0, -120))], approach_m=(1.0, 0, 0))
     assert all(isinstance(one, PassPath) for one in plan.pass_paths)
     assert [one.tip_mm.tolist() for one in plan.pass_paths] == [one.tip_mm.tolist() for one in plan.passes]
+
+
+# ---- fitted to the demonstration --------------------------------------------------------------------------------
+
+
+def hand_along(name):
+    """A hand that goes through the cells of a path, 1 mm beside their centres, in 0.25 s each."""
+    path = named_path(name)
+    tip_mm = np.repeat(path.tip_mm + np.array([1.0, -1.0, 1.0]), 25, axis=0)
+    stamps = np.arange(len(tip_mm)) / 100
+    return Demo("PSM2", "/t", "PSM2_base", 0.0, float(stamps[-1]), stamps, tip_mm)
+
+
+@settings(deadline=None, max_examples=30)
+@given(places_mm, turns_xyzw, st.integers(0, 1000), st.tuples(*[st.floats(-2.4, 2.4)] * 3))
+def test_with_its_demonstration_a_pass_is_the_fitted_path_moved(place_mm, turn_xyzw, start, off_mm):
+    policy, grid, demo = learnt(NAME), named_path(NAME).grid, hand_along(NAME)
+    turned, goal_mm = matrix_of([turn_xyzw])[0], policy.path.tip_mm[-1]
+    here_mm = grid.centres_mm(start % grid.n_states) + off_mm
+    start_mm = turned @ (here_mm - goal_mm) + place_mm
+    plan = stacked([SuturePoint(place_mm, turn_xyzw)] * 2, starts_mm=[None, start_mm], demo=demo)
+    for one, from_mm in zip(plan.passes, (policy.path.tip_mm[0], here_mm), strict=True):
+        followed = rollout(policy, from_mm)
+        fit = fit_to_demo(followed, trace(demo, policy.path), from_mm)
+        assert one.tip_mm == pytest.approx((fit.tip_mm - goal_mm) @ turned.T + place_mm, abs=1e-5)
+        assert one.states.tolist() == followed.states.tolist()
+        assert one.tip_mm[-1] == pytest.approx(place_mm, abs=EXACT_MM)
+        assert one.tip_mm[0] == pytest.approx(one.start_mm, abs=EXACT_MM)
+
+
+def test_a_plan_says_which_path_it_has():
+    assert stacked([SuturePoint((0, 0, -120))]).path == "cell centres"
+    assert stacked([SuturePoint((0, 0, -120))], demo=hand_along(NAME)).path == "fitted"
+
+
+def test_a_plan_with_anothers_demonstration_is_refused():
+    with pytest.raises(BadPlan, match="not learnt from this demonstration"):
+        stacked([SuturePoint((0, 0, -120))], demo=hand_along("an angle"))
 
 
 # ---- refused ----------------------------------------------------------------------------------------------------

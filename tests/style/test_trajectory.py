@@ -94,6 +94,24 @@ def test_too_high_a_speed_is_brought_down_to_the_joints_limits():
     assert slow.duration_s > fast.duration_s
 
 
+def test_it_is_slow_where_the_way_bends_and_at_its_ends_and_at_full_speed_elsewhere():
+    line = np.array([[-30, 50, -130], [0, 50, -130], [0, 80, -130]], float)
+    motion = time_parametrise([PassPath(line, POINTING_DOWN)], speed_mm_s=10.0)
+    speed = np.linalg.norm(np.diff(motion.tip_mm, axis=0), axis=1) * motion.rate_hz
+    way = np.append(0, np.cumsum(speed[:-1])) / motion.rate_hz
+    assert motion.speed_mm_s == 10.0
+    for place, most in ((0, 3.5), (30, 7.5), (60, 3.5)):
+        assert speed[np.abs(way - place) < 0.3].max() < most
+    for middle in (15, 45):
+        assert speed[np.abs(way - middle) < 5].mean() == pytest.approx(10.0, rel=0.05)
+
+
+def test_two_points_close_to_each_other_are_no_jerk():
+    for length in (1e-3, 0.1, 1.0, 10.0):
+        line = [[0, 50, -130], [0, 50, -130 + length]]
+        assert time_parametrise([PassPath(line, POINTING_DOWN)]).speed_mm_s == 20.0
+
+
 def test_a_long_move_does_not_swing_out_of_its_corners():
     line = [[0, 50, -130], [0, 50, -120], [40, 50, -120], [40, 55, -120]]
     assert time_parametrise([PassPath(line, POINTING_DOWN)], rate_hz=60.0).deviation_mm <= 1.25

@@ -1,0 +1,224 @@
+"""Draw the paper's Figures 5 to 9 from their numbers, in the colours of `skills.drawing`."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.ticker import MultipleLocator
+
+from skills.drawing import CELLS, GOAL, RECORDED, ROLLOUT
+from skills.report.fig_8 import Learnt
+from skills.report.numbers import Numbers
+from skills.style._arrays import Floats
+from skills.style.grid import GridPath
+
+DPI = 110
+TICK_MM = 10.0
+BOX = (4, 4, 3)  # wide, wide, high, as in the paper: flat paths are stretched to be seen, the axes tell
+BLACK, FAILED = "#000000", "#cc79a7"
+REWARDS = "PuOr"  # orange pays less than nothing, purple more; told apart by the colour-blind
+NAME_ABOVE_MM = 6.0
+PASSES = ("#0072b2", "#56b4e9", "#009e73", "#e69f00", "#d55e00")  # all told apart by the colour-blind (Okabe, Ito)
+
+
+def draw_all(numbers: Numbers, folder: Path) -> dict[str, Path]:
+    """Draw every figure of one source into a folder: its file by the figure's name."""
+    files = {}
+    for name, draw in DRAWINGS.items():
+        files[name] = folder / f"{name}-{numbers.source.name}.png"
+        figure = draw(numbers)
+        FigureCanvasAgg(figure)
+        figure.savefig(files[name], dpi=DPI)
+    return files
+
+
+def draw_fig_5(numbers: Numbers) -> Figure:
+    """Draw the recovered reward (left) beside the sparse one (right); size and colour say how much a state pays."""
+    both, path = numbers.fig_5, numbers.source.path
+    figure = _figure(11.5, 5.2)
+    titles = (
+        f"Maximum entropy IRL, {both.iterations} iterations\n"
+        f"{both.found} of its {both.visited} highest rewards lie on the path",
+        f"Sparse reward, Algorithm 1\n10 at the goal, 1 at {both.visited - 1} visited states, 0 elsewhere",
+    )
+    for place, (rewards, title) in enumerate(zip((both.recovered, both.sparse), titles, strict=True), start=1):
+        axes = _space(figure, (1, 2, place), title)
+        _scale(figure, axes, _dots(axes, path, rewards), rewards)
+    for end, name in ((path.tip_mm[0], "start"), (path.tip_mm[-1], "goal")):
+        axes.text(end[0], end[1], end[2] + NAME_ABOVE_MM, name, fontsize=9, ha="center", zorder=9)
+    return _titled(figure, f"Fig. 5: reward functions of {numbers.source.title}")
+
+
+def _dots(axes: Any, path: GridPath, rewards: Floats) -> Any:
+    """Draw a dot for every state, the best ones last; by the root of its reward, so that 1 is seen beside 10."""
+    most = np.abs(rewards).max()
+    states = np.argsort(np.abs(rewards), kind="stable")
+    root = np.sign(rewards) * np.sqrt(np.abs(rewards) / most)
+    sizes = (1.5 + 80 * root**2 + 40 * np.abs(root)) * np.where(root < 0, 0.3, 1.0)  # so as not to hide what pays
+    edges = np.where(root > 0.25, 0.6, 0.0)
+    return axes.scatter(
+        *path.grid.centres_mm(states).T,
+        c=root[states],
+        s=sizes[states],
+        linewidths=edges[states],
+        edgecolors=BLACK,
+        cmap=REWARDS,
+        vmin=-1,
+        vmax=1,
+        depthshade=False,
+    )
+
+
+def _scale(figure: Figure, axes: Any, dots: Any, rewards: Floats) -> None:
+    most, least = float(np.abs(rewards).max()), min(float(rewards.min()), 0.0)
+    bar = figure.colorbar(dots, ax=axes, shrink=0.6, pad=0.1, label="reward for entering the state")
+    ticks = [value for value in (-10, -3, -1, 0, 1, 3, 10) if least <= value <= most]
+    bar.set_ticks([float(np.sign(v) * np.sqrt(abs(v) / most)) for v in ticks], labels=[str(v) for v in ticks])
+    bar.ax.set_ylim(-float(np.sqrt(-least / most)), 1.0)
+
+
+def draw_fig_6(numbers: Numbers) -> Figure:
+    """Draw a recorded motion and its path; beside it the paper's path, whose own recording was not published."""
+    source, told = numbers.source, numbers.fig_6
+    panels = 2 if source.recorded_elsewhere else 1
+    figure = _figure(6.2 * panels, 5.0)
+    rmse = ", ".join(f"{value:.2f}" for value in told.rmse_mm)
+    whose = "a raw recording of the study, of another motion" if source.recorded_elsewhere else source.title
+    axes = _space(figure, (1, panels, 1), f"{whose}\n{told.samples} samples, {told.states} states, RMSE {rmse} mm")
+    axes.plot(*source.recorded.tip_mm.T, color=RECORDED, linewidth=1.4, label="raw")
+    _path(axes, source.recorded.path, label=f"discretised, {told.cell_mm:g} mm")
+    _mark_ends(axes, source.recorded.path)
+    if source.recorded_elsewhere:
+        states, revisits = len(source.path.states), source.path.revisits
+        axes = _space(
+            figure, (1, 2, 2), f"{source.title}: published discretised\n{states} states, {revisits} visited twice"
+        )
+        _path(axes, source.path)
+        _mark_ends(axes, source.path)
+    return _titled(figure, "Fig. 6: raw and discretised trajectory", legend=True)
+
+
+def draw_fig_7(numbers: Numbers) -> Figure:
+    """Draw five passes, each ending at its suture point."""
+    stacked = numbers.fig_7
+    figure = _figure(8.6, 6.6)
+    axes = _space(figure, (1, 1, 1), f"goals moved to {len(stacked.points_mm)} suture points")
+    for number, (tip_mm, color) in enumerate(zip(stacked.passes_mm, PASSES, strict=True), start=1):
+        axes.plot(*tip_mm.T, color=color, linewidth=1.8, marker="o", markersize=2.5, label=f"pass {number}")
+        axes.scatter(*tip_mm[0], color=color, s=45, marker="s", depthshade=False)
+    axes.scatter(*stacked.points_mm.T, color=BLACK, s=80, marker="*", label="suture point", zorder=9, depthshade=False)
+    return _titled(figure, f"Fig. 7: one policy of {numbers.source.title}, successive passes", legend=True)
+
+
+def draw_fig_8(numbers: Numbers) -> Figure:
+    """Draw three policies of each learner, one learner to a row, with DTW's lines to the demonstration."""
+    learners = list(dict.fromkeys(one.by for one in numbers.fig_8))
+    figure = _figure(12.5, 3.9 * len(learners) + 0.9)
+    for row, by in enumerate(learners):
+        mine = [one for one in numbers.fig_8 if one.by == by]
+        for column, one in enumerate(mine, start=1):
+            _draw_learnt(_space(figure, (len(learners), 3, 3 * row + column), _told(one)), one)
+    return _titled(figure, f"Fig. 8: three policies of {numbers.source.title}, with DTW", legend=True)
+
+
+def _told(one: Learnt) -> str:
+    states, of = len(one.rollout.states), len(one.rollout.path.states)
+    end = "" if one.rollout.finished else ", never arrives"
+    return f"{one.by}\n{one.which}: {states} states for {of}, DTW {one.dtw_total_mm:g} mm{end}"
+
+
+def _draw_learnt(axes: Any, one: Learnt) -> None:
+    path_mm, tip_mm = one.rollout.path.tip_mm, one.rollout.tip_mm
+    for number, (i, j) in enumerate(one.pairs.tolist()):
+        label = "DTW" if number == 0 else None
+        axes.plot(*np.stack((tip_mm[i], path_mm[j])).T, color=BLACK, linewidth=0.8, linestyle="--", label=label)
+    _path(axes, one.rollout.path, width=3.6)
+    axes.plot(*tip_mm.T, color=ROLLOUT, linewidth=1.6, marker="o", markersize=2.5, label="learnt")
+    _mark_ends(axes, one.rollout.path)
+
+
+def draw_fig_9(numbers: Numbers) -> Figure:
+    """Draw ours from ten other starts; beside it the published policy that fails from one of its own."""
+    theirs = len(numbers.fig_9[0].published) > 0
+    figure = _figure(6.4 * (1 + theirs), 5.2)
+    arrived = sum(one.ours.finished for one in numbers.fig_9)
+    axes = _space(figure, (1, 1 + theirs, 1), f"ours, seed 0: {arrived} of {len(numbers.fig_9)} arrive")
+    _draw_starts(axes, numbers, [one.ours for one in numbers.fig_9])
+    if theirs:
+        first = [one.published[0] for one in numbers.fig_9]
+        arrived = sum(one.finished for one in first)
+        axes = _space(figure, (1, 2, 2), f"published policy 1: {arrived} of {len(first)} arrive")
+        _draw_starts(axes, numbers, first)
+    return _titled(figure, f"Fig. 9: other starts, {numbers.source.title}", legend=True)
+
+
+def _draw_starts(axes: Any, numbers: Numbers, rollouts: Sequence[Any]) -> None:
+    _path(axes, numbers.source.path, width=3.2)
+    labelled: set[str] = set()
+    for one in sorted(rollouts, key=lambda one: not one.finished):
+        color, label = (ROLLOUT, "from other starts") if one.finished else (FAILED, "goes round, never arrives")
+        axes.plot(*one.tip_mm.T, color=color, linewidth=1.3 if one.finished else 3.0, label=_once(label, labelled))
+        axes.scatter(*one.tip_mm[0], color=color, s=26 if one.finished else 70, depthshade=False)
+    _mark_ends(axes, numbers.source.path)
+
+
+def _once(label: str, labelled: set[str]) -> str | None:
+    fresh = label not in labelled
+    labelled.add(label)
+    return label if fresh else None
+
+
+def _figure(wide_inch: float, high_inch: float) -> Figure:
+    figure = Figure((wide_inch, high_inch))
+    figure.set_layout_engine("constrained", rect=(0.01, 0, 0.96, 1))  # a z axis has its name outside its box
+    return figure
+
+
+def _space(figure: Figure, place: tuple[int, int, int], title: str) -> Any:
+    """Add axes in mm with a title; their limits follow what is drawn."""
+    axes: Any = figure.add_subplot(*place, projection="3d")
+    axes.set_title(title, fontsize=10)
+    axes.set_xlabel("x (mm)")
+    axes.set_ylabel("y (mm)")
+    axes.set_zlabel("z (mm)")
+    axes.tick_params(labelsize=7)
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(MultipleLocator(TICK_MM))
+    axes.set_box_aspect(BOX, zoom=0.95)
+    return axes
+
+
+def _path(axes: Any, path: GridPath, *, width: float = 1.8, label: str = "demonstration in the grid") -> None:
+    alpha = 0.55 if width > 2 else 1.0
+    axes.plot(
+        *path.tip_mm.T, color=CELLS, linewidth=width, alpha=alpha, marker="o", markersize=width + 1.5, label=label
+    )
+
+
+def _mark_ends(axes: Any, path: GridPath) -> None:
+    axes.scatter(*path.tip_mm[0], color=CELLS, s=70, marker="s", label="start", zorder=8, depthshade=False)
+    axes.scatter(*path.tip_mm[-1], color=GOAL, s=130, marker="*", label="goal", zorder=9, depthshade=False)
+
+
+def _titled(figure: Figure, title: str, *, legend: bool = False) -> Figure:
+    figure.suptitle(title, fontsize=13)
+    spaces: list[Any] = [axes for axes in figure.axes if axes.name == "3d"]
+    entries: dict[str, Any] = {}
+    for axes in spaces:
+        handles, labels = axes.get_legend_handles_labels()
+        entries |= dict(zip(labels, handles, strict=True))
+    if legend:
+        figure.legend(entries.values(), entries.keys(), loc="outside lower center", ncols=len(entries), frameon=False)
+    return figure
+
+
+DRAWINGS: dict[str, Callable[[Numbers], Figure]] = {
+    "fig-5": draw_fig_5,
+    "fig-6": draw_fig_6,
+    "fig-7": draw_fig_7,
+    "fig-8": draw_fig_8,
+    "fig-9": draw_fig_9,
+}

@@ -1,0 +1,173 @@
+"""The numbers as tables, for the page, for programs and for the terminal alike; nothing is computed here."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+from skills.report.numbers import Numbers
+from skills.report.table_1 import Row, Triple, as_printed
+from skills.style import paper
+
+Cell = str | int | float
+
+
+@dataclass(frozen=True)
+class Table:
+    """Named columns and rows under a caption; `name` is unique on the page."""
+
+    name: str
+    caption: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[Cell, ...], ...]
+
+
+def tables_of(numbers: Numbers) -> dict[str, tuple[Table, ...]]:
+    """Write all numbers of a source down: the tables of each figure."""
+    return {figure: tuple(write(numbers) for write in writers) for figure, writers in WRITERS.items()}
+
+
+def _fig_5(numbers: Numbers) -> Table:
+    told = numbers.fig_5
+    rows: tuple[tuple[Cell, ...], ...] = (
+        ("iterations of IRL", told.iterations),
+        ("negative log-likelihood of the demonstration, all rewards 0 (nat per move)", round(told.nats[0], 4)),
+        ("the same with the recovered reward", round(told.nats[1], 4)),
+        (f"of the {told.visited} highest recovered rewards, on visited states", told.found),
+        ("starts from which value iteration on it reaches the goal, of 1331", told.starts_reaching),
+        ("from the demonstrated start it", "reaches the goal" if told.walk.finished else _stops(numbers)),
+    )
+    return _named("fig-5", numbers, "The recovered reward", ("what", "value"), rows)
+
+
+def _stops(numbers: Numbers) -> str:
+    walk = numbers.fig_5.walk
+    still = len(walk.states) > 1 and walk.states[-1] == walk.states[-2]
+    moves = len(set(walk.states.tolist())) - 1
+    return f"{'stands still' if still else 'goes round in circles'} after {moves} move{'' if moves == 1 else 's'}"
+
+
+def _fig_6(numbers: Numbers) -> Table:
+    told = numbers.fig_6
+    rows: tuple[tuple[Cell, ...], ...] = (
+        ("samples", told.samples),
+        ("cell (mm)", told.cell_mm),
+        ("states", told.states),
+        ("states visited before", told.revisits),
+        ("states that no sample lies in", told.bridged),
+        ("RMSE of the samples, x, y, z (mm)", _xyz(told.rmse_mm)),
+    )
+    caption = (
+        "The raw recording (another motion of the study)" if numbers.source.recorded_elsewhere else "The recording"
+    )
+    return _named("fig-6", numbers, caption, ("what", "value"), rows)
+
+
+def _fig_7(numbers: Numbers) -> Table:
+    told = numbers.fig_7
+    passes = zip(told.points_mm.tolist(), told.passes_mm, strict=True)
+    rows = ((number, _xyz(point), len(tip), _xyz(tip[-1].tolist())) for number, (point, tip) in enumerate(passes, 1))
+    caption = f"Five passes, at most {told.worst_miss_mm:g} mm from the demonstration moved there"
+    return _named("fig-7", numbers, caption, ("pass", "suture point (mm)", "states", "ends at (mm)"), rows)
+
+
+def _fig_8(numbers: Numbers) -> Table:
+    rows = (
+        (
+            one.by,
+            one.which,
+            "yes" if one.rollout.finished else "no",
+            len(one.rollout.states),
+            one.exact_states,
+            one.dtw_total_mm,
+            one.starts_reaching,
+        )
+        for one in numbers.fig_8
+    )
+    columns = ("policy", "which", "arrives", "states", "exact states", "DTW (mm)", "starts that arrive, of 1331")
+    caption = f"From the demonstrated start; the demonstration has {len(numbers.source.path.states)} states"
+    return _named("fig-8", numbers, caption, columns, rows)
+
+
+def _tried(numbers: Numbers) -> Table:
+    rows = ((one.by, one.seeds, one.reached, one.exact) for one in numbers.tried)
+    columns = ("learner", "seeds", "arrive", "give the demonstration back")
+    return _named("seeds", numbers, "The same learners on many seeds, from 0 on", columns, rows)
+
+
+def _fig_9(numbers: Numbers) -> Table:
+    theirs = tuple(f"published {number} arrives" for number in range(1, len(numbers.source.published) + 1))
+    rows = (
+        (
+            _xyz(one.start_mm),
+            "yes" if one.ours.finished else "no",
+            one.joins_at,
+            one.dtw_total_mm,
+            *("yes" if way.finished else "no" for way in one.published),
+        )
+        for one in numbers.fig_9
+    )
+    columns = ("start (mm)", "ours arrives", "joins the path at its state", "DTW of ours (mm)", *theirs)
+    return _named("fig-9", numbers, "Ten starts in the printed range", columns, rows)
+
+
+def _range(numbers: Numbers) -> Table:
+    rows = ((one.by, one.starts, one.arriving) for one in numbers.arriving)
+    return _named("range", numbers, "All grid points of the printed range", ("policy", "starts", "arrive"), rows)
+
+
+def _table_1(numbers: Numbers) -> Table:
+    columns = ("trajectories", "mean (mm)", "standard deviation (mm)", "RMSE (mm)", "total DTW (mm)", "pairs")
+    rows = (
+        (_of(one), _xyz(one.mean_mm), _xyz(one.std_mm), _xyz(one.rmse_mm), round(one.total_mm, 3), one.pairs)
+        for one in numbers.table_1
+    )
+    return _named("table-1", numbers, "Dissimilarity along x, y, z, three policies together", columns, rows)
+
+
+def _ranges(numbers: Numbers) -> Table:
+    """Show what does not depend on a tie-break: how far the split over the axes may move."""
+    columns = ("trajectories", "axis", "sum (mm)", "least (mm)", "most (mm)")
+    rows = (
+        (_of(one), "xyz"[axis], round(one.sum_mm[axis], 3), _at(one.least_mm, axis), _at(one.most_mm, axis))
+        for one in numbers.table_1
+        for axis in range(3)
+    )
+    return _named("ranges", numbers, "The same as sums, and all that equally short alignments allow", columns, rows)
+
+
+def _of(row: Row) -> str:
+    return f"{row.of} ({row.unfinished} never arrive)" if row.unfinished else row.of
+
+
+def _at(ends: Triple | None, axis: int) -> Cell:
+    return "not known" if ends is None else ends[axis]
+
+
+def printed_rmse() -> Table:
+    """Compare the printed RMSE with the one that follows from the printed Table I: no source is in it."""
+    printed = paper.RMSE_AS_PRINTED_MM
+    follows = as_printed().rmse_mm
+    rows = tuple(
+        ("xyz"[axis], printed[axis], round(follows[axis], 3), round(follows[axis] / printed[axis])) for axis in range(3)
+    )
+    columns = ("axis", "printed, as mm", "follows from Table I (mm)", "times")
+    return Table("rmse", "The paper's RMSE beside sqrt(mean^2 + std^2) of its own Table I", columns, rows)
+
+
+def _named(
+    name: str, numbers: Numbers, caption: str, columns: tuple[str, ...], rows: Iterable[tuple[Cell, ...]]
+) -> Table:
+    return Table(f"{name}-{numbers.source.name}", f"{caption}: {numbers.source.title}", columns, tuple(rows))
+
+
+def _xyz(values: Iterable[float]) -> str:
+    return ", ".join(f"{value:.3f}".rstrip("0").rstrip(".") for value in values)
+
+
+WRITERS: dict[str, tuple[Callable[[Numbers], Table], ...]] = {
+    "fig-5": (_fig_5,),
+    "fig-6": (_fig_6,),
+    "fig-7": (_fig_7,),
+    "fig-8": (_fig_8, _tried),
+    "fig-9": (_fig_9, _range),
+    "table-1": (_table_1, _ranges),
+}
