@@ -37,7 +37,7 @@ def best_s(work: Callable[[], object], rounds: int = ROUNDS) -> float:
 
 
 def learning(reward: RewardMap, table: Table) -> None:
-    """Time both learners and the certificate against one pass of the certificate's own size."""
+    """Time both learners, and the certificate as a part of the learning."""
     for learner in (PhaseQLearning(), CellQLearning()):
         policy = learn_policy(reward, learner)
         took, checked = best_s(lambda: learn_policy(reward, learner)), best_s(lambda: certify(policy))  # noqa: B023
