@@ -124,6 +124,33 @@ def test_sqlite_is_opened_as_its_promises_need(tmp_path: Path):
     connection.close()
 
 
+def test_a_new_file_that_somebody_else_is_just_opening_is_waited_for(tmp_path: Path):
+    """SQLite does not wait by itself here: a change to the write-ahead log beside a writer fails at once."""
+    file = tmp_path / "skills.sqlite"
+    writer = sqlite3.connect(file, isolation_level=None, check_same_thread=False)
+    writer.execute("BEGIN IMMEDIATE")
+    done = threading.Timer(0.2, writer.execute, ["COMMIT"])
+    done.start()
+    database = Database(f"sqlite:///{file}")
+    with database.reading() as session:
+        assert session.scalar(text("PRAGMA journal_mode")) == "wal"
+    done.join()
+    writer.close()
+    database.close()
+
+
+def test_a_new_file_that_stays_locked_is_busy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(sessions, "BUSY_TIMEOUT_MS", 100)
+    file = tmp_path / "skills.sqlite"
+    writer = sqlite3.connect(file, isolation_level=None)
+    writer.execute("BEGIN IMMEDIATE")
+    database = Database(f"sqlite:///{file}")
+    with pytest.raises(Busy), database.reading() as session:
+        session.execute(text("SELECT 1"))
+    writer.close()
+    database.close()
+
+
 def test_the_folder_of_a_new_database_is_made(tmp_path: Path):
     database = Database(f"sqlite:///{tmp_path / 'a' / 'b' / 'skills.sqlite'}")
     database.migrate()
