@@ -8,15 +8,19 @@ export SKILLS_PAPER_DATA ?= $(abspath $(wildcard ../shared/paper/data))
 
 .PHONY: demo test serve bench nightly lint lock clean
 
-# uv where it is present, venv and pip otherwise; either way the same versions, checked by their hashes.
+# uv where it is present, venv and pip otherwise; either way the same versions, checked by their hashes. One package,
+# movement-primitives, comes as source: setuptools is there first, and without Cython it is built with no compiler.
+SETUPTOOLS := sed -n '/^setuptools==/,/[^\\]$$/p' requirements.lock
 $(READY): requirements.lock pyproject.toml
 	@if command -v uv >/dev/null 2>&1; then \
 	  uv venv -q --allow-existing --python $(PYTHON) $(VENV) && \
-	  VIRTUAL_ENV=$(CURDIR)/$(VENV) uv pip sync -q --require-hashes requirements.lock && \
+	  $(SETUPTOOLS) | VIRTUAL_ENV=$(CURDIR)/$(VENV) uv pip install -q --require-hashes -r - && \
+	  VIRTUAL_ENV=$(CURDIR)/$(VENV) uv pip sync -q --require-hashes --no-build-isolation requirements.lock && \
 	  VIRTUAL_ENV=$(CURDIR)/$(VENV) uv pip install -q --no-deps --no-build-isolation -e . ; \
 	else \
 	  $(PYTHON) -m venv $(VENV) && \
-	  $(BIN)/python -m pip install -q --require-hashes -r requirements.lock && \
+	  $(SETUPTOOLS) | $(BIN)/python -m pip install -q --require-hashes -r /dev/stdin && \
+	  $(BIN)/python -m pip install -q --require-hashes --no-build-isolation -r requirements.lock && \
 	  $(BIN)/python -m pip install -q --no-deps --no-build-isolation -e . ; \
 	fi
 	@touch $@

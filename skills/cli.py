@@ -180,11 +180,15 @@ def demo_add(
     proposal: Annotated[int | None, typer.Option(help="Take this proposed hand-off, counted from 1.")] = None,
     grid: Annotated[str, typer.Option(help="auto, paper or fit.")] = "auto",
     cell_mm: Annotated[float | None, typer.Option()] = None,
+    hysteresis: Annotated[
+        float, typer.Option(help="How far beyond its cell a sample stays in it: 0 to 0.5 cells, 0.25 against tremor.")
+    ] = 0.0,
     session: Annotated[str | None, typer.Option()] = None,
     as_json: AsJson = False,
 ) -> None:
     """Store a recording and one demonstration of it."""
-    asked: dict[str, Any] = {"arm": arm, "topic": topic, "grid": grid, "cell_mm": cell_mm, "session": session}
+    asked: dict[str, Any] = {"arm": arm, "topic": topic, "session": session}
+    asked |= {"grid": grid, "cell_mm": cell_mm, "hysteresis": hysteresis}
     file = recording_file(path)
     with service() as client:
         if proposal is None:
@@ -199,6 +203,10 @@ def demo_add(
             answer = client.cut_demo(stored["sha256"], surgeon=surgeon, suture=suture, **asked)
     answer["path_states"] = answer["report"]["path_states"]
     show(answer, as_json, ("id", "surgeon", "suture", "arm", "frame", "path_states"))
+    if not as_json:
+        x, y, z = answer["report"]["discretisation_rmse_mm"]
+        loss = f"{x:.2f}, {y:.2f}, {z:.2f} mm off their cells along x, y, z (RMSE)"
+        out.print(f"{answer['report']['revisits']} crossings; samples are {loss}")
 
 
 @demos.command("list")
@@ -357,14 +365,15 @@ def report(
     to: Annotated[Path, typer.Option(help="The folder to write to.")] = Path("build/report"),
     irl_iterations: Annotated[int, typer.Option(min=1, help="Of maximum-entropy IRL, for Fig. 5.")] = 200,
     seeds: Annotated[int, typer.Option(min=1, help="Try each learner on this many seeds.")] = 200,
+    runs: Annotated[int, typer.Option(min=1, help="Of each policy and rival, for each probability of a slip.")] = 1000,
     as_json: AsJson = False,
 ) -> None:
-    """Redraw the paper's Figures 5 to 9 and Table I: pictures and one HTML page."""
+    """Redraw the paper's Figures 5 to 9 and Table I, with rivals beside them: pictures and one HTML page."""
     from skills.report import ABSENT, Effort, write_report
     from skills.settings import settings
 
     with err.status("...") as status:
-        effort = Effort(irl_iterations=irl_iterations, seeds=seeds)
+        effort = Effort(irl_iterations=irl_iterations, seeds=seeds, runs=runs)
         written = write_report(to, settings().paper_data, effort, status.update)
     if not written.has_paper_data:
         err.print(ABSENT, soft_wrap=True)

@@ -87,11 +87,11 @@ class Client:
     def add_demo(
         self, recording: Path | bytes, *, surgeon: str, suture: str, media_type: str | None = None, **query: Any
     ) -> Json:
-        """Store a recording and one demonstration of it."""
+        """Store a recording and one demonstration of it: arm, topic, start_s, end_s, grid, cell_mm, hysteresis."""
         return self._upload("/demos", recording, media_type, {"surgeon": surgeon, "suture": suture, **query})
 
     def cut_demo(self, recording: str, *, surgeon: str, suture: str, **asked: Any) -> Json:
-        """Cut a demonstration out of a stored recording, named by its digest."""
+        """Cut a demonstration out of a stored recording, named by its digest; it is asked for as in `add_demo`."""
         body = {"surgeon": surgeon, "suture": suture, **_given(asked)}
         return self._json("POST", f"/recordings/{recording}/demos", json=body)
 

@@ -16,6 +16,7 @@ from skills.api.app import create_app, prepare_database
 from skills.client import Client
 from skills.db.session import Database
 from skills.jobs.child import start_worker_child
+from skills.jobs.warm import align_once, warm_up
 from skills.samples import load_samples
 from skills.settings import Settings
 
@@ -34,6 +35,7 @@ def prepare(settings: Settings) -> None:
 
 def serve(settings: Settings, *, samples: bool = False) -> None:
     """Serve until told to stop; the address must have been checked (`Settings.check_address`)."""
+    warm_up(align_once)
     prepare(settings)
     server = uvicorn.Server(
         uvicorn.Config(

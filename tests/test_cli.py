@@ -67,6 +67,21 @@ def test_from_a_bag_folder_to_a_released_policy_and_a_plan(skills, tmp_path: Pat
     assert (code, "erased for good" in said) == (1, True)
 
 
+def test_a_demonstration_with_hysteresis_tells_its_states_crossings_and_loss(skills, tmp_path: Path) -> None:
+    bag = tmp_path / "plover.mcap"
+    bag.write_bytes(next(s for s in sample_recordings() if s.surgeon == "plover").data)
+    assert skills("seed")[0] == 0
+    add = ("demo", "add", str(bag), "--surgeon", "plover", "--suture", "simple-running", "--proposal", "1")
+    code, said = skills(*add)
+    assert (code, "19 crossings" in said) == (0, True), said
+    code, said = skills(*add, "--hysteresis", "0.25")
+    assert (code, "0 crossings; samples are 1.56, 1.54, 1.56 mm off" in said) == (0, True), said
+    _, said = skills(*add, "--hysteresis", "0.25", "--json")
+    assert (json.loads(said)["hysteresis"], json.loads(said)["path_states"]) == (0.25, 18)
+    code, said = skills(*add, "--hysteresis", "0.6")
+    assert (code, "less than or equal to 0.5" in said) == (1, True), said
+
+
 def test_what_is_no_recording_is_refused_with_a_sentence(skills, tmp_path: Path) -> None:
     code, said = skills("recording", "add", str(tmp_path))
     assert (code, "exactly one .mcap" in said) == (1, True)

@@ -11,7 +11,7 @@ from skills.db import models as rows
 from skills.db.base import rfc3339 as at
 from skills.library.plans import PlanRequest
 from skills.library.training import learner_of
-from skills.style.grid import GridMode
+from skills.style.grid import MAX_HYSTERESIS, GridMode
 from skills.style.learning.irl import MaxEntIRL
 from skills.style.learning.learners import MAX_SEED, Learner
 from skills.style.learning.q_learning import CellQLearning, PhaseQLearning
@@ -33,6 +33,15 @@ Whole = Annotated[StrictInt, Field(ge=0, le=2**31)]
 Number = Annotated[float, Field(strict=True)]  # true is no length
 Coordinate = Annotated[Number, Field(ge=-10_000, le=10_000)]
 Point = tuple[Coordinate, Coordinate, Coordinate]
+Hysteresis = Annotated[
+    float,
+    Field(
+        ge=0,
+        le=MAX_HYSTERESIS,
+        description="Cells by which a sample must be beyond a face of its cell to leave it; 0.25 keeps a tremor from "
+        "crossing a face again and again, and the report says what is lost in mm.",
+    ),
+]
 Component = Annotated[Number, Field(ge=-1e6, le=1e6)]
 
 
@@ -72,6 +81,7 @@ class DemoIn(Schema):
     end_s: Annotated[float, Field(ge=0, le=1e9)] | None = None
     grid: GridMode = "auto"
     cell_mm: Annotated[float, Field(ge=0.25, le=50)] | None = None
+    hysteresis: Hysteresis = 0.0
     session: SlugField | None = None
 
 
@@ -214,6 +224,7 @@ def demo_out(row: rows.Demonstration) -> dict[str, Any]:
         "start_s": row.start_s,
         "end_s": row.end_s,
         "session": row.session,
+        "hysteresis": row.hysteresis,
         "state": "active" if row.withdrawn_at is None else "withdrawn",
         "report": row.report,
         "created_at": at(row.created_at),

@@ -22,18 +22,22 @@ from sqlalchemy import (
 from sqlalchemy.orm import Mapped, mapped_column, relationship
 
 from skills.db.base import Base, now
-from skills.db.packed import Packed, stored
+from skills.db.packed import Packed, added_later, stored
 from skills.style.certificate import Coverage
 from skills.style.demo import Demo
 from skills.style.grid import GridPath, GridWorld
 from skills.style.learning.learners import LEARNERS
-from skills.style.learning.q_learning import Training
+from skills.style.learning.q_learning import PhaseQLearning, Training
+from skills.style.learning.value_iteration import ValueIteration
 from skills.style.plan import Pass, SuturePlan, SuturePoint
 from skills.style.playback import Playback
 from skills.style.policy import Policy
 from skills.style.reward import RewardLevels, RewardMap
 
 stored(GridWorld, GridPath, RewardLevels, *LEARNERS.values(), Training, SuturePoint, Pass)
+added_later(GridPath, "hysteresis")
+added_later(PhaseQLearning, "slip")
+added_later(ValueIteration, "slip")
 
 RowId = Annotated[
     int, mapped_column(BigInteger().with_variant(Integer, "sqlite"), primary_key=True, autoincrement=True)
@@ -123,6 +127,7 @@ class Demonstration(Base):
     start_s: Mapped[float]
     end_s: Mapped[float]
     session: Mapped[str | None]
+    hysteresis: Mapped[float]  # cells; 0 in all that were stored before there was any
     demo: Mapped[Demo] = mapped_column(Packed(Demo), deferred=True)
     path: Mapped[GridPath] = mapped_column(Packed(GridPath), deferred=True)
     report: Mapped[dict[str, Any]]

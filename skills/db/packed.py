@@ -8,7 +8,7 @@ the arrays themselves, so it does not depend on how they were compressed.
 import hashlib
 import io
 import json
-from dataclasses import fields, is_dataclass
+from dataclasses import Field, fields, is_dataclass
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -21,6 +21,7 @@ FORMAT = b"SKILLS01"
 T = TypeVar("T")
 
 _VALUES: dict[str, type] = {}
+_ADDED: set[tuple[type, str]] = set()
 
 
 def stored(*values: type) -> None:
@@ -28,6 +29,14 @@ def stored(*values: type) -> None:
     for value in values:
         assert is_dataclass(value) and _VALUES.get(value.__name__, value) is value, value
         _VALUES[value.__name__] = value
+
+
+def added_later(value: type, field: str) -> None:
+    """Name a field that a class got after values of it had been stored; its default is what all of them had.
+
+    It is left out while it holds that default, so that every value keeps its digest.
+    """
+    _ADDED.add((value, field))
 
 
 def digest(value: Any) -> str:
@@ -88,7 +97,7 @@ def _flatten(value: Any, arrays: list[np.ndarray[Any, Any]]) -> Any:
         assert type(value).__name__ in _VALUES, f"{type(value).__name__} is not declared as stored"
         return {
             "value": type(value).__name__,
-            "of": {f.name: _flatten(getattr(value, f.name), arrays) for f in fields(value)},
+            "of": {f.name: _flatten(getattr(value, f.name), arrays) for f in fields(value) if _is_written(value, f)},
         }
     if isinstance(value, dict):
         return {"dict": [[_flatten(k, arrays), _flatten(v, arrays)] for k, v in value.items()]}
@@ -97,6 +106,10 @@ def _flatten(value: Any, arrays: list[np.ndarray[Any, Any]]) -> Any:
     if isinstance(value, np.generic):
         return value.item()
     return value
+
+
+def _is_written(value: Any, field: Field[Any]) -> bool:
+    return (type(value), field.name) not in _ADDED or getattr(value, field.name) != field.default
 
 
 def _build(tree: Any, arrays: list[np.ndarray[Any, Any]]) -> Any:

@@ -6,6 +6,7 @@ The row of a job in our database is the truth; the engine only sees to it that s
     workflows   what a worker does with one job: try, try again, give up
     lease       who has fallen silent, whatever the clocks say
     watch       what a worker does between jobs: show that it lives, tell, take over, read back
+    warm        the compiled loops, ready before they are needed
     worker      the worker process
     child       that process as a child of the service
 """

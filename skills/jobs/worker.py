@@ -37,13 +37,14 @@ def run_worker(settings: Settings, *, parent: int | None = None, perform: Perfor
         perform: Carries a job out; `skills.library.perform_job` unless told otherwise.
     """
     stop = _stopped_by_signals()
+    perform = perform or _library()
     executor = f"{os.getpid()}-{uuid.uuid4().hex}"  # never used again: the engine would run its work twice
     database = Database(settings.database_url)
     client = connect(settings)
     watch = Watch(database, client, executor, Leases(settings.lease_s), DBOS._recover_pending_workflows)
     try:
         watch.beat()  # before it can hold any work
-        with _engine(Work(database, settings, perform or _library()), executor, watch):
+        with _engine(Work(database, settings, perform), executor, watch):
             while not (stop.is_set() or _orphaned(parent)):
                 _survive(watch.round)
                 stop.wait(ROUND_S)
@@ -55,8 +56,11 @@ def run_worker(settings: Settings, *, parent: int | None = None, perform: Perfor
 
 
 def _library() -> Perform:
-    from skills.library import perform_job  # late: it brings everything along
+    """Take the library's work, and warm up for it."""
+    from skills.jobs.warm import learn_once, warm_up  # late: they bring everything along
+    from skills.library import perform_job
 
+    warm_up(learn_once)
     return perform_job
 
 
@@ -113,6 +117,8 @@ def main() -> None:
     logging.basicConfig(level=logging.WARNING, format="%(asctime)s worker %(levelname)s %(message)s")
     os.nice(NICENESS)
     run_worker(Settings(), parent=int(sys.argv[1]))
+    logging.shutdown()
+    os._exit(0)  # nobody waits for what is still being compiled
 
 
 if __name__ == "__main__":

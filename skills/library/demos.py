@@ -36,6 +36,7 @@ class Cut:
     end_s: float | None = None
     grid: GridMode = "auto"
     cell_mm: float | None = None
+    hysteresis: float = 0.0
     session: str | None = None
 
 
@@ -53,13 +54,13 @@ def make_demo(recording: Recording, cut: Cut) -> Made:
     """Cut a hand-off out of a recording and put it into its grid world."""
     demo = cut_demo(recording, arm=cut.arm, topic=cut.topic, start_s=cut.start_s, end_s=cut.end_s)
     grid = choose_grid(demo.tip_mm, cut.grid, cut.cell_mm)
-    path = discretize(demo.tip_mm, grid)
+    path = discretize(demo.tip_mm, grid, cut.hysteresis)
     report = asdict(describe(demo)) | {
         "grid": asdict(grid) | {"chosen": "paper" if grid == PAPER_GRID else "fit"},
         "path_states": len(path.states),
         "revisits": path.revisits,
         "bridged_cells": path.bridged,
-        "discretisation_rmse_mm": list(discretisation_rmse(demo.tip_mm, grid)),
+        "discretisation_rmse_mm": list(discretisation_rmse(demo.tip_mm, grid, path.hysteresis)),
     }
     return Made(demo, path, sparse_reward(path), report)
 
@@ -92,7 +93,7 @@ def _store_demo(
     session: Session, stored: StoredRecording, made: Made, cut: Cut, actor: str
 ) -> tuple[Demonstration, bool]:
     surgeon, suture = find_surgeon(session, cut.surgeon), find_suture_type(session, cut.suture)
-    identity = {
+    identity: dict[str, Any] = {
         "recording": stored.sha256,
         "surgeon": surgeon.slug,
         "suture": suture.slug,
@@ -101,6 +102,8 @@ def _store_demo(
         "segment_s": [made.demo.start_s, made.demo.end_s],
         "grid": asdict(made.path.grid),
     }
+    if made.path.hysteresis:  # else left out, so that a demonstration is still known by the digest it always had
+        identity["hysteresis"] = made.path.hysteresis
     demo_sha256 = sha256(canonical(identity))
     known = session.scalar(select(Demonstration).where(Demonstration.sha256 == demo_sha256))
     if known is not None:
@@ -119,6 +122,7 @@ def _store_demo(
         start_s=made.demo.start_s,
         end_s=made.demo.end_s,
         session=cut.session,
+        hysteresis=made.path.hysteresis,
         demo=made.demo,
         path=made.path,
         report=made.report,

@@ -21,7 +21,7 @@ from skills.style.certificate import Certificate, Coverage, certify
 from skills.style.demo import Demo
 from skills.style.evaluation import discretisation_rmse, measure
 from skills.style.kinematics import POINTING_DOWN, reachable
-from skills.style.learning.learners import LEARNER_VERSION, LEARNERS, Learner
+from skills.style.learning.learners import LEARNER_VERSION, LEARNERS, Learner, refuse_too_large
 from skills.style.learning.q_learning import PhaseQLearning
 from skills.style.plan import rotation_of
 from skills.style.policy import Policy, learn_policy, rollout_from
@@ -51,6 +51,7 @@ def request_training(
         NotFound: The surgeon, the suture type or the demonstration is unknown.
         Conflict: There is no active demonstration, or the surgeon's consent does not cover training.
         BadInput: More than one demonstration, or one of another style.
+        BadSettings: Learning it would need too much memory.
     """
     who, what = find_surgeon(session, surgeon), find_suture_type(session, suture)
     check_consent(who, "training")
@@ -63,11 +64,13 @@ def request_training(
         raise BadInput("The demonstration belongs to another style.")
     if demo.withdrawn_at is not None:
         raise Conflict("The demonstration was withdrawn.")
+    learner = learner or PhaseQLearning()
+    refuse_too_large(demo.path, learner)
     request = {
         "surgeon": who.slug,
         "suture": what.slug,
         "demos": [demo.sha256],
-        "learner": describe_learner(learner or PhaseQLearning()),
+        "learner": describe_learner(learner),
         "learner_version": LEARNER_VERSION,
         "seed": seed,
         "release": release,
@@ -188,7 +191,8 @@ def describe_policy(
 ) -> dict[str, Any]:
     """Write what a client is told of a policy (interface.md), but for its version, digest, release and arrays."""
     path, grid = policy.path, policy.path.grid
-    metrics = asdict(measure(rollout_from(policy, path.start), discretisation_rmse(demo.tip_mm, grid)))
+    lost_mm = discretisation_rmse(demo.tip_mm, grid, path.hysteresis)
+    metrics = asdict(measure(rollout_from(policy, path.start), lost_mm))
     return {
         "surgeon": request["surgeon"],
         "suture": request["suture"],
@@ -216,6 +220,7 @@ def describe_policy(
         },
         "grid_certificate": {
             "states_checked": certificate.checked,
+            "states_finishing": certificate.finishing,
             "suboptimal_actions": certificate.suboptimal,
             "demonstration_reproduced": certificate.demonstration_reproduced,
             "refused_because": refused_because,

@@ -1,10 +1,10 @@
-"""`skills report`: the paper's Figures 5 to 9 and Table I, redrawn from the pure core.
+"""`skills report`: the paper's Figures 5 to 9 and Table I, redrawn from the pure core, and rivals beside them.
 
     sources  --compute-->  Numbers  --draw_all-->  PNG
                                     --tables_of-->  tables  --write_page-->  one HTML page
 
-A file for each figure (`fig_5` to `fig_9`, `table_1`) computes its numbers; `drawings` draws them, `tables` and
-`sections` put them into words, and `page` into HTML. Nothing is asked of a server.
+A file for each figure (`fig_5` to `fig_9`, `table_1`, `slips`) computes its numbers; `drawings` draws them, `tables`
+and `sections` put them into words, and `page` into HTML. Nothing is asked of a server.
 """
 
 import json
@@ -62,7 +62,7 @@ def write_report(
         numbers = compute(source, effort)
         parts.append(Part(source.title, draw_all(numbers, to), tables_of(numbers)))
     page, data = to / "index.html", to / "numbers.json"
-    options = f"--irl-iterations {effort.irl_iterations} --seeds {effort.seeds}"
+    options = f"--irl-iterations {effort.irl_iterations} --seeds {effort.seeds} --runs {effort.runs}"
     page.write_text(write_page(parts, printed_rmse(), [PRIVATE if theirs else ABSENT], options))
     tables = (printed_rmse(), *(table for part in parts for some in part.tables.values() for table in some))
     data.write_text(json.dumps([asdict(table) for table in tables], indent=1))

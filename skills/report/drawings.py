@@ -1,4 +1,4 @@
-"""Draw the paper's Figures 5 to 9 from their numbers, in the colours of `skills.drawing`."""
+"""Draw the paper's Figures 5 to 9, and its rivals, from their numbers, in the colours of `skills.drawing`."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -13,6 +13,7 @@ from skills.drawing import CELLS, GOAL, RECORDED, ROLLOUT
 from skills.report.fig_8 import Learnt
 from skills.report.numbers import Numbers
 from skills.style._arrays import Floats
+from skills.style.disturbance import wilson
 from skills.style.grid import GridPath
 
 DPI = 110
@@ -22,6 +23,16 @@ BLACK, FAILED = "#000000", "#cc79a7"
 REWARDS = "PuOr"  # orange pays less than nothing, purple more; told apart by the colour-blind
 NAME_ABOVE_MM = 6.0
 PASSES = ("#0072b2", "#56b4e9", "#009e73", "#e69f00", "#d55e00")  # all told apart by the colour-blind (Okabe, Ito)
+
+LINES = (  # of the policies and their rivals, told apart by colour, marker and dashes alike
+    (ROLLOUT, "o", "-"),
+    ("#56b4e9", "P", "-."),
+    ("#e69f00", "D", "--"),
+    (BLACK, "x", ":"),
+    (FAILED, "v", "-"),
+    (CELLS, "s", "-"),
+    (GOAL, "^", "--"),
+)
 
 
 def draw_all(numbers: Numbers, folder: Path) -> dict[str, Path]:
@@ -171,6 +182,35 @@ def _once(label: str, labelled: set[str]) -> str | None:
     return label if fresh else None
 
 
+def draw_rivals(numbers: Numbers) -> Figure:
+    """Draw against the probability of a slip: who follows, at what cost in moves, and how far off."""
+    figure = _figure(13.5, 5.0)
+    follow, extra, off = figure.subplots(1, 3)
+    for by, (color, marker, line) in zip(dict.fromkeys(one.by for one in numbers.disturbed), LINES, strict=True):
+        mine = [one for one in numbers.disturbed if one.by == by]
+        slips, outcomes = [one.slip for one in mine], [one.outcome for one in mine]
+        style: dict[str, Any] = {"color": color, "marker": marker, "linestyle": line, "linewidth": 1.6, "markersize": 6}
+        share = np.array([one.followed / one.runs for one in outcomes])
+        ends = np.array([wilson(one.followed, one.runs) for one in outcomes]).T
+        follow.errorbar(slips, share, yerr=np.abs(ends - share), capsize=2, label=by, **style)
+        costs = [np.nan if one.extra_moves is None else one.extra_moves for one in outcomes]
+        extra.plot(slips, costs, **style)
+        off.plot(slips, [one.dtw_total_mm for one in outcomes], **style)
+    _against_slips(follow, "follow all of the demonstration", "share of runs, with 95 % intervals")
+    _against_slips(extra, "extra moves of those that follow", "moves")
+    _against_slips(off, "DTW to the demonstration, all runs", "mm")
+    figure.legend(*follow.get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
+    return _titled(figure, f"Rivals under slips: {numbers.source.title}, {numbers.disturbed[0].outcome.runs} runs each")
+
+
+def _against_slips(axes: Any, title: str, what: str) -> None:
+    axes.set_title(title, fontsize=10)
+    axes.set_xlabel("probability of a slip in each move")
+    axes.set_ylabel(what)
+    axes.set_ylim(bottom=0)
+    axes.grid(alpha=0.3)
+
+
 def _figure(wide_inch: float, high_inch: float) -> Figure:
     figure = Figure((wide_inch, high_inch))
     figure.set_layout_engine("constrained", rect=(0.01, 0, 0.96, 1))  # a z axis has its name outside its box
@@ -221,4 +261,5 @@ DRAWINGS: dict[str, Callable[[Numbers], Figure]] = {
     "fig-7": draw_fig_7,
     "fig-8": draw_fig_8,
     "fig-9": draw_fig_9,
+    "rivals": draw_rivals,
 }

@@ -1,11 +1,17 @@
-"""Fig. 8: three policies of one demonstration, in the paper's state, in ours, and those that the authors published."""
+"""Fig. 8: three policies of one demonstration, in the paper's state, in ours, and those that the authors published.
 
+Beside them two rivals that learn no policy: the demonstration replayed, and a dynamic movement primitive.
+"""
+
+import os
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
-from skills.report import published
+from skills.report import dmp, published
 from skills.report.sources import Source
 from skills.style import paper
 from skills.style._arrays import Ints
@@ -13,17 +19,19 @@ from skills.style.certificate import coverage
 from skills.style.evaluation import dtw, measure
 from skills.style.learning.q_learning import CellQLearning, PhaseQLearning
 from skills.style.policy import Policy, Rollout, learn_policy, rollout_from
-from skills.style.reward import sparse_reward
+from skills.style.reward import RewardMap, sparse_reward
+from skills.style.rivals import replay
 
 SEEDS = tuple(range(paper.N_POLICIES))
 PUBLISHED, CELL, PHASE = "published by the authors", "the paper's state: cell", "ours: phase and cell"
+REPLAY, PRIMITIVE = "rival: shortest way, then replay", "rival: dynamic movement primitive"
 PUBLISHED_PARAMETERS = "the paper's state, the authors' parameters"
 
 
 @dataclass(frozen=True, eq=False)
 class Learnt:
-    """A policy's way from the demonstrated start, DTW's pairs with the demonstration (K, 2), and how many starts reach
-    the goal.
+    """A policy's or a rival's way from the demonstrated start, DTW's pairs with the demonstration (K, 2), and how many
+    starts reach the goal.
     """
 
     by: str
@@ -66,6 +74,18 @@ def three_policies(source: Source) -> tuple[Learnt, ...]:
     return (*theirs, *learnt)
 
 
+def two_rivals(source: Source, primitive: dmp.Primitive) -> tuple[Learnt, ...]:
+    """Follow the two rivals, undisturbed: nothing of them is drawn at random."""
+    path, everywhere = source.path, np.arange(source.path.grid.n_states)
+    replays = [replay(path, state) for state in everywhere.tolist()]
+    passes = dmp.rollouts(primitive, everywhere)
+    basis = f"{primitive.weights.shape[1]} basis functions"
+    return tuple(
+        _learnt(by, which, ways[path.start], sum(way.finished for way in ways))
+        for by, which, ways in ((REPLAY, "as recorded", replays), (PRIMITIVE, basis, passes))
+    )
+
+
 def learn_three(source: Source, learner: CellQLearning | PhaseQLearning) -> list[Policy]:
     """Learn the policies of seeds 0, 1 and 2."""
     return [learn_policy(sparse_reward(source.path), learner, seed) for seed in SEEDS]
@@ -78,17 +98,22 @@ def _learnt(by: str, which: str, followed: Rollout, starts_reaching: int) -> Lea
 
 
 def try_seeds(source: Source, seeds: int) -> tuple[Tried, ...]:
-    """Learn with the seeds from 0 on: what the paper's three policies cannot tell."""
+    """Learn with the seeds from 0 on, on all processors: what the paper's three policies cannot tell."""
     learners: dict[str, CellQLearning | PhaseQLearning] = {
         PUBLISHED_PARAMETERS: CellQLearning.published(),
         CELL: CellQLearning(),
         PHASE: PhaseQLearning(),
     }
     reward = sparse_reward(source.path)
-    return tuple(
-        _count(by, [rollout_from(learn_policy(reward, learner, seed), source.path.start) for seed in range(seeds)])
-        for by, learner in learners.items()
-    )
+    with ThreadPoolExecutor(os.cpu_count()) as threads:  # the loops let go of the interpreter
+        return tuple(
+            _count(by, list(threads.map(partial(_try, reward, learner), range(seeds))))
+            for by, learner in learners.items()
+        )
+
+
+def _try(reward: RewardMap, learner: CellQLearning | PhaseQLearning, seed: int) -> Rollout:
+    return rollout_from(learn_policy(reward, learner, seed), reward.path.start)
 
 
 def _count(by: str, rollouts: Sequence[Rollout]) -> Tried:

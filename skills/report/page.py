@@ -51,7 +51,8 @@ def write_page(parts: Sequence[Part], printed: Table, notices: Sequence[str], op
         f'<meta name="viewport" content="width=device-width"><title>The paper, redrawn</title>'
         f"<style>{STYLE}</style></head><body><h1>The paper, redrawn</h1>"
         "<p>Collaborative Suturing: A Reinforcement Learning Approach to Automate Hand-off Task in Suturing for "
-        "Surgical Robots: its Figures 5 to 9 and Table I, computed anew. Research use only.</p>"
+        "Surgical Robots: its Figures 5 to 9 and Table I, computed anew, and what the paper did not compare: two "
+        "rivals, and arms that slip. Research use only.</p>"
         "<p>Axes are in mm in the frame of the arm's base, and not to one scale.</p>"
         f"{told}<nav>{links}</nav>{body}</body></html>\n"
     )

@@ -3,7 +3,9 @@
 from dataclasses import dataclass
 
 from skills.report.fig_8 import SEEDS
+from skills.report.slips import SEED
 from skills.report.table_1 import PAPER_PAIRS
+from skills.style.disturbance import BUDGET
 from skills.style.evaluation import TIE_BREAK
 
 COMMAND = "skills report"
@@ -62,7 +64,9 @@ SECTIONS = (
         "In the paper's state a cell has one best action, so a path that crosses itself cannot be followed, and the "
         "exactly best policy cuts corners: the published policies and ours in that state alike skip most of the "
         "demonstration. With the phase in the state every seed gives the demonstration back, state by state; its DTW "
-        "lines have no length. With the authors' published parameters hardly a seed arrives at all.",
+        "lines have no length. With the authors' published parameters hardly a seed arrives at all. Undisturbed, two "
+        "rivals give the demonstration back as well: a replay by its nature, the movement primitive with as many basis "
+        "functions as it is shown ticks. They are not drawn; see Rivals.",
         f"{_SEEDS}; the table of seeds: from 0 on",
         EXACT,
     ),
@@ -72,6 +76,7 @@ SECTIONS = (
         "A single policy from other starts: x from -25 to -5, y from 50 to 60, z from -130 to -135 mm.",
         "Ten of the range's 30 grid points (the paper does not list its own). Ours joins the path at its nearest state "
         "and follows it from there, so a start beside a later part has a large DTW: that is the part it did not need. "
+        "Of several nearest states the replay takes the first, ours may take a later one and then leaves out more. "
         "The first published policy goes round in circles from some of them, (-25, 50, -135) mm among them. The "
         "authors' data of this figure has that start, and its other ways are the first policy's: it is not of a single "
         "policy.",
@@ -90,5 +95,21 @@ SECTIONS = (
         "user's path that is reproduced here, not an expert's.",
         _SEEDS,
         f"{EXACT}; the printed row {3 * 0.0005 * PAPER_PAIRS:.2g} mm, by its rounding",
+    ),
+    Section(
+        "rivals",
+        "Rivals: slips",
+        "The paper compares its policies with nothing else, and disturbs nothing.",
+        "With the probability given, instead of the intended move one of the 27 moves, drawn uniformly, is made. A "
+        "run follows where it enters every state of the demonstration in order and ends at the goal; extra moves are "
+        "the mean over those runs, DTW (total) and the farthest distance from the path over all runs. Without slips "
+        "all but the paper's state follow exactly: a policy is no better than a recording then. With slips it is, for "
+        "it looks where it is. A replay of moves never notices. A replay of positions, and the movement primitive, "
+        "are pulled to where the clock says: they always arrive, soon, and leave out what they were late for. From "
+        "one slip in five moves on, the replay of positions is as near to the path in DTW as ours, or nearer: ours "
+        "goes back for what it missed, and where it was pushed too far for that, it stops. A replay that looked where "
+        "it is and waited for each position would be our policy.",
+        f"{SEED}, the same slips for all",
+        f"sampled: the intervals given; by the Markov chain: 1e-9; at most {BUDGET} moves for each state of the path",
     ),
 )

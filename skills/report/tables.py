@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from skills.report.numbers import Numbers
 from skills.report.table_1 import Row, Triple, as_printed
 from skills.style import paper
+from skills.style.disturbance import wilson
+from skills.style.evaluation import measure
 
 Cell = str | int | float
 
@@ -18,6 +20,9 @@ class Table:
     caption: str
     columns: tuple[str, ...]
     rows: tuple[tuple[Cell, ...], ...]
+
+    def __post_init__(self) -> None:
+        assert len(set(self.columns)) == len(self.columns), "rows become objects by the names of their columns"
 
 
 def tables_of(numbers: Numbers) -> dict[str, tuple[Table, ...]]:
@@ -80,7 +85,7 @@ def _fig_8(numbers: Numbers) -> Table:
             one.dtw_total_mm,
             one.starts_reaching,
         )
-        for one in numbers.fig_8
+        for one in (*numbers.fig_8, *numbers.fig_8_rivals)
     )
     columns = ("policy", "which", "arrives", "states", "exact states", "DTW (mm)", "starts that arrive, of 1331")
     caption = f"From the demonstrated start; the demonstration has {len(numbers.source.path.states)} states"
@@ -102,10 +107,14 @@ def _fig_9(numbers: Numbers) -> Table:
             one.joins_at,
             one.dtw_total_mm,
             *("yes" if way.finished else "no" for way in one.published),
+            *(measure(one.replayed).dtw_total_mm, measure(one.primitive).dtw_total_mm),
+            "yes" if one.primitive.finished else "no",
         )
         for one in numbers.fig_9
     )
-    columns = ("start (mm)", "ours arrives", "joins the path at its state", "DTW of ours (mm)", *theirs)
+    ours = ("ours arrives", "joins the path at its state", "DTW of ours (mm)")
+    rivals = ("DTW of the replay (mm)", "DTW of the movement primitive (mm)", "it arrives")
+    columns = ("start (mm)", *ours, *theirs, *rivals)
     return _named("fig-9", numbers, "Ten starts in the printed range", columns, rows)
 
 
@@ -132,6 +141,46 @@ def _ranges(numbers: Numbers) -> Table:
         for axis in range(3)
     )
     return _named("ranges", numbers, "The same as sums, and all that equally short alignments allow", columns, rows)
+
+
+def _disturbed(numbers: Numbers) -> Table:
+    rows = (
+        (
+            one.slip,
+            one.by,
+            *_share(one.outcome.followed, one.outcome.runs),
+            *_share(one.outcome.arrived, one.outcome.runs),
+            round(one.outcome.left_out, 2),
+            "none followed" if one.outcome.extra_moves is None else round(one.outcome.extra_moves, 2),
+            round(one.outcome.dtw_total_mm, 1),
+            round(one.outcome.farthest_mm, 2),
+        )
+        for one in numbers.disturbed
+    )
+    shares = ("follow (%)", "95 % interval of it", "arrive (%)", "95 % interval of that")
+    columns = ("slip", "by", *shares, "states left out", "extra moves", "DTW (mm)", "farthest (mm)")
+    return _named("rivals", numbers, f"{numbers.disturbed[0].outcome.runs} runs each", columns, rows)
+
+
+def _share(count: int, of: int) -> tuple[float, str]:
+    low, high = wilson(count, of)
+    return round(100 * count / of, 4), f"{100 * low:.1f} to {100 * high:.1f}"
+
+
+def _exact(numbers: Numbers) -> Table:
+    planned = len(numbers.source.path.states) - 1
+    rows = (
+        (
+            one.slip,
+            one.by,
+            round(100 * one.exact.finishes, 4),
+            "none follows" if one.exact.moves is None else round(one.exact.moves - planned, 3),
+        )
+        for one in numbers.disturbed
+        if one.exact is not None
+    )
+    columns = ("slip", "by", "follow (%)", "extra moves")
+    return _named("rivals-exact", numbers, "Ours by its Markov chain: nothing drawn", columns, rows)
 
 
 def _of(row: Row) -> str:
@@ -170,4 +219,5 @@ WRITERS: dict[str, tuple[Callable[[Numbers], Table], ...]] = {
     "fig-8": (_fig_8, _tried),
     "fig-9": (_fig_9, _range),
     "table-1": (_table_1, _ranges),
+    "rivals": (_disturbed, _exact),
 }

@@ -9,9 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from skills.style._arrays import frozen
+from skills.style._arrays import Floats, frozen
 from skills.style.domain import FINISHED
-from skills.style.exact import Mdp, action_values, exact_values
+from skills.style.exact import Mdp, action_values, exact_q, exact_values
+from skills.style.learning import _kernels
 from skills.style.policy import Policy, rollout_from
 from skills.style.reward import sparse_reward
 
@@ -36,11 +37,14 @@ class Coverage:
 class Certificate:
     """What was checked: every greedy action of the certified domain against exact values, and every start.
 
-    `checked` states (phase and cell) of which `suboptimal` have a greedy action worse than the best one.
+    `checked` states (phase and cell) of which `suboptimal` have a greedy action worse than the best one; from
+    `finishing` of them the policy rejoins the demonstration and finishes. Where the policy was learnt with slips, the
+    exact values are those of the world that slips; all walks are without slips.
     """
 
     checked: int
     suboptimal: int
+    finishing: int
     starts: int
     starts_reaching: int
     starts_joining_nearest: int
@@ -54,18 +58,15 @@ class Certificate:
 
 def certify(policy: Policy) -> tuple[Certificate, Coverage]:
     """Check a policy against exact dynamic programming, and follow it from every start."""
-    domain = policy.domain
-    live = np.flatnonzero(domain.certified & ~domain.terminal)
-    mdp = mdp_of(policy)
-    values = exact_values(mdp)
-    greedy = policy.greedy[live].astype(np.int64)
-    achieved = action_values(mdp, values, live, greedy)
-    best = values[live]
+    live = policy.domain.certified & ~policy.domain.terminal
+    achieved, best = _achieved(policy)
     optimal = achieved >= best - TIE * np.abs(best)  # written so that NaN fails
-    covered = coverage(policy)
+    finishing = finishes(policy)
+    covered = _coverage(policy, finishing)
     certificate = Certificate(
-        checked=len(live),
-        suboptimal=int(np.count_nonzero(~optimal)),
+        checked=int(live.sum()),
+        suboptimal=int(np.count_nonzero(live & ~optimal)),
+        finishing=int(np.count_nonzero(live & finishing)),
         starts=len(covered.reaches),
         starts_reaching=int(covered.reaches.sum()),
         starts_joining_nearest=int(covered.joins_nearest.sum()),
@@ -76,29 +77,43 @@ def certify(policy: Policy) -> tuple[Certificate, Coverage]:
 
 def mdp_of(policy: Policy) -> Mdp:
     """State what a policy is checked against: Algorithm 1's rewards, whatever rewards it was learnt from."""
-    return Mdp(policy.domain, sparse_reward(policy.path, policy.levels), policy.learner.gamma)
+    learner = policy.learner
+    return Mdp(policy.domain, sparse_reward(policy.path, policy.levels), learner.gamma, learner.slip)
+
+
+def _achieved(policy: Policy) -> tuple[Floats, Floats]:
+    """Work out what each row's greedy action is worth if all is done well after it, and the best one, both (rows,)."""
+    mdp = mdp_of(policy)
+    if mdp.slip > 0:
+        q = exact_q(mdp)
+        return q[np.arange(len(q)), policy.greedy.astype(np.int64).clip(0)], q.max(axis=1)
+    best = exact_values(mdp)
+    return action_values(mdp, best, policy.moves), best
+
+
+def finishes(policy: Policy) -> NDArray[np.bool_]:
+    """Tell for every row whether the walk from it finishes, (rows,), by doubling the length of all walks at once."""
+    moves = policy.moves
+    done = (policy.greedy == FINISHED) | (moves.finishes & (policy.greedy >= 0))
+    walk = np.arange(policy.domain.n_rows)
+    walk = np.where(done | (policy.greedy < 0) | (moves.row < 0), walk, moves.row)
+    for _ in range(policy.domain.n_rows.bit_length()):
+        walk = walk[walk]
+    return np.asarray(done[walk])
 
 
 def coverage(policy: Policy) -> Coverage:
     """Follow the policy from every state at once."""
-    return Coverage(_reaches(policy), _joins_nearest(policy))
+    return _coverage(policy, finishes(policy))
 
 
-def _reaches(policy: Policy) -> NDArray[np.bool_]:
-    """Tell for every state whether the walk from it ends at the goal, by doubling the length of all walks at once."""
-    domain, grid = policy.domain, policy.path.grid
-    everywhere = np.arange(domain.n_rows)
-    moves = policy.moves
-    done = (policy.greedy == FINISHED) | (moves.finishes & (policy.greedy >= 0))
-    walk = np.where(done | (policy.greedy < 0) | (moves.row < 0), everywhere, moves.row)
-    for _ in range(domain.n_rows.bit_length()):
-        walk = walk[walk]
-    rows = domain.rows_of(np.zeros(grid.n_states, np.int64), grid.cells_of(np.arange(grid.n_states)))
-    at_end = np.zeros(grid.n_states, bool)
-    for state in np.unique(policy.path.states):
-        phase, at_end[state] = domain.start(int(state))
-        rows[state] = domain.rows_of(phase, grid.cells_of(state)) if not at_end[state] else rows[state]
-    return np.asarray(at_end | done[walk[rows]])
+def _coverage(policy: Policy, finishing: NDArray[np.bool_]) -> Coverage:
+    domain, path = policy.domain, policy.path
+    reaches = finishing[: path.grid.n_states].copy()  # phase 0
+    for state in np.unique(path.states):
+        phase, at_end = domain.start(int(state))
+        reaches[state] = at_end or finishing[policy.row(phase, int(state))]
+    return Coverage(reaches, _joins_nearest(policy))
 
 
 def _joins_nearest(policy: Policy) -> NDArray[np.bool_]:
@@ -107,9 +122,8 @@ def _joins_nearest(policy: Policy) -> NDArray[np.bool_]:
     states = np.arange(path.grid.n_states)
     stepped = policy.moves.state[: len(states)]
     on_path = np.isin(states, path.states)
-    cells, fewest = path.grid.cells_of(states), np.full(len(states), np.iinfo(np.int64).max)
-    for waypoint in path.cells:  # one at a time: all at once would be states x waypoints
-        np.minimum(fewest, np.abs(cells - waypoint).max(axis=1), out=fewest)
+    fewest = np.where(on_path, 0, len(states))
+    _kernels.spread_distances_compiled(fewest.reshape(path.grid.shape))
     at, moved = states.copy(), np.zeros(len(states), np.int64)
     for _ in range(int(fewest.max())):
         walking = ~on_path[at]

@@ -97,10 +97,13 @@ def measure(rollout: Rollout, discretisation_rmse_mm: tuple[float, float, float]
     )
 
 
-def discretisation_rmse(tip_mm: ArrayLike, grid: GridWorld) -> tuple[float, float, float]:
-    """Measure what rounding to the grid loses: RMSE of samples, (T, 3) mm, against the centres of their cells."""
+def discretisation_rmse(tip_mm: ArrayLike, grid: GridWorld, hysteresis: float = 0.0) -> tuple[float, float, float]:
+    """Measure what the grid loses: RMSE of samples in order, (T, 3) mm, against the centres of the cells they are in.
+
+    With hysteresis, in cells, these are not always the nearest ones (`GridWorld.cells_along`).
+    """
     tip_mm = np.asarray(tip_mm, float)
-    apart = tip_mm - grid.centres_mm(grid.states_at(tip_mm))
+    apart = tip_mm - grid.centres_mm(grid.states_of(grid.cells_along(tip_mm, hysteresis)))
     return _xyz(np.sqrt((apart**2).mean(axis=0)))
 
 

@@ -1,6 +1,6 @@
 """Algorithm 1 of the paper: sparse rewards along the demonstrated path."""
 
-from dataclasses import dataclass
+from dataclasses import asdict, astuple, dataclass
 from math import isfinite
 
 import numpy as np
@@ -20,7 +20,9 @@ class RewardLevels:
     off_grid: float = -1.0  # for a move off the grid, which stays where it is
 
     def __post_init__(self) -> None:
-        levels = (self.goal, self.visited, self.other, self.off_grid)
+        for name, level in asdict(self).items():
+            object.__setattr__(self, name, float(level))  # from an `other` of 0 numpy would make a map of whole numbers
+        levels = astuple(self)
         if not (all(map(isfinite, levels)) and self.goal > self.visited > self.other >= self.off_grid):
             raise BadSettings(
                 "Rewards must be finite and ordered goal > visited > other >= off_grid (Algorithm 1).", levels=levels

@@ -84,6 +84,7 @@ def trace(demo: Demo, path: GridPath) -> Trace:
 
     Raises:
         BadPlan: The path was not made of this demonstration.
+        OutsideGrid: This demonstration is not even in the path's grid.
     """
     waypoints = _waypoints(demo.tip_mm, path)
     seconds, tip = smoothed_tip(demo.stamps_s, demo.tip_mm, TREMOR_S)
@@ -126,7 +127,7 @@ def fit_to_demo(followed: Rollout, demonstrated: Trace, start_mm: Floats) -> Fit
 
 def _waypoints(tip_mm: Floats, path: GridPath) -> Ints:
     """Find the waypoint of each sample, (T,), as `discretize` counts them: a jump over n cells is n waypoints."""
-    cells = path.grid.cells_at(tip_mm)
+    cells = path.grid.cells_along(tip_mm, path.hysteresis)
     waypoints = np.append(0, np.cumsum(np.abs(np.diff(cells, axis=0)).max(axis=1)))
     if waypoints[-1] != len(path.states) - 1 or (path.cells[waypoints] != cells).any():
         raise BadPlan("The policy was not learnt from this demonstration; give the one that its path was made of.")

@@ -18,7 +18,7 @@ SOUND: dict[tuple[str, str], Any] = {
     ("PUT", "/suture-types/{suture}"): {"name": "n", "family": "f", "also_called": ["a"], "description": "d"},
     ("POST", "/recordings/{recording}/demos"): {
         **KESTREL, "arm": "PSM", "topic": "table", "start_s": 0.0, "end_s": 0.5, "grid": "fit",
-        "cell_mm": 5.0, "session": "s",
+        "cell_mm": 5.0, "hysteresis": 0.25, "session": "s",
     },
     ("POST", "/trainings"): {
         **KESTREL, "demos": ["0" * 64], "seed": 0, "release": True,

@@ -116,6 +116,9 @@ CASES = {
     "a segment from NaN": Bad(BAG, 422, "invalid-request", MCAP, {"start_s": "nan"}, demos_only=True),
     "a cell of ours": Bad(BAG, 422, "bad-settings", MCAP, {"grid": "paper", "cell_mm": 2}, demos_only=True),
     "an infinite cell": Bad(BAG, 422, "invalid-request", MCAP, {"cell_mm": "inf"}, demos_only=True),
+    "a negative hysteresis": Bad(BAG, 422, "invalid-request", MCAP, {"hysteresis": -0.1}, demos_only=True),
+    "more than half a cell": Bad(BAG, 422, "invalid-request", MCAP, {"hysteresis": 0.6}, demos_only=True),
+    "a hysteresis that is NaN": Bad(BAG, 422, "invalid-request", MCAP, {"hysteresis": "nan"}, demos_only=True),
     "a grid that there is not": Bad(BAG, 422, "invalid-request", MCAP, {"grid": CANARY}, demos_only=True),
     "no surgeon": Bad(BAG, 422, "invalid-request", MCAP, {"surgeon": None}, demos_only=True),
     "a rate that is NaN": Bad(cases.hand_off(), 422, "invalid-request", query={"rate_hz": "nan"}),
@@ -238,6 +241,7 @@ def test_a_bad_part_of_a_good_recording_is_refused_and_leaves_no_row(tmp_path):
             ({"surgeon": "nobody"}, 404),
             ({"suture": "nothing"}, 404),
             ({"grid": "paper", "cell_mm": 1}, 422),
+            ({"hysteresis": 0.6}, 422),
             ({"colour": "red"}, 422),
         ):
             body = KESTREL | more

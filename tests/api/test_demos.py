@@ -96,6 +96,35 @@ def test_another_grid_is_another_demonstration_of_the_same_recording(here: Servi
     }  # fmt: skip
 
 
+def test_hysteresis_makes_another_demonstration_and_says_what_it_costs(here: Service):
+    plover = next(s for s in sample_recordings() if s.surgeon == "plover")
+    stored = here.client.add_recording(plover.data)
+    part = {name: stored["segments"][0][name] for name in ("start_s", "end_s")}
+    plain, same, calm = (here.client.cut_demo(stored["id"], **KESTREL, **part, hysteresis=h) for h in (None, 0, 0.25))
+    assert plain == same
+    assert here.client.add_demo(plover.data, **KESTREL, **part, hysteresis=0.25) == calm == here.client.demo(calm["id"])
+    assert calm["id"] != plain["id"]
+    assert (plain["hysteresis"], calm["hysteresis"]) == (0.0, 0.25)
+    for demo, states, crossings, lost_mm in ((plain, 44, 19, 2.30), (calm, 18, 0, 2.69)):
+        report, path = demo["report"], here.client.demo_path(demo["id"])
+        assert (report["path_states"], report["revisits"]) == (states, crossings)
+        assert np.linalg.norm(report["discretisation_rmse_mm"]) == pytest.approx(lost_mm, abs=0.01)
+        assert (path["hysteresis"], len(path["states"])) == (demo["hysteresis"], states)
+    assert here.train(demos=[calm["id"]], release=True)["result"]["released"]
+    policy = here.client.policy(**KESTREL)
+    assert policy["metrics"]["discretisation_rmse_mm"] == calm["report"]["discretisation_rmse_mm"]
+    assert (policy["metrics"]["exact_states"], policy["waypoints"]) == (18, path["states"])
+
+
+def test_the_schema_tells_of_hysteresis_on_both_doors(service: Service):
+    schema = service.http.get("/openapi.json").json()
+    in_query = {one["name"]: one for one in schema["paths"]["/demos"]["post"]["parameters"]}["hysteresis"]
+    in_body = schema["components"]["schemas"]["DemoIn"]["properties"]["hysteresis"]
+    for told in (in_query["schema"], in_body):
+        assert (told["minimum"], told["maximum"], told["default"]) == (0, 0.5, 0.0)
+    assert "mm" in in_query["description"] and "mm" in in_body["description"]
+
+
 def test_the_same_bytes_read_in_another_way_are_refused(here: Service):
     here.client.add_demo(cases.hand_off(), media_type=CSV, **KESTREL)
     with pytest.raises(Problem, match="stored already") as refused:

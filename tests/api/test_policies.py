@@ -180,9 +180,28 @@ def test_what_value_iteration_finds_is_released_without_a_move_of_the_arm(traine
     result = trained.train(learner={"kind": "value-iteration"}, release=True)["result"]
     assert result["released"]
     policy = trained.client.policy(**KESTREL)
-    assert (policy["version"], policy["learner"], policy["settings"]) == (2, "value-iteration", {"gamma": 0.1})
+    assert (policy["version"], policy["learner"], policy["settings"]) == (
+        2,
+        "value-iteration",
+        {"gamma": 0.1, "slip": 0.0},
+    )
     assert (policy["training"]["steps"], policy["training"]["settled"]) == (0, True)
     assert policy["actions"] == trained.client.policy(**KESTREL, version=1)["actions"]
+
+
+def test_a_policy_for_moves_that_slip_is_released_where_it_is_exact_and_refused_where_it_was_sampled(trained: Service):
+    result = trained.train(learner={"kind": "value-iteration", "slip": 0.1}, release=True)["result"]
+    assert result["released"]
+    assert trained.client.policy(**KESTREL)["settings"] == {"gamma": 0.1, "slip": 0.1}
+    sampled = {"kind": "phase-q-learning", "slip": 0.1, "alpha": 0.1, "max_sweeps": 50}
+    result = trained.train(learner=sampled, release=True)["result"]
+    assert not result["released"]
+    assert "greedy actions are not optimal" in result["not_released_because"]
+
+
+def test_every_state_from_which_the_policy_finishes_is_counted(trained: Service):
+    certificate = trained.client.policy(**KESTREL)["grid_certificate"]
+    assert certificate["states_finishing"] == certificate["states_checked"] > 1331
 
 
 def test_the_papers_failed_baseline_is_learnt_and_refused_with_reasons(trained: Service):

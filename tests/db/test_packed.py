@@ -18,7 +18,7 @@ from skills.errors import Corrupt
 from skills.recordings import read_recording
 from skills.style.certificate import certify
 from skills.style.demo import cut_demo
-from skills.style.grid import PAPER_GRID, discretize
+from skills.style.grid import PAPER_GRID, GridWorld, discretize
 from skills.style.learning.irl import MaxEntIRL
 from skills.style.learning.q_learning import CellQLearning, PhaseQLearning
 from skills.style.learning.value_iteration import ValueIteration
@@ -58,6 +58,7 @@ VALUES = [
     DEMO,
     replace(DEMO, rotation_xyzw=None),
     PATH,
+    replace(PATH, hysteresis=0.25),
     REWARD,
     POLICY,
     PHASED,
@@ -109,6 +110,20 @@ def test_every_stored_value_comes_back_bit_by_bit(value: object):
 
 def test_no_class_that_is_stored_was_left_out_above():
     assert {name for value in VALUES for name in names_in(value)} == set(packed._VALUES)
+
+
+def test_a_path_without_hysteresis_is_stored_as_before_there_was_any():
+    """A policy's digest is taken of its path: one that changed would be refused as damaged."""
+    assert digest(PATH) == "e8de8820d1a92553287d1df30d43004d9de384079f9365f7438e4f50a50c019c"
+    assert digest(REWARD) == "23c1e05194a3b2e0a290d02a4ed1262be3bab91a17bf57f4174d72e7f0b9639c"
+    assert digest(replace(PATH, hysteresis=0.25)) != digest(PATH)
+    older = {"grid": tree_of(PATH.grid), "states": {"array": 0}, "bridged": 0}
+    assert_same(unpack(forged({"value": "GridPath", "of": older}, a0=PATH.states)), PATH)
+
+
+def tree_of(grid: GridWorld) -> dict:
+    of = {"origin_mm": {"tuple": grid.origin_mm}, "cell_mm": grid.cell_mm, "shape": {"tuple": grid.shape}}
+    return {"value": "GridWorld", "of": of}
 
 
 def test_arrays_come_back_read_only():

@@ -68,8 +68,8 @@ def changed(column: str) -> str:
     """Write SQL for another value of a column of a table that can be withdrawn: there an equal one is no change."""
     if column.endswith("row"):
         return "row + 1000"
-    if column in ("start_s", "end_s"):
-        return "start_s - 1"
+    if column in ("start_s", "end_s", "hysteresis"):
+        return f"{column} + 0.25"
     if column.endswith("_at"):
         return f"{column} + interval '1 second'"
     return {"demo": "'\\x00'", "path": "'\\x00'", "report": "'{}'"}.get(column, "'other'")

@@ -1,29 +1,35 @@
 """The use cases on both back ends: once where it is asked at once, and nothing where it was taken back."""
 
+import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from sqlalchemy import func, select, text
 
 from skills.db.base import Base
 from skills.db.models import Event, Job, PolicyVersion, StoredRecording
 from skills.db.session import Database
-from skills.errors import Conflict, Corrupt, Erased
+from skills.errors import BadSettings, Conflict, Corrupt, Erased
 from skills.library import jobs, releases, work
 from skills.library.catalogue import find_surgeon, put_surgeon, seed_catalogue
 from skills.library.demos import find_demo, withdraw_demo
 from skills.library.erasure import erase_surgeon
 from skills.library.policies import learnt, policy_of
 from skills.library.recordings import recording_bytes
+from skills.style.evaluation import discretisation_rmse
+from skills.style.grid import PAPER_GRID, discretize
 from skills.style.learning.irl import MaxEntIRL
 from skills.style.learning.value_iteration import ValueIteration
 from tests import backends
 from tests.library import cases
 
 AT_ONCE = 8
+SHAKE = np.random.default_rng(5).normal(0, 0.4, (150, 3)).clip(-1, 1)  # mm, less than a quarter of a cell
+TREMBLING = cases.table(cases.points_mm(samples=50) + SHAKE)
 
 
 def at_once(what: Callable[[int], Any]) -> list[Any]:
@@ -50,6 +56,39 @@ def test_the_same_upload_eight_times_at_once_is_one_demonstration(database: Data
     assert len(set(rows)) == 1
     found = counts(database)
     assert (found["recordings"], found["demonstrations"], found["reward_maps"]) == (1, 1, 1)
+
+
+def test_a_demonstration_without_hysteresis_is_known_by_the_digest_it_always_had(database: Database):
+    before = "2d0be8822177b9f47a9808ec71e04fffe2e9bb86840f119ebb9ffa65720734d6"
+    assert cases.add_demo(database).sha256 == cases.add_demo(database, hysteresis=0.0).sha256 == before
+    assert cases.add_demo(database, hysteresis=0.25).sha256 != before
+    assert counts(database)["demonstrations"] == 2
+
+
+def test_hysteresis_is_kept_with_the_path_and_learnt_and_planned_with(database: Database):
+    demo = cases.add_demo(database, TREMBLING, hysteresis=0.25)
+    plain = cases.add_demo(database, TREMBLING)
+    with database.reading() as session:
+        kept = find_demo(session, demo.sha256)
+        assert (kept.hysteresis, kept.path.hysteresis) == (0.25, 0.25)
+        path, tip_mm = kept.path, kept.demo.tip_mm
+    assert path.states.tolist() == discretize(tip_mm, PAPER_GRID, 0.25).states.tolist()
+    assert (demo.report["path_states"], demo.report["revisits"]) == (len(path.states), 0)
+    assert plain.report["revisits"] > 0
+    lost_mm = list(discretisation_rmse(tip_mm, PAPER_GRID, 0.25))
+    assert demo.report["discretisation_rmse_mm"] == lost_mm != plain.report["discretisation_rmse_mm"]
+    version = cases.train(database, demos=[demo.sha256], release=True)
+    assert version.manifest["metrics"]["discretisation_rmse_mm"] == lost_mm
+    assert version.manifest["metrics"]["exact_states"] == len(path.states)
+    assert cases.add_plan(database).about["path"] == "fitted"
+
+
+def test_a_hysteresis_that_cannot_be_meant_leaves_no_row(database: Database):
+    before = counts(database)
+    for hysteresis in (-0.1, 0.6, math.nan):
+        with pytest.raises(BadSettings):
+            cases.add_demo(database, hysteresis=hysteresis)
+    assert counts(database) == before
 
 
 def test_the_same_surgeon_eight_times_at_once_is_one_surgeon(database: Database):

@@ -11,10 +11,16 @@ from alembic.config import Config
 from alembic.runtime.migration import MigrationContext
 from alembic.script import ScriptDirectory
 from sqlalchemy import inspect, text
+from sqlalchemy.exc import DatabaseError
 
 from skills.db.base import Base
 from skills.db.session import Database, _alembic
 from skills.errors import Conflict
+from skills.library.demos import find_demo, withdraw_demo
+from skills.library.erasure import erase_demo
+from skills.library.plans import find_plan
+from skills.library.policies import find_by_digest
+from skills.library.verified import learnt, planned
 from tests import backends
 from tests.library import cases
 
@@ -84,6 +90,58 @@ def test_every_revision_goes_down_and_up_on_tables_with_rows_in_them(database: D
         go(database, command.downgrade, script.down_revision or "base")
     assert tables(database) == {"alembic_version"}
     database.migrate()
+
+
+def test_what_the_first_version_stored_is_kept_whole_and_still_guarded(database: Database):
+    go(database, command.upgrade, "0001")
+    first = shape(database)
+    database.migrate()
+    cases.add_surgeon(database)
+    demo, version = cases.add_demo(database), cases.train(database, release=True)
+    plan = cases.add_plan(database)
+    go(database, command.downgrade, "0001")  # now it is what the first version would have written
+    assert shape(database) == first
+    for column in ("arm", "sha256", "path"):
+        assert_guarded(database, column)
+    before = rows(database, "demonstrations")
+    database.migrate()
+    assert rows(database, "demonstrations") == [row | {"hysteresis": 0.0} for row in before]
+    for column in ("arm", "sha256", "path", "hysteresis"):
+        assert_guarded(database, column)
+    with database.reading() as session:
+        assert find_demo(session, demo.sha256).path.hysteresis == 0
+        assert learnt(find_by_digest(session, version.sha256)).path.hysteresis == 0
+        assert planned(find_plan(session, plan.sha256)).arm == demo.arm
+    assert cases.add_demo(database).sha256 == demo.sha256
+    assert cases.add_demo(database, hysteresis=0.25).sha256 != demo.sha256
+    with database.writing() as session:
+        withdraw_demo(session, demo.sha256, "test")
+    assert_guarded(database, "withdrawn_at", "NULL")
+
+
+def rows(database: Database, table: str) -> list[dict[str, object]]:
+    with database.reading() as session:
+        return [dict(row) for row in session.execute(text(f"SELECT * FROM {table} ORDER BY row")).mappings()]
+
+
+def assert_guarded(database: Database, column: str, new: str | None = None) -> None:
+    """The column cannot be changed; on PostgreSQL an equal value would be no change."""
+    other = {"path": "'\\x00'", "hysteresis": "0.25"}.get(column, "'other'")
+    with pytest.raises(DatabaseError, match="demonstrations is append-only"), database.writing() as session:
+        session.execute(text(f"UPDATE demonstrations SET {column} = {new or other}"))
+
+
+def test_a_demonstration_with_hysteresis_cannot_go_down_and_nothing_is_changed(database: Database):
+    database.migrate()
+    cases.add_surgeon(database)
+    demo = cases.add_demo(database, hysteresis=0.25)
+    before = shape(database), rows(database, "demonstrations")
+    with pytest.raises(Conflict, match="cannot read demonstrations with hysteresis; erase them first"):
+        go(database, command.downgrade, "0001")
+    assert (shape(database), rows(database, "demonstrations")) == before
+    with database.writing() as session:
+        erase_demo(session, demo.sha256, "test")
+    go(database, command.downgrade, "0001")
 
 
 def test_migrating_again_changes_nothing(database: Database):

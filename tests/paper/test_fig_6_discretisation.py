@@ -33,5 +33,25 @@ def test_rounding_loses_about_what_a_uniform_error_would(raw_mm, cell_mm):
     assert rmse_mm == pytest.approx((cell_mm / np.sqrt(12),) * 3, rel=0.25)
 
 
+@pytest.mark.parametrize(
+    ("cell_mm", "hysteresis", "states", "revisits", "lost_mm"),
+    [
+        (5.0, 0.0, 360, 225, 2.546),
+        (5.0, 0.25, 214, 110, 3.088),
+        (2.5, 0.0, 710, 277, 1.203),
+        (2.5, 0.25, 458, 129, 1.387),
+        (1.0, 0.0, 1683, 198, 0.557),
+        (1.0, 0.25, 1067, 68, 0.612),
+    ],
+)
+def test_hysteresis_halves_the_crossings_and_costs_a_tenth_of_a_cell(
+    raw_mm, cell_mm, hysteresis, states, revisits, lost_mm
+):
+    grid = fit_grid(raw_mm, cell_mm)
+    path = discretize(raw_mm, grid, hysteresis)
+    assert (len(path.states), path.revisits, path.bridged) == (states, revisits, 0)
+    assert np.linalg.norm(discretisation_rmse(raw_mm, grid, hysteresis)) == pytest.approx(lost_mm, abs=0.001)  # mm
+
+
 def test_the_users_path_loses_nothing_since_it_was_published_rounded(user_table):
     assert discretisation_rmse(1000 * user_table[:, :3], PAPER_GRID) == pytest.approx((0, 0, 0), abs=1e-9)  # mm

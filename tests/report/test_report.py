@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 
 from skills.cli import app
 from skills.report.sections import SECTIONS
+from skills.report.slips import SLIPS
 from skills.report.sources import sample_source
 from skills.settings import settings
 from skills.style.evaluation import measure
@@ -18,8 +19,9 @@ from skills.style.learning.q_learning import CellQLearning
 from skills.style.policy import learn_policy, rollout_from
 from skills.style.reward import sparse_reward
 
-QUICK = ("--irl-iterations", "3", "--seeds", "2")
+QUICK = ("--irl-iterations", "3", "--seeds", "2", "--runs", "20")
 FIGURES = ("fig-5", "fig-6", "fig-7", "fig-8", "fig-9")
+PICTURES = (*FIGURES, "rivals")
 PNG = b"\x89PNG\r\n\x1a\n"
 
 
@@ -90,14 +92,14 @@ def test_without_the_papers_data_it_draws_the_sample_and_says_what_is_absent(wit
     assert code == 0, printed + said
     assert "THE PAPER'S DATA IS NOT HERE" in said
     assert "THE PAPER'S DATA IS NOT HERE" in (to / "index.html").read_text().replace("&#x27;", "'")
-    assert sorted(file.name for file in to.glob("*.png")) == [f"{figure}-sample.png" for figure in FIGURES]
+    assert sorted(file.name for file in to.glob("*.png")) == [f"{name}-sample.png" for name in PICTURES]
     assert all(file.read_bytes().startswith(PNG) for file in to.glob("*.png"))
     assert "DTW (mm)" in printed
 
 
 def test_the_page_has_every_figure_and_names_command_seed_and_tolerance(without, page):
-    assert page.sections == [*FIGURES, "table-1"]
-    assert len(page.alts) == len(FIGURES) and all(page.alts)
+    assert page.sections == [*FIGURES, "table-1", "rivals"]
+    assert len(page.alts) == len(PICTURES) and all(page.alts)
     text = (without[0] / "index.html").read_text()
     made = re.findall(r"Command: skills report ([^.]*)\. Seed: [^.]+\. Tolerance: [^<]+\.</p>", text)
     assert made == [" ".join(QUICK)] * len(SECTIONS)
@@ -120,7 +122,8 @@ def test_the_numbers_of_the_page_are_those_of_the_core(page):
         followed = rollout_from(policy, path.start)
         assert rows[seed][1:4] == [f"seed {seed}", "yes", str(len(followed.states))]
         assert float(rows[seed][5]) == measure(followed).dtw_total_mm
-    assert [row[3:6] for row in rows[3:]] == [[str(len(path.states))] * 2 + ["0"]] * 3  # ours gives it back
+    states = str(len(path.states))
+    assert [row[3:6] for row in rows[3:]] == [[states, states, "0"]] * 5  # ours, and the rivals, give it back
     assert page.tables["seeds-sample"][3][1:] == ["2", "2", "2"]
 
 
@@ -130,6 +133,27 @@ def test_the_pages_rmse_is_a_thousand_times_the_printed_one(page):
         ["0.0027", "2.728"],
         ["0.002", "1.967"],
     ]
+
+
+def test_the_page_says_how_policy_and_rivals_fare_with_slips(page):
+    head, *rows = page.tables["rivals-sample"]
+    assert head[:3] == ["slip", "by", "follow (%)"]
+    assert len(rows) == len(SLIPS) * len({row[1] for row in rows}) == 42
+    follow = {(float(row[0]), row[1]): float(row[2]) for row in rows}
+    assert [row[2] for row in rows[:7]] == [
+        "100",
+        "100",
+        "100",
+        "0",
+        "100",
+        "100",
+        "100",
+    ]  # the cell state cuts corners
+    rivals = [share for (slip, by), share in follow.items() if slip == 0.1 and not by.startswith("ours")]
+    assert follow[0.1, "ours: phase and cell"] >= 90 > 30 > max(rivals)
+    exact = {(float(row[0]), row[1]): float(row[2]) for row in page.tables["rivals-exact-sample"][1:]}
+    assert (exact[0.0, "ours: phase and cell"], round(exact[0.1, "ours: phase and cell"])) == (100, 99)
+    assert all(exact[slip, "ours, solved for this slip"] > exact[slip, "ours: phase and cell"] for slip in SLIPS[1:])
 
 
 def test_the_same_command_twice_gives_the_same_numbers_and_pictures(without, tmp_path):
@@ -142,7 +166,7 @@ def test_the_same_command_twice_gives_the_same_numbers_and_pictures(without, tmp
 
 def test_programs_get_the_tables_as_json(without):
     tables = {table["name"]: table for table in json.loads((without[0] / "numbers.json").read_text())}
-    assert {"fig-5-sample", "seeds-sample", "table-1-sample", "ranges-sample", "rmse"} <= set(tables)
+    assert {"fig-5-sample", "seeds-sample", "table-1-sample", "ranges-sample", "rivals-sample", "rmse"} <= set(tables)
     assert all(len(row) == len(table["columns"]) for table in tables.values() for row in table["rows"])
 
 
@@ -152,21 +176,23 @@ def test_with_the_papers_data_the_published_policies_stand_beside_ours(tmp_path)
         pytest.skip("THE PAPER'S DATA IS NOT HERE: set SKILLS_PAPER_DATA to its folder to run this test")
     code, printed, said = run(tmp_path, Path(folder), "--json")
     assert (code, "NOT HERE" in said) == (0, False), said
-    assert len(list(tmp_path.glob("*.png"))) == 2 * len(FIGURES)
+    assert len(list(tmp_path.glob("*.png"))) == 2 * len(PICTURES)
     tables = {table["name"]: table["rows"] for table in json.loads(printed)}
     assert [(row[0][:9], row[5], row[6]) for row in tables["fig-8-paper"][:3]] == [
         ("published", 140.0, 1205),
         ("published", 145.0, 1331),
         ("published", 145.0, 1181),
     ]
-    assert [row[2:6] for row in tables["fig-8-paper"][6:]] == [["yes", 28, 28, 0.0]] * 3
+    assert [row[2:6] for row in tables["fig-8-paper"][6:]] == [["yes", 28, 28, 0.0]] * 5  # ours, and the rivals
     assert tables["fig-9-paper"][0][:2] == ["-25, 50, -135", "yes"]
-    assert tables["fig-9-paper"][0][4:] == ["no", "yes", "yes"]  # the single policy of Fig. 9 was not the first one
+    assert tables["fig-9-paper"][0][4:7] == ["no", "yes", "yes"]  # the single policy of Fig. 9 was not the first one
     assert tables["range-paper"] == [
         ["published policy 1", 30, 19],
         ["published policy 2", 30, 30],
         ["published policy 3", 30, 30],
         ["ours, seed 0", 30, 30],
+        ["rival: shortest way, then replay", 30, 30],
+        ["rival: dynamic movement primitive", 30, 30],
     ]
     by = {row[0]: row for row in tables["table-1-paper"]}
     assert by["published by the authors"][4] == 430.0

@@ -133,3 +133,14 @@ def test_rounding_loses_what_the_samples_are_off_their_cells():
     grid = GridWorld((0.0, 0.0, 0.0), 10.0, (3, 3, 3))
     assert discretisation_rmse([[3, 0, 10], [13, 14, 10]], grid) == pytest.approx((3, np.sqrt(8), 0), abs=1e-12)  # mm
     assert discretisation_rmse(PAPER_GRID.centres_mm(np.arange(1331)), PAPER_GRID) == (0, 0, 0)
+
+
+def test_with_hysteresis_the_loss_is_measured_from_the_cells_that_the_samples_are_in():
+    grid = GridWorld((0.0, 0.0, 0.0), 10.0, (3, 3, 3))
+    tip_mm = [[0, 0, 0], [7, 0, 0], [8, 0, 6]]  # at 7 mm still in cell 0; at 8 mm in cells 1 along x and 1 along z
+    assert discretisation_rmse(tip_mm, grid, 0.25) == pytest.approx(
+        (np.sqrt((7**2 + 2**2) / 3), 0, np.sqrt(4**2 / 3)), abs=1e-12
+    )  # mm
+    assert discretisation_rmse(tip_mm, grid) == pytest.approx(
+        (np.sqrt((3**2 + 2**2) / 3), 0, np.sqrt(4**2 / 3)), abs=1e-12
+    )  # mm

@@ -7,12 +7,15 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from skills.errors import BadInput, BadSettings, EmptyPath, NeverLeavesGoal, OutsideGrid
+from skills.style.evaluation import discretisation_rmse
 from skills.style.grid import MARGIN_CELLS, PAPER_GRID, GridPath, GridWorld, choose_grid, discretize, fit_grid
 
 ORIGIN = (0.0, 0.0, 0.0)
 LINE = GridWorld(ORIGIN, 1.0, (9, 1, 1))
 clouds_mm = st.integers(1, 12).flatmap(lambda n: arrays(float, (n, 3), elements=st.floats(-100, 100)))
 cells_mm = st.sampled_from([1.0, 2.5, 3.3, 5.0, 7.0])
+motions_mm = clouds_mm.map(lambda tip_mm: tip_mm / 10)  # a few cells wide, so that samples are often near a face
+hystereses = st.one_of(st.sampled_from([0.0, 0.25, 0.5]), st.floats(0, 0.5))
 
 
 # ---- the grid world ---------------------------------------------------------------------------------------------
@@ -120,15 +123,16 @@ def test_a_jump_is_bridged_by_the_straight_line_of_touching_cells():
     assert path.bridged == 3
 
 
-@given(clouds_mm.filter(lambda tip_mm: np.ptp(tip_mm, axis=0).max() > 10), cells_mm)
-def test_every_path_is_26_connected_and_passes_all_samples_in_order(tip_mm, cell_mm):
+@given(clouds_mm.filter(lambda tip_mm: np.ptp(tip_mm, axis=0).max() > 20), cells_mm, hystereses)
+def test_every_path_is_26_connected_and_passes_all_samples_in_order(tip_mm, cell_mm, hysteresis):
     grid = fit_grid(tip_mm, max(cell_mm, 2.5))
-    path = discretize(tip_mm, grid)
+    path = discretize(tip_mm, grid, hysteresis)
     assert all(np.abs(b - a).max() == 1 for a, b in pairwise(path.cells))
     left = iter(path.states.tolist())
-    sampled = [state for state, _ in groups(grid.states_at(tip_mm).tolist())]
+    sampled = [state for state, _ in groups(grid.states_of(grid.cells_along(tip_mm, hysteresis)).tolist())]
     assert all(state in left for state in sampled)
     assert path.bridged == len(path.states) - len(sampled)
+    assert (path.start, path.goal, path.hysteresis) == (sampled[0], sampled[-1], hysteresis)
 
 
 def groups(states):
@@ -147,6 +151,102 @@ def test_a_bridge_is_as_short_as_can_be_and_stays_within_half_a_cell_of_the_line
     assert len(cells) == n + 1
     on_the_line = a + (b - a) * (np.arange(n + 1) / n)[:, None]
     assert np.abs(cells - on_the_line).max() <= 0.5 + 1e-9  # cells
+
+
+# ---- hysteresis -------------------------------------------------------------------------------------------------
+
+
+def along(x_mm, hysteresis):
+    """Put places on `LINE` into its cells."""
+    return LINE.cells_along([[x, 0, 0] for x in x_mm], hysteresis)[:, 0].tolist()
+
+
+def test_a_sample_stays_in_its_cell_until_it_is_beyond_the_hysteresis():
+    x_mm = [0.3, 0.6, 0.75, 0.76, 0.5, 0.25, 0.24, 0.7]
+    assert along(x_mm, 0.25) == [0, 0, 0, 1, 1, 1, 0, 0]
+    assert along(x_mm, 0.0) == [0, 1, 1, 1, 1, 0, 0, 1]
+    assert discretize([[x, 0, 0] for x in x_mm], LINE, 0.25).states.tolist() == [0, 1, 0]
+
+
+def test_it_then_goes_to_its_nearest_cell_along_all_axes():
+    grid = GridWorld(ORIGIN, 1.0, (5, 5, 5))
+    tip_mm = [[0, 0, 0], [0, 0.7, 0], [0.8, 0.7, 0.4], [0.8, 0.7, 3.4]]
+    assert grid.cells_along(tip_mm, 0.25).tolist() == [[0, 0, 0], [0, 0, 0], [1, 1, 0], [1, 1, 3]]
+    assert discretize(tip_mm, grid, 0.25).bridged == 2
+
+
+@given(motions_mm, cells_mm)
+def test_without_hysteresis_every_sample_is_in_its_nearest_cell(tip_mm, cell_mm):
+    grid = fit_grid(tip_mm, cell_mm)
+    assert grid.cells_along(tip_mm).tolist() == grid.cells_at(tip_mm).tolist()
+
+
+@given(motions_mm, cells_mm, hystereses)
+def test_a_sample_leaves_its_cell_only_where_it_is_too_far_and_then_for_the_nearest(tip_mm, cell_mm, hysteresis):
+    grid = fit_grid(tip_mm, cell_mm)
+    cells = grid.cells_along(tip_mm, hysteresis)
+    off = np.abs(tip_mm - np.array(grid.origin_mm) - cell_mm * cells).max(axis=1) / cell_mm  # cells
+    assert (off <= 0.5 + hysteresis + 1e-9).all()
+    nearest = grid.cells_at(tip_mm)
+    assert (cells[0] == nearest[0]).all()
+    for before, cell, near, tip in zip(cells, cells[1:], nearest[1:], tip_mm[1:], strict=False):
+        if (cell != before).any():
+            assert (cell == near).all()
+            assert np.abs(tip - grid.origin_mm - cell_mm * before).max() / cell_mm > 0.5 + hysteresis - 1e-9
+
+
+@given(motions_mm.filter(lambda tip_mm: np.ptp(tip_mm, axis=0).max() > 4), hystereses)
+def test_a_path_is_never_longer_than_without_hysteresis(tip_mm, hysteresis):
+    """What it enters are some of the nearest cells, in order, and a way that leaves places out is no longer."""
+    grid = fit_grid(tip_mm, 1.0)
+    assert len(discretize(tip_mm, grid, hysteresis).states) <= len(discretize(tip_mm, grid).states)
+
+
+shaking = arrays(float, 80, elements=st.floats(-1, 1))
+
+
+@given(shaking, st.floats(0.05, 0.5))
+def test_a_tremor_within_the_hysteresis_crosses_no_face(shake, hysteresis):
+    x_mm = 0.5 + 0.99 * hysteresis * shake
+    assert set(along([0.0, *x_mm], hysteresis)) == {0}
+
+
+@given(shaking, st.floats(0.05, 0.3), st.floats(0, 0.1))
+def test_a_trembling_hand_that_goes_one_way_crosses_each_face_once(shake, hysteresis, pace_mm):
+    x_mm = pace_mm * np.arange(80) + 0.99 * hysteresis * shake
+    cells = along([0.0, *x_mm.clip(0)], hysteresis)
+    assert (np.diff(cells) >= 0).all()
+
+
+def test_without_hysteresis_such_a_hand_crosses_them_again_and_again():
+    x_mm = 0.1 * np.arange(80) + 0.24 * (-1.0) ** np.arange(80)
+    assert np.count_nonzero(np.diff(along(x_mm.clip(0), 0.0)) < 0) >= 8
+    assert np.count_nonzero(np.diff(along(x_mm.clip(0), 0.25)) < 0) == 0
+
+
+def test_the_goal_is_the_cell_that_the_last_sample_is_still_in():
+    assert discretize([[0, 0, 0], [1, 0, 0], [1.7, 0, 0]], LINE, 0.25).goal == 1
+
+
+def test_a_sample_outside_the_grid_is_refused_though_it_might_have_stayed_inside():
+    for hysteresis in (0.0, 0.25):
+        with pytest.raises(OutsideGrid, match="1 of 3 points"):
+            discretize([[0, 0, 0], [8, 0, 0], [8.6, 0, 0]], LINE, hysteresis)
+
+
+@pytest.mark.parametrize("hysteresis", [-0.01, 0.51, np.nan, np.inf])
+def test_a_hysteresis_that_cannot_be_meant_is_refused(hysteresis):
+    tip_mm = [[0, 0, 0], [1, 0, 0]]
+    for refused in (
+        lambda: discretize(tip_mm, LINE, hysteresis),
+        lambda: discretisation_rmse(tip_mm, LINE, hysteresis),
+        lambda: GridPath(LINE, np.array([0, 1]), hysteresis=hysteresis),
+    ):
+        with pytest.raises(BadSettings, match=r"from 0 to 0\.5 cells"):
+            refused()
+
+
+# ---- what is no path --------------------------------------------------------------------------------------------
 
 
 def test_an_empty_path_is_refused():

@@ -6,24 +6,24 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from skills.style.domain import REACH, Domain
 from skills.style.grid import GridPath, GridWorld
 from skills.style.learning import _kernels
-from skills.style.learning.q_learning import CellQLearning, PhaseQLearning
+from skills.style.learning.q_learning import CellQLearning, PhaseQLearning, Sweeper
 from skills.style.policy import learn_policy
 from skills.style.reward import sparse_reward
 from tests.style.paths import named_path
 
-GOAL, VISITED, OTHER, OFF_GRID = LEVELS = (10.0, 1.0, 0.0, -1.0)
+GOAL, VISITED, OTHER, OFF_GRID = (10.0, 1.0, 0.0, -1.0)
 STAY, UP = 13, 14
 TWO_CELLS = GridPath(GridWorld((0.0, 0.0, 0.0), 5.0, (1, 1, 2)), np.array([0, 1]))
 LEARNERS = [
     CellQLearning(alpha=0.3, epsilon_start=0.9, epsilon_end=0.2, episodes=60, max_steps=30),
     PhaseQLearning(alpha=0.5, max_steps=3, max_sweeps=2),
+    PhaseQLearning(alpha=0.5, max_steps=2, max_sweeps=3, slip=0.4),
 ]
 
 
-@pytest.mark.parametrize("learner", LEARNERS, ids=lambda learner: learner.kind)
+@pytest.mark.parametrize("learner", LEARNERS, ids=["cell", "phase", "phase, slipping"])
 @pytest.mark.parametrize("name", ["two cells", "to and fro"])
 def test_the_compiled_loops_and_the_plain_ones_agree_to_the_last_bit(monkeypatch, learner, name):
     agreed: list[str] = []
@@ -76,14 +76,14 @@ def episodes(starts, *, first, alpha=0.5, gamma=0.5, max_steps=1, epsilon=0.0):
         value,
         best,
         sparse_reward(TWO_CELLS).rewards,
-        np.array(TWO_CELLS.grid.shape),
-        np.array(starts),
+        np.array(TWO_CELLS.grid.shape, np.uint64),
+        np.array(starts, np.uint64),
         np.full(len(starts), epsilon),
         OFF_GRID,
         alpha,
         gamma,
         max_steps,
-        TWO_CELLS.goal,
+        np.uint64(TWO_CELLS.goal),
         rng,
         tally,
     )
@@ -110,41 +110,19 @@ def test_an_episode_goes_on_to_the_goal_and_ends_there():
     assert q[0, UP] > 5
 
 
-def swept(rows, *, model, phases=1, alpha=0.5, gamma=0.5):
-    """Sweep once over each phase of two cells, the last one first: the Q values of some (phase, cell)."""
-    domain = Domain(TWO_CELLS, phased=True)
-    q, value = np.zeros((domain.n_rows, 27)), np.zeros(domain.n_rows)
-    for phase in (1, 0)[:phases]:
-        _kernels.sweep_compiled(
-            q,
-            value,
-            model,
-            TWO_CELLS.grid.cells_of([0, 1]),
-            sparse_reward(TWO_CELLS).rewards,
-            domain.joins,
-            TWO_CELLS.cells,
-            domain.low,
-            domain.size,
-            domain.offset,
-            domain.state_of,
-            domain.certified & ~domain.terminal,
-            phase,
-            False,
-            np.array(LEVELS),
-            alpha,
-            gamma,
-            TWO_CELLS.goal,
-            REACH,
-            1e-12,
-        )
-    return q[domain.rows_of([p for p, _ in rows], [[0, 0, z] for _, z in rows])]
+def swept(rows, *, model, phases=(1,), alpha=0.5, gamma=0.5):
+    """Sweep once over some phases of two cells, in turn: the Q values of some (phase, cell)."""
+    sweeper = Sweeper(sparse_reward(TWO_CELLS), PhaseQLearning(alpha=alpha, gamma=gamma))
+    for phase in phases:
+        sweeper.sweep(phase, model, (0,))
+    return sweeper.q[sweeper.domain.rows_of([p for p, _ in rows], [[0, 0, z] for _, z in rows])]
 
 
-def explored(max_steps=1):
+def explored(max_steps=1, first=0, slip=0.0):
     """Try every action in both cells."""
     model, tally = np.full((2, 27), _kernels.UNKNOWN, np.int32), np.zeros(3, int)
     shape, rng = np.array(TWO_CELLS.grid.shape), np.ones(1, np.uint64)
-    _kernels.explore_compiled(model, shape, np.arange(54), max_steps, TWO_CELLS.goal, rng, tally)
+    _kernels.explore_compiled(model, shape, first, slip, max_steps, TWO_CELLS.goal, rng, tally)
     return model, tally.tolist()
 
 
@@ -164,7 +142,7 @@ def test_exploring_ends_at_the_goal_or_after_its_steps():
 
 def test_equation_1_by_hand_in_the_phase_state():
     model, _ = explored()
-    joined, not_joined = swept([(1, 0), (0, 0)], model=model, phases=2)
+    joined, not_joined = swept([(1, 0), (0, 0)], model=model, phases=(1, 0))
     assert joined[UP] == 0.5 * GOAL
     assert joined[STAY] == OTHER  # it has left waypoint 0 behind: standing there pays nothing, and goes on with nothing
     assert joined[0] == 0.5 * OFF_GRID
@@ -182,16 +160,72 @@ def test_what_was_never_tried_is_not_learnt():
 
 def test_the_random_numbers_are_those_of_xorshift64():
     # Marsaglia 2003, (13, 7, 17), from the state 1: by hand in whole numbers
-    rng, x = np.ones(1, np.uint64), 1
+    bits, x = np.uint64(1), 1
     for _ in range(1000):
         x ^= x << 13 & 0xFFFFFFFFFFFFFFFF
         x ^= x >> 7
         x ^= x << 17 & 0xFFFFFFFFFFFFFFFF
-        assert int(_kernels.next_random(rng)) == x
+        bits = _kernels.next_random(bits)
+        assert int(bits) == x
+
+
+def drawn(count):
+    """Draw random bits, one after the other."""
+    bits = np.uint64(1)
+    for _ in range(count):
+        bits = _kernels.next_random(bits)
+        yield bits
 
 
 def test_exploration_takes_every_action_about_equally_often():
-    rng = np.ones(1, np.uint64)
-    taken = np.bincount([_kernels.any_action(_kernels.next_random(rng)) for _ in range(27_000)], minlength=27)
+    taken = np.bincount([int(_kernels.any_action(bits)) for bits in drawn(27_000)], minlength=27)
     assert len(taken) == 27
     assert taken == pytest.approx(1000, abs=160)  # five standard deviations
+
+
+def test_where_one_starts_to_explore_makes_no_difference_to_what_is_found():
+    assert all(np.array_equal(explored(first=first)[0], explored()[0]) for first in range(54))
+
+
+def test_a_move_slips_as_often_as_it_is_told_to_and_off_the_grid_it_then_stays():
+    """In the middle of 3 x 3 x 3 cells a slip is another move 26 times of 27; at a corner 19 of 27 slips stay."""
+    grid, rounds, slip = GridWorld((0.0, 0.0, 0.0), 5.0, (3, 3, 3)), 400, 0.3
+    rng, tally, moved, stayed = np.ones(1, np.uint64), np.zeros(3, int), 0, 0
+    model = np.full((27, 27), _kernels.UNKNOWN, np.int32)
+    for _ in range(rounds):
+        _kernels.explore_compiled(model, np.array(grid.shape), 0, slip, 1, 26, rng, tally)
+        moved += np.count_nonzero(model[13] != np.arange(27))  # from the middle, an action leads to its own number
+        stayed += np.count_nonzero(
+            model[0][np.arange(27) // 9 == 0] == 0
+        )  # nine that lead off the grid unless they slip
+    assert moved / (27 * rounds) == pytest.approx(slip * 26 / 27, abs=0.02)
+    assert stayed / (9 * rounds) == pytest.approx(slip * (27 - 7) / 27, abs=0.035)
+
+
+@settings(deadline=None)
+@given(st.tuples(*[st.integers(1, 6)] * 3), st.integers(1, 5), st.integers(0, 2**32))
+def test_the_fewest_moves_to_some_places_are_those_of_the_distance_to_each(shape, count, seed):
+    rng = np.random.default_rng(seed)
+    places = rng.integers(shape, size=(count, 3))
+    cells = np.stack(np.indices(shape), axis=-1)
+    expected = np.abs(cells[..., None, :] - places).max(axis=-1).min(axis=-1)
+    for spread in (_kernels.spread_distances, _kernels.spread_distances_compiled):
+        distance = np.full(shape, 1000)
+        distance[tuple(places.T)] = 0
+        spread(distance)
+        assert np.array_equal(distance, expected)
+
+
+@pytest.mark.parametrize("sweeps", [2, 10])
+def test_the_compiled_values_settle_as_the_plain_ones_do_to_the_last_bit(sweeps):
+    path = named_path("a figure of eight")
+    found = []
+    for settle in (_kernels.settle, _kernels.settle_compiled):
+        rewards = sparse_reward(path).rewards
+        best, worth = np.zeros(path.grid.n_states), rewards.copy()
+        stays = np.arange(path.grid.n_states) != path.goal
+        shape = np.array(path.grid.shape)
+        settled = settle(best, worth, rewards, stays, shape, path.goal, OFF_GRID, 0.5, 1e-14, sweeps)
+        found.append((settled, best.tobytes(), worth.tobytes()))
+    assert found[0] == found[1]
+    assert found[0][0] == (sweeps == 10)

@@ -6,13 +6,16 @@ import pytest
 
 from skills.errors import BadSettings
 from skills.style.certificate import certify
+from skills.style.grid import MOVES, GridPath, GridWorld
 from skills.style.learning.learners import MAX_SEED
 from skills.style.learning.q_learning import CellQLearning, PhaseQLearning
+from skills.style.learning.value_iteration import ValueIteration
 from skills.style.policy import learn_policy, rollout_from
 from skills.style.reward import RewardLevels, sparse_reward
 from tests.style.paths import follow, joins_nearest, named_path, random_path
 
 REWARD = sparse_reward(named_path("a figure of eight"))
+STAY, OFF_GRID_PAYS = 13, -1.0
 both_learners = pytest.mark.parametrize("learner", [CellQLearning(), PhaseQLearning()], ids=["cell", "phase"])
 
 
@@ -43,6 +46,7 @@ def check_path(path, seeds):
         assert certificate.every_action_optimal
         assert certificate.demonstration_reproduced
         assert certificate.starts_reaching == certificate.starts_joining_nearest == path.grid.n_states
+        assert certificate.finishing == certificate.checked  # from wherever it was pushed to
         actions, waypoints = policy.table(), path.states.tolist()
         for start in range(path.grid.n_states):  # and so says a client that knows the interface's text alone
             states, finished = follow(actions, path.grid.shape, waypoints, start)
@@ -80,6 +84,90 @@ def test_a_learner_tells_how_it_is_called():
     published = CellQLearning.published()
     assert (published.alpha, published.gamma, published.epsilon_falls_over) == (0.1, 0.01, 0.5)
     assert (published.epsilon_start, published.epsilon_end, published.episodes) == (1.0, 0.0, 5000)
+
+
+# ---- where moves slip -------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def slipping():
+    """The exact policy of a world in which a move slips once in ten, and the rows in which there is one to take."""
+    policy = learn_policy(REWARD, ValueIteration(slip=0.1))
+    return policy, policy.domain.certified & ~policy.domain.terminal
+
+
+def outcomes(policy):
+    """Where each action leads from each row without a slip, and what it pays, both (rows, 27); -1: nowhere."""
+    domain, rewards = policy.domain, REWARD.rewards
+    after, pays = np.zeros((domain.n_rows, 27), int), np.zeros((domain.n_rows, 27))
+    for row in range(domain.n_rows):
+        phase, here = int(domain.phase_of[row]), domain.cell_of[row]
+        for action, step in enumerate(MOVES):
+            cell = here + step
+            if not policy.path.grid.holds(cell):
+                after[row, action], pays[row, action] = row, OFF_GRID_PAYS
+                continue
+            state = int(policy.path.grid.states_of(cell))
+            then, ends = domain.enter(phase, state)
+            place = None if ends else policy.row(then, state)
+            after[row, action] = -1 if place is None else place
+            pays[row, action] = rewards[state] if phase == 0 else 10.0 if ends else float(then > phase)
+    return after, pays
+
+
+def learn_slipping(alpha, sweeps, seed=0):
+    return learn_policy(REWARD, PhaseQLearning(alpha=alpha, slip=0.1, max_sweeps=sweeps), seed)
+
+
+def test_exact_values_of_a_world_that_slips_are_those_of_a_second_method(slipping):
+    """The values of its greedy policy solve a system of linear equations."""
+    exact, live = slipping
+    domain, slip, gamma = exact.domain, 0.1, exact.learner.gamma
+    after, pays = outcomes(exact)
+    n, greedy = domain.n_rows, exact.greedy.astype(int).clip(0)
+    anywhere_pays, chances = np.zeros(n), np.zeros((n, n + 1))
+    for action in range(27):
+        off = pays[:, action] == OFF_GRID_PAYS
+        np.add.at(chances, (np.arange(n), np.where(off, after[:, STAY], after[:, action])), slip / 27)
+        anywhere_pays += np.where(off, pays[:, STAY], pays[:, action]) / 27
+    made = after[np.arange(n), greedy]
+    np.add.at(chances, (np.arange(n), made), 1 - slip)
+    reward = (1 - slip) * pays[np.arange(n), greedy] + slip * anywhere_pays
+    chances[~live], reward[~live] = 0.0, 0.0
+    values = np.linalg.solve(np.eye(n) - gamma * chances[:, :n], reward)
+    assert exact.q.max(axis=1)[live] == pytest.approx(values[live], rel=1e-9, abs=0)
+
+
+def test_a_learning_rate_below_1_comes_the_nearer_to_the_exact_values_the_lower_it_is_and_1_never_does(slipping):
+    exact, live = slipping
+    best = exact.q[live].max(axis=1)
+    apart = {
+        alpha: float(np.median(np.abs(learn_slipping(alpha, sweeps).q[live].max(axis=1) / best - 1)))
+        for alpha, sweeps in ((1.0, 100), (0.3, 100), (0.1, 200), (0.02, 1000))
+    }
+    assert apart[1.0] > 0.15
+    assert apart[1.0] > apart[0.3] > apart[0.1] > apart[0.02]
+    assert apart[0.02] < 0.05
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_is_learnt_while_moves_slip_follows_from_everywhere(seed):
+    certificate, _ = certify(learn_slipping(0.02, 1000, seed))
+    assert certificate.demonstration_reproduced
+    assert certificate.finishing == certificate.checked
+    assert certificate.starts_reaching == certificate.starts_joining_nearest == certificate.starts
+    assert certify(learn_slipping(1.0, 100, seed))[0].finishing < certificate.checked
+
+
+def test_a_slip_makes_near_ties_that_samples_cannot_tell_so_only_the_exact_policy_passes(slipping):
+    exact, live = slipping
+    assert certify(exact)[0].every_action_optimal
+    learnt = learn_slipping(0.02, 1000)
+    certificate, _ = certify(learnt)
+    assert 0 < certificate.suboptimal < certificate.checked
+    rows = np.flatnonzero(live)
+    lost = 1 - exact.q[rows, learnt.greedy[rows].astype(int)] / exact.q[rows].max(axis=1)
+    assert lost.max() < 0.15
 
 
 # ---- the same again ---------------------------------------------------------------------------------------------
@@ -141,6 +229,13 @@ def test_an_epsilon_that_is_no_share_is_refused(name):
             CellQLearning(**{name: value})
 
 
+@pytest.mark.parametrize("learner", [PhaseQLearning, ValueIteration])
+@pytest.mark.parametrize("slip", [-0.1, 1.0, np.nan])
+def test_a_slip_that_is_no_chance_is_refused(learner, slip):
+    with pytest.raises(BadSettings, match="slip"):
+        learner(slip=slip)
+
+
 def test_numbers_of_episodes_and_sweeps_are_bounded():
     for episodes in (0, 10_000_001):
         with pytest.raises(BadSettings, match="episodes"):
@@ -148,6 +243,16 @@ def test_numbers_of_episodes_and_sweeps_are_bounded():
     for sweeps in (0, 100_001):
         with pytest.raises(BadSettings, match="max_sweeps"):
             PhaseQLearning(max_sweeps=sweeps)
+
+
+@pytest.mark.parametrize(
+    ("learner", "gib"), [(PhaseQLearning(), "6.8"), (CellQLearning(), "6.8"), (ValueIteration(slip=0.1), "27.2")]
+)
+def test_a_grid_too_large_for_memory_is_refused_with_the_number_before_any_is_taken(learner, gib):
+    grid = GridWorld((0.0, 0.0, 0.0), 1.0, (230, 230, 230))
+    reward = sparse_reward(GridPath(grid, np.array([0, 1, 2])))
+    with pytest.raises(BadSettings, match=f"12167000 cells needs about {gib} GiB .* at most 4 GiB"):
+        learn_policy(reward, learner)
 
 
 def test_a_loop_that_pays_more_than_arriving_is_refused_with_what_it_pays():

@@ -35,6 +35,11 @@ def test_a_move_off_the_grid_may_pay_what_other_states_pay():
     assert RewardLevels(off_grid=0.0).off_grid == 0
 
 
+def test_levels_given_as_whole_numbers_do_not_round_the_others():
+    rewards = sparse_reward(named_path("an angle"), RewardLevels(goal=10.5, visited=1.5, other=0, off_grid=-1)).rewards
+    assert sorted(set(rewards)) == [0, 1.5, 10.5]
+
+
 @given(st.integers(0, 500))
 def test_every_map_has_one_goal_and_pays_on_the_path_alone(seed):
     path = random_path(seed)

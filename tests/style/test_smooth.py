@@ -5,6 +5,7 @@ and fro within 0.5 mm; aligned by our DTW; the root mean square of the pairs' 3-
 there the path goes to the policy's start and goal, the centres of their cells, and the hand was elsewhere in them.
 """
 
+from dataclasses import replace
 from functools import cache
 from io import BytesIO
 from math import dist
@@ -254,15 +255,40 @@ def test_cells_that_no_sample_lies_in_are_crossed_in_a_straight_line():
 
 
 @settings(deadline=None, max_examples=60)
-@given(st.integers(0, 10**6), st.sampled_from([1.0, 5.0, 40.0]))
-def test_any_recording_whatever_is_followed_through_its_cells(seed, pace_mm):
+@given(st.integers(0, 10**6), st.sampled_from([1.0, 5.0, 40.0]), st.sampled_from([0.0, 0.25, 0.5]))
+def test_any_recording_whatever_is_followed_through_its_cells(seed, pace_mm, hysteresis):
     rng = np.random.default_rng(seed)
     tip_mm = 20 + np.cumsum(rng.normal(0, pace_mm / 5, (int(rng.integers(4, 120)), 3)), axis=0)
     tip_mm = np.concatenate((tip_mm.clip(-2.4, 42.4), [[1.0, 2.0, 3.0], [9.0, 2.0, 3.0]]))
-    path = discretize(tip_mm, GRID)
+    path = discretize(tip_mm, GRID, hysteresis)
     followed = along_itself(path)
     fit = fit_to_demo(followed, trace(recorded(tip_mm), path), path.tip_mm[0])
     assert_through_its_cells(followed, fit)
+
+
+@pytest.mark.parametrize(("name", "number"), HAND_OFFS)
+def test_with_hysteresis_the_path_is_shorter_and_the_recording_is_followed_as_well(name, number):
+    demo, policy = shipped(name, number)
+    path = discretize(demo.tip_mm, PAPER_GRID, 0.25)
+    assert len(path.states) < 0.8 * len(policy.path.states)
+    followed = along_itself(path)
+    fit = fit_to_demo(followed, trace(demo, path), path.tip_mm[0])
+    assert_through_its_cells(followed, fit)
+    assert rmse_mm(fit.tip_mm, demo.tip_mm) <= 1.0
+    assert turns_deg(fit.tip_mm).max() < 35
+
+
+def test_a_trembling_hand_crosses_its_own_path_19_times_and_with_hysteresis_never():
+    demo, policy = shipped("plover-simple-running", 0)
+    assert (len(policy.path.states), policy.path.revisits) == (44, 19)
+    path = discretize(demo.tip_mm, PAPER_GRID, 0.25)
+    assert (len(path.states), path.revisits) == (18, 0)
+
+
+def test_a_path_made_with_another_hysteresis_is_refused():
+    demo, policy = shipped("plover-simple-running", 0)
+    with pytest.raises(BadPlan, match="not learnt from this demonstration"):
+        trace(demo, replace(policy.path, hysteresis=0.25))
 
 
 def test_the_papers_own_state_is_followed_as_far_as_it_follows():

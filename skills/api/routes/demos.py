@@ -128,6 +128,7 @@ def get_path(demo: Digest, db: Db) -> dict[str, Any]:
             "demo": row.sha256,
             "frame": row.frame,
             "grid": row.report["grid"],
+            "hysteresis": path.hysteresis,
             "states": path.states.tolist(),
             "path_mm": path.tip_mm.tolist(),
             "stamps_s": recorded.stamps_s.tolist(),

@@ -3,8 +3,8 @@
 Arrays and numbers in, nothing allocated, nothing raised. The plain function and the compiled one agree to the last
 bit; a test says so. This is the only file that knows numba.
 
-Random bits come from xorshift64 (Marsaglia 2003), whose state is one uint64 that is not 0; an action is drawn from the
-low half of 64 bits, and whether to explore from the high half.
+Random bits come from xorshift64 (Marsaglia 2003), whose state, `rng`, is one uint64 that is not 0, shape (1,); an
+action is drawn from the low half of 64 bits, and whether to explore or to slip from the high half.
 """
 
 from typing import Any
@@ -14,23 +14,24 @@ from numba import njit
 from numba.extending import register_jitable
 
 UNKNOWN, OFF_GRID = -2, -1  # in a model: never tried; would leave the grid, and stays
+# Whole numbers without a sign; one of these and a number of Python's would give a float.
+NONE, ONE, THREE, SEVEN, NINE, THIRTEEN, SEVENTEEN = (np.uint64(n) for n in (0, 1, 3, 7, 9, 13, 17))
+ACTIONS, HALF, LOW_HALF = np.uint64(27), np.uint64(32), np.uint64(0xFFFFFFFF)
 
 
 @register_jitable
-def next_random(rng: Any) -> Any:
-    """Draw 64 random bits; `rng` is the generator's state, (1,) uint64."""
-    x = rng[0]
-    x ^= x << np.uint64(13)
-    x ^= x >> np.uint64(7)
-    x ^= x << np.uint64(17)
-    rng[0] = x
+def next_random(x: Any) -> Any:
+    """Draw the next 64 random bits, uint64, after others."""
+    x ^= x << THIRTEEN
+    x ^= x >> SEVEN
+    x ^= x << SEVENTEEN
     return x
 
 
 @register_jitable
 def any_action(bits: Any) -> Any:
-    """Turn random bits into one of the 27 actions."""
-    return np.int64(((bits & np.uint64(0xFFFFFFFF)) * np.uint64(27)) >> np.uint64(32))
+    """Turn random bits into one of the 27 actions, uint64."""
+    return ((bits & LOW_HALF) * ACTIONS) >> HALF
 
 
 def run_episodes(
@@ -38,88 +39,107 @@ def run_episodes(
     value: Any,  # (n_states,) float64: the largest Q value of each state, kept up to date
     best: Any,  # (n_states,) int8: its action, the first of equals
     rewards: Any,  # (n_states,) float64: Algorithm 1
-    shape: Any,  # (3,) int64
-    starts: Any,  # (E,) int64: the state that each episode starts in
+    shape: Any,  # (3,) uint64
+    starts: Any,  # (E,) uint64: the state that each episode starts in
     epsilons: Any,  # (E,) float64: its exploration
     off_grid: float,  # the reward of a move off the grid
     alpha: float,
     gamma: float,
     max_steps: int,
-    goal: int,
+    goal: Any,  # uint64
     rng: Any,
     tally: Any,  # (3,) int64: steps taken, episodes that finished, episodes that ran out of steps
 ) -> None:
-    """Learn in the paper's cell state by Eq. 1, one episode for each start."""
+    """Learn in the paper's cell state by Eq. 1, one episode for each start.
+
+    Whole numbers have no sign, so that no index is looked at twice; x, y and z count from 1, so that none is below 0.
+    """
     nx, ny, nz = shape[0], shape[1], shape[2]
+    before_first = (ny + ONE) * nz + ONE
+    random = rng[0]
+    steps = 0
     for episode in range(len(starts)):
         state = starts[episode]
-        x = state // (ny * nz)
-        y = state // nz % ny
-        z = state % nz
+        x = state // (ny * nz) + ONE
+        y = state // nz % ny + ONE
+        z = state % nz + ONE
         explores = np.uint64(epsilons[episode] * 4294967296.0)
         finished = False
         for _ in range(max_steps):
-            bits = next_random(rng)
-            action = any_action(bits) if bits >> np.uint64(32) < explores else np.int64(best[state])
-            a = action // 9
-            b = (action - 9 * a) // 3
-            to_x = x + a - 1
-            to_y = y + b - 1
-            to_z = z + action - 9 * a - 3 * b - 1
+            random = next_random(random)
+            action = any_action(random) if random >> HALF < explores else np.uint64(best[state])
+            to_x = x + action // NINE - ONE
+            to_y = y + action // THREE % THREE - ONE
+            to_z = z + action % THREE - ONE
             after = state
-            if to_x >= 0 and to_x < nx and to_y >= 0 and to_y < ny and to_z >= 0 and to_z < nz:
+            if (to_x != NONE) & (to_x <= nx) & (to_y != NONE) & (to_y <= ny) & (to_z != NONE) & (to_z <= nz):
                 x, y, z = to_x, to_y, to_z
-                after = (x * ny + y) * nz + z
+                after = (x * ny + y) * nz + z - before_first
                 target = rewards[after]
                 finished = after == goal
                 if not finished:
                     target += gamma * value[after]
             else:
                 target = off_grid + gamma * value[state]
-            row = state * 27
-            new = (1 - alpha) * q[row + action] + alpha * target
+            row = state * ACTIONS
+            new = target
+            if alpha < 1:
+                new = (1 - alpha) * q[row + action] + alpha * target
             q[row + action] = new
             if new > value[state]:
                 value[state] = new
                 best[state] = action
-            elif action == best[state] and new < value[state]:
-                top = 0
-                for other in range(1, 27):
-                    if q[row + other] > q[row + top]:
-                        top = other
-                best[state] = top
-                value[state] = q[row + top]
-            elif new == value[state] and action < best[state]:
+            elif action == np.uint64(best[state]):
+                if new < value[state]:
+                    top = NONE
+                    for other in range(1, 27):
+                        if q[row + np.uint64(other)] > q[row + top]:
+                            top = np.uint64(other)
+                    best[state] = top
+                    value[state] = q[row + top]
+            elif new == value[state] and action < np.uint64(best[state]):
                 best[state] = action
             state = after
-            tally[0] += 1
+            steps += 1
             if finished:
                 break
         tally[1] += finished
         tally[2] += not finished
+    tally[0] += steps
+    rng[0] = random
 
 
 def explore(
     model: Any,  # (n_states, 27) int32: the state that each action led to, `OFF_GRID` or `UNKNOWN`
     shape: Any,  # (3,) int64
-    starts: Any,  # (E,) int64: the state that each episode starts in, times 27, plus its first action
+    first: int,  # the state that the first episode starts in, times 27, plus its action; all others follow in turn
+    slip: float,  # how likely any of the 27 moves is made instead
     max_steps: int,
     goal: int,
     rng: Any,
     tally: Any,  # as for `run_episodes`
 ) -> None:
-    """Move about in the grid and remember where each action led, one episode for each start."""
+    """Move about in the grid and remember where each action led, an episode from every state with every action."""
     nx, ny, nz = shape[0], shape[1], shape[2]
-    for episode in range(len(starts)):
-        state = starts[episode] // 27
-        action = starts[episode] % 27
+    slips = np.uint64(slip * 4294967296.0)
+    random = rng[0]
+    episodes = nx * ny * nz * 27
+    for episode in range(episodes):
+        state = (first + episode) % episodes // 27
+        action = np.int64((first + episode) % 27)
         finished = False
         for step in range(max_steps):
             if step > 0:
-                action = any_action(next_random(rng))
-            x = state // (ny * nz) + action // 9 - 1
-            y = state // nz % ny + action // 3 % 3 - 1
-            z = state % nz + action % 3 - 1
+                random = next_random(random)
+                action = np.int64(any_action(random))
+            slipped = False
+            if slips > NONE:
+                random = next_random(random)
+                slipped = random >> HALF < slips
+            made = np.int64(any_action(random)) if slipped else action
+            x = state // (ny * nz) + made // 9 - 1
+            y = state // nz % ny + made // 3 % 3 - 1
+            z = state % nz + made % 3 - 1
             tally[0] += 1
             if x >= 0 and x < nx and y >= 0 and y < ny and z >= 0 and z < nz:
                 after = (x * ny + y) * nz + z
@@ -127,92 +147,119 @@ def explore(
                 state = after
                 finished = after == goal
             else:
-                model[state, action] = OFF_GRID
+                model[state, action] = state if slipped else OFF_GRID
             if finished:
                 break
         tally[1] += finished
         tally[2] += not finished
+    rng[0] = random
 
 
 def sweep(
     q: Any,  # (rows, 27) float64, learnt in place
     value: Any,  # (rows,) float64: the largest Q value of each row
     model: Any,  # as for `explore`
-    cells: Any,  # (n_states, 3) int64
-    rewards: Any,  # (n_states,) float64: Algorithm 1
-    joins: Any,  # (n_states,) int64: the phase that entering a state in phase 0 leads to, 0: it stays
-    waypoints: Any,  # (P, 3) int64
-    low: Any,
-    size: Any,
-    offset: Any,  # the boxes of the domain's phases: see `skills.style.domain`
     states: Any,  # (rows,) int64: the state of each row
     live: Any,  # (rows,) bool: whether anything is to be learnt in it
-    phase: int,
+    stays: Any,  # (rows,) bool: whether entering its state stays in the phase
+    worth: Any,  # (n_states,) float64: what entering each state in the phase pays and leads to, kept up to date
+    first: int,  # row of the phase
+    last: int,  # row of the phase, and one more
     backwards: bool,  # whether rows are taken from the last one to the first
-    levels: Any,  # (4,) float64: goal, visited, other, off_grid
+    other: float,  # the reward of entering a state and staying in the phase
+    off_grid: float,
     alpha: float,
     gamma: float,
-    goal: int,
-    reach: int,  # Chebyshev radius of the domain of a phase above 0
     tolerance: float,
 ) -> Any:
     """Apply Eq. 1 once to every action that was tried in a phase: how many Q values changed, relatively, by more."""
     changed = 0
-    last = len(low) - 1
-    first = offset[phase]
-    count = offset[phase + 1] - first
-    for i in range(count):
-        row = first + (count - 1 - i if backwards else i)
+    for i in range(last - first):
+        row = last - 1 - i if backwards else first + i
         if not live[row]:
             continue
+        state = states[row]
         top = -np.inf
         for action in range(27):
-            to = model[states[row], action]
-            if to == UNKNOWN:
-                top = max(top, q[row, action])
-                continue
-            after = phase
-            ends = False
-            if to == OFF_GRID:
-                reward = levels[3]
-                going_on = value[row]
-            else:
-                x, y, z = cells[to, 0], cells[to, 1], cells[to, 2]
-                if phase == 0:
-                    reward = rewards[to]
-                    ends = to == goal
-                    if joins[to] > 0:
-                        after = joins[to]
-                else:
-                    reward = levels[2]
-                    ahead = max(
-                        abs(x - waypoints[phase, 0]), abs(y - waypoints[phase, 1]), abs(z - waypoints[phase, 2])
-                    )
-                    behind = max(
-                        abs(x - waypoints[phase - 1, 0]),
-                        abs(y - waypoints[phase - 1, 1]),
-                        abs(z - waypoints[phase - 1, 2]),
-                    )
-                    if ahead == 0 and phase == last:
-                        reward = levels[0]
-                        ends = True
-                    elif ahead == 0:
-                        reward = levels[1]
-                        after = phase + 1
-                    elif ahead > reach and behind > reach:
-                        ends = True  # beyond the domain nothing is promised
-                going_on = 0.0
-                if not ends:
-                    at = ((x - low[after, 0]) * size[after, 1] + y - low[after, 1]) * size[after, 2]
-                    going_on = value[offset[after] + at + z - low[after, 2]]
-            old = q[row, action]
-            new = (1 - alpha) * old + alpha * (reward + gamma * going_on)
-            q[row, action] = new
-            top = max(top, new)
-            if abs(new - old) > tolerance * abs(new):
-                changed += 1
+            to = model[state, action]
+            new = q[row, action]
+            if to != UNKNOWN:
+                target = off_grid + gamma * value[row]
+                if to != OFF_GRID:
+                    target = worth[to]
+                old = new
+                new = (1 - alpha) * old + alpha * target
+                q[row, action] = new
+                if abs(new - old) > tolerance * abs(new):
+                    changed += 1
+            if new > top:
+                top = new
         value[row] = top
+        if stays[row]:
+            worth[state] = other + gamma * top
     return changed
+
+
+def settle(
+    best: Any,  # (n_states,) float64: what the best move in each state is worth, found in place
+    worth: Any,  # (n_states,) float64: what entering each state is worth, kept up to date
+    rewards: Any,  # (n_states,) float64: Algorithm 1
+    stays: Any,  # (n_states,) bool: whether entering it leads to nothing else
+    shape: Any,  # (3,) int64
+    goal: int,
+    off_grid: float,
+    gamma: float,
+    tolerance: float,
+    max_sweeps: int,
+) -> Any:
+    """Iterate values over the grid, to and fro, until nothing changes, relatively, by more: whether it came to that."""
+    nx, ny, nz = shape[0], shape[1], shape[2]
+    for number in range(max_sweeps):
+        changed = 0
+        for i in range(len(best)):
+            state = i if number % 2 == 0 else len(best) - 1 - i
+            if state == goal:
+                continue
+            x = state // (ny * nz)
+            y = state // nz % ny
+            z = state % nz
+            top = -np.inf
+            if x == 0 or y == 0 or z == 0 or x == nx - 1 or y == ny - 1 or z == nz - 1:
+                top = off_grid + gamma * best[state]
+            for to_x in range(max(x - 1, 0), min(x + 2, nx)):
+                for to_y in range(max(y - 1, 0), min(y + 2, ny)):
+                    for to_z in range(max(z - 1, 0), min(z + 2, nz)):
+                        there = worth[(to_x * ny + to_y) * nz + to_z]
+                        if there > top:
+                            top = there
+            if not abs(top - best[state]) <= tolerance * abs(top):
+                changed += 1
+            best[state] = top
+            if stays[state]:
+                worth[state] = rewards[state] + gamma * top
+        if changed == 0:
+            return True
+    return False
+
+
+def spread_distances(
+    distance: Any,  # (nx, ny, nz) int64: 0 at the places to measure from, elsewhere more than any; filled in place
+) -> None:
+    """Count the fewest moves from each cell (Chebyshev), in one pass there and one back (Rosenfeld and Pfaltz 1966)."""
+    nx, ny, nz = distance.shape
+    for way in range(2):
+        for i in range(nx):
+            x = i if way == 0 else nx - 1 - i
+            for j in range(ny):
+                y = j if way == 0 else ny - 1 - j
+                for k in range(nz):
+                    z = k if way == 0 else nz - 1 - k
+                    fewest = distance[x, y, z]
+                    for to_x in range(max(x - 1, 0), min(x + 2, nx)):
+                        for to_y in range(max(y - 1, 0), min(y + 2, ny)):
+                            for to_z in range(max(z - 1, 0), min(z + 2, nz)):
+                                fewest = min(fewest, distance[to_x, to_y, to_z] + 1)
+                    distance[x, y, z] = fewest
 
 
 def warp(distance: Any, cost: Any) -> None:
@@ -222,7 +269,22 @@ def warp(distance: Any, cost: Any) -> None:
             cost[i + 1, j + 1] = distance[i, j] + min(cost[i, j], cost[i, j + 1], cost[i + 1, j])
 
 
-run_episodes_compiled = njit(nogil=True, cache=True)(run_episodes)
-explore_compiled = njit(nogil=True, cache=True)(explore)
-sweep_compiled = njit(nogil=True, cache=True)(sweep)
-warp_compiled = njit(nogil=True, cache=True)(warp)
+def compiled(loop: Any) -> Any:
+    """Compile a loop at its first call, and keep its machine code for other processes.
+
+    Call it with the same types always: two processes that compile it for different ones at once can keep one's code
+    under the other's name. Where numba can write to no folder, each process compiles for itself; `skills.jobs.warm`
+    says so.
+    """
+    try:
+        return njit(nogil=True, cache=True)(loop)
+    except RuntimeError:  # numba's way to say that it has nowhere to write
+        return njit(nogil=True)(loop)
+
+
+run_episodes_compiled = compiled(run_episodes)
+explore_compiled = compiled(explore)
+sweep_compiled = compiled(sweep)
+settle_compiled = compiled(settle)
+spread_distances_compiled = compiled(spread_distances)
+warp_compiled = compiled(warp)

@@ -4,6 +4,8 @@ from typing import get_args
 
 from skills.errors import BadSettings
 from skills.style._arrays import Floats
+from skills.style.domain import Domain
+from skills.style.grid import GridPath
 from skills.style.learning.irl import MaxEntIRL, learn_from_recovered
 from skills.style.learning.q_learning import CellQLearning, PhaseQLearning, Training, learn_q
 from skills.style.learning.value_iteration import ValueIteration, iterate_values
@@ -11,8 +13,11 @@ from skills.style.reward import RewardLevels, RewardMap
 
 Learner = PhaseQLearning | CellQLearning | ValueIteration | MaxEntIRL
 LEARNERS: dict[str, type[Learner]] = {learner.kind: learner for learner in get_args(Learner)}
-LEARNER_VERSION = 2  # part of a training's identity: raise it when the same settings would learn something else
+LEARNER_VERSION = 3  # part of a training's identity: raise it when the same settings would learn something else
 MAX_SEED = 2**63 - 1
+MAX_BYTES = 4 << 30  # ours: a laptop has 8 GiB, and others learn beside it
+BYTES_A_ROW = 600  # of the domain, measured with 51 and 101 cells a side: Q values twice, and what the rest works out
+BYTES_A_SLIPPING_ROW = 2400  # the certificate keeps what each of the 27 actions leads to
 
 
 def learn_values(reward: RewardMap, learner: Learner, seed: int) -> tuple[Floats, Training]:
@@ -22,16 +27,32 @@ def learn_values(reward: RewardMap, learner: Learner, seed: int) -> tuple[Floats
 
     Raises:
         BadSettings: The seed is not an integer from 0 to 2^63 - 1, or arriving would not pay (see `_refuse_loops`), or
-            the path is too long for the learner.
+            the grid is too large for memory, or the path too long for the learner.
     """
     if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed <= MAX_SEED:
         raise BadSettings("The seed must be an integer from 0 to 2^63 - 1.")
     _refuse_loops(reward.levels, learner)
+    refuse_too_large(reward.path, learner)
     if isinstance(learner, ValueIteration):
         return iterate_values(reward, learner), _without_moving(settled=True)
     if isinstance(learner, MaxEntIRL):
         return learn_from_recovered(reward, learner), _without_moving(settled=False)
     return learn_q(reward, learner, seed)
+
+
+def refuse_too_large(path: GridPath, learner: Learner) -> None:
+    """Refuse a path whose policy would need too much memory, before any is taken.
+
+    Raises:
+        BadSettings: It would need more than `MAX_BYTES`.
+    """
+    needed = Domain(path, learner.phased).n_rows * (BYTES_A_SLIPPING_ROW if learner.slip > 0 else BYTES_A_ROW)
+    if needed > MAX_BYTES:
+        raise BadSettings(
+            f"Learning {len(path.states)} waypoints in a grid of {path.grid.n_states} cells needs about "
+            f"{needed / 2**30:.1f} GiB of memory, and at most {MAX_BYTES / 2**30:g} GiB may be; take larger cells.",
+            needed_bytes=needed,
+        )
 
 
 def _without_moving(*, settled: bool) -> Training:

@@ -12,7 +12,8 @@ phase: moves are remembered as a model, and Eq. 1 is applied to the remembered m
 first (planning from a learnt model, as in Dyna-Q: Sutton 1990).
 """
 
-from dataclasses import astuple, dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass
 from math import floor, isfinite
 from typing import ClassVar
 
@@ -22,7 +23,8 @@ from numpy.typing import NDArray
 from skills.errors import BadSettings
 from skills.style import paper
 from skills.style._arrays import Floats
-from skills.style.domain import REACH, Domain
+from skills.style.domain import Domain
+from skills.style.grid import GridPath
 from skills.style.learning import _kernels
 from skills.style.reward import RewardMap
 
@@ -37,9 +39,13 @@ class PhaseQLearning:
 
     The paper is silent on all but the stop rules. Moves are deterministic, so alpha 1 loses nothing; with gamma 0.1
     the nearest waypoint is always worth most (at 0.3 some starts run for the goal and skip the path). Every cell and
-    action starts an episode in an order drawn from the seed, so that all has been tried once: one move is enough for
+    action starts an episode, from one drawn by the seed on, so that all has been tried once: one move is enough for
     that, and is the default length; after the first move an episode goes on at random. Phases are then swept until a
     sweep changes nothing: Eq. 1 holds everywhere, whatever the seed.
+
+    With a slip, all is tried again before each of `max_sweeps` sweeps, and alpha must be below 1: the lower, the nearer
+    to the exact values, and the longer it takes. Slips leave differences between actions that are finer than samples
+    tell, so the certificate finds actions that are not quite the best; `ValueIteration` with the same slip is exact.
     """
 
     kind: ClassVar[str] = "phase-q-learning"
@@ -50,9 +56,12 @@ class PhaseQLearning:
     max_steps: int = 1
     max_episode_s: float = paper.MAX_EPISODE_S
     step_s: float = 0.25  # a cell of 5 mm at 20 mm/s
-    max_sweeps: int = 1000  # of a phase; with alpha 1 a handful is enough
+    slip: float = 0.0  # how likely, instead of the intended move, any of the 27 is made
+    max_sweeps: int = 1000  # of a phase; with alpha 1 and no slips a handful is enough
 
     def __post_init__(self) -> None:
+        if not 0 <= self.slip < 1:
+            raise BadSettings("slip must lie in [0, 1).", slip=self.slip)
         _check(self.alpha, self.gamma, (), self.max_steps, self.max_episode_s, self.step_s)
         if not 1 <= self.max_sweeps <= 100_000:
             raise BadSettings("max_sweeps must lie between 1 and 100 000.", max_sweeps=self.max_sweeps)
@@ -68,6 +77,7 @@ class CellQLearning:
 
     kind: ClassVar[str] = "cell-q-learning"
     phased: ClassVar[bool] = False
+    slip: ClassVar[float] = 0.0
 
     alpha: float = 1.0
     gamma: float = 0.1
@@ -135,82 +145,126 @@ def learn_q(reward: RewardMap, learner: QLearner, seed: int) -> tuple[Floats, Tr
     cap = floor(min(learner.max_steps, moves_in_time))
     chance = _Chance(seed)
     if isinstance(learner, PhaseQLearning):
-        model, episodes = _explore(reward, cap, chance)
-        q, updates, settled = _plan(reward, learner, model)
+        q, updates, settled = _learn_in_phases(reward, learner, cap, chance)
     else:
-        q, episodes, settled = _run_episodes(reward, learner, cap, chance), learner.episodes, False
+        q, settled = _run_episodes(reward, learner, cap, chance), False
     steps, finished, capped = (int(n) for n in chance.tally)
     if isinstance(learner, CellQLearning):
         updates = steps  # once for each move
+    episodes = finished + capped
     by_time = cap < learner.max_steps
     out_of_steps, out_of_time = (0, capped) if by_time else (capped, 0)
     return q, Training(steps, updates, episodes, finished, out_of_steps, out_of_time, settled)
 
 
 class _Chance:
-    """What a seed decides, and what came of it: the order of starts, the kernels' random bits, and their tally."""
+    """What a seed decides, and what came of it: where episodes start, the kernels' random bits, and their tally."""
 
     def __init__(self, seed: int) -> None:
-        self.order = np.random.Generator(np.random.PCG64(seed))
+        self.draw = np.random.Generator(np.random.PCG64(seed))
         self.bits = np.random.SeedSequence(seed).generate_state(1, np.uint64) | np.uint64(1)
         self.tally = np.zeros(3, np.int64)
 
 
-def _explore(reward: RewardMap, cap: int, chance: _Chance) -> tuple[Model, int]:
-    """Start an episode with every action in every cell: where each led, (n_states, 27), and how many episodes."""
-    grid = reward.path.grid
-    pairs = grid.n_states * paper.N_ACTIONS
-    model = np.full((grid.n_states, paper.N_ACTIONS), _kernels.UNKNOWN, np.int32)
-    starts = chance.order.permutation(pairs)
-    _kernels.explore_compiled(model, np.array(grid.shape), starts, cap, reward.path.goal, chance.bits, chance.tally)
-    return model, pairs
+def _learn_in_phases(reward: RewardMap, learner: PhaseQLearning, cap: int, chance: _Chance) -> tuple[Floats, int, bool]:
+    """Try every action in every cell and apply Eq. 1 to what it led to: Q values, updates, settled.
+
+    Without slips one round of trying tells all, and phases are swept until nothing changes. With slips every sweep has
+    a round of its own, since another one may lead elsewhere.
+    """
+    sweeper = Sweeper(reward, learner)
+    model = np.full((reward.path.grid.n_states, paper.N_ACTIONS), _kernels.UNKNOWN, np.int32)
+    if learner.slip == 0:
+        _explore(model, reward.path, learner.slip, cap, chance)
+        settled = sweeper.settle(model)
+        return sweeper.q, sweeper.updates, settled
+    for number in range(learner.max_sweeps):
+        _explore(model, reward.path, learner.slip, cap, chance)
+        for phase in sweeper.phases:
+            sweeper.sweep(phase, model, (number,))
+    return sweeper.q, sweeper.updates, False
 
 
-def _plan(reward: RewardMap, learner: PhaseQLearning, model: Model) -> tuple[Floats, int, bool]:
-    """Apply Eq. 1 to the model, phase by phase from the last, until nothing changes: Q values, updates, settled."""
-    domain, levels = Domain(reward.path, phased=True), reward.levels
-    q, value = np.zeros((domain.n_rows, paper.N_ACTIONS)), np.zeros(domain.n_rows)
-    live = domain.certified & ~domain.terminal
-    cells, pays = reward.path.grid.cells_of(np.arange(reward.path.grid.n_states)), np.array(astuple(levels))
-    updates, settled = 0, True
-    for phase in range(domain.phases - 1, -1, -1):
-        tried = int(live[domain.offset[phase] : domain.offset[phase + 1]].sum()) * paper.N_ACTIONS
-        changed = tried
-        for number in range(learner.max_sweeps):
+def _explore(model: Model, path: GridPath, slip: float, cap: int, chance: _Chance) -> None:
+    """Start an episode with every action in every cell, from one drawn at random on, and write down where each led."""
+    first = int(chance.draw.integers(model.size))
+    shape = np.array(path.grid.shape)
+    _kernels.explore_compiled(model, shape, first, float(slip), cap, path.goal, chance.bits, chance.tally)
+
+
+class Sweeper:
+    """The Q values of a domain in the phase state, and the sweeps that apply Eq. 1 to them."""
+
+    def __init__(self, reward: RewardMap, learner: PhaseQLearning) -> None:
+        self.reward, self.learner, self.domain = reward, learner, Domain(reward.path, phased=True)
+        domain, path = self.domain, reward.path
+        self.phases = range(domain.phases - 1, -1, -1)  # the last one first, for values come from there
+        self.q, self.value = np.zeros((domain.n_rows, paper.N_ACTIONS)), np.zeros(domain.n_rows)
+        self.live = domain.certified & ~domain.terminal
+        advances = np.where(domain.phase_of > 0, domain.state_of == path.states[domain.phase_of], False)
+        advances[: domain.offset[1]] = domain.joins > 0
+        self.stays = self.live & ~advances
+        self.worth = np.full(path.grid.n_states, reward.levels.other)
+        self.updates = 0
+
+    def settle(self, model: Model) -> bool:
+        """Sweep each phase to and fro, for values travel with the sweep, until nothing changes: whether it did."""
+        changed = [self.sweep(phase, model, range(self.learner.max_sweeps)) for phase in self.phases]
+        return not any(changed)
+
+    def sweep(self, phase: int, model: Model, numbers: Iterable[int]) -> int:
+        """Sweep a phase, backwards where a sweep's number is odd, until nothing changes: how much the last one did."""
+        domain, levels, learner = self.domain, self.reward.levels, self.learner
+        first, last = int(domain.offset[phase]), int(domain.offset[phase + 1])
+        states = domain.state_of[first:last]
+        self._enter(phase, first, last)
+        changed = tried = int(np.count_nonzero(self.live[first:last])) * paper.N_ACTIONS
+        for number in numbers:
             changed = _kernels.sweep_compiled(
-                q,
-                value,
+                self.q,
+                self.value,
                 model,
-                cells,
-                reward.rewards,
-                domain.joins,
-                reward.path.cells,
-                domain.low,
-                domain.size,
-                domain.offset,
                 domain.state_of,
-                live,
-                phase,
-                number % 2 == 1,  # to and fro, for values travel with the sweep
-                pays,
-                learner.alpha,
-                learner.gamma,
-                reward.path.goal,
-                REACH,
+                self.live,
+                self.stays,
+                self.worth,
+                first,
+                last,
+                number % 2 == 1,
+                levels.other,
+                levels.off_grid,
+                float(learner.alpha),  # always of one type: see `_kernels.compiled`
+                float(learner.gamma),
                 SETTLED,
             )
-            updates += tried
+            self.updates += tried
             if changed == 0:
                 break
-        settled &= changed == 0
-    return q, updates, settled
+        self.worth[states] = levels.other
+        return int(changed)
+
+    def _enter(self, phase: int, first: int, last: int) -> None:
+        """Say what entering each state in a phase is worth; beyond its domain nothing is promised."""
+        domain, path, gamma = self.domain, self.reward.path, self.learner.gamma
+        stays = first + np.flatnonzero(self.stays[first:last])
+        if phase == 0:
+            joining = np.flatnonzero(domain.joins)
+            after = domain.rows_of(domain.joins[joining], path.grid.cells_of(joining))
+            self.worth[:] = self.reward.rewards
+            self.worth[joining] += gamma * self.value[after]
+        elif phase == domain.phases - 1:
+            self.worth[path.goal] = self.reward.levels.goal
+        else:
+            after = domain.rows_of(phase + 1, path.cells[phase])
+            self.worth[path.states[phase]] = self.reward.levels.visited + gamma * self.value[after]
+        self.worth[domain.state_of[stays]] = self.reward.levels.other + gamma * self.value[stays]
 
 
 def _run_episodes(reward: RewardMap, learner: CellQLearning, cap: int, chance: _Chance) -> Floats:
     """Run the paper's episodes, each from a cell drawn at random; epsilon falls on a line, then stays."""
     n_states, goal = reward.path.grid.n_states, reward.path.goal
     q = np.zeros((n_states, paper.N_ACTIONS))
-    starts = chance.order.integers(n_states - 1, size=learner.episodes)
+    starts = chance.draw.integers(n_states - 1, size=learner.episodes)
     starts += starts >= goal  # anywhere but at the goal
     falling = np.arange(learner.episodes) / (learner.epsilon_falls_over * learner.episodes)
     _kernels.run_episodes_compiled(
@@ -218,14 +272,14 @@ def _run_episodes(reward: RewardMap, learner: CellQLearning, cap: int, chance: _
         np.zeros(n_states),
         np.zeros(n_states, np.int8),
         reward.rewards,
-        np.array(reward.path.grid.shape),
-        starts,
+        np.array(reward.path.grid.shape, np.uint64),
+        starts.astype(np.uint64),
         np.interp(falling, (0.0, 1.0), (learner.epsilon_start, learner.epsilon_end)),
         reward.levels.off_grid,
-        learner.alpha,
-        learner.gamma,
+        float(learner.alpha),
+        float(learner.gamma),
         cap,
-        goal,
+        np.uint64(goal),
         chance.bits,
         chance.tally,
     )

@@ -26,8 +26,11 @@ class ValueIteration:
     phased: ClassVar[bool] = True
 
     gamma: float = 0.1
+    slip: float = 0.0  # how likely, instead of the intended move, any of the 27 is made
 
     def __post_init__(self) -> None:
+        if not 0 <= self.slip < 1:
+            raise BadSettings("slip must lie in [0, 1).", slip=self.slip)
         if not 0 < self.gamma < 1:
             raise BadSettings(
                 "gamma must lie in (0, 1): with 1 arriving later is worth as much as arriving now.", gamma=self.gamma
@@ -40,4 +43,4 @@ def iterate_values(reward: RewardMap, settings: ValueIteration) -> Floats:
     Raises:
         BadSettings: Value iteration does not settle.
     """
-    return exact_q(Mdp(Domain(reward.path, settings.phased), reward, settings.gamma))
+    return exact_q(Mdp(Domain(reward.path, settings.phased), reward, settings.gamma, settings.slip))

@@ -1,0 +1,118 @@
+"""Compiled loops before the first job, from a folder of one's own."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from skills.errors import BadSettings
+from skills.jobs.warm import check_kept, kept_in
+from tests.style.test_kernel_cache import start, told
+
+WARM = """
+from threading import enumerate as threads
+from skills.jobs.warm import align_once, learn_once, warm_up
+def finish():
+    [thread.join() for thread in threads() if thread.name == "warm-up"]
+def touched():
+    return {name: len(loop.signatures) for name, loop in loops.items()}
+"""
+
+
+def test_a_worker_warms_up_when_it_starts_and_its_first_job_loads_and_compiles_nothing():
+    code = "from skills.jobs.worker import _library\n_library()\nfinish()\nwarm = touched()\nlearn()\n"
+    each = told(start(WARM + code + "dtw(path.tip_mm, path.tip_mm)\ntell(warm=warm, after=touched())"))
+    assert each["warm"] == each["after"]
+    assert sum(each["after"].values()) >= 3
+
+
+def test_a_server_warms_up_what_a_rollout_calls():
+    code = "warm_up(align_once).join()\nwarm = touched()\ndtw(path.tip_mm, path.tip_mm)\n"
+    each = told(start(WARM + code + "tell(warm=warm, after=touched())"))
+    assert each["warm"] == each["after"]
+    assert sum(each["after"].values()) == 1
+
+
+def test_what_a_power_cut_left_half_written_is_made_anew(tmp_path):
+    tmp_path.chmod(0o700)
+    code = WARM + "warm_up(align_once).join()\ntell(aligned=dtw(path.tip_mm, path.tip_mm[::-1]).total_mm)"
+    whole = told(start(code, NUMBA_CACHE_DIR=str(tmp_path)))
+    (kept,) = tmp_path.rglob("*.nbc")
+    os.truncate(kept, 100)
+    mended, after = (told(start(code, NUMBA_CACHE_DIR=str(tmp_path))) for _ in range(2))
+    assert whole["aligned"] == mended["aligned"] == after["aligned"] > 0
+    assert "cannot be loaded; they are made anew" in mended["logged"]
+    assert (mended["compiled"], after["compiled"], after["loaded"], after["logged"]) == (1, 0, 1, "")
+
+
+# ---- where others can write
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder two levels down that only this user can write to, wherever the tests run."""
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    folder = tmp_path / "cache" / "learning"
+    folder.mkdir(parents=True)
+    for part in (folder, *folder.parents[:2]):
+        part.chmod(0o700)
+    return folder
+
+
+def test_a_folder_of_ones_own_is_taken_and_so_is_the_one_beside_the_code(folder):
+    check_kept(folder)
+    check_kept(kept_in())
+
+
+@pytest.mark.parametrize("mode", [0o777, 0o775, 0o1777, 0o702], ids=oct)
+def test_a_folder_that_others_can_write_to_is_refused(folder, mode):
+    folder.chmod(mode)
+    with pytest.raises(BadSettings, match=rf"other users can write to {folder}: set NUMBA_CACHE_DIR"):
+        check_kept(folder)
+
+
+def test_a_folder_that_others_could_put_another_one_in_the_place_of_is_refused_unless_it_is_sticky(folder):
+    folder.parent.chmod(0o777)
+    with pytest.raises(BadSettings, match=f"other users can write to {folder.parent}:"):
+        check_kept(folder)
+    folder.parent.chmod(0o1777)
+    check_kept(folder)
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="a folder of another user: only root can make one")
+def test_another_users_folder_is_refused(folder):
+    os.chown(folder, 12345, -1)
+    with pytest.raises(BadSettings, match="other users can write"):
+        check_kept(folder)
+
+
+def test_a_named_folder_that_cannot_be_written_to_is_not_passed_over_in_silence(folder, monkeypatch):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "/dev/null/cache")
+    for kept in (folder, None):
+        with pytest.raises(BadSettings, match="NUMBA_CACHE_DIR=/dev/null/cache cannot be written to"):
+            check_kept(kept)
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(folder.parent))
+    check_kept(folder)
+
+
+@pytest.mark.parametrize("command", ["serve", "worker"])
+def test_nothing_starts_that_would_load_machine_code_from_where_others_write(tmp_path, command):
+    open_to_all = tmp_path / "cache"
+    open_to_all.mkdir()
+    open_to_all.chmod(0o777)
+    environment = {
+        "NUMBA_CACHE_DIR": str(open_to_all),
+        "SKILLS_DATABASE_URL": f"sqlite:///{tmp_path / 'skills.sqlite'}",
+    }
+    run = [sys.executable, "-m", "skills", command]
+    refused = subprocess.run(run, env={**os.environ, **environment}, capture_output=True, text=True, timeout=60)
+    assert refused.returncode == 1
+    assert refused.stderr.startswith("BadSettings: Machine code is loaded from")
+    assert list(tmp_path.iterdir()) == [open_to_all]
+
+
+def test_nowhere_to_keep_them_is_said():
+    logged = told(start("from skills.jobs.warm import check_kept\ncheck_kept(None)\ntell()"))["logged"]
+    assert "every process compiles them for itself; set NUMBA_CACHE_DIR to a folder of this user's own" in logged
