@@ -85,7 +85,7 @@ def against_c(reward: RewardMap, table: Table) -> None:
 
 def two_threads(reward: RewardMap, table: Table) -> None:
     """Learn the same styles on one thread and on two: the loops let go of the interpreter."""
-    learner, seeds = CellQLearning(episodes=50_000), range(4)
+    learner, seeds = CellQLearning(episodes=200_000), range(4)
 
     def learn_all(threads: int) -> float:
         began = time.perf_counter()
