@@ -2,7 +2,9 @@
 
     Recording
     ├── Motion      where one arm's tip was, one per pose topic: stamps_ns (T,), tip_mm (T, 3), rotation_xyzw (T, 4)
-    ├── Signal      one number over time, a jaw's angle or a clutch pedal: stamps_ns (T,), values (T,)
+    ├── Joints      what one arm's joints measured: stamps_ns (T,), positions (T, J)
+    ├── Signal      one number over time, a jaw's angle or a pedal: stamps_ns (T,), values (T,)
+    ├── Label       a stretch of time that somebody named: a stage of the session, a gesture
     └── TopicInfo   what else is in the file
 
 Everything is checked here, once: numbers are finite, time runs forwards, coordinates can be metres of an arm,
@@ -22,7 +24,7 @@ COORDINATE_LIMIT_MM = 1000.0  # ours: a PSM reaches 0.3 m; ten times that is mil
 DUPLICATE_SHARE_LIMIT = 0.5  # ours: beyond it the stamps say nothing about when the samples were taken
 QUATERNION_TOLERANCE = 1e-3  # ours: three printed decimals pass, an unnormalised quaternion does not
 
-Format = Literal["mcap", "csv"]
+Format = Literal["mcap", "csv", "jigsaws", "rosbag2", "rosbag1"]
 Integrity = Literal["full", "partial", "none"]
 
 
@@ -88,6 +90,44 @@ class Signal:
         _set(self, "values", frozen(self.values, np.float64, self.stamps_ns.shape, f"values of {self.topic}"))
 
 
+@dataclass(frozen=True, eq=False)
+class Joints:
+    """The joints of one arm over time.
+
+    Attributes:
+        arm: The arm's name, such as "PSM2".
+        topic: Where they come from.
+        stamps_ns: Integer nanoseconds, shape (T,), never decreasing.
+        positions: Shape (T, J): rad, but of a PSM the third, its insertion, in mm.
+    """
+
+    arm: str
+    topic: str
+    stamps_ns: Ints
+    positions: Floats
+
+    def __post_init__(self) -> None:
+        _set(self, "stamps_ns", frozen(self.stamps_ns, np.int64, (None,), f"stamps of {self.topic}"))
+        _check_forwards(self.topic, self.stamps_ns)
+        if np.shape(self.positions)[:1] == self.stamps_ns.shape:
+            _check_finite(self.topic, self.stamps_ns, np.asarray(self.positions, dtype=np.float64))
+        shape = (len(self.stamps_ns), None)
+        _set(self, "positions", frozen(self.positions, np.float64, shape, f"positions of {self.topic}"))
+
+
+@dataclass(frozen=True)
+class Label:
+    """A stretch of time that somebody named, both ends included, in the recording's own nanoseconds.
+
+    `kind` is "stage" (of a session, from a recorder's tags) or "gesture" (of JIGSAWS, such as "G6").
+    """
+
+    name: str
+    kind: Literal["stage", "gesture"]
+    start_ns: int
+    end_ns: int
+
+
 @dataclass(frozen=True)
 class TopicInfo:
     """One topic of a file: its name, its message type, how many messages."""
@@ -108,6 +148,14 @@ class Recording:
         jaws: Arm and its jaw's angle in rad.
         clutch: The console's clutch pedal.
         topics: Everything that the file holds, used or not.
+        joints: What the joints of PSMs and MTMs measured.
+        masters: Where the tips of MTMs were; they teach nothing.
+        grippers: MTM and its gripper's angle in rad.
+        pedals: Topic and state of every pedal, the clutch included: 0 released, 1 pressed, 2 a quick tap.
+        following: Teleoperation, such as "MTMR_PSM1", and whether it drove its PSM: 0 or 1.
+        scales: Teleoperation and its motion scale.
+        tools: Arm and its instrument as the console names it, such as "LARGE_NEEDLE_DRIVER:400006".
+        labels: What somebody named, in order of time.
     """
 
     format: Format
@@ -116,6 +164,14 @@ class Recording:
     jaws: tuple[tuple[str, Signal], ...] = ()
     clutch: Signal | None = None
     topics: tuple[TopicInfo, ...] = ()
+    joints: tuple[Joints, ...] = ()
+    masters: tuple[Motion, ...] = ()
+    grippers: tuple[tuple[str, Signal], ...] = ()
+    pedals: tuple[tuple[str, Signal], ...] = ()
+    following: tuple[tuple[str, Signal], ...] = ()
+    scales: tuple[tuple[str, Signal], ...] = ()
+    tools: tuple[tuple[str, str], ...] = ()
+    labels: tuple[Label, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.motions:
