@@ -8,6 +8,7 @@ import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import asdict
 from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ParamSpec
@@ -28,10 +29,12 @@ app = typer.Typer(
 )
 recordings = typer.Typer(no_args_is_help=True, help="Raw recordings.")
 demos = typer.Typer(no_args_is_help=True, help="Demonstrations: one hand-off each.")
+jigsaws = typer.Typer(no_args_is_help=True, help="The JIGSAWS data set, which its authors give on request.")
 policies = typer.Typer(no_args_is_help=True, help="Learnt policies.")
 app.add_typer(recordings, name="recording")
 app.add_typer(demos, name="demo")
 app.add_typer(policies, name="policy")
+app.add_typer(jigsaws, name="jigsaws")
 
 out = Console(highlight=False, width=None if sys.stdout.isatty() else 160)  # in a pipe, digests stay whole
 err = Console(stderr=True, highlight=False)
@@ -39,6 +42,11 @@ err = Console(stderr=True, highlight=False)
 AsJson = Annotated[bool, typer.Option("--json", help="Print the service's JSON.")]
 Surgeon = Annotated[str, typer.Argument(help="The surgeon's pseudonym.")]
 Suture = Annotated[str, typer.Argument(help="The suture type, such as simple-running.")]
+RateHz = Annotated[float | None, typer.Option(help="Samples per second, for a table without times.")]
+Frame = Annotated[str | None, typer.Option(help="The frame of a table's positions; PSM_base where none is given.")]
+RecordingPath = Annotated[
+    Path, typer.Argument(help="A recording, a bag folder, or a session's folder with one; pictures stay here.")
+]
 Triple = tuple[float, float, float]
 
 
@@ -89,14 +97,21 @@ def finished(client: "Client", job: dict[str, Any]) -> dict[str, Any]:
         return client.wait(job)
 
 
-def recording_file(path: Path) -> Path:
-    """Find the one recording that a path means: a file, or the only .mcap in a bag folder."""
-    if path.is_file():
-        return path
-    found = sorted(path.glob("*.mcap")) if path.is_dir() else []
-    if len(found) != 1:
-        raise BadInput(f"{path} is neither a recording nor a folder with exactly one .mcap file.")
-    return found[0]
+@contextmanager
+def ready(path: Path) -> Iterator[tuple[Path, Callable[[int], None]]]:
+    """Make the recording that a path means ready to be sent: the file to send, and what is told of bytes sent."""
+    from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
+
+    from skills.recordings.folder import find_bag, ready_to_send
+
+    bag = find_bag(path)
+    columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=err, transient=True) as bar:
+        reading = bar.add_task("reading", total=bag.size_bytes)
+        with ready_to_send(bag, lambda count: bar.advance(reading, count)) as file:
+            bar.update(reading, visible=False)
+            sending = bar.add_task("sending", total=file.stat().st_size)
+            yield file, lambda count: bar.advance(sending, count)
 
 
 # ---- the installation
@@ -153,10 +168,10 @@ def seed() -> None:
 
 @recordings.command("add")
 @refusing
-def recording_add(path: Path, as_json: AsJson = False) -> None:
+def recording_add(path: RecordingPath, rate_hz: RateHz = None, frame: Frame = None, as_json: AsJson = False) -> None:
     """Store a recording and see which hand-offs it seems to hold."""
-    with service() as client:
-        stored = client.add_recording(recording_file(path))
+    with service() as client, ready(path) as (file, sent):
+        stored = client.add_recording(file, sent=sent, rate_hz=rate_hz, frame=frame)
     if as_json:
         out.print_json(json.dumps(stored))
         return
@@ -164,13 +179,15 @@ def recording_add(path: Path, as_json: AsJson = False) -> None:
         f"{stored['sha256']}  {stored['format']}, {stored['duration_s']:.1f} s, integrity {stored['integrity']}",
         soft_wrap=True,
     )
+    for name, value in stored["notes"].items():
+        out.print(f"{name}: {value}", markup=False, soft_wrap=True)
     show(stored["segments"], False, ("arm", "start_s", "end_s", "reason"))
 
 
 @demos.command("add")
 @refusing
 def demo_add(
-    path: Path,
+    path: RecordingPath,
     surgeon: Annotated[str, typer.Option()],
     suture: Annotated[str, typer.Option()],
     arm: Annotated[str | None, typer.Option(help="Needed where a recording has several arms.")] = None,
@@ -184,17 +201,20 @@ def demo_add(
         float, typer.Option(help="How far beyond its cell a sample stays in it: 0 to 0.5 cells, 0.25 against tremor.")
     ] = 0.0,
     session: Annotated[str | None, typer.Option()] = None,
+    rate_hz: RateHz = None,
+    frame: Frame = None,
     as_json: AsJson = False,
 ) -> None:
     """Store a recording and one demonstration of it."""
     asked: dict[str, Any] = {"arm": arm, "topic": topic, "session": session}
     asked |= {"grid": grid, "cell_mm": cell_mm, "hysteresis": hysteresis}
-    file = recording_file(path)
-    with service() as client:
+    how: dict[str, Any] = {"rate_hz": rate_hz, "frame": frame}
+    with service() as client, ready(path) as (file, sent):
         if proposal is None:
-            answer = client.add_demo(file, surgeon=surgeon, suture=suture, start_s=start_s, end_s=end_s, **asked)
+            asked |= {"start_s": start_s, "end_s": end_s}
+            answer = client.add_demo(file, surgeon=surgeon, suture=suture, sent=sent, **how, **asked)
         else:
-            stored = client.add_recording(file)
+            stored = client.add_recording(file, sent=sent, **how)
             proposed = [s for s in stored["segments"] if arm in (None, s["arm"])]
             if not 1 <= proposal <= len(proposed):
                 raise BadInput(f"The recording has {len(proposed)} proposed hand-offs; see `skills recording add`.")
@@ -231,6 +251,39 @@ def demo_withdraw(demo: str) -> None:
     """Withdraw a demonstration and the releases that rest on it."""
     with service() as client:
         client.withdraw_demo(demo)
+
+
+@jigsaws.command("add")
+@refusing
+def jigsaws_add(
+    folder: Annotated[Path, typer.Argument(help="With TASK/kinematics/AllGestures/*.txt and what belongs to them.")],
+    task: Annotated[list[str] | None, typer.Option(help="Only this task, such as Suturing; once for each.")] = None,
+    suture: Annotated[
+        str | None, typer.Option(help="Make demonstrations of this suture type of the proposed hand-offs.")
+    ] = None,
+    arm: Annotated[str | None, typer.Option(help="Of PSM_left or PSM_right only.")] = None,
+    prefix: Annotated[str, typer.Option(help="Before a surgeon's letter, in their pseudonym.")] = "jigsaws",
+    as_json: AsJson = False,
+) -> None:
+    """Store every trial of a folder; exit code 1 where one was refused, and the others are stored."""
+    from rich.progress import track
+
+    from skills.dataset import find_trials, send_trials
+
+    found = find_trials(folder, task or ())
+    with service() as client:
+        sending = send_trials(client, found, suture=suture, arm=arm, prefix=prefix)
+        done = [asdict(sent) for sent in track(sending, "sending", total=len(found), console=err, transient=True)]
+    if as_json:
+        out.print_json(json.dumps(done))
+    else:
+        rows = [one | {"recording": (one["recording"] or "")[:12], "demos": len(one["demos"])} for one in done]
+        show(rows, False, ("trial", "surgeon", "skill_level", "score", "recording", "proposed", "demos"))
+        for one in done:
+            for problem in one["problems"]:
+                err.print(f"{one['trial']}: {problem}", style="red", markup=False, soft_wrap=True)
+    if any(one["problems"] for one in done):
+        raise typer.Exit(1)
 
 
 # ---- learning

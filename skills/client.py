@@ -10,11 +10,12 @@ Answers are the JSON of the service. What it refuses is raised as `Problem`.
 
 import base64
 import hashlib
+import io
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, BinaryIO, Self
 
 import httpx2 as httpx
 
@@ -22,7 +23,7 @@ from skills.errors import SkillsError
 
 Json = dict[str, Any]
 Position = Sequence[float]
-MEDIA_TYPES = {".mcap": "application/vnd.mcap", ".csv": "text/csv"}
+PIECE_BYTES = 1 << 20
 ENDED = ("succeeded", "failed", "cancelled")
 
 
@@ -80,15 +81,35 @@ class Client:
 
     # ---- recordings and demonstrations
 
-    def add_recording(self, recording: Path | bytes, media_type: str | None = None, **query: Any) -> Json:
-        """Store a recording: its digest, its topics and the hand-offs proposed in it."""
-        return self._upload("/recordings", recording, media_type, query)
+    def add_recording(
+        self,
+        recording: Path | bytes,
+        media_type: str | None = None,
+        sent: Callable[[int], None] | None = None,
+        **query: Any,
+    ) -> Json:
+        """Store a recording: its digest, its topics and the hand-offs proposed in it.
+
+        Args:
+            recording: A file, which is never held in memory, or bytes. They are sent with their digest.
+            media_type: What they are; left out, it is told by the content.
+            sent: Is told of bytes as they go out.
+            query: `rate_hz` and `frame`, for a table.
+        """
+        return self._upload("/recordings", recording, media_type, query, sent)
 
     def add_demo(
-        self, recording: Path | bytes, *, surgeon: str, suture: str, media_type: str | None = None, **query: Any
+        self,
+        recording: Path | bytes,
+        *,
+        surgeon: str,
+        suture: str,
+        media_type: str | None = None,
+        sent: Callable[[int], None] | None = None,
+        **query: Any,
     ) -> Json:
         """Store a recording and one demonstration of it: arm, topic, start_s, end_s, grid, cell_mm, hysteresis."""
-        return self._upload("/demos", recording, media_type, {"surgeon": surgeon, "suture": suture, **query})
+        return self._upload("/demos", recording, media_type, {"surgeon": surgeon, "suture": suture, **query}, sent)
 
     def cut_demo(self, recording: str, *, surgeon: str, suture: str, **asked: Any) -> Json:
         """Cut a demonstration out of a stored recording, named by its digest; it is asked for as in `add_demo`."""
@@ -237,13 +258,41 @@ class Client:
             if cursor is None:
                 return items
 
-    def _upload(self, path: str, recording: Path | bytes, media_type: str | None, query: Mapping[str, Any]) -> Json:
-        data = recording if isinstance(recording, bytes) else recording.read_bytes()
-        if media_type is None:
-            media_type = "application/vnd.mcap" if isinstance(recording, bytes) else MEDIA_TYPES[recording.suffix]
-        digest = base64.b64encode(hashlib.sha256(data).digest()).decode()
-        headers = {"Content-Type": media_type, "Content-Digest": f"sha-256=:{digest}:"}
-        return self._json("POST", path, content=data, headers=headers, params=_given(query))
+    def _upload(
+        self,
+        path: str,
+        recording: Path | bytes,
+        media_type: str | None,
+        query: Mapping[str, Any],
+        sent: Callable[[int], None] | None,
+    ) -> Json:
+        from skills.recordings import media_type_of  # slow to import
+
+        with io.BytesIO(recording) if isinstance(recording, bytes) else recording.open("rb") as file:
+            size, digest = _digest(file)
+            headers = {
+                "Content-Type": media_type or media_type_of(file),
+                "Content-Digest": f"sha-256=:{digest}:",
+                "Content-Length": str(size),
+            }
+            return self._json("POST", path, content=_pieces(file, sent), headers=headers, params=_given(query))
+
+
+def _digest(file: BinaryIO) -> tuple[int, str]:
+    """Return the size of a file, and its SHA-256 in base64."""
+    seen, size = hashlib.sha256(), 0
+    for data in _pieces(file, None):
+        seen.update(data)
+        size += len(data)
+    return size, base64.b64encode(seen.digest()).decode()
+
+
+def _pieces(file: BinaryIO, sent: Callable[[int], None] | None) -> Iterator[bytes]:
+    file.seek(0)
+    while data := file.read(PIECE_BYTES):
+        yield data
+        if sent is not None:
+            sent(len(data))
 
 
 def _given(query: Mapping[str, Any]) -> Json:

@@ -12,9 +12,11 @@
     ├── PreconditionFailed      it changed since the caller last looked
     ├── UnknownFormat           the content is of no format that is read here
     ├── TooLarge                over a limit of the settings
+    ├── TooSlow                 the body of a request did not come in time
     ├── Corrupt                 what was stored is no longer what was stored
     ├── Busy                    the database or the queue cannot take it now
-    └── SimulationFailed        the simulator crashed, hung or answered nonsense
+    ├── SimulationFailed        the simulator crashed, hung or answered nonsense
+    └── Unanswered              a process of ours gave no answer; whoever asked it says so in words of its own
 
 An error is named after what is wrong, carries the offending numbers as attributes of `numbers`, and its message says
 what to do next. Only `skills.api.problems` knows which status code each one becomes.
@@ -57,6 +59,10 @@ class TooLarge(SkillsError):
     """Over a limit of the settings."""
 
 
+class TooSlow(SkillsError):
+    """The body of a request did not come in time."""
+
+
 class Corrupt(SkillsError):
     """What was stored is no longer what was stored."""
 
@@ -67,6 +73,15 @@ class Busy(SkillsError):
 
 class SimulationFailed(SkillsError):
     """The simulator crashed, hung or answered nonsense: the check did not happen."""
+
+
+class Unanswered(SkillsError):
+    """A process of ours gave no answer: the `cause` in a word or three, and what it `did`, as a sentence goes on."""
+
+    def __init__(self, cause: str, did: str) -> None:
+        super().__init__(f"A process of ours {did}.", cause=cause)
+        self.cause = cause
+        self.did = did
 
 
 # ---- recordings ------------------------------------------------------------------------------------------------

@@ -17,6 +17,7 @@ from skills.client import Client
 from skills.db.session import Database
 from skills.jobs.child import start_worker_child
 from skills.jobs.warm import align_once, warm_up
+from skills.punctual import PunctualConnection
 from skills.samples import load_samples
 from skills.settings import Settings
 
@@ -42,6 +43,7 @@ def serve(settings: Settings, *, samples: bool = False) -> None:
             create_app(settings),
             host=settings.host,
             port=settings.port,
+            http=PunctualConnection,
             log_level="warning",
             timeout_graceful_shutdown=GRACE_S,
             server_header=False,

@@ -31,6 +31,14 @@ class Settings(BaseSettings):
 
     max_upload_bytes: int = Field(default=256 * MEBIBYTE, gt=0)
     upload_deadline_s: float = Field(default=120.0, gt=0)
+    upload_patience_s: float = Field(default=20.0, gt=0)  # then a body must have come at this rate, a modem's:
+    upload_bytes_per_s: int = Field(default=16 << 10, gt=0)
+    readers: int = Field(default=4, ge=1, le=24)  # uploads read at once, each in a process of its own, under these:
+    reading_memory_bytes: int = Field(default=1024 * MEBIBYTE, gt=0)  # a million poses in MCAP take 320 MiB
+    reading_cpu_s: int = Field(default=30, gt=0)  # they take 1 s, as a table 3
+    reading_wall_s: float = Field(default=60.0, gt=0)  # others may be read beside it
+    reading_file_bytes: int = Field(default=1024 * MEBIBYTE, gt=0)  # a bag unpacked from its archive
+    reading_answer_bytes: int = Field(default=256 * MEBIBYTE, gt=0)  # 4 million poses
     playback_timeout_s: float = Field(default=120.0, gt=0)
     playback_memory_bytes: int = Field(default=1024 * MEBIBYTE, gt=0)
     worker_threads: int = Field(default=2, ge=1, le=64)

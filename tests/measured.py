@@ -62,9 +62,9 @@ def measure(side: int, waypoints: int) -> Cost:
     )
 
 
-def peak_mib() -> float:
-    """Read the most memory that this process has had resident so far, in MiB."""
-    (line,) = (line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM:"))
+def peak_mib(pid: int | str = "self") -> float:
+    """Read the most memory that a process, by default this one, has had resident so far, in MiB."""
+    (line,) = (line for line in Path(f"/proc/{pid}/status").read_text().splitlines() if line.startswith("VmHWM:"))
     return int(line.split()[1]) / MIB
 
 

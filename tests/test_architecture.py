@@ -56,6 +56,7 @@ def test_imports_lead_downwards_only_and_every_module_has_its_floor(monkeypatch,
     [
         ("mcap", "recordings/"),
         ("mcap_ros2", "recordings/"),
+        ("rosbags", "recordings/ros.py"),
         ("pybullet", "sim/"),
         ("pybullet_data", "sim/"),
         ("numba", "style/learning/_kernels.py"),

@@ -13,9 +13,11 @@ from skills import __version__
 from skills.api.answers import Encoded
 from skills.api.problems import TOO_LARGE, answer_refusals
 from skills.api.routes import catalogue, demos, operating, plans, policies, trainings
+from skills.confined.limits import Limits
 from skills.db.session import Database
 from skills.jobs.engine import Engine
 from skills.library.catalogue import seed_catalogue
+from skills.recordings.confined import ConfinedReader
 from skills.settings import Settings
 
 DESCRIPTION = (
@@ -30,7 +32,8 @@ def create_app(settings: Settings) -> FastAPI:
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         await to_thread.run_sync(prepare_database, app.state.database)
-        yield
+        with confined_reader(settings) as app.state.reader:
+            yield
         await to_thread.run_sync(app.state.engine.close)
         app.state.database.close()
 
@@ -61,6 +64,18 @@ def prepare_database(database: Database) -> None:
     database.migrate()
     with database.writing() as session:
         seed_catalogue(session)
+
+
+def confined_reader(settings: Settings) -> ConfinedReader:
+    """Make the reader of what people send, under the limits of the settings."""
+    limits = Limits(
+        memory_bytes=settings.reading_memory_bytes,
+        wall_s=settings.reading_wall_s,
+        cpu_s=settings.reading_cpu_s,
+        file_bytes=settings.reading_file_bytes,
+        children=False,
+    )
+    return ConfinedReader(limits, answer_bytes=settings.reading_answer_bytes, at_once=settings.readers)
 
 
 class Service(FastAPI):
@@ -94,7 +109,7 @@ class Headers:
                     headers = MutableHeaders(scope=message)
                 headers["X-Request-ID"] = secrets.token_hex(8)
                 headers["X-Content-Type-Options"] = "nosniff"
-                headers["Content-Security-Policy"] = "default-src 'self'; frame-ancestors 'none'"
+                headers.setdefault("Content-Security-Policy", "default-src 'self'; frame-ancestors 'none'")
             elif in_plain_text:
                 message["body"] = TOO_LARGE.body
             await send(message)

@@ -1,5 +1,6 @@
-"""What routes ask for: the database, the engine, who is asking, and an upload on its way in."""
+"""What routes ask for: the database, the engine, the reader, who is asking, and an upload on its way in."""
 
+import asyncio
 import hashlib
 import tempfile
 import time
@@ -7,17 +8,18 @@ from collections.abc import AsyncIterator
 from typing import Annotated, Any
 
 from fastapi import Depends, Header, Path, Query, Request
+from starlette.requests import ClientDisconnect
 
 from skills.db.session import Database
-from skills.errors import TooLarge, UnknownFormat, UnreadableRecording
+from skills.errors import TooLarge, TooSlow, UnknownFormat, UnreadableRecording
 from skills.jobs.engine import Engine
-from skills.library.recordings import MEDIA_TYPES, Upload, check_digest
+from skills.library.recordings import Reader, Upload, check_digest
+from skills.recordings import MEDIA_TYPES
 from skills.settings import Settings
 
 SLUG = r"^[a-z0-9][a-z0-9_-]{0,63}$"
 DIGEST = r"^[0-9a-f]{64}$"
 SPOOL_BYTES = 8 << 20
-LATER = {"application/zip": "bag folders", "text/plain": "JIGSAWS kinematics"}
 
 
 def _database(request: Request) -> Database:
@@ -28,6 +30,11 @@ def _database(request: Request) -> Database:
 def _engine(request: Request) -> Engine:
     engine: Engine = request.app.state.engine
     return engine
+
+
+def _reader(request: Request) -> Reader:
+    reader: Reader = request.app.state.reader
+    return reader
 
 
 def _settings(request: Request) -> Settings:
@@ -42,6 +49,7 @@ def _actor() -> str:
 
 Db = Annotated[Database, Depends(_database)]
 Jobs = Annotated[Engine, Depends(_engine)]
+Read = Annotated[Reader, Depends(_reader)]
 Actor = Annotated[str, Depends(_actor)]
 Slug = Annotated[str, Path(pattern=SLUG)]
 Digest = Annotated[str, Path(pattern=DIGEST)]
@@ -69,28 +77,48 @@ async def receive(
     Raises:
         UnknownFormat: The content type is none that is read here.
         TooLarge: The body is over the limit.
-        UnreadableRecording: It came too slowly, or is not what its Content-Digest says.
+        TooSlow: It did not come in time.
+        UnreadableRecording: It ended early, or is not what its Content-Digest says.
     """
     media_type = content_type.partition(";")[0].strip().lower()
-    if media_type in LATER:
-        raise UnknownFormat(f"{LATER[media_type]} are not read yet; send the .mcap file or a CSV.")
     if media_type not in MEDIA_TYPES:
-        raise UnknownFormat(f"Send the recording as the raw body with Content-Type {' or '.join(MEDIA_TYPES)}.")
+        known = ", ".join(f"{kind} ({name})" for kind, name in MEDIA_TYPES.items())
+        raise UnknownFormat(f"Send the recording as the raw body with one of these as its Content-Type: {known}.")
     if content_encoding not in (None, "identity"):
         raise UnknownFormat("Send the body without Content-Encoding; MCAP compresses itself.")
-    seen, size, deadline = hashlib.sha256(), 0, time.monotonic() + settings.upload_deadline_s
+    seen, size = hashlib.sha256(), 0
     with tempfile.SpooledTemporaryFile(max_size=SPOOL_BYTES) as file:
-        async for data in request.stream():
+        async for data in _in_time(request, settings):
             size += len(data)
             if size > settings.max_upload_bytes:
                 raise TooLarge(f"A recording has at most {settings.max_upload_bytes} bytes; cut it.")
-            if time.monotonic() > deadline:
-                raise UnreadableRecording("The body came too slowly; send it again.")
             seen.update(data)
             file.write(data)
         sha256 = seen.hexdigest()
         vouched = check_digest(content_digest, sha256)
         yield Upload(file, sha256, size, media_type, rate_hz, frame, vouched)  # type: ignore[arg-type]
+
+
+async def _in_time(request: Request, settings: Settings) -> AsyncIterator[bytes]:
+    """Give a body piece by piece, for as long as it comes fast enough and is not given up.
+
+    Raises:
+        TooSlow: It is slower than the settings' rate, their patience granted, or not there at their deadline.
+        UnreadableRecording: The sender went away.
+    """
+    began, size, pieces = time.monotonic(), 0, request.stream()
+    while True:
+        allowed_s = min(settings.upload_patience_s + size / settings.upload_bytes_per_s, settings.upload_deadline_s)
+        try:
+            data = await asyncio.wait_for(anext(pieces, None), began + allowed_s - time.monotonic())
+        except TimeoutError:
+            raise TooSlow("The body came too slowly; send it again over a better line.") from None
+        except ClientDisconnect:
+            raise UnreadableRecording("The body ended early; send it again.") from None
+        if data is None:
+            return
+        size += len(data)
+        yield data
 
 
 Incoming = Annotated[Upload, Depends(receive)]

@@ -21,6 +21,7 @@ log = logging.getLogger("skills.api")
 STATUS: tuple[tuple[type[errors.SkillsError], int, str], ...] = (
     (errors.UnknownFormat, 415, "This format is not read here"),
     (errors.TooLarge, 413, "Too large"),
+    (errors.TooSlow, 408, "Too slow"),
     (errors.NotFound, 404, "Not found"),
     (errors.Erased, 410, "Erased for good"),
     (errors.PreconditionFailed, 412, "It changed meanwhile"),
@@ -30,6 +31,7 @@ STATUS: tuple[tuple[type[errors.SkillsError], int, str], ...] = (
     (errors.SimulationFailed, 503, "The simulator failed"),
     (errors.BadInput, 422, "What was sent cannot be used"),
 )
+HEADERS = {errors.Busy: {"Retry-After": "1"}, errors.TooSlow: {"Connection": "close"}}
 DETAILS = {
     400: "The body cannot be read as JSON; mend it.",
     404: "See /openapi.json for the calls there are.",
@@ -80,7 +82,7 @@ def answer_refusals(app: FastAPI) -> None:
     def refused(_request: Request, error: errors.SkillsError) -> Response:
         for family, status, title in STATUS:
             if isinstance(error, family):
-                headers = {"Retry-After": "1"} if isinstance(error, errors.Busy) else None
+                headers = HEADERS.get(family)
                 numbers = {"numbers": error.numbers} if error.numbers else {}
                 return problem(status, kind_of(error), title, str(error), headers=headers, **numbers)
         raise error

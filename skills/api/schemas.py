@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, StrictBool, StrictInt, create
 from skills.api.deps import DIGEST, SLUG
 from skills.db import models as rows
 from skills.db.base import rfc3339 as at
-from skills.library.plans import PlanRequest
+from skills.library.plans import Approach, PlanRequest
 from skills.library.training import learner_of
 from skills.style.grid import MAX_HYSTERESIS, GridMode
 from skills.style.learning.irl import MaxEntIRL
@@ -153,16 +153,23 @@ class PlanIn(Schema):
     frame: Name | None = None
     instrument: Name | None = None
     speed_mm_s: Annotated[Number, Field(gt=0, le=1000)] = 20.0
-    psm_m: WaitingArmIn | None = None
+    psm_m: WaitingArmIn | None = Field(
+        default=None, description="Left out, it is taken from the demonstration where that has PSM_M's pose."
+    )
+    realignment: StrictBool = Field(default=True, description="false plans A1 alone, without A2's turn.")
 
     @property
     def request(self) -> PlanRequest:
         """The request as the library knows it."""
         given = {name: getattr(self, name) for name in ("surgeon", "suture", "version", "arm", "frame", "instrument")}
         points = [SuturePoint(p.position_mm, p.rotation_xyzw) for p in self.suture_points]
-        approach = None if self.psm_m is None else self.psm_m.approach
+        approach: Approach | Literal["demonstrated"] = "demonstrated" if self.psm_m is None else self.psm_m.approach
         return PlanRequest(
-            suture_points=points, starts_mm=self.starts_mm, speed_mm_s=self.speed_mm_s, approach_m=approach, **given
+            suture_points=points,
+            starts_mm=self.starts_mm,
+            speed_mm_s=self.speed_mm_s,
+            approach_m=approach if self.realignment else None,
+            **given,
         )
 
 

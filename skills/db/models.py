@@ -22,9 +22,10 @@ from sqlalchemy import (
 from sqlalchemy.orm import Mapped, mapped_column, relationship
 
 from skills.db.base import Base, now
-from skills.db.packed import Packed, added_later, stored
+from skills.db.packed import Packed, stored
+from skills.packing import added_later
 from skills.style.certificate import Coverage
-from skills.style.demo import Demo
+from skills.style.demo import Demo, Partner, Pause
 from skills.style.grid import GridPath, GridWorld
 from skills.style.learning.learners import LEARNERS
 from skills.style.learning.q_learning import PhaseQLearning, Training
@@ -34,8 +35,10 @@ from skills.style.playback import Playback
 from skills.style.policy import Policy
 from skills.style.reward import RewardLevels, RewardMap
 
-stored(GridWorld, GridPath, RewardLevels, *LEARNERS.values(), Training, SuturePoint, Pass)
+stored(GridWorld, GridPath, RewardLevels, *LEARNERS.values(), Training, SuturePoint, Pass, Pause, Partner)
 added_later(GridPath, "hysteresis")
+added_later(Demo, "pauses")
+added_later(Demo, "partner")
 added_later(PhaseQLearning, "slip")
 added_later(ValueIteration, "slip")
 

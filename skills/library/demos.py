@@ -1,6 +1,7 @@
 """Demonstrations: hand-offs cut out of recordings and put into their grid worlds, checked before anything is kept."""
 
-import io
+import json
+import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -10,17 +11,18 @@ from sqlalchemy.orm import Session
 
 from skills.db.base import now
 from skills.db.models import Demonstration, Release, StoredRecording, StoredRewardMap
-from skills.db.packed import canonical, digest, sha256
+from skills.db.packed import digest
 from skills.db.session import Database
 from skills.errors import Conflict, NotFound
 from skills.library.catalogue import find_surgeon, find_suture_type
 from skills.library.events import record
-from skills.library.recordings import Upload, find_recording, keep, read_upload, recording_bytes
+from skills.library.recordings import Reader, Upload, find_recording, keep, read_upload, recording_bytes
 from skills.library.releases import withdraw_resting_on
+from skills.packing import canonical, sha256
 from skills.recordings import read_recording
-from skills.style.demo import Demo, Recording, cut_demo, describe
-from skills.style.evaluation import discretisation_rmse
+from skills.style.demo import Demo, Recording, cut_demo
 from skills.style.grid import PAPER_GRID, GridMode, GridPath, choose_grid, discretize
+from skills.style.quality import describe, describe_path
 from skills.style.reward import RewardMap, sparse_reward
 
 
@@ -55,36 +57,67 @@ def make_demo(recording: Recording, cut: Cut) -> Made:
     demo = cut_demo(recording, arm=cut.arm, topic=cut.topic, start_s=cut.start_s, end_s=cut.end_s)
     grid = choose_grid(demo.tip_mm, cut.grid, cut.cell_mm)
     path = discretize(demo.tip_mm, grid, cut.hysteresis)
-    report = asdict(describe(demo)) | {
-        "grid": asdict(grid) | {"chosen": "paper" if grid == PAPER_GRID else "fit"},
-        "path_states": len(path.states),
-        "revisits": path.revisits,
-        "bridged_cells": path.bridged,
-        "discretisation_rmse_mm": list(discretisation_rmse(demo.tip_mm, grid, path.hysteresis)),
-    }
-    return Made(demo, path, sparse_reward(path), report)
+    duplicates = recording.motion_of(arm=demo.arm, topic=demo.topic).duplicate_stamps
+    return Made(demo, path, sparse_reward(path), report_on(demo, path, duplicates))
 
 
-def upload_demo(database: Database, upload: Upload, cut: Cut, actor: str) -> tuple[Demonstration, bool]:
+def report_on(demo: Demo, path: GridPath, duplicate_stamps: int) -> dict[str, Any]:
+    """Write what is measured of a demonstration and its path, and what to do about it.
+
+    Args:
+        demo: The demonstration.
+        path: It in its grid.
+        duplicate_stamps: Samples of the whole recorded motion that carried the stamp of the sample before.
+    """
+    of_motion, of_path = describe(demo), describe_path(demo, path)
+    advice = [*of_motion.advice, *_about_duplicates(duplicate_stamps), *of_path.advice]
+    grid = asdict(path.grid) | {"chosen": "paper" if path.grid == PAPER_GRID else "fit"}
+    partner = None if demo.partner is None else asdict(demo.partner) | {"approach": list(demo.partner.approach)}
+    numbers = asdict(of_motion) | asdict(of_path) | {"duplicate_stamps": duplicate_stamps}
+    written: dict[str, Any] = json.loads(canonical(numbers | {"grid": grid, "partner": partner, "advice": advice}))
+    return written  # as it is read back
+
+
+def full_report(demonstration: Demonstration) -> dict[str, Any]:
+    """Measure a stored demonstration again: what was stored of an older one says less."""
+    motions = demonstration.recording.about["motions"]
+    duplicates = next((m["duplicate_stamps"] for m in motions if m["topic"] == demonstration.topic), 0)
+    return report_on(demonstration.demo, demonstration.path, duplicates)
+
+
+def _about_duplicates(count: int) -> list[str]:
+    if count == 0:
+        return []
+    samples = "1 sample" if count == 1 else f"{count} samples"
+    return [f"{samples} carried the stamp of the sample before and were dropped: check the recorder's clock."]
+
+
+def upload_demo(
+    database: Database, upload: Upload, cut: Cut, actor: str, read: Reader = read_recording
+) -> tuple[Demonstration, bool]:
     """Store a recording and one demonstration of it, both or neither."""
     with database.reading() as session:  # refused before the long work, looked up again when writing
         find_surgeon(session, cut.surgeon)
         find_suture_type(session, cut.suture)
-    recording = read_upload(upload)
+    recording = read_upload(upload, read)
     made = make_demo(recording, cut)
     with database.writing() as session:
         stored, _ = keep(session, upload, recording, actor)
         return _store_demo(session, stored, made, cut, actor)
 
 
-def add_demo(database: Database, recording_sha256: str, cut: Cut, actor: str) -> tuple[Demonstration, bool]:
+def add_demo(
+    database: Database, recording_sha256: str, cut: Cut, actor: str, read: Reader = read_recording
+) -> tuple[Demonstration, bool]:
     """Cut one more demonstration out of a stored recording."""
-    with database.reading() as session:
-        find_surgeon(session, cut.surgeon)
-        find_suture_type(session, cut.suture)
-        stored = find_recording(session, recording_sha256)
-        data = b"".join(recording_bytes(session, stored))
-    made = make_demo(read_recording(io.BytesIO(data), **stored.reading), cut)
+    with tempfile.TemporaryFile() as file:
+        with database.reading() as session:
+            find_surgeon(session, cut.surgeon)
+            find_suture_type(session, cut.suture)
+            stored = find_recording(session, recording_sha256)
+            file.writelines(recording_bytes(session, stored))
+        recording = read(file, **stored.reading)
+    made = make_demo(recording, cut)
     with database.writing() as session:
         return _store_demo(session, find_recording(session, recording_sha256), made, cut, actor)
 
@@ -102,6 +135,8 @@ def _store_demo(
         "segment_s": [made.demo.start_s, made.demo.end_s],
         "grid": asdict(made.path.grid),
     }
+    if made.demo.pauses:  # of a recording with presses, the same segment once had the samples in them
+        identity["left_out"] = [asdict(pause) for pause in made.demo.pauses]
     if made.path.hysteresis:  # else left out, so that a demonstration is still known by the digest it always had
         identity["hysteresis"] = made.path.hysteresis
     demo_sha256 = sha256(canonical(identity))

@@ -6,7 +6,7 @@ from sqlalchemy.orm import Session
 
 from skills.db.base import now
 from skills.db.models import Event, Surgeon
-from skills.db.packed import canonical, sha256
+from skills.packing import canonical, sha256
 
 
 def record(

@@ -9,9 +9,9 @@ from sqlalchemy.orm import Session
 
 from skills.db.base import now
 from skills.db.models import Job, Surgeon
-from skills.db.packed import canonical, sha256
 from skills.errors import Conflict, NotFound
 from skills.library.events import record
+from skills.packing import canonical, sha256
 
 LIVE = ("queued", "running", "succeeded")
 ACTIVE = ("queued", "running")

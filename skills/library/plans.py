@@ -3,29 +3,36 @@
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from math import isfinite
-from typing import Any
+from typing import Any, Literal
 
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from skills.db.models import Job, Plan, StoredPlayback
-from skills.db.packed import canonical, sha256
 from skills.db.session import Database
 from skills.errors import BadPlan, NotFound
 from skills.library import jobs, policies
 from skills.library.events import record
 from skills.library.verified import learnt, plan_identity, planned
+from skills.packing import canonical, sha256
 from skills.settings import Settings
+from skills.style.demo import Demo
 from skills.style.plan import SuturePlan, SuturePoint, pose_xyzw, rotation_of, stack
 from skills.style.playback import judge
 from skills.style.trajectory import Trajectory, time_parametrise
 
 RATE_HZ = 240.0  # ours: PyBullet's own step
 
+Approach = tuple[float, float, float]
+
 
 @dataclass(frozen=True)
 class PlanRequest:
-    """What is asked for: a style, where its passes end and start, and what the arm should be."""
+    """What is asked for: a style, where its passes end and start, and what the arm should be.
+
+    `approach_m` is PSM_M's approach in the arm's frame; "demonstrated" takes it from the demonstration, where that has
+    it, and None plans A1 alone.
+    """
 
     surgeon: str
     suture: str
@@ -36,7 +43,7 @@ class PlanRequest:
     frame: str | None = None
     instrument: str | None = None
     speed_mm_s: float = 20.0
-    approach_m: tuple[float, float, float] | None = None
+    approach_m: Approach | Literal["demonstrated"] | None = "demonstrated"
 
 
 def plan_sutures(database: Database, request: PlanRequest, actor: str) -> tuple[Plan, bool]:
@@ -54,6 +61,7 @@ def plan_sutures(database: Database, request: PlanRequest, actor: str) -> tuple[
             raise BadPlan(
                 f"The policy was demonstrated with {name} '{have}'; a plan keeps it, so give that or leave it out."
             )
+    approach, source = _approach(request, demo)
     plan = stack(
         followed,
         request.suture_points,
@@ -63,12 +71,12 @@ def plan_sutures(database: Database, request: PlanRequest, actor: str) -> tuple[
         rotation=rotation_of(demo.rotation_xyzw),
         demo=demo,
         starts_mm=request.starts_mm,
-        approach_m=request.approach_m,
+        approach_m=approach,
         speed_mm_s=request.speed_mm_s,
     )
     trajectory = trajectory_of(plan)
     identity = plan_identity(sha, plan)
-    about = describe_plan(plan, trajectory)
+    about = describe_plan(plan, trajectory, source)
     with database.writing() as session:
         known = session.scalar(select(Plan).where(Plan.sha256 == identity))
         if known is not None:
@@ -81,20 +89,29 @@ def plan_sutures(database: Database, request: PlanRequest, actor: str) -> tuple[
         return stored, True
 
 
+def _approach(request: PlanRequest, demo: Demo) -> tuple[Approach | None, str | None]:
+    """Choose PSM_M's approach, and say where it comes from: the request, else the demonstration."""
+    if request.approach_m != "demonstrated":
+        return request.approach_m, None if request.approach_m is None else "the request"
+    if demo.partner is None:
+        return None, None
+    return demo.partner.approach, f"the demonstration: {demo.partner.arm} at {demo.partner.at_s:g} s of its recording"
+
+
 def trajectory_of(plan: SuturePlan) -> Trajectory:
     """Put a plan into time, at `RATE_HZ`; the same plan gives the same bytes."""
     return time_parametrise(plan.pass_paths, speed_mm_s=plan.speed_mm_s, rate_hz=RATE_HZ, instrument=plan.instrument)
 
 
-def describe_plan(plan: SuturePlan, trajectory: Trajectory) -> dict[str, Any]:
-    """Write what a client is told of a plan, but for its digests."""
+def describe_plan(plan: SuturePlan, trajectory: Trajectory, source: str | None) -> dict[str, Any]:
+    """Write what a client is told of a plan, but for its digests; `source` is where PSM_M's approach comes from."""
     return {
         "arm": plan.arm,
         "frame": plan.frame,
         "instrument": plan.instrument,
         "orientation": plan.orientation,
         "path": plan.path,
-        "psm_m": None if plan.approach_m is None else {"approach": list(plan.approach_m)},
+        "psm_m": None if plan.approach_m is None else {"approach": list(plan.approach_m), "from": source},
         "realignment": plan.approach_m is not None,
         "speed_mm_s": plan.speed_mm_s,
         "passes": [

@@ -2,23 +2,24 @@
 
 import base64
 import hashlib
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import Any, BinaryIO
 
-import numpy as np
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from skills.db.models import RecordingChunk, StoredRecording
 from skills.db.session import Database
 from skills.errors import BadInput, Conflict, Corrupt, NotFound, UnknownFormat, UnreadableRecording
+from skills.library.about import about_recording
 from skills.library.events import record
-from skills.recordings import read_recording
-from skills.style.demo import Recording, propose_segments
+from skills.recordings import MEDIA_TYPES, media_type_of, read_recording
+from skills.style.demo import Recording
 
 CHUNK_BYTES = 1 << 20
-MEDIA_TYPES = {"application/vnd.mcap": "mcap", "text/csv": "csv"}
+Reader = Callable[..., Recording]  # `read_recording`, or what calls it somewhere else
+BAGS = ("mcap", "rosbag1", "rosbag2")  # of a text's checksums nobody expects any
 
 
 @dataclass(frozen=True)
@@ -58,28 +59,30 @@ def check_digest(header: str | None, of_bytes: str) -> bool:
     raise BadInput("Content-Digest needs sha-256=:BASE64:, the SHA-256 of the body.")
 
 
-def read_upload(upload: Upload) -> Recording:
+def read_upload(upload: Upload, read: Reader = read_recording) -> Recording:
     """Read and check a recording.
 
     Raises:
         BadRecording: It cannot be used, or nothing vouches for its bytes.
         UnknownFormat: It is not of the media type that it was sent as.
     """
-    recording = read_recording(upload.file, rate_hz=upload.rate_hz, frame=upload.frame)
-    if recording.format != MEDIA_TYPES[upload.media_type]:
-        right = next(kind for kind, name in MEDIA_TYPES.items() if name == recording.format)
-        raise UnknownFormat(f"The content is not what Content-Type says; send it as {right}.")
-    if recording.format == "mcap" and recording.integrity == "none" and not upload.vouched:
+    right = media_type_of(upload.file)
+    if right != upload.media_type:
+        raise UnknownFormat(f"The content is {MEDIA_TYPES[right]}, not what Content-Type says; send it as {right}.")
+    recording = read(upload.file, **upload.reading)
+    if recording.format in BAGS and recording.integrity == "none" and not upload.vouched:
         raise UnreadableRecording(
-            "This MCAP file has no checksums, so damage would go unseen; send it with a Content-Digest header "
-            "(sha-256=:BASE64:), or record it with CRCs."
+            f"The content is {MEDIA_TYPES[right]} without checksums, so damage would go unseen; send it with a "
+            "Content-Digest header (sha-256=:BASE64:), or record it as MCAP with CRCs."
         )
     return recording
 
 
-def store_recording(database: Database, upload: Upload, actor: str) -> tuple[StoredRecording, bool]:
+def store_recording(
+    database: Database, upload: Upload, actor: str, read: Reader = read_recording
+) -> tuple[StoredRecording, bool]:
     """Store the bytes once: (the row, whether it is new)."""
-    recording = read_upload(upload)
+    recording = read_upload(upload, read)
     with database.writing() as session:
         return keep(session, upload, recording, actor)
 
@@ -114,37 +117,6 @@ def keep(session: Session, upload: Upload, recording: Recording, actor: str) -> 
         number += 1
     record(session, actor, "add", "recording", upload.sha256)
     return stored, True
-
-
-def about_recording(recording: Recording) -> dict[str, Any]:
-    """Say what is in a recording and how good it is, and which hand-offs it seems to hold, by arm."""
-    return {
-        "duration_s": recording.duration_s,
-        "topics": [asdict(topic) for topic in recording.topics],
-        "motions": [
-            {
-                "arm": m.arm,
-                "topic": m.topic,
-                "frame": m.frame,
-                "samples": len(m.stamps_ns),
-                "duplicate_stamps": m.duplicate_stamps,
-            }
-            for m in recording.motions
-        ],
-        "quality": [
-            {
-                "topic": m.topic,
-                "duration_s": float(np.ptp(m.stamps_ns)) / 1e9,
-                "rate_hz": 1e9 / float(np.median(np.diff(m.stamps_ns))) if len(m.stamps_ns) > 1 else None,
-                "longest_gap_s": float(np.diff(m.stamps_ns).max(initial=0)) / 1e9,
-                "extent_mm": np.ptp(m.tip_mm, axis=0).tolist(),
-            }
-            for m in recording.motions
-        ],
-        "segments": [
-            {"arm": arm, **asdict(segment)} for arm in recording.arms for segment in propose_segments(recording, arm)
-        ],
-    }
 
 
 def find_recording(session: Session, recording_sha256: str) -> StoredRecording:

@@ -8,7 +8,7 @@ from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from skills.db.models import Demonstration, Job, PolicyVersion, StoredRewardMap
-from skills.db.packed import canonical, digest, sha256
+from skills.db.packed import digest
 from skills.db.session import Database
 from skills.errors import BadInput, BadSettings, Conflict
 from skills.library import jobs, releases
@@ -16,6 +16,7 @@ from skills.library.catalogue import check_consent, find_surgeon, find_suture_ty
 from skills.library.demos import find_demo, newest_demo
 from skills.library.events import record
 from skills.library.verified import policy_identity
+from skills.packing import canonical, sha256
 from skills.settings import Settings
 from skills.style.certificate import Certificate, Coverage, certify
 from skills.style.demo import Demo

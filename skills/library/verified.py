@@ -7,9 +7,10 @@ said of it, a plan and the policy that it follows. What does not agree is refuse
 from typing import Any
 
 from skills.db.models import Plan, PolicyVersion
-from skills.db.packed import canonical, digest, sha256
+from skills.db.packed import digest
 from skills.errors import Corrupt
 from skills.library.kept import Kept
+from skills.packing import canonical, sha256
 from skills.style.certificate import Coverage
 from skills.style.plan import SuturePlan
 from skills.style.policy import Policy

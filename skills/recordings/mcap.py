@@ -1,278 +1,321 @@
 """Read a ROS 2 recording of a dVRK from MCAP, whole or not at all.
 
-The file is read once from front to back with every checksum verified. An index is never trusted: the library's seeking
-reader drops the checksums where the index is missing, and flipped bits in it go unnoticed. A file that ends early, has
-bytes after its end, lacks its footer, or holds another number of messages than its own statistics say is refused.
+    file --Walker--> stretches of messages --Decoder--> columns, by topic --read_mcap--> Recording
 
-What "integrity" means:
+The file is walked once from front to back with every checksum verified; see `walker`. What "integrity" means:
     full      a checksum covers every message: of its chunk, or of the whole data section
     partial   some chunks have one, others do not
     none      no checksum (0 means "not available" in MCAP; rosbags writes so): a flipped bit would go unnoticed
 
 Messages are taken in the order of their log time, as every MCAP reader does; samples carry the stamp of their header,
-and those may not run backwards in that order.
+and those may not run backwards in that order. Messages without a header carry their log time.
+
+A demonstration rests on the motions, jaws and the clutch: whatever is wrong with one of them refuses the file. Anything
+else is beside it: a topic of it that cannot be used is left out, and `left_out` says why.
 """
 
 from collections import Counter
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
-from typing import Any, BinaryIO, TypeVar
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import BinaryIO
 
-import lz4.frame  # type: ignore[import-untyped]
 import numpy as np
-import zstandard
-from mcap.records import Channel, Chunk, DataEnd, Header, McapRecord, Message, Schema, Statistics
-from mcap.stream_reader import StreamReader, breakup_chunk
-from mcap_ros2.decoder import DecoderFactory
 from numpy.typing import NDArray
 
 from skills.errors import MixedFrames, NoUsableTopic, SkillsError, UnreadableRecording
 from skills.recordings import topics
-from skills.style.recording import Integrity, Motion, Recording, Signal, TopicInfo, recorded_motion
+from skills.recordings.cdr import Columns, Decoder, Wanted, fields_of
+from skills.recordings.source import RECOVER
+from skills.recordings.topics import Kind, Meaning
+from skills.recordings.walker import MAGIC, Channel, Schema, Stretch, Walker
+from skills.style._arrays import Floats, Ints
+from skills.style.recording import Joints, Motion, Recording, Signal, TopicInfo, recorded_motion
 
-MAGIC = b"\x89MCAP0\r\n"
-CHUNK_LIMIT_BYTES = 64 * 2**20  # recorders write chunks of 1 to 4 MiB
-RECORD_LIMIT_BYTES = 256 * 2**20  # attachments may be larger than chunks
-TOTAL_LIMIT_BYTES = 4 * 2**30
-RECOVER = "`mcap recover FILE -o NEW` writes what can be saved into a new file."
+__all__ = ["MAGIC", "NeedsRosbags", "read_mcap"]
 
-_NANO = 1_000_000_000
-_Named = TypeVar("_Named", Schema, Channel)
+TOOL_LIMIT = 200  # characters of an instrument's name
+_INSERTION = 2  # the one PSM joint that slides
+
+_HEADER = "header.frame_id"
+_POSITION = Wanted(("position",), first=True)
+_WANTED = {
+    topics.POSE: Wanted(
+        tuple(f"pose.position.{axis}" for axis in "xyz") + tuple(f"pose.orientation.{axis}" for axis in "xyzw"), _HEADER
+    ),
+    topics.TRANSFORM: Wanted(
+        tuple(f"transform.translation.{axis}" for axis in "xyz")
+        + tuple(f"transform.rotation.{axis}" for axis in "xyzw"),
+        _HEADER,
+    ),
+    topics.JOINT_STATE: Wanted(("position",)),
+    topics.JOY: Wanted(("buttons",), first=True),
+    topics.BOOL: Wanted(("data",)),
+    topics.FLOAT64: Wanted(("data",)),
+    topics.STRING: Wanted((), "data"),
+}
+
+
+class NeedsRosbags(UnreadableRecording):
+    """A file whose checksums are right and whose types only rosbags knows; `numbers["integrity"]` is what it has."""
 
 
 def read_mcap(file: BinaryIO) -> Recording:
-    """Read the motions, jaws and clutch of a dVRK recording.
+    """Read everything of a dVRK recording that is used here.
 
     Args:
         file: The MCAP file, at its beginning.
 
     Raises:
         UnreadableRecording: Truncated, corrupt, over the limits of size, or of an encoding that is not read here.
+        NeedsRosbags: All is well, but a topic that matters is defined in another language, such as IDL.
         NoUsableTopic: No topic has the pose of a PSM.
         MixedFrames, BackwardStamps, RepeatedStamps, NotFinite, NotMetres, NotAQuaternion: See `skills.errors`.
     """
     try:
         return _recording(_read_log(file))
-    except SkillsError:
+    except (SkillsError, MemoryError):
         raise
-    except Exception as error:  # a damaged file makes the parser raise anything, struct.error and KeyError among it
+    except Exception as error:  # a damaged file makes a parser raise anything
         raise UnreadableRecording(
             f"The MCAP file is truncated or corrupt ({type(error).__name__}: {error}). {RECOVER}"
         ) from error
 
 
 @dataclass
+class _Topic:
+    """What one topic said, in the order of the file."""
+
+    name: str
+    meaning: Meaning
+    log_ns: list[NDArray[np.uint64]] = field(default_factory=list)
+    columns: list[Columns] = field(default_factory=list)
+
+    @property
+    def is_needed(self) -> bool:
+        """Whether the demonstration rests on it."""
+        return self.meaning.kind in (Kind.MOTION, Kind.JAW) or self.name in topics.CLUTCH_TOPICS
+
+
+@dataclass
 class _Log:
-    """What one pass over the file found; of messages only those that are used are kept."""
+    """What one walk over the file found; of messages only what is used is kept."""
 
-    schemas: dict[int, Schema] = field(default_factory=dict)
-    channels: dict[int, Channel] = field(default_factory=dict)
-    counts: Counter[int] = field(default_factory=Counter)
-    messages: dict[str, list[Message]] = field(default_factory=dict)
-    with_checksum: int = 0
-    chunks: int = 0
-    uncompressed_bytes: int = 0
-    data_checksum: int | None = None
+    walker: Walker
+    topics: dict[str, _Topic] = field(default_factory=dict)
+    decoders: dict[int, Decoder | None] = field(default_factory=dict)
+    left_out: dict[str, str] = field(default_factory=dict)
+    foreign: list[Channel] = field(default_factory=list)
 
-    def take(self, record: McapRecord, *, checksum: bool) -> None:
-        """Keep a schema, a channel or a used message."""
-        if isinstance(record, Schema):
-            _define(self.schemas, record.id, record)
-        elif isinstance(record, Channel):
-            _define(self.channels, record.id, record)
-        elif isinstance(record, Message):
-            self.counts[record.channel_id] += 1
-            self.with_checksum += checksum
-            channel = self.channels[record.channel_id]
-            if _is_used(channel.topic, self.type_of(channel)):
-                self.messages.setdefault(channel.topic, []).append(record)
+    def take(self, stretch: Stretch) -> None:
+        """Decode and keep messages, if their topic is used."""
+        number = stretch.channel.number
+        if number not in self.decoders:
+            self.decoders[number] = self._decoder(stretch.channel)
+        decoder = self.decoders[number]
+        if decoder is None or stretch.channel.topic in self.left_out:
+            return
+        topic = self.topics[stretch.channel.topic]
+        try:
+            topic.columns.append(decoder.decode(stretch.data, stretch.begin, stretch.length))
+            topic.log_ns.append(stretch.log_ns)
+        except SkillsError as error:
+            self.leave_out(topic, error)
+
+    def leave_out(self, topic: _Topic, error: SkillsError) -> None:
+        """Do without a topic that cannot be used, unless the demonstration rests on it."""
+        if topic.is_needed:
+            raise error
+        self.left_out[topic.name] = str(error)
+        topic.columns.clear()
+        topic.log_ns.clear()
 
     def type_of(self, channel: Channel) -> str:
         """Return the message type of a channel; a channel without schema has none."""
-        return "" if channel.schema_id == 0 else self.schemas[channel.schema_id].name
+        return "" if channel.schema == 0 else self.walker.schemas[channel.schema].name
 
-    @property
-    def integrity(self) -> Integrity:
-        """Say how much of the messages a checksum covers."""
-        if self.data_checksum or self.with_checksum == self.counts.total():
-            return "full"
-        return "partial" if self.with_checksum else "none"
+    def _decoder(self, channel: Channel) -> Decoder | None:
+        """Return what decodes a channel; None where it is not used, or not by us."""
+        message_type = _ros2_name(self.type_of(channel))
+        meaning = topics.meaning(channel.topic, message_type)
+        if meaning is None:
+            return None
+        schema = self.walker.schemas[channel.schema]
+        topic = self.topics.setdefault(channel.topic, _Topic(channel.topic, meaning))
+        if schema.encoding == "ros2idl":
+            self.foreign.append(channel)
+            return None
+        wanted = _POSITION if meaning.kind in (Kind.JAW, Kind.GRIPPER) else _WANTED[message_type]
+        try:
+            _check_encoding(channel, schema)
+            return Decoder(channel.topic, fields_of(schema.name, _text(schema)), wanted)
+        except SkillsError as error:
+            self.leave_out(topic, error)
+            return None
 
 
 def _read_log(file: BinaryIO) -> _Log:
-    log = _Log()
-    reader = StreamReader(file, emit_chunks=True, validate_crcs=True, record_size_limit=RECORD_LIMIT_BYTES)
-    for position, record in enumerate(reader.records):
-        if (position == 0) != isinstance(record, Header):
-            raise UnreadableRecording(f"An MCAP file begins with one header; this one does not. {RECOVER}")
-        if log.data_checksum is not None:
-            _check_summary(log, record)
-        elif isinstance(record, DataEnd):
-            log.data_checksum = record.data_section_crc
-        elif isinstance(record, Chunk):
-            _read_chunk(log, record)
-        else:
-            log.take(record, checksum=False)
-    if log.data_checksum is None:
-        raise UnreadableRecording(f"The MCAP file has no end of its data section. {RECOVER}")
-    if file.read(1):
-        raise UnreadableRecording("Bytes follow the end of the MCAP file; give one file, not several joined.")
+    log = _Log(Walker(file))
+    for stretch in log.walker.stretches():
+        log.take(stretch)
+    if log.foreign:
+        channel, integrity = log.foreign[0], log.walker.integrity
+        schema = log.walker.schemas[channel.schema]
+        raise NeedsRosbags(
+            f"{channel.topic} is of a type that is defined in {schema.encoding!r}; 'ros2msg' is read. Record where the "
+            ".msg files of the packages are installed, or convert the bag.",
+            topic=channel.topic,
+            integrity=integrity,
+        )
     return log
 
 
-def _read_chunk(log: _Log, chunk: Chunk) -> None:
-    log.chunks += 1
-    log.uncompressed_bytes += chunk.uncompressed_size
-    if chunk.uncompressed_size > CHUNK_LIMIT_BYTES or log.uncompressed_bytes > TOTAL_LIMIT_BYTES:
+def _text(schema: Schema) -> str:
+    try:
+        return schema.definition.decode()
+    except UnicodeDecodeError:
+        raise UnreadableRecording(f"The definition of {schema.name} is not UTF-8. {RECOVER}") from None
+
+
+def _check_encoding(channel: Channel, schema: Schema) -> None:
+    if (channel.encoding, schema.encoding) != ("cdr", "ros2msg"):
         raise UnreadableRecording(
-            f"Chunk {log.chunks} unpacks to {chunk.uncompressed_size} bytes, {log.uncompressed_bytes} in all; "
-            f"the limits are {CHUNK_LIMIT_BYTES} and {TOTAL_LIMIT_BYTES}. Record with smaller chunks.",
-            chunk_bytes=chunk.uncompressed_size,
-            total_bytes=log.uncompressed_bytes,
-        )
-    plain = replace(chunk, compression="", data=_unpacked(chunk))
-    for record in breakup_chunk(plain, validate_crc=True):
-        log.take(record, checksum=chunk.uncompressed_crc != 0)
-
-
-def _unpacked(chunk: Chunk) -> bytes:
-    """Unpack a chunk into no more memory than it claims; the library trusts the frame's own size, which may be any."""
-    size = chunk.uncompressed_size
-    if chunk.compression == "zstd":
-        data = zstandard.ZstdDecompressor().stream_reader(chunk.data).read(size + 1)
-    elif chunk.compression == "lz4":
-        data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=size + 1)
-    elif chunk.compression == "":
-        data = chunk.data
-    else:
-        raise UnreadableRecording(f"A chunk is compressed with {chunk.compression!r}; zstd, lz4 and none are read.")
-    if len(data) != size:
-        raise UnreadableRecording(f"A chunk does not unpack to the {size} bytes that it claims. {RECOVER}", bytes=size)
-    return data
-
-
-def _check_summary(log: _Log, record: McapRecord) -> None:
-    """Compare what was read with the file's own statistics: a chunk that was skipped over shows here."""
-    if isinstance(record, Message | Chunk):
-        raise UnreadableRecording(f"Messages follow the end of the data section. {RECOVER}")
-    if not isinstance(record, Statistics):
-        return
-    if (record.message_count, record.chunk_count) != (log.counts.total(), log.chunks):
-        raise UnreadableRecording(
-            f"The MCAP file says {record.message_count} messages in {record.chunk_count} chunks, but holds "
-            f"{log.counts.total()} in {log.chunks}. {RECOVER}",
-            said=record.message_count,
-            found=log.counts.total(),
+            f"{channel.topic} is encoded as {channel.encoding!r} with a {schema.encoding!r} schema; 'cdr' with "
+            "'ros2msg' is read. Convert the bag with `ros2 bag convert` or `rosbags-convert`.",
+            topic=channel.topic,
         )
 
 
-def _define(known: dict[int, _Named], number: int, record: _Named) -> None:
-    if known.setdefault(number, record) != record:
-        raise UnreadableRecording(f"Two {type(record).__name__.lower()}s have the number {number}. {RECOVER}")
-
-
-def _is_used(topic: str, message_type: str) -> bool:
-    return (
-        topics.arm_of_pose(topic, message_type) is not None
-        or topics.arm_of_jaw(topic, message_type) is not None
-        or topics.is_clutch(topic, message_type)
-    )
+def _ros2_name(name: str) -> str:
+    """Write "std_msgs/Bool", as ROS 1 does, like "std_msgs/msg/Bool"."""
+    return name.replace("/", "/msg/") if name.count("/") == 1 else name
 
 
 def _recording(log: _Log) -> Recording:
-    decode = _decoder(log)
-    motions, jaws, clutches = [], {}, {}
-    for topic, messages in sorted(log.messages.items()):
-        message_type = log.type_of(log.channels[messages[0].channel_id])
-        decoded = [decode(message) for message in sorted(messages, key=lambda message: message.log_time)]
-        if arm := topics.arm_of_pose(topic, message_type):
-            motions.append(_motion(arm, topic, decoded))
-        elif arm := topics.arm_of_jaw(topic, message_type):
-            jaws[arm] = _signal(topic, decoded, "position")
-        else:
-            clutches[topic] = _signal(topic, decoded, "buttons")
+    motions, masters, joints, tools = [], [], [], []
+    signals: dict[Kind, dict[str, Signal]] = {kind: {} for kind in Kind}
+    for topic in sorted(log.topics.values(), key=lambda topic: topic.name):
+        if not topic.columns:
+            continue
+        kind, whose = topic.meaning.kind, topic.meaning.whose
+        try:
+            if kind is Kind.MOTION:
+                motions.append(_motion(topic))
+            elif kind is Kind.MASTER:
+                masters.append(_motion(topic))
+            elif kind is Kind.JOINTS:
+                joints.append(_joints(topic))
+            elif kind is Kind.TOOL:
+                tools.append((whose, _tool(topic)))
+            else:
+                signals[kind][whose] = _signal(topic)
+        except SkillsError as error:
+            log.leave_out(topic, error)
+    pedals = signals[Kind.PEDAL]
     return Recording(
         format="mcap",
-        integrity=log.integrity,
+        integrity=log.walker.integrity,
         motions=tuple(motions),
-        jaws=tuple(jaws.items()),
-        clutch=next((clutches[topic] for topic in topics.CLUTCH_TOPICS if topic in clutches), None),
+        jaws=tuple(signals[Kind.JAW].items()),
+        clutch=next((pedals[name] for name in topics.CLUTCH_TOPICS if name in pedals), None),
         topics=_topics(log),
+        joints=tuple(joints),
+        masters=tuple(masters),
+        grippers=tuple(signals[Kind.GRIPPER].items()),
+        pedals=tuple(pedals.items()),
+        following=tuple(signals[Kind.FOLLOWING].items()),
+        scales=tuple(signals[Kind.SCALE].items()),
+        tools=tuple(tools),
+        notes=tuple(sorted(log.walker.notes.items())),
+        left_out=tuple(sorted(log.left_out.items())),
     )
 
 
 def _topics(log: _Log) -> tuple[TopicInfo, ...]:
     counts: Counter[tuple[str, str]] = Counter()
-    for number, channel in log.channels.items():
-        counts[channel.topic, log.type_of(channel)] += log.counts[number]
+    for number, channel in log.walker.channels.items():
+        counts[channel.topic, log.type_of(channel)] += log.walker.counts[number]
     return tuple(TopicInfo(name, message_type, count) for (name, message_type), count in sorted(counts.items()))
 
 
-def _decoder(log: _Log) -> Callable[[Message], Any]:
-    """Return the function that decodes a message by the schema of its channel."""
-    factory = DecoderFactory()
-    decoders: dict[int, Callable[[bytes], Any]] = {}
-
-    def decode(message: Message) -> Any:
-        decoder = decoders.get(message.channel_id)
-        if decoder is None:
-            decoder = decoders[message.channel_id] = _channel_decoder(log, factory, log.channels[message.channel_id])
-        return decoder(message.data)
-
-    return decode
+# ---- from columns to values -------------------------------------------------------------------------------------
 
 
-def _channel_decoder(log: _Log, factory: DecoderFactory, channel: Channel) -> Callable[[bytes], Any]:
-    schema = log.schemas[channel.schema_id]
-    decoder: Callable[[bytes], Any] | None = factory.decoder_for(channel.message_encoding, schema)
-    if decoder is None:
-        raise UnreadableRecording(
-            f"{channel.topic} is encoded as {channel.message_encoding!r} with a {schema.encoding!r} schema; 'cdr' with "
-            "'ros2msg' is read. Record where the .msg files of the packages are installed, or convert the bag.",
-            topic=channel.topic,
-        )
-    return decoder
-
-
-def _motion(arm: str, topic: str, decoded: list[Any]) -> Motion:
-    poses = np.array([_pose(message) for message in decoded], dtype=np.float64)
+def _motion(topic: _Topic) -> Motion:
+    stamps_ns, poses = _in_order(topic)
+    with np.errstate(over="ignore"):  # what becomes infinite is refused below
+        tip_mm = 1000.0 * poses[:, :3]  # the recording speaks metres
     return recorded_motion(
-        arm=arm,
-        topic=topic,
-        frame=_one_frame(topic, decoded),
-        stamps_ns=_stamps_ns(decoded),
-        tip_mm=1000.0 * poses[:, :3],  # the recording speaks metres
+        arm=topic.meaning.whose,
+        topic=topic.name,
+        frame=_one_frame(topic),
+        stamps_ns=stamps_ns,
+        tip_mm=tip_mm,
         rotation_xyzw=poses[:, 3:],
     )
 
 
-def _pose(message: Any) -> tuple[float, ...]:
-    """Return x, y, z in metres and the quaternion x, y, z, w of a PoseStamped or a TransformStamped."""
-    if hasattr(message, "pose"):
-        place, turn = message.pose.position, message.pose.orientation
-    else:
-        place, turn = message.transform.translation, message.transform.rotation
-    return (place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w)
-
-
-def _one_frame(topic: str, decoded: list[Any]) -> str:
-    frames = list(dict.fromkeys(str(message.header.frame_id) for message in decoded))
+def _one_frame(topic: _Topic) -> str:
+    frames = list(dict.fromkeys(frame for columns in topic.columns for frame in columns.labels_in_order))
     if len(frames) > 1:
         raise MixedFrames(
-            f"{topic} gives poses in {len(frames)} frames, {frames[0]!r} and {frames[1]!r}; record them apart.",
-            topic=topic,
+            f"{topic.name} gives poses in {len(frames)} frames, {frames[0]!r} and {frames[1]!r}; record them apart.",
+            topic=topic.name,
             frames=frames[:20],
         )
     return frames[0]
 
 
-def _signal(topic: str, decoded: list[Any], name: str) -> Signal:
-    values = [getattr(message, name) for message in decoded]
-    if not all(values):
-        raise NoUsableTopic(f"{topic} has messages without {name}; leave the topic out of the recording.", topic=topic)
-    return Signal(_stamps_ns(decoded), np.array([value[0] for value in values], dtype=np.float64), topic)
+def _joints(topic: _Topic) -> Joints:
+    stamps_ns, positions = _in_order(topic)
+    if topic.meaning.whose.upper().startswith("PSM"):
+        if positions.shape[1] <= _INSERTION:
+            raise NoUsableTopic(f"{topic.name} has {positions.shape[1]} joints; a PSM has 6.", topic=topic.name)
+        with np.errstate(over="ignore"):  # what becomes infinite is refused below
+            positions[:, _INSERTION] *= 1000.0  # the recording speaks metres
+    return Joints(topic.meaning.whose, topic.name, stamps_ns, positions)
 
 
-def _stamps_ns(decoded: list[Any]) -> NDArray[np.int64]:
-    stamps = (message.header.stamp for message in decoded)
-    return np.array([stamp.sec * _NANO + stamp.nanosec for stamp in stamps], dtype=np.int64)
+def _signal(topic: _Topic) -> Signal:
+    stamps_ns, values = _in_order(topic)
+    if values.shape[1] == 0:
+        raise NoUsableTopic(
+            f"{topic.name} has messages without a value; leave the topic out of the recording.", topic=topic.name
+        )
+    return Signal(stamps_ns, values[:, 0], topic.name)
+
+
+def _tool(topic: _Topic) -> str:
+    """Return the last instrument that was named."""
+    log_ns = np.concatenate(topic.log_ns)
+    said = [columns.labels[k] for columns in topic.columns for k in columns.label_of.tolist()]
+    last: str = said[len(said) - 1 - int(np.argmax(log_ns[::-1]))]
+    if len(last) > TOOL_LIMIT or not last.isprintable():
+        raise NoUsableTopic(f"{topic.name} names no instrument; leave it out of the recording.", topic=topic.name)
+    return last
+
+
+def _in_order(topic: _Topic) -> tuple[Ints, Floats]:
+    """Return stamps, shape (T,), and values, shape (T, K), in the order of their log time."""
+    log_ns = np.concatenate(topic.log_ns)
+    widths = sorted({columns.values.shape[1] for columns in topic.columns})
+    if len(widths) > 1:
+        raise NoUsableTopic(
+            f"{topic.name} has messages with {widths[0]} and with {widths[1]} values; record them apart.",
+            topic=topic.name,
+        )
+    stamps_ns = np.concatenate(list(_stamps(topic)))
+    values = np.concatenate([columns.values for columns in topic.columns])
+    if (log_ns[1:] >= log_ns[:-1]).all():
+        return stamps_ns, values
+    order = np.argsort(log_ns, kind="stable")
+    return stamps_ns[order], values[order]
+
+
+def _stamps(topic: _Topic) -> Iterable[Ints]:
+    for log_ns, columns in zip(topic.log_ns, topic.columns, strict=True):
+        if columns.stamps_ns is not None:
+            yield columns.stamps_ns
+        elif log_ns.max() < 2**63:
+            yield log_ns.astype(np.int64)
+        else:
+            raise UnreadableRecording(f"{topic.name} was logged after the year 2262.", topic=topic.name)

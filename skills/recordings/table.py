@@ -15,7 +15,6 @@ name would be lost without a word. A table has no checksum, so its integrity is 
 
 import csv
 import io
-import math
 from array import array
 from dataclasses import dataclass
 from decimal import Decimal
@@ -47,6 +46,7 @@ _QUATERNION, _RPY = ("qx", "qy", "qz", "qw"), ("roll_rad", "pitch_rad", "yaw_rad
 KNOWN = ("t_s", *_METRES, *_MILLIMETRES, *_QUATERNION, *_RPY, "jaw_rad", "clutch")
 _LATEST_S = 4e9  # the year 2096; later is a time in milliseconds or worse
 _FASTEST_HZ = 100_000.0
+_FIRST_ROW = 2  # the header is row 1
 
 
 @dataclass(frozen=True)
@@ -154,7 +154,7 @@ def _check_time(*, has_times: bool, rate_hz: float | None) -> None:
 
 
 def _numbers(names: list[str], rows: "_Rows") -> _Table:
-    cells, stamps, blank_line = array("d"), array("q"), 0
+    cells, times, blank_line = array("d"), list[str](), 0
     time_column = names.index("t_s") if "t_s" in names else None
     for row in rows:
         if not row:
@@ -164,38 +164,58 @@ def _numbers(names: list[str], rows: "_Rows") -> _Table:
             line = blank_line or rows.line_num
             found = 0 if blank_line else len(row)
             raise UnreadableRecording(f"Row {line} has {found} cells, the header {len(names)}. Export the table again.")
-        cells.extend(_number(cell, name, rows.line_num) for cell, name in zip(row, names, strict=True))
+        try:
+            cells.extend(map(float, row))
+        except ValueError:
+            raise _no_number(names, row, rows.line_num) from None
+        if "_" in "".join(row):  # Python reads 1_000 as a number, no exporter writes it
+            raise _no_number(names, row, rows.line_num)
         if time_column is not None:
-            stamps.append(_exact_ns(row[time_column], cells[time_column - len(names)], rows.line_num))
+            times.append(row[time_column])
     if not cells:
         raise UnreadableRecording("The table has a header and no rows.")
     columns = np.frombuffer(cells).reshape(-1, len(names))
+    _check_finite(names, columns)
     return _Table(
         columns={name: columns[:, k] for k, name in enumerate(names)},
-        stamps_ns=np.frombuffer(stamps, dtype=np.int64) if stamps else None,
+        stamps_ns=None if time_column is None else _exact_ns(times, columns[:, time_column]),
         rows=len(columns),
     )
 
 
-def _number(cell: str, name: str, row: int) -> float:
+def _no_number(names: list[str], row: list[str], line: int) -> UnreadableRecording:
+    name = next(name for name, cell in zip(names, row, strict=True) if "_" in cell or not _is_number(cell))
+    return UnreadableRecording(
+        f"Row {line}, column {name}: this is not a number; export the table again.", row=line, column=name
+    )
+
+
+def _is_number(cell: str) -> bool:
     try:
-        value = float(cell)
+        float(cell)
     except ValueError:
-        value = None
-    if value is None or "_" in cell:  # Python reads 1_000 as a number, no exporter writes it
-        raise UnreadableRecording(
-            f"Row {row}, column {name}: this is not a number; export the table again.", row=row, column=name
-        )
-    if not math.isfinite(value):
-        raise NotFinite(f"Row {row}, column {name}: NaN or infinity; cut the row.", row=row, column=name)
-    return value
+        return False
+    return True
 
 
-def _exact_ns(cell: str, seconds: float, row: int) -> int:
+def _check_finite(names: list[str], columns: Floats) -> None:
+    wrong = ~np.isfinite(columns)
+    if wrong.any():
+        row, column = np.argwhere(wrong)[0].tolist()
+        line, name = row + _FIRST_ROW, names[column]
+        raise NotFinite(f"Row {line}, column {name}: NaN or infinity; cut the row.", row=line, column=name)
+
+
+def _exact_ns(times: list[str], seconds: Floats) -> Ints:
     """Return whole nanoseconds: a float of seconds since 1970 is only good to 240 ns."""
-    if abs(seconds) > _LATEST_S:
-        raise BadColumns(f"Row {row}, column t_s: {seconds:g} s is after the year 2096; give seconds.", row=row)
-    return round(Decimal(cell.strip()) * 1_000_000_000)
+    late = np.abs(seconds) > _LATEST_S
+    if late.any():
+        row = int(np.argmax(late))
+        raise BadColumns(
+            f"Row {row + _FIRST_ROW}, column t_s: {seconds[row]:g} s is after the year 2096; give seconds.",
+            row=row + _FIRST_ROW,
+        )
+    return np.array([round(Decimal(cell.strip()) * 1_000_000_000) for cell in times], dtype=np.int64)
 
 
 def _stamps_ns(table: _Table, rate_hz: float | None) -> Ints:

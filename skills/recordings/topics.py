@@ -1,20 +1,72 @@
 """The words of a dVRK recording: which topic says what, and of which type.
 
 dVRK 2.2 and later publish the tip as PoseStamped, earlier versions as TransformStamped; both in metres, with the stamp
-of the measurement in the header. The topics follow the CRTK conventions (dVRK documentation, "Arms" and "Console").
+of the measurement in the header. The topics follow the CRTK conventions (dVRK documentation, "Arms" and "Console");
+any namespace may stand before them, as in `/CRTK/psm2/measured_cp`.
+
+A motion is what an arm did. What it was told to do (`setpoint_cp`, `servo_cp`, `move_cp` and the like) is none, nor is
+where something else stands (`T_b_w`, the base of an arm in a simulator's world).
 """
 
 import re
+from dataclasses import dataclass
+from enum import Enum, auto
 
 POSE = "geometry_msgs/msg/PoseStamped"
 TRANSFORM = "geometry_msgs/msg/TransformStamped"
 JOINT_STATE = "sensor_msgs/msg/JointState"
 JOY = "sensor_msgs/msg/Joy"
+BOOL = "std_msgs/msg/Bool"
+FLOAT64 = "std_msgs/msg/Float64"
+STRING = "std_msgs/msg/String"
 
 CLUTCH_TOPICS = ("/console/clutch", "/footpedals/clutch")  # the first that is there is used
-RELEASED, PRESSED, QUICK_TAP = 0, 1, 2  # buttons[0] of a clutch
+RELEASED, PRESSED, QUICK_TAP = 0, 1, 2  # buttons[0] of a pedal
 
-_ARM = re.compile(r"PSM\d*", re.IGNORECASE)
+_PSM = re.compile(r"PSM\d*", re.IGNORECASE)
+_MTM = re.compile(r"MTM[LR]?\d*", re.IGNORECASE)
+_PAIR = re.compile(r"MTM[LR]?\d*_PSM\d*", re.IGNORECASE)
+_COMMANDS = re.compile(r"setpoint|desired|goal|servo|move|T_b_w")
+_CONSOLE = ("clutch", "camera", "operator_present")
+
+
+class Kind(Enum):
+    """What a topic tells."""
+
+    MOTION = auto()  # where the tip of a PSM was
+    MASTER = auto()  # where the tip of an MTM was
+    JOINTS = auto()  # what the joints of either measured
+    JAW = auto()
+    GRIPPER = auto()
+    PEDAL = auto()
+    FOLLOWING = auto()  # whether an MTM drove its PSM
+    SCALE = auto()
+    TOOL = auto()
+
+
+@dataclass(frozen=True)
+class Meaning:
+    """What a topic tells, and of whom: an arm such as "PSM2", a teleoperation such as "MTMR_PSM1", a pedal's topic."""
+
+    kind: Kind
+    whose: str
+
+
+def meaning(topic: str, message_type: str) -> Meaning | None:
+    """Say what a topic of this type tells; None where it is not used here."""
+    if message_type in (POSE, TRANSFORM):
+        return _of_pose(topic)
+    if message_type == JOINT_STATE and topic.endswith("/measured_js"):
+        return _of_joints(topic)
+    if message_type in (JOY, BOOL) and _is_pedal(topic):
+        return Meaning(Kind.PEDAL, topic)
+    if message_type == BOOL and topic.endswith("/following"):
+        return _about(Kind.FOLLOWING, _named(_PAIR, topic))
+    if message_type == FLOAT64 and topic.endswith("/scale"):
+        return _about(Kind.SCALE, _named(_PAIR, topic))
+    if message_type == STRING and topic.endswith("/tool_type"):
+        return _about(Kind.TOOL, _named(_PSM, topic))
+    return None
 
 
 def arm_of_pose(topic: str, message_type: str) -> str | None:
@@ -22,25 +74,38 @@ def arm_of_pose(topic: str, message_type: str) -> str | None:
 
     `/PSM2/local/measured_cp` and `/CRTK/psm2/measured_cp` are a PSM's; `/SUJ/PSM2/...` is what carries it.
     """
-    if message_type not in (POSE, TRANSFORM):
+    said = meaning(topic, message_type)
+    return said.whose if said is not None and said.kind is Kind.MOTION else None
+
+
+def _of_pose(topic: str) -> Meaning | None:
+    if _COMMANDS.search(topic.rsplit("/", 1)[-1]):
         return None
-    return _arm_in(topic)
+    return _about(Kind.MOTION, _named(_PSM, topic)) or _about(Kind.MASTER, _named(_MTM, topic))
 
 
-def arm_of_jaw(topic: str, message_type: str) -> str | None:
-    """Return the PSM whose measured jaw angle a topic tells, None for any other topic."""
-    if message_type != JOINT_STATE or not topic.endswith("/jaw/measured_js"):
-        return None
-    return _arm_in(topic)
+def _of_joints(topic: str) -> Meaning | None:
+    psm, mtm = _named(_PSM, topic), _named(_MTM, topic)
+    part = topic.split("/")[-2]
+    if part == "jaw":
+        return _about(Kind.JAW, psm)
+    if part == "gripper":
+        return _about(Kind.GRIPPER, mtm)
+    return Meaning(Kind.JOINTS, part) if part in (psm, mtm) else None
 
 
-def is_clutch(topic: str, message_type: str) -> bool:
-    """Say whether a topic tells the clutch pedal."""
-    return topic in CLUTCH_TOPICS and message_type == JOY
+def _is_pedal(topic: str) -> bool:
+    *_, group, name = ["", "", *topic.split("/")]
+    return group == "footpedals" or (group == "console" and name in _CONSOLE)
 
 
-def _arm_in(topic: str) -> str | None:
+def _about(kind: Kind, whose: str | None) -> Meaning | None:
+    return None if whose is None else Meaning(kind, whose)
+
+
+def _named(pattern: re.Pattern[str], topic: str) -> str | None:
+    """Return the first part of a topic that is such a name; the passive arm that carries a PSM is not its tip."""
     names = topic.split("/")
     if "SUJ" in names:
         return None
-    return next((name for name in names if _ARM.fullmatch(name)), None)
+    return next((name for name in names if pattern.fullmatch(name)), None)

@@ -1,64 +1,49 @@
-"""Write a recording as the MCAP file that a dVRK's recorder would have written.
+"""Write recordings and motions as a dVRK's recorder would have written them: an MCAP file, or a bag folder around one.
+
+    Recording --messages_of--> Message ... --write_messages--> MCAP file --write_bag--> bag folder, zipped
 
 Profile ros2, CDR messages with ros2msg schemas, zstd chunks with checksums. Positions go out in metres, stamps in whole
-nanoseconds; the log time of a message is its stamp. The same recording gives the same bytes with the same versions of
-the mcap libraries.
+nanoseconds; the log time of a message is its stamp. The same messages give the same bytes with the same version of the
+mcap library. `metadata.yaml` is of version 9, which ROS 2 Jazzy writes and reads.
 """
 
 import io
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import IO
 
-from mcap.records import Schema
-from mcap_ros2.writer import Writer
+from mcap.writer import Writer
 
 from skills.errors import BadRecording
-from skills.recordings import topics
-from skills.style.recording import Motion, Recording, Signal
+from skills.recordings import messages, topics
+from skills.recordings.archive import pack
+from skills.recordings.messages import DEFINITIONS, HASHES, Message
+from skills.style._arrays import Floats
+from skills.style.recording import Joints, Motion, Recording, Signal
 
-_NANO = 1_000_000_000
-_RULE = "=" * 80
-_HEADER = f"""{_RULE}
-MSG: std_msgs/Header
-builtin_interfaces/Time stamp
-string frame_id
-{_RULE}
-MSG: builtin_interfaces/Time
-int32 sec
-uint32 nanosec
-"""
-DEFINITIONS = {
-    topics.POSE: f"""std_msgs/Header header
-geometry_msgs/Pose pose
-{_RULE}
-MSG: geometry_msgs/Pose
-geometry_msgs/Point position
-geometry_msgs/Quaternion orientation
-{_RULE}
-MSG: geometry_msgs/Point
-float64 x
-float64 y
-float64 z
-{_RULE}
-MSG: geometry_msgs/Quaternion
-float64 x
-float64 y
-float64 z
-float64 w
-{_HEADER}""",
-    topics.JOINT_STATE: f"""std_msgs/Header header
-string[] name
-float64[] position
-float64[] velocity
-float64[] effort
-{_HEADER}""",
-    topics.JOY: f"""std_msgs/Header header
-float32[] axes
-int32[] buttons
-{_HEADER}""",
-}
+__all__ = ["DEFINITIONS", "Written", "messages_of", "write_bag", "write_mcap", "write_messages"]
 
-Event = tuple[int, str, str, dict[str, Any]]  # stamp in ns, topic, type, message
+NOTES = "suture-skills"  # the metadata record of an MCAP file that says what it was made from
+_LIBRARY = "suture-skills"
+_QOS = "offered_qos_profiles"
+_INSERTION = 2  # the one PSM joint that slides
+
+
+@dataclass
+class Written:
+    """What went into a file: messages by topic, and the log times of the first and the last."""
+
+    counts: dict[tuple[str, str], int] = field(default_factory=dict)
+    first_ns: int | None = None
+    last_ns: int = 0
+
+    def count(self, message: Message) -> int:
+        """Count a message: how many there were before on its topic."""
+        before = self.counts.get((message.topic, message.type), 0)
+        self.counts[message.topic, message.type] = before + 1
+        self.first_ns = message.log_ns if self.first_ns is None else min(self.first_ns, message.log_ns)
+        self.last_ns = max(self.last_ns, message.log_ns)
+        return before
 
 
 def write_mcap(recording: Recording) -> bytes:
@@ -70,50 +55,147 @@ def write_mcap(recording: Recording) -> bytes:
     Raises:
         BadRecording: A motion without orientation, or a stamp before 1970.
     """
-    if recording.origin_ns < 0:
-        raise BadRecording("A message needs a stamp after 1970; give the recording one before writing.")
     file = io.BytesIO()
-    writer = Writer(file)
-    schemas: dict[str, Schema] = {}
-    sent: dict[str, int] = {}
-    for stamp_ns, topic, message_type, message in sorted(_events(recording), key=lambda event: event[:2]):
-        if message_type not in schemas:
-            schemas[message_type] = writer.register_msgdef(message_type, DEFINITIONS[message_type])
-        sent[topic] = sent.get(topic, -1) + 1
-        writer.write_message(topic, schemas[message_type], message, log_time=stamp_ns, sequence=sent[topic])
-    writer.finish()  # type: ignore[no-untyped-call]
+    write_messages(messages_of(recording), file, dict(recording.notes))
     return file.getvalue()
 
 
-def _events(recording: Recording) -> Iterator[Event]:
+def write_messages(said: Iterable[Message], file: IO[bytes], notes: Mapping[str, str] | None = None) -> Written:
+    """Write messages, in the order given, as an MCAP file; `notes` go into a metadata record of it."""
+    writer, written = Writer(file), Written()
+    writer.start(profile="ros2", library=_LIBRARY)
+    schemas: dict[str, int] = {}
+    channels: dict[tuple[str, str], int] = {}
+    if notes:
+        writer.add_metadata(NOTES, dict(notes))
+    for message in said:
+        key = (message.topic, message.type)
+        if message.type not in schemas:
+            definition = DEFINITIONS[message.type].encode()
+            schemas[message.type] = writer.register_schema(message.type, "ros2msg", definition)
+        if key not in channels:
+            channels[key] = writer.register_channel(message.topic, "cdr", schemas[message.type], {_QOS: "[]"})
+        writer.add_message(channels[key], message.log_ns, message.data, message.log_ns, written.count(message))
+    writer.finish()  # type: ignore[no-untyped-call]
+    return written
+
+
+def write_bag(said: Iterable[Message], name: str = "bag", notes: Mapping[str, str] | None = None) -> bytes:
+    """Return messages as a zipped bag folder, `NAME/metadata.yaml` and `NAME/NAME.mcap`, as `ros2 bag` opens it."""
+    file = io.BytesIO()
+    written = write_messages(said, file, notes)
+    file.seek(0)
+    out = io.BytesIO()
+    pack({f"{name}/metadata.yaml": io.BytesIO(_metadata(written, f"{name}.mcap")), f"{name}/{name}.mcap": file}, out)
+    return out.getvalue()
+
+
+def messages_of(recording: Recording) -> list[Message]:
+    """Return everything of a recording as messages, in order of time.
+
+    Raises:
+        BadRecording: As `write_mcap`.
+    """
+    if recording.origin_ns < 0:
+        raise BadRecording("A message needs a stamp after 1970; give the recording one before writing.")
+    return sorted(_messages(recording), key=lambda message: (message.log_ns, message.topic))
+
+
+def _messages(recording: Recording) -> Iterator[Message]:
     for motion in recording.motions:
-        yield from _poses(motion)
-    for arm, jaw in recording.jaws:
-        topic = f"/{arm}/jaw/measured_js"
-        for stamp_ns, value in _samples(jaw):
-            message = {"name": ["jaw"], "position": [value], "velocity": [], "effort": []}
-            yield stamp_ns, topic, topics.JOINT_STATE, _stamped(stamp_ns, "", message)
-    if recording.clutch is not None:
-        for stamp_ns, value in _samples(recording.clutch):
-            message = {"axes": [], "buttons": [int(value)]}
-            yield stamp_ns, topics.CLUTCH_TOPICS[0], topics.JOY, _stamped(stamp_ns, "", message)
+        yield from _poses(motion, "local/measured_cp")
+    for motion in recording.masters:
+        yield from _poses(motion, "measured_cp")
+    for joints in recording.joints:
+        topic = _named(joints.topic, f"/{joints.arm}/measured_js")
+        for stamp_ns, row in zip(joints.stamps_ns.tolist(), _metric(joints).tolist(), strict=True):
+            yield messages.joint_state(topic, stamp_ns, row)
+    for kind, signals in (("jaw", recording.jaws), ("gripper", recording.grippers)):
+        for arm, signal in signals:
+            for stamp_ns, value in _samples(signal):
+                yield messages.joint_state(f"/{arm}/{kind}/measured_js", stamp_ns, [value], [kind])
+    for topic, pedal in _pedals(recording):
+        for stamp_ns, value in _samples(pedal):
+            yield messages.joy(topic, stamp_ns, [int(value)])
+    for name, signal in recording.following:
+        for stamp_ns, value in _samples(signal):
+            yield messages.boolean(f"/{name}/following", stamp_ns, bool(value))
+    for name, signal in recording.scales:
+        for stamp_ns, value in _samples(signal):
+            yield messages.number(f"/{name}/scale", stamp_ns, value)
+    for arm, tool in recording.tools:
+        yield messages.text(f"/{arm}/tool_type", recording.origin_ns, tool)
 
 
-def _poses(motion: Motion) -> Iterator[Event]:
+def _poses(motion: Motion, topic: str) -> Iterator[Message]:
     if motion.rotation_xyzw is None:
         raise BadRecording(f"{motion.topic} has no orientation, and a pose message needs one; add it before writing.")
-    topic = motion.topic if motion.topic.startswith("/") else f"/{motion.arm}/local/measured_cp"
+    topic = _named(motion.topic, f"/{motion.arm}/{topic}")
     places = (motion.tip_mm / 1000.0).tolist()  # the recording speaks metres
-    for stamp_ns, (x, y, z), turn in zip(motion.stamps_ns.tolist(), places, motion.rotation_xyzw.tolist(), strict=True):
-        orientation = dict(zip("xyzw", turn, strict=True))
-        message = {"pose": {"position": {"x": x, "y": y, "z": z}, "orientation": orientation}}
-        yield stamp_ns, topic, topics.POSE, _stamped(stamp_ns, motion.frame, message)
+    for stamp_ns, place_m, turn in zip(motion.stamps_ns.tolist(), places, motion.rotation_xyzw.tolist(), strict=True):
+        yield messages.pose(topic, stamp_ns, motion.frame, place_m, turn)
+
+
+def _metric(joints: Joints) -> Floats:
+    """Return the positions as a message has them: what slides in metres."""
+    positions = joints.positions.copy()
+    if joints.arm.upper().startswith("PSM"):
+        positions[:, _INSERTION : _INSERTION + 1] /= 1000.0
+    return positions
+
+
+def _pedals(recording: Recording) -> Iterator[tuple[str, Signal]]:
+    yield from recording.pedals
+    clutch = recording.clutch
+    if clutch is not None:
+        topic = _named(clutch.topic, topics.CLUTCH_TOPICS[0])
+        if topic not in dict(recording.pedals):
+            yield topic, clutch
+
+
+def _named(topic: str, otherwise: str) -> str:
+    return topic if topic.startswith("/") else otherwise
 
 
 def _samples(signal: Signal) -> Iterator[tuple[int, float]]:
     return zip(signal.stamps_ns.tolist(), signal.values.tolist(), strict=True)
 
 
-def _stamped(stamp_ns: int, frame: str, message: dict[str, Any]) -> dict[str, Any]:
-    stamp = {"sec": stamp_ns // _NANO, "nanosec": stamp_ns % _NANO}
-    return {"header": {"stamp": stamp, "frame_id": frame}, **message}
+def _metadata(written: Written, file: str) -> bytes:
+    """Return metadata.yaml as ROS 2 Jazzy writes it, which is its version 9."""
+    start_ns, count = written.first_ns or 0, sum(written.counts.values())
+    duration_ns = written.last_ns - start_ns
+    topics_with_count = "".join(
+        f"""
+    - topic_metadata:
+        name: {topic}
+        type: {kind}
+        serialization_format: cdr
+        {_QOS}: []
+        type_description_hash: {HASHES[kind]}
+      message_count: {messages_on}"""
+        for (topic, kind), messages_on in written.counts.items()
+    )
+    return f"""rosbag2_bagfile_information:
+  version: 9
+  storage_identifier: mcap
+  duration:
+    nanoseconds: {duration_ns}
+  starting_time:
+    nanoseconds_since_epoch: {start_ns}
+  message_count: {count}
+  topics_with_message_count:{topics_with_count or " []"}
+  compression_format: ""
+  compression_mode: ""
+  relative_file_paths:
+    - {file}
+  files:
+    - path: {file}
+      starting_time:
+        nanoseconds_since_epoch: {start_ns}
+      duration:
+        nanoseconds: {duration_ns}
+      message_count: {count}
+  custom_data: ~
+  ros_distro: jazzy
+""".encode()

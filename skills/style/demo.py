@@ -1,19 +1,24 @@
-"""Cut one hand-off out of a recording, and say what kind of demonstration it is.
+"""Cut one hand-off out of a recording.
 
-    Recording --cut_demo--> Demo --describe--> DemoReport
+    Recording --cut_demo--> Demo
 
 The paper (Sec. III-A) learns from one segment: the hand-off of the needle, from the moment the arm moves off with it
-(A1) to the moment the other arm takes it (A2). `propose_segments` finds such stretches by motion and jaw; the surgeon
-decides. Seconds of a segment count from the recording's `origin_ns`; a demonstration's own `stamps_s` count from its
-first sample. Thresholds are ours: the paper cut by hand.
+(A1) to the moment the other arm takes it (A2). `propose_segments` finds such stretches; the surgeon decides. Seconds of
+a segment count from the recording's `origin_ns`; a demonstration's own `stamps_s` count from its first sample.
+
+Samples in which the arm was not driven, with the clutch down or without teleoperation, were not demonstrated and are
+left out. Time is not closed up: the stamps stay those of the recording, and `pauses` says where nothing was taken, so
+that a rate is a rate and a lost sample is not taken for a pause. Thresholds are ours: the paper cut by hand.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from skills.errors import BadSegment, NotMetres
 from skills.style._arrays import Floats, frozen
+from skills.style.partner import Partner, partner_at
+from skills.style.pauses import Pause, clutched, is_driven, undriven
 from skills.style.recording import (
     Format,
     Integrity,
@@ -21,22 +26,23 @@ from skills.style.recording import (
     Recording,
     Signal,
     TopicInfo,
+    base_frames,
     recorded_motion,
 )
-from skills.style.segments import Segment, press_times, propose_segments, smoothed_speed
+from skills.style.segments import Segment, propose_segments
 
 __all__ = [
     "Demo",
-    "DemoReport",
     "Format",
     "Integrity",
     "Motion",
+    "Partner",
+    "Pause",
     "Recording",
     "Segment",
     "Signal",
     "TopicInfo",
     "cut_demo",
-    "describe",
     "propose_segments",
     "recorded_motion",
 ]
@@ -44,7 +50,6 @@ __all__ = [
 CLASSIC_LARGE_NEEDLE_DRIVER = "400006"  # the dVRK's tool number; recordings rarely say another
 EXTENT_LIMITS_MM = (1.0, 300.0)  # below it millimetres were declared for metres; above it no PSM reaches
 EDGE_NS = 1000  # a segment may miss the recording's edge by a rounding of its seconds
-IDLE_MM_S = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +68,8 @@ class Demo:
         jaw_rad: The jaw's angle at each stamp, shape (T,), interpolated, held beyond its ends; or None.
         clutch_presses: How often the clutch pedal went down; quick taps do not count.
         instrument: The tool's number in the dVRK's files.
+        pauses: When the arm was not driven, between the samples that are here.
+        partner: The other arm as it takes the needle, in `frame`; None where its place cannot be told.
     """
 
     arm: str
@@ -76,6 +83,8 @@ class Demo:
     jaw_rad: Floats | None = None
     clutch_presses: int = 0
     instrument: str = CLASSIC_LARGE_NEEDLE_DRIVER
+    pauses: tuple[Pause, ...] = ()
+    partner: Partner | None = None
 
     def __post_init__(self) -> None:
         count = len(self.stamps_s)
@@ -95,39 +104,6 @@ class Demo:
         _check_extent(self.topic, self.tip_mm)
 
 
-@dataclass(frozen=True)
-class DemoReport:
-    """What kind of demonstration it is, in plain numbers, with advice in words.
-
-    Attributes:
-        duration_s: From the first sample to the last.
-        samples: How many.
-        rate_hz: Samples per second, from the median step between stamps.
-        longest_gap_s: The longest time without a sample.
-        path_length_mm: The tip's way from sample to sample, tremor included.
-        extent_mm: Size of the box around the path along x, y, z.
-        speed_median_mm_s: Median of the smoothed speed over time.
-        speed_peak_mm_s: Greatest smoothed speed.
-        clutch_presses: How often the clutch pedal went down.
-        idle_share: Share of the time slower than 1 mm/s, 0 to 1.
-        orientation_change_rad: Largest angle from the first orientation; None where not recorded.
-        advice: Sentences to the surgeon; empty where nothing stands out.
-    """
-
-    duration_s: float
-    samples: int
-    rate_hz: float
-    longest_gap_s: float
-    path_length_mm: float
-    extent_mm: tuple[float, float, float]
-    speed_median_mm_s: float
-    speed_peak_mm_s: float
-    clutch_presses: int
-    idle_share: float
-    orientation_change_rad: float | None
-    advice: tuple[str, ...]
-
-
 def cut_demo(
     recording: Recording,
     *,
@@ -136,7 +112,7 @@ def cut_demo(
     start_s: float | None = None,
     end_s: float | None = None,
 ) -> Demo:
-    """Cut one arm's motion between two moments out of a recording, both ends included.
+    """Cut one arm's motion between two moments out of a recording, both ends included, where the arm was driven.
 
     Args:
         recording: What `read_recording` gave.
@@ -147,19 +123,22 @@ def cut_demo(
 
     Raises:
         NoUsableTopic: There is no such arm or topic, or several arms and none named.
-        BadSegment: Not in the recording, empty, turned round, or with fewer than 2 samples.
+        BadSegment: Not in the recording, empty, turned round, or with fewer than 2 samples of a driven arm.
         NotMetres: The path's extent is below 1 mm or above 300 mm.
     """
     motion = recording.motion_of(arm=arm, topic=topic)
     first_ns, last_ns = _segment_ns(recording, motion, start_s, end_s)
-    inside = (motion.stamps_ns >= first_ns) & (motion.stamps_ns <= last_ns)
+    within = (motion.stamps_ns >= first_ns) & (motion.stamps_ns <= last_ns)
+    inside = within & is_driven(motion.stamps_ns, undriven(recording, motion.arm))
     if inside.sum() < 2:
+        left_out = int(within.sum() - inside.sum())
+        idle = f", and in {left_out} more the arm was not driven" if left_out else ""
         raise BadSegment(
-            f"The segment holds {inside.sum()} samples of {motion.topic}; at least 2 are needed. Widen it.",
+            f"The segment holds {inside.sum()} samples of {motion.topic}{idle}; at least 2 are needed. Widen it.",
             samples=int(inside.sum()),
         )
-    seconds = recording.seconds(motion.stamps_ns[inside])
     stamps_ns = motion.stamps_ns[inside]
+    seconds = recording.seconds(stamps_ns)
     return Demo(
         arm=motion.arm,
         topic=motion.topic,
@@ -170,31 +149,19 @@ def cut_demo(
         tip_mm=motion.tip_mm[inside],
         rotation_xyzw=None if motion.rotation_xyzw is None else motion.rotation_xyzw[inside],
         jaw_rad=_jaw_at(recording, motion.arm, seconds),
-        clutch_presses=_presses_between(recording, first_ns, last_ns),
+        clutch_presses=sum(first_ns <= down_ns <= last_ns for down_ns, _ in clutched(recording)),
+        pauses=_pauses(recording, motion.arm, int(stamps_ns[0]), int(stamps_ns[-1])),
+        partner=partner_at(recording, motion, float(seconds[-1]), base_frames(recording)),
     )
 
 
-def describe(demo: Demo) -> DemoReport:
-    """Measure a demonstration and advise on what would make it a better teacher."""
-    steps_s = np.diff(demo.stamps_s)
-    duration_s = float(demo.stamps_s[-1])
-    _, speed_mm_s = smoothed_speed(demo.stamps_s, demo.tip_mm)
-    extent = np.ptp(demo.tip_mm, axis=0)
-    numbers = DemoReport(
-        duration_s=duration_s,
-        samples=len(demo.stamps_s),
-        rate_hz=float(1.0 / np.median(steps_s)),
-        longest_gap_s=float(steps_s.max()),
-        path_length_mm=float(np.linalg.norm(np.diff(demo.tip_mm, axis=0), axis=1).sum()),
-        extent_mm=(float(extent[0]), float(extent[1]), float(extent[2])),
-        speed_median_mm_s=float(np.median(speed_mm_s)),
-        speed_peak_mm_s=float(speed_mm_s.max()),
-        clutch_presses=demo.clutch_presses,
-        idle_share=float((speed_mm_s < IDLE_MM_S).mean()),
-        orientation_change_rad=_orientation_change(demo.rotation_xyzw),
-        advice=(),
+def _pauses(recording: Recording, arm: str, first_ns: int, last_ns: int) -> tuple[Pause, ...]:
+    """Write when the arm was not driven between two samples, in seconds from the first."""
+    return tuple(
+        Pause((start - first_ns) / 1e9, (end - first_ns) / 1e9, cause)
+        for start, end, cause in undriven(recording, arm)
+        if first_ns < start and end < last_ns
     )
-    return replace(numbers, advice=_advice(numbers, has_jaw=demo.jaw_rad is not None))
 
 
 def _segment_ns(recording: Recording, motion: Motion, start_s: float | None, end_s: float | None) -> tuple[int, int]:
@@ -237,36 +204,3 @@ def _jaw_at(recording: Recording, arm: str, seconds: Floats) -> Floats | None:
     if jaw is None or len(jaw.values) == 0:
         return None
     return np.interp(seconds, recording.seconds(jaw.stamps_ns), jaw.values)
-
-
-def _presses_between(recording: Recording, first_ns: int, last_ns: int) -> int:
-    if recording.clutch is None:
-        return 0
-    return sum(first_ns <= down_ns <= last_ns for down_ns, _ in press_times(recording.clutch))
-
-
-def _orientation_change(rotation_xyzw: Floats | None) -> float | None:
-    """Return the largest angle between the first orientation and any other; q and -q are the same orientation."""
-    if rotation_xyzw is None:
-        return None
-    unit = rotation_xyzw / np.linalg.norm(rotation_xyzw, axis=1, keepdims=True)
-    cosine = np.abs(unit @ unit[0]).min()
-    return float(2.0 * np.arccos(min(1.0, cosine)))
-
-
-def _advice(report: DemoReport, *, has_jaw: bool) -> tuple[str, ...]:
-    said = []
-    if report.idle_share > 0.25:
-        said.append(f"The needle rests for {report.idle_share:.0%} of the time: cut the idle start and end away.")
-    if report.clutch_presses > 0:
-        times = "once" if report.clutch_presses == 1 else f"{report.clutch_presses} times"
-        said.append(f"You clutched {times}: set up the masters so that the hand-off fits into one sweep.")
-    if report.longest_gap_s > max(0.1, 5.0 / report.rate_hz):
-        said.append(f"The recorder lost {report.longest_gap_s:.2f} s: the path is guessed there, so record again.")
-    if report.rate_hz < 20.0:
-        said.append(f"Only {report.rate_hz:.0f} poses per second: quick turns are lost; record at 100 or more.")
-    if report.orientation_change_rad is None:
-        said.append("The wrist was not recorded: the path can be learnt, the turn of the needle cannot be checked.")
-    if not has_jaw:
-        said.append("The jaw was not recorded: grasp and release are not known.")
-    return tuple(said)

@@ -6,23 +6,30 @@
     ├── Signal      one number over time, a jaw's angle or a pedal: stamps_ns (T,), values (T,)
     ├── Label       a stretch of time that somebody named: a stage of the session, a gesture
     └── TopicInfo   what else is in the file
+    --base_frames--> BaseFrame   where an arm's base stands in the frame of another of its topics
 
 Everything is checked here, once: numbers are finite, time runs forwards, coordinates can be metres of an arm,
 quaternions have length one. What fails is refused with the topic and the time; nothing is repaired, sorted or
 rescaled. The readers in `skills.recordings` turn metres into millimetres before they come here.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 
-from skills.errors import BackwardStamps, NotAQuaternion, NotFinite, NotMetres, NoUsableTopic, RepeatedStamps
+from skills.errors import NoUsableTopic, RepeatedStamps
 from skills.style._arrays import Floats, Ints, frozen
+from skills.style._checks import check_finite, check_forwards, check_rotations, check_tips
+from skills.style.kinematics import quaternion_of
 
-COORDINATE_LIMIT_MM = 1000.0  # ours: a PSM reaches 0.3 m; ten times that is millimetres taken for metres
 DUPLICATE_SHARE_LIMIT = 0.5  # ours: beyond it the stamps say nothing about when the samples were taken
-QUATERNION_TOLERANCE = 1e-3  # ours: three printed decimals pass, an unnormalised quaternion does not
+PAIR_NS = 2_000_000  # ours: of poses so near in time a tip at 100 mm/s differs by 0.2 mm
+PAIRS_LEAST = 10  # ours: fewer say nothing about whether a base stood still
+WIDE_MM = 2.0  # ours: tips that go less to and fro do not tell a turn
+
+_INVERSE = np.array([-1.0, -1.0, -1.0, 1.0])  # of a unit quaternion x, y, z, w, when multiplied with it
 
 Format = Literal["mcap", "csv", "jigsaws", "rosbag2", "rosbag1"]
 Integrity = Literal["full", "partial", "none"]
@@ -55,7 +62,7 @@ class Motion:
         _set(self, "stamps_ns", frozen(self.stamps_ns, np.int64, (None,), f"stamps of {self.topic}"))
         if count == 0:
             raise NoUsableTopic(f"{self.topic} has no samples; record it again or choose another topic.")
-        _check_forwards(self.topic, self.stamps_ns)
+        check_forwards(self.topic, self.stamps_ns)
         if (np.diff(self.stamps_ns) == 0).any():
             raise RepeatedStamps(f"{self.topic} has samples with equal stamps; use recorded_motion, which counts them.")
         if np.shape(self.tip_mm) == (count, 3):  # any other shape is refused below
@@ -63,7 +70,7 @@ class Motion:
         _set(self, "tip_mm", frozen(self.tip_mm, np.float64, (count, 3), f"tip of {self.topic}"))
         if self.rotation_xyzw is not None:
             if np.shape(self.rotation_xyzw) == (count, 4):
-                _check_rotations(self.topic, self.stamps_ns, np.asarray(self.rotation_xyzw))
+                check_rotations(self.topic, self.stamps_ns, np.asarray(self.rotation_xyzw))
             rotation = frozen(self.rotation_xyzw, np.float64, (count, 4), f"orientation of {self.topic}")
             _set(self, "rotation_xyzw", rotation)
 
@@ -84,9 +91,9 @@ class Signal:
 
     def __post_init__(self) -> None:
         _set(self, "stamps_ns", frozen(self.stamps_ns, np.int64, (None,), f"stamps of {self.topic}"))
-        _check_forwards(self.topic, self.stamps_ns)
+        check_forwards(self.topic, self.stamps_ns)
         if np.shape(self.values) == self.stamps_ns.shape:
-            _check_finite(self.topic, self.stamps_ns, np.asarray(self.values, dtype=np.float64))
+            check_finite(self.topic, self.stamps_ns, np.asarray(self.values, dtype=np.float64))
         _set(self, "values", frozen(self.values, np.float64, self.stamps_ns.shape, f"values of {self.topic}"))
 
 
@@ -108,9 +115,9 @@ class Joints:
 
     def __post_init__(self) -> None:
         _set(self, "stamps_ns", frozen(self.stamps_ns, np.int64, (None,), f"stamps of {self.topic}"))
-        _check_forwards(self.topic, self.stamps_ns)
+        check_forwards(self.topic, self.stamps_ns)
         if np.shape(self.positions)[:1] == self.stamps_ns.shape:
-            _check_finite(self.topic, self.stamps_ns, np.asarray(self.positions, dtype=np.float64))
+            check_finite(self.topic, self.stamps_ns, np.asarray(self.positions, dtype=np.float64))
         shape = (len(self.stamps_ns), None)
         _set(self, "positions", frozen(self.positions, np.float64, shape, f"positions of {self.topic}"))
 
@@ -156,6 +163,8 @@ class Recording:
         scales: Teleoperation and its motion scale.
         tools: Arm and its instrument as the console names it, such as "LARGE_NEEDLE_DRIVER:400006".
         labels: What somebody named, in order of time.
+        notes: What the file says of its own making, name and value, such as the digest of what it was made from.
+        left_out: Topics that could have been used, and what is wrong with each; none that a demonstration rests on.
     """
 
     format: Format
@@ -172,6 +181,8 @@ class Recording:
     scales: tuple[tuple[str, Signal], ...] = ()
     tools: tuple[tuple[str, str], ...] = ()
     labels: tuple[Label, ...] = ()
+    notes: tuple[tuple[str, str], ...] = ()
+    left_out: tuple[tuple[str, str], ...] = ()
 
     def __post_init__(self) -> None:
         if not self.motions:
@@ -217,6 +228,122 @@ class Recording:
         return (stamps_ns - self.origin_ns) / 1e9
 
 
+@dataclass(frozen=True)
+class BaseFrame:
+    """Where the base of an arm stands: a point p of `local_frame` is at `position_mm` + R p in `frame`.
+
+    Attributes:
+        arm: The arm's name.
+        frame: In which its other pose is given, such as "ECM".
+        local_frame: Its base, the frame of its `local/measured_cp`.
+        position_mm: The base's place in `frame`.
+        rotation_xyzw: Its turn R as a unit quaternion.
+        spread_mm: The furthest that any pair of poses puts the base from there; much of it says that the base moved,
+            since the camera or the set-up joints did.
+        spread_rad: The widest that any pair turns it otherwise.
+    """
+
+    arm: str
+    frame: str
+    local_frame: str
+    position_mm: tuple[float, float, float]
+    rotation_xyzw: tuple[float, float, float, float]
+    spread_mm: float
+    spread_rad: float
+
+
+def base_frames(recording: Recording) -> tuple[BaseFrame, ...]:
+    """Find where the bases stand, of arms whose pose was recorded both in the base's frame and in another.
+
+    A base is the pose in the other frame times the inverse of the pose in its own, of samples of equal stamps or of
+    the nearest within `PAIR_NS`; the middle one of all, number by number, is told. Where the orientations do not fit
+    the tips, the tips decide, and `spread_rad` says how far the orientations are off.
+    """
+    whole = [motion for motion in recording.motions if motion.rotation_xyzw is not None]
+    found = [
+        _base_frame(local, other)
+        for local in whole
+        for other in whole
+        if _is_local(local) and not _is_local(other) and local.arm == other.arm and local.frame != other.frame
+    ]
+    return tuple(base for base in found if base is not None)
+
+
+def _base_frame(local: Motion, other: Motion) -> BaseFrame | None:
+    """Find a base; None where too few poses have a partner in time."""
+    here, there = _pairs(local.stamps_ns, other.stamps_ns)
+    if len(here) < PAIRS_LEAST:
+        return None
+    assert local.rotation_xyzw is not None and other.rotation_xyzw is not None
+    turns = _unit(_product(other.rotation_xyzw[there], local.rotation_xyzw[here] * _INVERSE))
+    turns *= np.where(turns @ turns[0] < 0, -1.0, 1.0)[:, None]  # q and -q are the same turn
+    turn = min(_candidates(turns, local.tip_mm[here], other.tip_mm[there]), key=lambda one: one[0])[1]
+    places = other.tip_mm[there] - _turned(turn, local.tip_mm[here])
+    place = np.median(places, axis=0)
+    sine = np.linalg.norm(_product(turns, turn * _INVERSE)[:, :3], axis=1).max()
+    x, y, z = place.tolist()
+    qx, qy, qz, qw = turn.tolist()
+    return BaseFrame(
+        arm=local.arm,
+        frame=other.frame,
+        local_frame=local.frame,
+        position_mm=(x, y, z),
+        rotation_xyzw=(qx, qy, qz, qw),
+        spread_mm=float(np.linalg.norm(places - place, axis=1).max()),
+        spread_rad=float(2.0 * np.arcsin(min(1.0, sine))),
+    )
+
+
+def _candidates(turns: Floats, here_mm: Floats, there_mm: Floats) -> Iterator[tuple[float, Floats]]:
+    """Give the middle of the turns, and the turn that brings the tips over best, with how badly each fits in mm.
+
+    The tips alone tell the turn (Kabsch) where they go to and fro in more than one direction.
+    """
+    found = [_unit(np.median(turns, axis=0))]
+    one, other = here_mm - here_mm.mean(axis=0), there_mm - there_mm.mean(axis=0)
+    left, size, right = np.linalg.svd(other.T @ one)
+    if size[1] > len(one) * WIDE_MM**2:
+        proper = np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
+        found.append(quaternion_of((left @ proper @ right)[None])[0])
+    for turn in found:
+        places = there_mm - _turned(turn, here_mm)
+        yield float(np.median(np.linalg.norm(places - np.median(places, axis=0), axis=1))), turn
+
+
+def _pairs(stamps_ns: Ints, others_ns: Ints) -> tuple[Ints, Ints]:
+    """Return which samples belong together: each with the nearest of the others, if that is near enough."""
+    after = np.clip(np.searchsorted(others_ns, stamps_ns), 1, max(1, len(others_ns) - 1))
+    before = after - 1
+    after = np.minimum(after, len(others_ns) - 1)
+    nearer = np.where(stamps_ns - others_ns[before] <= others_ns[after] - stamps_ns, before, after)
+    near = np.flatnonzero(np.abs(others_ns[nearer] - stamps_ns) <= PAIR_NS)
+    return near, nearer[near]
+
+
+def _is_local(motion: Motion) -> bool:
+    return motion.topic.endswith("/local/measured_cp")
+
+
+def _product(one: Floats, other: Floats) -> Floats:
+    """Multiply quaternions x, y, z, w."""
+    v, w = one[..., :3], one[..., 3:]
+    u, t = other[..., :3], other[..., 3:]
+    vector = w * u + t * v + np.cross(v, u)
+    return np.concatenate([vector, w * t - (v * u).sum(axis=-1, keepdims=True)], axis=-1)
+
+
+def _turned(turn: Floats, points_mm: Floats) -> Floats:
+    """Turn points, shape (N, 3), by one unit quaternion."""
+    across = 2.0 * np.cross(turn[:3], points_mm)
+    turned: Floats = points_mm + turn[3] * across + np.cross(turn[:3], across)
+    return turned
+
+
+def _unit(quaternions: Floats) -> Floats:
+    unit: Floats = quaternions / np.linalg.norm(quaternions, axis=-1, keepdims=True)
+    return unit
+
+
 def recorded_motion(
     *, arm: str, topic: str, frame: str, stamps_ns: Ints, tip_mm: Floats, rotation_xyzw: Floats | None
 ) -> Motion:
@@ -228,12 +355,14 @@ def recorded_motion(
         NotFinite, NotMetres, NotAQuaternion: As for `Motion`.
     """
     stamps_ns = np.asarray(stamps_ns, dtype=np.int64)
-    _check_forwards(topic, stamps_ns)
+    later = stamps_ns[1:] > stamps_ns[:-1]
+    if later.all():
+        return Motion(arm, topic, frame, stamps_ns, tip_mm, rotation_xyzw)
+    check_forwards(topic, stamps_ns)
     check_tips(topic, stamps_ns, tip_mm)  # before dropping, so that nothing wrong hides in a dropped sample
     if rotation_xyzw is not None:
-        _check_rotations(topic, stamps_ns, rotation_xyzw)
-    first = np.ones(len(stamps_ns), dtype=bool)
-    first[1:] = np.diff(stamps_ns) > 0
+        check_rotations(topic, stamps_ns, rotation_xyzw)
+    first = np.concatenate([[True], later])
     duplicates = int((~first).sum())
     if duplicates > DUPLICATE_SHARE_LIMIT * len(stamps_ns):
         raise RepeatedStamps(
@@ -247,80 +376,10 @@ def recorded_motion(
     return Motion(arm, topic, frame, stamps_ns[first], tip_mm[first], rotation, duplicates)
 
 
-def check_tips(topic: str, stamps_ns: Ints, tip_mm: Floats) -> None:
-    """Refuse positions that cannot be an arm's tip.
-
-    Args:
-        topic: Named in the refusal.
-        stamps_ns: Shape (T,), to name the time.
-        tip_mm: Shape (T, 3).
-
-    Raises:
-        NotFinite: NaN or infinity.
-        NotMetres: A coordinate beyond 1 m.
-    """
-    _check_finite(topic, stamps_ns, tip_mm)
-    far = (np.abs(tip_mm) > COORDINATE_LIMIT_MM).any(axis=1)
-    if far.any():
-        first = int(np.argmax(far))
-        metres = float(np.abs(tip_mm[first]).max() / 1000.0)
-        raise NotMetres(
-            f"{topic}: a coordinate of {metres:g} m {_at(stamps_ns, first)}; a PSM's tip stays within 1 m. "
-            "Give the positions in metres (or, in a table, name the columns x_mm, y_mm, z_mm).",
-            topic=topic,
-            sample=first,
-            metres=metres,
-        )
-
-
 def _preference(motion: Motion) -> tuple[int, str]:
     """Prefer the tip relative to the arm's own remote centre: it does not move with the camera or the set-up joints."""
     known = [f"/{motion.arm}/local/measured_cp", f"/{motion.arm}/measured_cp"]
     return (known.index(motion.topic) if motion.topic in known else len(known), motion.topic)
-
-
-def _check_rotations(topic: str, stamps_ns: Ints, rotation_xyzw: Floats) -> None:
-    _check_finite(topic, stamps_ns, rotation_xyzw)
-    length = np.linalg.norm(rotation_xyzw, axis=1)
-    off = np.abs(length - 1.0) > QUATERNION_TOLERANCE
-    if off.any():
-        first = int(np.argmax(off))
-        raise NotAQuaternion(
-            f"{topic}: the quaternion {_at(stamps_ns, first)} has length {length[first]:g}; "
-            "give unit quaternions x, y, z, w, or leave the orientation out.",
-            topic=topic,
-            sample=first,
-            length=float(length[first]),
-        )
-
-
-def _check_finite(topic: str, stamps_ns: Ints, values: Floats) -> None:
-    wrong = ~np.isfinite(values.reshape(len(values), -1)).all(axis=1)
-    if wrong.any():
-        first = int(np.argmax(wrong))
-        raise NotFinite(
-            f"{topic}: NaN or infinity {_at(stamps_ns, first)}; cut the recording before it or record again.",
-            topic=topic,
-            sample=first,
-        )
-
-
-def _check_forwards(topic: str, stamps_ns: Ints) -> None:
-    back = np.diff(stamps_ns) < 0
-    if back.any():
-        first = int(np.argmax(back)) + 1
-        step_s = float(stamps_ns[first - 1] - stamps_ns[first]) / 1e9
-        raise BackwardStamps(
-            f"{topic}: time runs backwards by {step_s:g} s {_at(stamps_ns, first - 1)} (sample {first}); "
-            "the recorder's clock was set or two recordings were joined. Give each part on its own.",
-            topic=topic,
-            sample=first,
-            step_s=step_s,
-        )
-
-
-def _at(stamps_ns: Ints, index: int) -> str:
-    return f"at {(int(stamps_ns[index]) - int(stamps_ns[0])) / 1e9:.3f} s"
 
 
 def _listed(topics: tuple[TopicInfo, ...]) -> str:

@@ -32,8 +32,8 @@ from skills.errors import BadPlan
 from skills.style._arrays import Floats, Ints, frozen
 from skills.style.demo import Demo
 from skills.style.grid import GridPath
+from skills.style.movement import smoothed_tip
 from skills.style.policy import Rollout
-from skills.style.segments import smoothed_tip
 
 TREMOR_S = 0.25  # a Hann window this wide has its zeros at 8, 12, 16 Hz and passes less than 3 % in between
 # Lengths as parts of a cell:

@@ -16,7 +16,7 @@ from skills.recordings import topics
 from tests import backends
 from tests.api.service import CSV, KESTREL, MCAP, Service, assert_problem, serving
 from tests.library import cases
-from tests.recordings import bags
+from tests.recordings import bags, trials
 
 TIP = cases.points_mm()
 BAG = cases.bag()
@@ -37,10 +37,10 @@ class Bad:
     demos_only: bool = False
 
 
-def zipped() -> bytes:
+def zipped(name: str = "bag/bag.mcap") -> bytes:
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w") as archive:
-        archive.writestr("bag/bag.mcap", BAG)
+        archive.writestr(name, BAG)
     return out.getvalue()
 
 
@@ -65,6 +65,7 @@ JOY = [
 ]
 TURNED = [bags.pose(bags.START_NS + k * bags.STEP_NS, 0.001 * k, frame="camera") for k in range(10, 20)]
 TWO_FRAMES = bags.pose_bag([*bags.straight(10), *TURNED])
+JIGSAWS = trials.text(trials.kinematics(60))
 STILL = cases.table(np.array([-10.0, 55, -135]) + np.linspace(-1, 1, 40)[:, None])
 CASES = {
     "empty": Bad(b"", 422, "unreadable-recording", MCAP),
@@ -72,7 +73,18 @@ CASES = {
     "only a header": Bad(b"t_s,x_m,y_m,z_m\n", 422, "unreadable-recording"),
     "no content type": Bad(BAG, 415, "unknown-format", ""),
     "json": Bad(b"{}", 415, "unknown-format", "application/json"),
-    "a zip archive": Bad(zipped(), 415, "unknown-format", "application/zip"),
+    "a zip archive with no bag": Bad(zipped("notes.md"), 415, "unknown-format", "application/zip"),
+    "a zip archive with a bag that is none": Bad(zipped("a.bag"), 422, "unreadable-recording", "application/zip"),
+    "half a zip archive": Bad(zipped()[:300], 422, "unreadable-recording", "application/zip"),
+    "a ROS 1 bag that is none": Bad(b"#ROSBAG V2.0\n", 422, "unreadable-recording", "application/x-rosbag"),
+    "a .db3 bag that is none": Bad(
+        b"SQLite format 3\0" + bytes(4000), 422, "unreadable-recording", "application/vnd.sqlite3"
+    ),
+    "JIGSAWS kinematics with a word in them": Bad(
+        JIGSAWS.replace(b"0.4", CANARY.encode(), 1), 422, "unreadable-recording", "text/plain"
+    ),
+    "JIGSAWS kinematics as a table": Bad(JIGSAWS, 415, "unknown-format", CSV),
+    "a rate for JIGSAWS": Bad(JIGSAWS, 422, "bad-settings", "text/plain", {"rate_hz": 30}),
     "a zip labelled as MCAP": Bad(zipped(), 415, "unknown-format", MCAP),
     "json labelled as MCAP": Bad(b'{"a": 1, "b": 2}', 415, "unknown-format", MCAP),
     "html labelled as MCAP": Bad(b"<html><p>Not found, sorry</p></html>", 415, "unknown-format", MCAP),

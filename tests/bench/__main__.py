@@ -24,6 +24,7 @@ from skills.style.learning.q_learning import CellQLearning, PhaseQLearning
 from skills.style.policy import Policy, learn_policy
 from skills.style.reward import RewardMap, sparse_reward
 from tests.bench.plain_c import plain_c
+from tests.bench.reading import reading
 from tests.measured import measured
 
 ROUNDS = 5
@@ -123,8 +124,7 @@ def main() -> None:
     """Print the table."""
     sample = next(s for s in sample_recordings() if s.surgeon == "wren")
     table = Table("what", "time", "in proportion", box=None)
-    read = best_s(lambda: read_recording(BytesIO(sample.data)))
-    table.add_row("reading a recording", f"{read * 1e3:.1f} ms", f"{len(sample.data) / read / 1e6:.1f} MB/s")
+    reading(table)
     demo = cut_demo(read_recording(BytesIO(sample.data)), start_s=sample.segments[0][0], end_s=sample.segments[0][1])
     reward = sparse_reward(discretize(demo.tip_mm, PAPER_GRID))
     theirs = paper_source(Settings().paper_data)

@@ -17,7 +17,7 @@ from skills.db.packed import FORMAT, Packed, digest, pack, unpack
 from skills.errors import Corrupt
 from skills.recordings import read_recording
 from skills.style.certificate import certify
-from skills.style.demo import cut_demo
+from skills.style.demo import Demo, Partner, Pause, cut_demo
 from skills.style.grid import PAPER_GRID, GridWorld, discretize
 from skills.style.learning.irl import MaxEntIRL
 from skills.style.learning.q_learning import CellQLearning, PhaseQLearning
@@ -57,6 +57,8 @@ PLAYBACK = Playback(
 VALUES = [
     DEMO,
     replace(DEMO, rotation_xyzw=None),
+    replace(DEMO, pauses=(Pause(0.1, 0.2, "clutch"),)),
+    replace(DEMO, partner=Partner("PSM1", 0.4, (1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 1.0))),
     PATH,
     replace(PATH, hysteresis=0.25),
     REWARD,
@@ -229,3 +231,12 @@ def test_a_class_that_was_not_declared_is_not_stored():
     recording = read_recording(io.BytesIO(hand_off()))
     with pytest.raises(AssertionError, match="not declared"):
         pack(recording)
+
+
+def test_a_demonstration_without_pauses_and_partner_has_the_digest_it_always_had():
+    seconds = np.arange(5) / 10
+    demo = Demo("PSM2", "/t", "f", 0.0, 0.4, seconds, np.stack([10 * seconds, 0 * seconds, 0 * seconds], axis=1))
+    assert digest(demo) == "9e59a8556a81d3eeaac88c9548dbe6d623876a97a8bf881295446fada3e23d29"
+    paused = replace(demo, pauses=(Pause(0.1, 0.2, "clutch"),))
+    partner = replace(demo, partner=Partner("PSM1", 0.4, (1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 1.0)))
+    assert len({digest(demo), digest(paused), digest(partner)}) == 3

@@ -14,11 +14,13 @@ import pytest
 from skills.client import Client
 from skills.demo import wait_until_ready
 
+WORKER, FORK_SERVER = "skills.jobs.worker", "skills.confined.fork_server"
+
 
 class Service:
     """A service that can be killed and started again on the same database."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, **settings: object) -> None:
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             self.port = free.getsockname()[1]
@@ -28,6 +30,7 @@ class Service:
             **{k: v for k, v in os.environ.items() if not k.startswith("SKILLS_")},
             "SKILLS_DATABASE_URL": f"sqlite:///{self.database}",
             "SKILLS_PORT": str(self.port),
+            **{f"SKILLS_{name.upper()}": str(value) for name, value in settings.items()},
         }
         self.process: subprocess.Popen[bytes] | None = None
 
@@ -35,6 +38,14 @@ class Service:
         self.process = subprocess.Popen([sys.executable, "-m", "skills", "serve"], env=self.environment)
         with Client(self.url) as client:
             wait_until_ready(client, self.process)
+
+    def child(self, word: str) -> int:
+        """Find the child process that has a word on its command line: its worker, or its fork server."""
+        assert self.process is not None
+        tasks = Path(f"/proc/{self.process.pid}/task")  # it may be any of its threads that started it
+        children = [pid for task in tasks.iterdir() for pid in (task / "children").read_text().split()]
+        (child,) = [int(pid) for pid in children if word in Path(f"/proc/{pid}/cmdline").read_text()]
+        return child
 
     def kill(self) -> None:
         assert self.process is not None
@@ -48,8 +59,8 @@ class Service:
 
 
 @contextmanager
-def running(folder: Path) -> Iterator[Service]:
-    service = Service(folder)
+def running(folder: Path, **settings: object) -> Iterator[Service]:
+    service = Service(folder, **settings)
     service.start()
     try:
         yield service

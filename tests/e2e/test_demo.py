@@ -20,7 +20,7 @@ def test_the_demo_does_the_main_job_and_exits_with_0(tmp_path: Path) -> None:
     assert all(exact == states for _, exact, states in styles)
     pictures = tmp_path / "build" / "demo"
     real = bool(os.environ.get("SKILLS_SAMPLE_RECORDINGS"))
-    learnt = "344 of 344 states, DTW 0 mm, 9570 of 9570 starts reach the goal; released."
+    learnt = "333 of 333 states, DTW 0 mm, 9570 of 9570 starts reach the goal; released."
     assert (learnt if real else "No real recording:") in printed
     assert ("Played back at its own place: feasible" in printed) == real
     assert len(list(pictures.glob("*-playback.png"))) >= len(styles)

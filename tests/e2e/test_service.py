@@ -11,7 +11,8 @@ import pytest
 
 from skills.client import Client
 from skills.seeds.recordings import sample_recordings
-from tests.e2e.conftest import Service, running
+from tests.e2e.conftest import FORK_SERVER, WORKER, running
+from tests.sim.test_confined import alive, waited
 
 SLOW_LEARNER = {"kind": "cell-q-learning", "episodes": 300_000}  # a few seconds of work
 
@@ -54,14 +55,11 @@ def test_the_recording_comes_back_exactly_and_two_segments_are_two_demonstration
     assert all(client.demo_recording(d["id"]) == sample.data for d in demos)
 
 
-def test_a_stopped_service_exits_with_0_and_takes_its_worker_along(tmp_path: Path) -> None:
+def test_a_stopped_service_exits_with_0_and_takes_its_children_along(tmp_path: Path) -> None:
     with running(tmp_path) as service:
-        worker = _child_of(service)
+        children = [service.child(WORKER), service.child(FORK_SERVER)]
         assert service.stop() == 0
-    deadline = time.monotonic() + 15
-    while _lives(worker) and time.monotonic() < deadline:
-        time.sleep(0.1)
-    assert not _lives(worker)
+    waited(lambda: not any(map(alive, children)))
 
 
 def test_a_worker_that_dies_is_replaced_and_its_job_done(tmp_path: Path) -> None:
@@ -69,7 +67,7 @@ def test_a_worker_that_dies_is_replaced_and_its_job_done(tmp_path: Path) -> None
     with running(tmp_path) as service, Client(service.url) as client:
         client.put_surgeon(sample.surgeon)
         client.add_demo(sample.data, surgeon=sample.surgeon, suture=sample.suture)
-        os.kill(_child_of(service), signal.SIGKILL)
+        os.kill(service.child(WORKER), signal.SIGKILL)
         done = client.wait(client.train(sample.surgeon, sample.suture, release=True), timeout_s=60)
         assert done["result"]["released"]
 
@@ -81,18 +79,3 @@ def test_an_address_that_others_can_reach_is_refused(tmp_path: Path, host: str) 
     assert ended.returncode == 1
     assert "SKILLS_HOST" in ended.stderr
     assert not list(tmp_path.iterdir())
-
-
-def _child_of(service: Service) -> int:
-    """Find the worker: the one child of the service, whichever of its threads started it."""
-    assert service.process is not None
-    tasks = Path(f"/proc/{service.process.pid}/task")
-    (child,) = [int(pid) for task in tasks.iterdir() for pid in (task / "children").read_text().split()]
-    return child
-
-
-def _lives(pid: int) -> bool:
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except FileNotFoundError:
-        return False

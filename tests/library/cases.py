@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from skills.db.models import Demonstration, Job, Plan, PolicyVersion
-from skills.db.packed import sha256
 from skills.db.session import Database
 from skills.jobs.workflows import Work
 from skills.library import perform_job
@@ -16,6 +15,7 @@ from skills.library.demos import Cut, upload_demo
 from skills.library.plans import PlanRequest, plan_sutures
 from skills.library.recordings import Upload
 from skills.library.training import request_training
+from skills.packing import sha256
 from skills.recordings import write_mcap
 from skills.settings import Settings
 from skills.style.learning.q_learning import CellQLearning

@@ -6,7 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.records import Channel, Message, Schema
+from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType
+from mcap.writer import Writer as RecordWriter
 from mcap_ros2.writer import Writer
 
 from skills.recordings import topics
@@ -54,6 +57,20 @@ def bag(messages, *, compression=CompressionType.ZSTD, chunk_size=1024, crcs=Tru
 def pose_bag(poses, *, topic=LOCAL, **how):
     """Write poses on one topic, logged one step apart whatever their own stamps say."""
     return bag([(START_NS + k * STEP_NS, topic, topics.POSE, message) for k, message in enumerate(poses)], **how)
+
+
+def unchunked(poses, *, checksum):
+    """Write poses outside of any chunk, with a checksum of the whole data section or without."""
+    records = list(StreamReader(io.BytesIO(pose_bag(poses))).records)
+    schema, channel = (next(r for r in records if isinstance(r, kind)) for kind in (Schema, Channel))
+    file = io.BytesIO()
+    writer = RecordWriter(file, use_chunking=False, enable_data_crcs=checksum)
+    writer.start(profile="ros2")
+    writer.register_channel(channel.topic, "cdr", writer.register_schema(schema.name, "ros2msg", schema.data))
+    for message in (r for r in records if isinstance(r, Message)):
+        writer.add_message(1, message.log_time, message.data, message.publish_time)
+    writer.finish()
+    return file.getvalue()
 
 
 def straight(count=20, **changes):

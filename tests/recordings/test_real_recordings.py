@@ -1,4 +1,5 @@
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +33,7 @@ def test_the_same_motion_in_two_encodings_is_the_same_to_the_last_bit(rosbag, ol
 def test_the_same_motion_in_two_encodings_gives_the_same_path(rosbag, old):
     (moving, *_), grid = propose_segments(rosbag), None
     paths = []
-    for recording in (rosbag, old):
+    for recording in (replace(rosbag, clutch=None), old):  # the old one has no clutch, and so nothing to leave out
         tip_mm = cut_demo(recording, start_s=moving.start_s, end_s=moving.end_s).tip_mm
         grid = grid or fit_grid(tip_mm)
         paths.append(discretize(tip_mm, grid))
@@ -60,6 +61,13 @@ def test_the_topics_of_a_bag_are_counted(rosbag):
 
 def test_two_presses_are_counted_and_the_quick_tap_is_not(rosbag):
     assert cut_demo(rosbag).clutch_presses == 2
+
+
+def test_what_was_recorded_while_the_clutch_was_down_is_left_out(rosbag):
+    demo, whole = cut_demo(rosbag), cut_demo(replace(rosbag, clutch=None))
+    assert [pause.cause for pause in demo.pauses] == ["clutch", "clutch"]
+    inside = sum(((whole.stamps_s >= p.start_s) & (whole.stamps_s <= p.end_s)).sum() for p in demo.pauses)
+    assert len(demo.stamps_s) == len(whole.stamps_s) - inside < len(whole.stamps_s)
 
 
 def test_the_jaw_is_open_at_first_and_closed_in_the_middle(rosbag):

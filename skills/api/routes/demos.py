@@ -3,16 +3,22 @@
 from typing import Annotated, Any
 
 import numpy as np
+import orjson
 from fastapi import APIRouter, Query, Response
 from fastapi.responses import StreamingResponse
 from sqlalchemy import select
 
-from skills.api.deps import SLUG, Actor, Db, Digest, Incoming, Jobs, Limit, RowCursor, page
+from skills.api.answers import JSON
+from skills.api.deps import SLUG, Actor, Db, Digest, Incoming, Jobs, Limit, Read, RowCursor, page
+from skills.api.pages.demo import demo_page
+from skills.api.pages.page import HEADERS
+from skills.api.routes.policies import Accept
 from skills.api.schemas import DemoIn, Schema, demo_out, recording_out
 from skills.db.models import Job, StoredRewardMap
+from skills.errors import UnknownFormat
 from skills.library import demos, erasure, recordings
 from skills.library.demos import Cut
-from skills.library.recordings import MEDIA_TYPES
+from skills.recordings import MEDIA_TYPES
 from skills.settings import MEBIBYTE
 
 uploads = APIRouter(tags=["demonstrations"])
@@ -46,10 +52,10 @@ class DemoUpload(DemoIn):
 
 @uploads.post("/recordings", status_code=201, openapi_extra=RAW_BODY, responses={200: {}})
 def add_recording(
-    upload: Incoming, _asked: Annotated[RecordingUpload, Query()], db: Db, actor: Actor, response: Response
+    upload: Incoming, _asked: Annotated[RecordingUpload, Query()], db: Db, read: Read, actor: Actor, response: Response
 ) -> dict[str, Any]:
     """Store a recording's bytes once, and propose the hand-offs in it."""
-    row, created = recordings.store_recording(db, upload, actor)
+    row, created = recordings.store_recording(db, upload, actor, read)
     response.status_code = 201 if created else 200
     response.headers["Location"] = f"/recordings/{row.sha256}"
     return recording_out(row)
@@ -57,10 +63,10 @@ def add_recording(
 
 @uploads.post("/demos", status_code=201, openapi_extra=RAW_BODY, responses={200: {}})
 def upload_demo(
-    upload: Incoming, asked: Annotated[DemoUpload, Query()], db: Db, actor: Actor, response: Response
+    upload: Incoming, asked: Annotated[DemoUpload, Query()], db: Db, read: Read, actor: Actor, response: Response
 ) -> dict[str, Any]:
     """Store a recording and one demonstration of it, both or neither."""
-    row, created = demos.upload_demo(db, upload, asked.cut(), actor)
+    row, created = demos.upload_demo(db, upload, asked.cut(), actor, read)
     response.status_code = 201 if created else 200
     response.headers["Location"] = f"/demos/{row.sha256}"
     return demo_out(row)
@@ -74,9 +80,9 @@ def get_recording(recording: Digest, db: Db) -> dict[str, Any]:
 
 
 @router.post("/recordings/{recording}/demos", status_code=201, responses={200: {}})
-def add_demo(recording: Digest, body: DemoIn, db: Db, actor: Actor, response: Response) -> dict[str, Any]:
+def add_demo(recording: Digest, body: DemoIn, db: Db, read: Read, actor: Actor, response: Response) -> dict[str, Any]:
     """Cut one demonstration out of a stored recording."""
-    row, created = demos.add_demo(db, recording, Cut(**body.model_dump()), actor)
+    row, created = demos.add_demo(db, recording, Cut(**body.model_dump()), actor, read)
     response.status_code = 201 if created else 200
     response.headers["Location"] = f"/demos/{row.sha256}"
     return demo_out(row)
@@ -134,6 +140,28 @@ def get_path(demo: Digest, db: Db) -> dict[str, Any]:
             "stamps_s": recorded.stamps_s.tolist(),
             "recorded_mm": recorded.tip_mm.tolist(),
         }
+
+
+@router.get("/demos/{demo}/report", responses={200: {"content": {"text/html": {}}}})
+def get_report(demo: Digest, db: Db, accept: Accept = "*/*") -> Response:
+    """Say what kind of demonstration it is and what to do about it: JSON, or with `Accept: text/html` a page."""
+    as_page = _wants_page(accept)
+    with db.reading() as session:
+        row = demos.find_demo(session, demo)
+        about, report = demo_out(row), demos.full_report(row)
+        if as_page:
+            return Response(demo_page(about, report, row.demo, row.path), headers=HEADERS, media_type="text/html")
+        return Response(orjson.dumps(about | {"report": report}), headers={"Vary": "Accept"}, media_type=JSON)
+
+
+def _wants_page(accept: str) -> bool:
+    """Choose between a page and JSON, the first that the client names."""
+    for wanted in (part.partition(";")[0].strip().lower() for part in accept.split(",")):
+        if wanted in ("text/html", "text/*"):
+            return True
+        if wanted in (JSON, "application/*", "*/*"):
+            return False
+    raise UnknownFormat("A report is given as application/json or text/html.")
 
 
 @router.get("/demos/{demo}/reward-map")

@@ -1,0 +1,229 @@
+"""The report of a demonstration, for programs and for people; and PSM_M's pose, which plans take from it."""
+
+import base64
+import hashlib
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from skills.recordings import write_mcap
+from skills.seeds.recordings import sample_recordings
+from skills.style.recording import Motion, Recording
+from tests.api.service import CSV, GOAL_MM, KESTREL, Service, assert_problem
+from tests.library import cases
+from tests.style import sessions
+
+PAGE = {"Accept": "text/html"}
+NUMBERS = (
+    "duration_s", "samples", "rate_hz", "longest_gap_s", "duplicate_stamps", "path_length_mm", "extent_mm",
+    "speed_median_mm_s", "speed_peak_mm_s", "jerk_rms_mm_s3", "log_dimensionless_jerk", "clutch_presses", "clutched_s",
+    "undriven_s", "idle_share", "a1_s", "a1_orientation_change_rad", "a1_turn_negligible", "orientation_change_rad",
+    "path_states", "revisits", "returns", "bridged_cells", "discretisation_rmse_mm", "discretisation_rmse_3d_mm",
+    "outside_paper_grid_share", "advised_hysteresis", "grid", "partner", "advice",
+)  # fmt: skip
+
+
+@pytest.fixture
+def here(service: Service) -> Service:
+    service.client.put_surgeon("kestrel")
+    return service
+
+
+@pytest.fixture
+def plover(here: Service) -> dict:
+    """A hesitant demonstration with two presses of the clutch and a tremor."""
+    sample = next(s for s in sample_recordings() if s.surgeon == "plover")
+    start_s, end_s = sample.segments[0]
+    return here.client.add_demo(sample.data, **KESTREL, start_s=start_s, end_s=end_s)
+
+
+class Page(HTMLParser):
+    """What is in a page: its tags, their attributes, and its text."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.attributes: list[tuple[str, str | None]] = []
+        self.text = ""
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list) -> None:
+        self.tags.append(tag)
+        self.attributes += attrs
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+def test_a_report_says_all_that_is_measured(here: Service, plover: dict):
+    answer = here.http.get(f"/demos/{plover['id']}/report")
+    assert answer.headers["content-type"] == "application/json"
+    assert answer.headers["vary"] == "Accept"
+    assert answer.json() == plover, "the report that came with it, measured again"
+    assert set(NUMBERS) == set(plover["report"])
+    report = plover["report"]
+    assert (report["clutch_presses"], report["a1_turn_negligible"]) == (2, True)
+    assert report["clutched_s"] == report["undriven_s"] == pytest.approx(2.4, abs=0.01)
+    said = " ".join(report["advice"])
+    for words in ("clutched twice", "starts and stops often", "Ask for hysteresis 0.25"):
+        assert words in said
+
+
+def test_a_report_is_a_page_for_people(here: Service, plover: dict):
+    answer = here.http.get(f"/demos/{plover['id']}/report", headers=PAGE)
+    assert answer.headers["content-type"].startswith("text/html")
+    page = Page(answer.text)
+    assert {"h1", "svg", "polyline", "rect", "table"} <= set(page.tags)
+    assert page.tags.count("svg") >= 4, "three views and the speed"
+    for words in (*plover["report"]["advice"], "Path length", "Smoothness", "Turn in A1", "Self-crossings", "Clutch"):
+        assert words in page.text
+    assert f"{plover['report']['path_length_mm']:.1f} mm" in page.text
+
+
+def test_a_page_runs_nothing_and_fetches_nothing(here: Service, plover: dict):
+    answer = here.http.get(f"/demos/{plover['id']}/report", headers=PAGE)
+    page = Page(answer.text)
+    assert not {"script", "img", "link", "iframe", "object", "a", "form"} & set(page.tags)
+    assert not [name for name, _ in page.attributes if name in ("href", "src", "style") or name.startswith("on")]
+    style = re.search("<style>(.*?)</style>", answer.text, re.DOTALL)[1]
+    allowed = base64.b64encode(hashlib.sha256(style.encode()).digest()).decode()
+    policy = answer.headers["content-security-policy"]
+    assert policy == f"default-src 'none'; style-src 'sha256-{allowed}'; frame-ancestors 'none'"
+    assert here.http.get(f"/demos/{plover['id']}/report").headers["content-security-policy"].startswith("default-src")
+
+
+def test_what_a_recording_calls_itself_is_no_mark_up(here: Service):
+    """A frame of a table may be any word of its pattern; a topic of an MCAP file is anybody's."""
+    value, _ = sessions.session(sessions.Kind(seed=5, passes=1, both_arms=False))
+    motion = value.motions[0]
+    nasty = f"/{motion.arm}/<script>alert(1)</script>&\"'/measured_cp"
+    data = write_mcap(_renamed(value, motion, nasty))
+    demo = here.client.add_demo(data, **KESTREL)
+    text = here.http.get(f"/demos/{demo['id']}/report", headers=PAGE).text
+    assert demo["topic"] == nasty
+    assert "<script" not in text
+    assert "&lt;script&gt;alert(1)&lt;/script&gt;&amp;" in text
+
+
+def _renamed(value, motion, topic):
+    return replace(value, motions=(replace(motion, topic=topic),), jaws=(), clutch=None)
+
+
+@pytest.mark.parametrize(
+    ("accept", "kind"),
+    [
+        ("*/*", "json"),
+        ("application/json", "json"),
+        ("text/html,application/xhtml+xml,application/xml;q=0.9,*/*;q=0.8", "html"),
+        ("application/json, text/html", "json"),
+    ],
+)
+def test_the_first_that_a_client_names_is_given(here: Service, plover: dict, accept: str, kind: str):
+    answer = here.http.get(f"/demos/{plover['id']}/report", headers={"Accept": accept})
+    assert kind in answer.headers["content-type"]
+
+
+def test_a_report_in_another_form_is_refused(here: Service, plover: dict):
+    assert_problem(here.http.get(f"/demos/{plover['id']}/report", headers={"Accept": "image/png"}), 415)
+    assert_problem(here.http.get(f"/demos/{'0' * 64}/report"), 404, "not-found")
+
+
+def test_a_good_demonstration_is_told_so(here: Service):
+    demo = here.client.add_demo(cases.hand_off(), media_type=CSV, **KESTREL)
+    text = here.http.get(f"/demos/{demo['id']}/report", headers=PAGE).text
+    assert "wrist was not recorded" in text
+    assert "not recorded" in text, "a turn that is not known"
+
+
+def test_a_demonstration_of_an_older_version_is_measured_again(here: Service):
+    demo = here.client.add_demo(cases.hand_off(), media_type=CSV, **KESTREL)
+    here.tamper("""UPDATE demonstrations SET report = '{"duration_s": 1.0, "grid": {}}'""")
+    assert here.client.demo(demo["id"])["report"] == {"duration_s": 1.0, "grid": {}}, "as it was stored"
+    assert here.http.get(f"/demos/{demo['id']}/report").json()["report"] == demo["report"]
+    assert here.http.get(f"/demos/{demo['id']}/report", headers=PAGE).status_code == 200
+
+
+def test_the_clutched_samples_make_another_demonstration_than_with_them(here: Service, plover: dict):
+    """A demonstration of the same segment that was stored with them keeps its name, and is not given for this one."""
+    path = here.client.demo_path(plover["id"])
+    assert len(path["recorded_mm"]) == plover["report"]["samples"]
+    assert max(np.diff(path["stamps_s"])) > 1.0, "the stamps are the recording's own"
+
+
+# ---- proposals --------------------------------------------------------------------------------------------------
+
+
+def test_a_recording_proposes_hand_offs_in_the_form_in_which_they_are_asked_for(here: Service):
+    value, truths = sessions.session(sessions.Kind(seed=1, passes=3))
+    about = here.client.add_recording(write_mcap(value))
+    mine = [s for s in about["segments"] if s["arm"] == sessions.A]
+    assert len(mine) == len(truths)
+    for segment in mine:
+        assert segment["start_s"] < segment["handover_s"] < segment["end_s"]
+        assert (segment["found_by"], segment["reason"]) == ("jaw", "; ".join(segment["reasons"]))
+    corrected = {"arm": mine[0]["arm"], "start_s": mine[0]["start_s"] + 0.5, "end_s": mine[0]["end_s"]}
+    demo = here.client.cut_demo(about["id"], **KESTREL, **corrected)
+    assert demo["start_s"] == pytest.approx(corrected["start_s"], abs=0.011)
+
+
+# ---- PSM_M ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def two_arms(here: Service) -> dict:
+    """A policy of a demonstration in whose frame the other arm is known: its base is found in the frame of both."""
+    here.client.add_demo(beside(), **KESTREL, arm="PSM2")
+    here.train(release=True)
+    return here.client.demos()[0]
+
+
+def beside() -> bytes:
+    """The hand-off of `cases`, with PSM1 waiting 15 mm beside its end, its approach along -x."""
+    tip = cases.points_mm()
+    stamps_ns = cases.START_NS + np.arange(len(tip)) * (10**9 // cases.RATE_HZ)
+    down = np.tile([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0], (len(tip), 1))
+    along_x = np.tile([0.0, -np.sqrt(0.5), 0.0, np.sqrt(0.5)], (len(tip), 1))
+    waiting = np.tile(np.add(tip[-1], [15.0, 0, 0]), (len(tip), 1))
+    motions = (
+        Motion("PSM2", "/PSM2/local/measured_cp", "PSM2_base", stamps_ns, tip, down),
+        Motion("PSM2", "/PSM2/measured_cp", "world", stamps_ns, tip, down),
+        Motion("PSM1", "/PSM1/measured_cp", "world", stamps_ns, waiting, along_x),
+    )
+    return write_mcap(Recording(format="mcap", integrity="full", motions=motions))
+
+
+def plan(service: Service, **asked: object) -> dict:
+    return service.client.plan(**KESTREL, suture_points=[{"position_mm": GOAL_MM}], **asked)
+
+
+def test_a_plan_takes_psm_ms_approach_from_the_demonstration_and_says_so(here: Service, two_arms: dict):
+    partner = two_arms["report"]["partner"]
+    assert partner["arm"] == "PSM1"
+    assert partner["approach"] == pytest.approx([-1.0, 0.0, 0.0])
+    made = plan(here)
+    assert made["psm_m"]["approach"] == pytest.approx([-1.0, 0.0, 0.0])
+    assert made["psm_m"]["from"] == f"the demonstration: PSM1 at {partner['at_s']:g} s of its recording"
+    assert made["realignment"]
+    x, y, z, w = made["passes"][0]["target_xyzw"]
+    normal = np.array([1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)])
+    assert abs(normal @ [-1, 0, 0]) == pytest.approx(1.0), "PSM_A's normal is parallel to PSM_M's approach"
+
+
+def test_a_given_approach_comes_before_the_demonstrated_one(here: Service, two_arms: dict):
+    made = plan(here, psm_m={"approach": [0.0, -1.0, 0.0]})
+    assert made["psm_m"] == {"approach": [0.0, -1.0, 0.0], "from": "the request"}
+    assert made["id"] != plan(here)["id"]
+
+
+def test_a1_alone_is_planned_where_that_is_asked_for(here: Service, two_arms: dict):
+    made = plan(here, realignment=False)
+    assert (made["psm_m"], made["realignment"], made["passes"][0]["target_xyzw"]) == (None, False, None)
+
+
+def test_the_page_shows_the_other_arm(here: Service, two_arms: dict):
+    text = here.http.get(f"/demos/{two_arms['id']}/report", headers=PAGE).text
+    assert "PSM1 as it takes the needle" in text
+    assert 'class="partner"' in text

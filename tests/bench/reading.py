@@ -1,0 +1,86 @@
+"""How fast recordings are read, beside unpacking their chunks alone and beside libraries that decode each message."""
+
+import struct
+from collections.abc import Callable
+from io import BytesIO
+from time import thread_time
+
+import zstandard
+from mcap.stream_reader import StreamReader
+from mcap_ros2.reader import read_ros2_messages
+from rich.table import Table
+
+from skills.recordings.mcap import read_mcap
+from skills.style.demo import cut_demo
+from skills.style.grid import discretize, fit_grid
+from tests.recordings import large, records
+
+ROUNDS = 9
+LIBRARY_S = 3.0  # the libraries take a hundred times as long, so they read a shorter recording of the same kind
+
+
+def reading(table: Table) -> None:
+    """Read a session of four arms, a minute at 200 Hz, and a long recording of one."""
+    session = large.four_arms()
+    chunks = _chunks(session)
+    size = sum(size for _, size in chunks)
+    messages = sum(topic.messages for topic in read_mcap(BytesIO(session)).topics)
+    unpacking, ours = _in_turn(lambda: _unpack(chunks), lambda: read_mcap(BytesIO(session)))
+    table.add_row("reading four arms, 60 s at 200 Hz", f"{ours * 1e3:.0f} ms", f"{size / ours / 1e6:.0f} MB/s unpacked")
+    table.add_row("  unpacking its chunks alone", f"{unpacking * 1e3:.0f} ms", f"{size / unpacking / 1e6:.0f} MB/s")
+    after = ours - unpacking
+    table.add_row("  ours, of that speed", f"{unpacking / ours:.2f}", f"{unpacking / after:.2f} without the unpacking")
+    table.add_row("  a message", f"{ours / messages * 1e9:.0f} ns", f"{messages} messages")
+    _libraries(ours / messages, table)
+    _long(table)
+
+
+def _libraries(ours_s: float, table: Table) -> None:
+    session = large.four_arms(LIBRARY_S)
+    messages = sum(topic.messages for topic in read_mcap(BytesIO(session)).topics)
+    walking = _best(lambda: sum(1 for _ in StreamReader(BytesIO(session), validate_crcs=True).records)) / messages
+    decoding = _best(lambda: sum(1 for _ in read_ros2_messages(BytesIO(session)))) / messages
+    table.add_row("  mcap, records only", f"{walking * 1e9:.0f} ns a message", f"{walking / ours_s:.0f} x ours")
+    table.add_row("  mcap-ros2-support", f"{decoding * 1e9:.0f} ns a message", f"{decoding / ours_s:.0f} x ours")
+
+
+def _long(table: Table) -> None:
+    data = large.one_arm(1_000_000)
+
+    def work() -> None:
+        tip_mm = cut_demo(read_mcap(BytesIO(data))).tip_mm
+        discretize(tip_mm, fit_grid(tip_mm))
+
+    table.add_row("10^6 poses: read, cut, discretised", f"{_best(work, rounds=3):.2f} s", "")
+
+
+def _chunks(data: bytes) -> list[tuple[bytes, int]]:
+    """Take the stored bytes and the size of every chunk, all of them zstd."""
+    found = []
+    for part in records.parts_of(data):
+        if part.opcode == records.CHUNK:
+            (size,) = struct.unpack_from("<Q", part.content, 16)
+            found.append((part.content[28 + 4 + len("zstd") + 8 :], size))
+    return found
+
+
+def _unpack(chunks: list[tuple[bytes, int]]) -> None:
+    for stored, size in chunks:
+        zstandard.ZstdDecompressor().decompress(stored, max_output_size=size)
+
+
+def _in_turn(one: Callable[[], object], other: Callable[[], object]) -> tuple[float, float]:
+    """Take the best of some rounds of each, in turn, so that both see the same machine."""
+    pairs = [(_best(one, rounds=1), _best(other, rounds=1)) for _ in range(ROUNDS)]
+    ours, theirs = zip(*pairs, strict=True)
+    return min(ours), min(theirs)
+
+
+def _best(work: Callable[[], object], rounds: int = 2) -> float:
+    """Take the best of some rounds, in seconds of this thread's processor time."""
+    times = []
+    for _ in range(rounds):
+        began = thread_time()
+        work()
+        times.append(thread_time() - began)
+    return min(times)

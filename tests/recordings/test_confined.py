@@ -1,0 +1,149 @@
+"""Reading apart: the same recording or the same refusal as without, and whatever else happens is a refusal too."""
+
+import io
+import logging
+import tempfile
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import fields, is_dataclass
+from typing import IO, Any
+
+import numpy as np
+import pytest
+
+from skills.confined.limits import Limits
+from skills.errors import BadColumns, BadInput, Busy, SkillsError, UnreadableRecording
+from skills.recordings import confined, read_recording
+from skills.recordings.confined import KNOWN, ConfinedReader, Refusal
+from skills.style import recording as values
+from tests.recordings import bags
+
+LIMITS = Limits(memory_bytes=512 << 20, wall_s=20.0, cpu_s=20, file_bytes=64 << 20, children=False)
+MOST = 32 << 20
+BAG = bags.pose_bag(bags.straight(40))
+TABLE = b"t_s,x_mm,y_mm,z_mm,jaw_rad\n" + b"".join(b"%f,1,2,-100.5,0.25\n" % (k / 50) for k in range(40))
+
+
+@pytest.fixture(scope="module")
+def reader() -> Iterator[ConfinedReader]:
+    with ConfinedReader(LIMITS, answer_bytes=MOST, at_once=4) as reader:
+        yield reader
+
+
+def read(reader: ConfinedReader, data: bytes, **how: Any) -> values.Recording:
+    with tempfile.TemporaryFile() as file:
+        file.write(data)
+        return reader(file, **how)
+
+
+def same(one: Any, other: Any) -> bool:
+    """Whether two values are equal to the last bit, their arrays' types and read-only flags included."""
+    if is_dataclass(one):
+        return type(one) is type(other) and all(same(getattr(one, f.name), getattr(other, f.name)) for f in fields(one))
+    if isinstance(one, tuple):
+        return len(one) == len(other) and all(map(same, one, other))
+    if isinstance(one, np.ndarray):
+        return one.dtype == other.dtype and one.tobytes() == other.tobytes() and not other.flags.writeable
+    return bool(one == other)
+
+
+@pytest.mark.parametrize(
+    ("data", "how"), [(BAG, {}), (TABLE, {}), (TABLE, {"frame": "ECM"})], ids=["bag", "csv", "ECM"]
+)
+def test_the_recording_is_the_same_to_the_last_bit(reader, data, how):
+    assert same(read_recording(io.BytesIO(data), **how), read(reader, data, **how))
+
+
+def test_every_value_of_a_recording_may_come_back():
+    assert {v for v in vars(values).values() if is_dataclass(v) and v.__module__ == values.__name__} == {
+        *KNOWN.values()
+    } - {Refusal}
+
+
+@pytest.mark.parametrize(
+    ("data", "how"),
+    [
+        *((b"", {}), (b"PK\x03\x04", {}), (BAG[:500], {}), (b"t_s,x_m\n0,1\n", {})),
+        *((BAG, {"frame": "camera"}), (BAG, {"rate_hz": 9})),
+    ],
+    ids=["empty", "zip", "cut", "columns", "frame", "rate"],
+)  # fmt: skip
+def test_a_refusal_is_the_same(reader, data, how):
+    with pytest.raises(SkillsError) as apart:
+        read(reader, data, **how)
+    with pytest.raises(SkillsError) as here:
+        read_recording(io.BytesIO(data), **how)
+    one, other = apart.value, here.value
+    assert (type(one), str(one), one.numbers) == (type(other), str(other), other.numbers)
+
+
+def test_numbers_that_are_no_json_come_back_as_they_would_be_shown():
+    refused = BadColumns("No.", share=float("inf"), stamp=np.int64(3), names=["a", None])
+    numbers = Refusal.of(refused).read().numbers
+    assert numbers == {"share": float("inf"), "stamp": "3", "names": ["a", None]}
+
+
+NONSENSE = [
+    *("garbage", "nothing", "with_pickles", "unfolding", "another_value", "a_class_that_is_not_named"),
+    *("an_empty_recording", "our_mistake", "no_error_at_all"),
+]
+
+
+@pytest.mark.parametrize("fault", NONSENSE)
+def test_nonsense_is_a_refusal(fault, caplog, monkeypatch):
+    monkeypatch.setattr(confined.log, "disabled", False)  # import-linter, in another test, disables what it finds
+    with (
+        ConfinedReader(LIMITS, answer_bytes=MOST, at_once=1, target=f"tests.confined.faults:{fault}") as wrong,
+        pytest.raises(UnreadableRecording) as caught,
+    ):
+        read(wrong, BAG)
+    assert caught.value.numbers == {"cause": "nonsense"}
+    assert "nonsense" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("fault", "cause", "advice"),
+    [
+        ("crash", "crashed", "SIGSEGV; the file may be damaged"),
+        ("leave", "failed", "mcap doctor"),
+        ("eat_memory", "out of memory", "512 MiB; cut the recording"),
+        ("answer_without_end", "too much", "64 MiB; cut the recording"),
+        ("spin", "hung", "1 s of processor time; cut the recording"),
+    ],
+)
+def test_what_becomes_of_a_reader_is_a_refusal_that_says_what_to_do(fault, cause, advice):
+    limits = Limits(**vars(LIMITS) | {"cpu_s": 1})
+    with ConfinedReader(limits, answer_bytes=MOST, at_once=1, target=f"tests.confined.faults:{fault}") as wrong:
+        with pytest.raises(UnreadableRecording, match=advice) as caught:
+            read(wrong, BAG)
+        assert isinstance(caught.value, BadInput)
+        assert caught.value.numbers == {"cause": cause}
+
+
+def test_a_fault_of_ours_is_logged_without_the_file_in_it(monkeypatch):
+    def broken(_file: IO[bytes]) -> None:
+        raise KeyError("Zaphod")
+
+    monkeypatch.setattr(confined, "read_recording", broken)
+    with pytest.raises(RuntimeError, match=r"^KeyError$") as caught:
+        confined.parse(io.BytesIO(), io.BytesIO())
+    assert caught.value.__suppress_context__
+    assert caught.traceback[-1].name == "broken"
+
+
+def test_too_many_at_once_are_told_to_come_back(caplog):
+    caplog.set_level(logging.CRITICAL)
+    limits = Limits(**vars(LIMITS) | {"wall_s": 0.5})
+    with (
+        ConfinedReader(limits, answer_bytes=MOST, at_once=12, target="tests.confined.faults:hang") as slow,
+        ThreadPoolExecutor(40) as threads,
+    ):
+        refused = list(threads.map(lambda _: refusal(slow), range(40)))
+    assert set(refused) == {UnreadableRecording, Busy}
+    assert refused.count(UnreadableRecording) == confined.WAITING
+
+
+def refusal(reader: ConfinedReader) -> type[SkillsError]:
+    with pytest.raises(SkillsError) as caught:
+        read(reader, BAG)
+    return type(caught.value)

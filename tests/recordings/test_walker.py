@@ -1,0 +1,260 @@
+"""The walk over records: what it follows, what it counts, and what it refuses."""
+
+import io
+import struct
+import time
+import zlib
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from skills.errors import UnreadableRecording
+from skills.recordings import chain, topics, walker
+from skills.recordings.chain import follow, follow_one_by_one
+from skills.recordings.unpack import unpack
+from skills.recordings.walker import Walker
+from tests.recordings import records
+from tests.recordings.definitions import DEFINITIONS
+from tests.recordings.records import Part, channel, chunk, message, record, schema, whole
+
+TYPE = schema(1, topics.BOOL, DEFINITIONS[topics.BOOL])
+DEFINED = TYPE + channel(1, 1, "/a")
+ONE = message(1, 5, b"\0\1\0\0\1")
+
+
+def walked(data: bytes):
+    """Walk a whole file: the walker, and channel, log time and content of every message."""
+    walk = Walker(io.BytesIO(data))
+    said = [
+        (stretch.channel.topic, int(log_ns), bytes(stretch.data[begin : begin + length]))
+        for stretch in walk.stretches()
+        for log_ns, begin, length in zip(stretch.log_ns, stretch.begin, stretch.length, strict=True)
+    ]
+    return walk, said
+
+
+def refused(data: bytes, match: str):
+    with pytest.raises(UnreadableRecording, match=match):
+        walked(data)
+
+
+# ---- records one behind the other -------------------------------------------------------------------------------
+
+HEADS = st.sampled_from([b"\5", b"\5\x16\0\0\0\0\0\0\0", b"\5\x1f\0\0\0\0\0\0\0\0", b"\0", b"\5\0\0\0\0\0\0\0\0", b"x"])
+CONTENTS = st.lists(HEADS, max_size=12).map(b"".join)
+MESSAGES = CONTENTS.map(lambda content: message(1, 5, content))
+OTHERS = st.tuples(st.sampled_from([3, 4, 0x80, 0xFF]), CONTENTS).map(lambda pair: record(*pair))
+ENDS = st.sampled_from(
+    [b"", b"\5", b"\5\x16\0\0\0\0\0\0\0", b"\5\xff\0\0\0\0\0\0\0" + bytes(40), b"\6" + bytes(8), b"\3"]
+)
+
+
+def same(one, other):
+    np.testing.assert_array_equal(one.messages, other.messages)
+    np.testing.assert_array_equal(one.lengths, other.lengths)
+    assert (one.others, one.end) == (other.others, other.end)
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.lists(st.one_of(MESSAGES, MESSAGES, OTHERS), max_size=30), ENDS)
+def test_looking_everywhere_at_once_finds_what_following_one_by_one_finds(pieces, end):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(chain, "SMALL_BYTES", 0)
+        found = follow(np.frombuffer(b"".join(pieces) + end, np.uint8))
+    data = np.frombuffer(b"".join(pieces) + end, np.uint8)
+    same(found, follow_one_by_one(data))
+    assert found.end == len(data) - len(end)
+
+
+def test_many_false_heads_are_no_trouble():
+    data = np.frombuffer(3000 * message(1, 5, 4 * b"\5\x16\0\0\0\0\0\0\0"), np.uint8)
+    same(follow(data), follow_one_by_one(data))
+    assert len(follow(data).messages) == 3000
+
+
+def test_many_other_records_are_no_trouble():
+    data = np.frombuffer(3000 * (ONE + record(0x80, b"")), np.uint8)
+    same(follow(data), follow_one_by_one(data))
+
+
+# ---- whole files ------------------------------------------------------------------------------------------------
+
+
+def test_messages_come_in_chunks_between_them_or_without_any():
+    loose, packed = DEFINED + ONE + ONE, chunk(DEFINED + ONE + ONE)
+    for body in (loose, packed, chunk(DEFINED) + ONE + chunk(ONE), loose[: len(DEFINED + ONE)] + chunk(ONE)):
+        walk, said = walked(whole(body))
+        assert said == [("/a", 5, b"\0\1\0\0\1")] * 2
+        assert walk.counts == {1: 2}
+
+
+def test_a_file_without_messages_is_whole():
+    assert walked(whole(b""))[1] == []
+    assert walked(whole(chunk(b"", compression="")))[1] == []
+    assert walked(whole(chunk(b"", compression="lz4")))[1] == []
+
+
+def test_a_definition_may_be_said_again_but_not_otherwise():
+    assert len(walked(whole(chunk(DEFINED + ONE) + chunk(DEFINED + ONE)))[1]) == 2
+    refused(whole(DEFINED + channel(1, 1, "/b") + ONE), "Two channels have the number 1")
+    refused(whole(DEFINED + schema(1, topics.BOOL, "bool other\n") + ONE), "Two schemas have the number 1")
+    refused(whole(schema(0, topics.BOOL, "bool data\n")), "number 0")
+
+
+def test_what_a_message_needs_must_stand_before_it():
+    refused(whole(ONE), "channel 1, which is not defined")
+    refused(whole(chunk(TYPE + ONE + channel(1, 1, "/a"))), "channel 1, which is not defined")
+    refused(whole(channel(1, 1, "/a") + TYPE), "not defined before it")
+
+
+def test_records_of_other_kinds_are_passed_by():
+    other = record(0x90, b"private") + record(records.ATTACHMENT, bytes(100)) + record(records.MESSAGE_INDEX, bytes(6))
+    metadata = record(records.METADATA, records.text("name") + bytes(4))
+    assert len(walked(whole(other + DEFINED + metadata + ONE + other))[1]) == 1
+
+
+@pytest.mark.parametrize("kind", [0, 1, 2, 6, 7, 9, 0x0F, 0x10, 0x7F])
+def test_a_chunk_holds_messages_and_definitions_only(kind):
+    refused(whole(chunk(DEFINED + ONE + record(kind, bytes(40)))), "whole messages and definitions")
+
+
+@pytest.mark.parametrize("kind", [0, 1, 2, 0x0B, 0x10, 0x7F])
+def test_a_record_of_an_impossible_kind_among_the_messages_is_refused(kind):
+    refused(whole(DEFINED + record(kind, bytes(40)) + ONE), f"{kind:#x} stands among")
+
+
+def test_a_chunk_ends_where_its_last_record_ends():
+    body = DEFINED + ONE
+    refused(whole(chunk(body[:-1]) + chunk(ONE)), "whole messages")
+    refused(whole(chunk(body + ONE[:20]) + chunk(ONE[20:])), "whole messages")
+
+
+def test_a_message_shorter_than_its_own_times_is_refused():
+    short = record(records.MESSAGE, bytes(21))
+    refused(whole(DEFINED + short), "shorter than its own times")
+    refused(whole(chunk(DEFINED + short)), "whole messages")
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lz4", ""])
+def test_a_chunk_unpacks_to_exactly_what_it_claims(compression):
+    body = DEFINED + ONE
+    for size in (len(body) - 1, len(body) + 1):
+        refused(whole(chunk(body, compression=compression, size=size)), f"the {size} bytes that it claims")
+    stored = records.packed(body, compression)
+    refused(whole(chunk(body, compression=compression, stored=stored + b"x")), "that it claims")
+
+
+def test_a_second_frame_behind_the_first_is_refused():
+    body = DEFINED + ONE
+    for compression in ("zstd", "lz4"):
+        twice = 2 * records.packed(body, compression)
+        for size in (len(body), 2 * len(body)):
+            refused(whole(chunk(b"", compression=compression, stored=twice, size=size, crc=0)), "that it claims")
+
+
+def test_an_unknown_compression_is_named():
+    refused(whole(chunk(DEFINED, compression="gzip")), "'gzip'")
+    with pytest.raises(UnreadableRecording, match="'gzip'"):
+        unpack(memoryview(b""), "gzip", 0)
+
+
+def test_every_checksum_is_checked():
+    body = DEFINED + ONE
+    refused(whole(chunk(body, crc=zlib.crc32(body) ^ 1)), "CRC.* of chunk 1 is wrong")
+    data = bytearray(whole(body, checksum=True))
+    data[30] ^= 1
+    refused(bytes(data), "CRC|UTF-8|begins")
+    sealed = records.resealed([*records.parts_of(whole(chunk(body)))[:-1], Part(records.STATISTICS, b"")])
+    assert walked(sealed)[0].integrity == "full"
+    for back in (9, 12, 60):  # the checksum of the summary, and what it covers
+        damaged = bytearray(sealed)
+        damaged[-8 - back] ^= 1
+        with pytest.raises(UnreadableRecording):
+            walked(bytes(damaged))
+
+
+def test_integrity_says_what_checksums_cover():
+    body = DEFINED + ONE
+    sealed = [*records.parts_of(whole(chunk(body)))[:-1], Part(records.STATISTICS, b"")]
+    assert walked(whole(chunk(body)))[0].integrity == "full"
+    assert walked(whole(chunk(body) + chunk(ONE, crc=0)))[0].integrity == "partial"
+    assert walked(whole(chunk(body, crc=0)))[0].integrity == "none"
+    assert walked(whole(body))[0].integrity == "none"
+    assert walked(whole(body, checksum=True))[0].integrity == "full"
+    assert walked(records.resealed(sealed))[0].integrity == "full"
+
+
+def test_a_record_that_could_have_been_a_chunk_leaves_no_full_integrity():
+    assert walked(whole(chunk(DEFINED + ONE) + record(0x86, chunk(ONE)[9:])))[0].integrity == "partial"
+
+
+def test_the_statistics_count_what_is_there():
+    counts = struct.pack("<QHIIIIQQI", 1, 1, 1, 0, 0, 1, 0, 0, 0)
+    parts = records.parts_of(whole(chunk(DEFINED + ONE)))
+    good = records.joined([*parts[:-1], Part(records.STATISTICS, counts), parts[-1]])
+    assert len(walked(records.MAGIC + good + records.MAGIC)[1]) == 1
+    for wrong in (struct.pack("<Q", 2) + counts[8:], counts[:22] + struct.pack("<I", 2) + counts[26:]):
+        bad = records.joined([*parts[:-1], Part(records.STATISTICS, wrong), parts[-1]])
+        refused(records.MAGIC + bad + records.MAGIC, "says . messages in . chunks")
+
+
+def test_nothing_stands_before_the_beginning_or_behind_the_end():
+    good = whole(DEFINED + ONE)
+    refused(good + b"x", "follow the end")
+    refused(good + good, "follow the end")
+    refused(b"x" + good, "first bytes")
+    refused(records.MAGIC + good, "one header|within a record")
+    refused(whole(DEFINED + records.header() + ONE), "0x1 stands among")
+
+
+def test_messages_in_the_summary_are_refused():
+    parts = records.parts_of(whole(DEFINED))
+    refused(records.MAGIC + records.joined([*parts[:-1], Part(5, ONE[9:]), parts[-1]]) + records.MAGIC, "0x5 follows")
+
+
+def test_what_our_own_writer_noted_is_read_and_what_others_noted_is_not():
+    noted = records.text("made from") + records.text("abc")
+    for name, expected in ((walker.NOTES, {"made from": "abc"}), ("other", {})):
+        metadata = record(records.METADATA, records.text(name) + struct.pack("<I", len(noted)) + noted)
+        assert walked(whole(metadata))[0].notes == expected
+
+
+# ---- limits -----------------------------------------------------------------------------------------------------
+
+
+def test_channels_records_and_messages_are_limited(monkeypatch):
+    monkeypatch.setattr(chain, "RECORD_LIMIT", 5)
+    refused(whole(6 * chunk(b"", compression="")), "more than 5 records")
+    refused(whole(chunk(6 * record(0x80, b""))), "more than 5 records")
+    monkeypatch.setattr(walker, "MESSAGE_LIMIT", 2)
+    refused(whole(DEFINED + 3 * ONE), "more than 2 messages")
+    monkeypatch.setattr(walker, "CHANNEL_LIMIT", 1)
+    refused(whole(DEFINED + channel(2, 1, "/b")), "are 1 and")
+
+
+def test_definitions_are_limited_by_their_bytes_too():
+    large = b"".join(schema(number, "a/B", f"string<=5 x{' ' * (5 << 20)}") for number in (1, 2, 3, 4))
+    refused(whole(chunk(large)), "the limits")
+    assert len(walked(whole(chunk(large[: len(large) // 2])))[0].schemas) == 2
+
+
+def test_messages_among_other_records_cost_no_look_at_all_that_follows():
+    data = whole(DEFINED + 20_000 * (ONE + record(records.METADATA, records.text("a") + bytes(4))))
+    began = time.process_time()
+    assert len(walked(data)[1]) == 20_000
+    assert time.process_time() - began < 2.0
+
+
+def test_a_long_attachment_is_read_a_block_at_a_time():
+    class Counted(io.BytesIO):
+        largest = 0
+
+        def read(self, size=-1):
+            Counted.largest = max(Counted.largest, size)
+            return super().read(size)
+
+    file = Counted(whole(record(records.ATTACHMENT, bytes(5 << 20)) + DEFINED + ONE))
+    assert sum(len(stretch.begin) for stretch in Walker(file).stretches()) == 1
+    assert 0 < Counted.largest <= 1 << 20
