@@ -245,6 +245,21 @@ def demo_show(demo: str) -> None:
         out.print_json(json.dumps(client.demo(demo)))
 
 
+@demos.command("report")
+@refusing
+def demo_report(
+    demo: str,
+    html: Annotated[Path | None, typer.Option(help="Write it to this file as a page for a browser.")] = None,
+) -> None:
+    """Tell how good a demonstration is, and what would make it better."""
+    with service() as client:
+        if html is None:
+            out.print_json(json.dumps(client.demo_report(demo)))
+        else:
+            html.write_bytes(client.demo_report_page(demo))
+            out.print(f"The report: {html}")
+
+
 @demos.command("withdraw")
 @refusing
 def demo_withdraw(demo: str) -> None:

@@ -124,6 +124,14 @@ class Client:
         """Look a demonstration up."""
         return self._json("GET", f"/demos/{demo}")
 
+    def demo_report(self, demo: str) -> Json:
+        """Get a demonstration with its report, measured anew."""
+        return self._json("GET", f"/demos/{demo}/report")
+
+    def demo_report_page(self, demo: str) -> bytes:
+        """Get a demonstration's report as a page, which needs nothing from outside."""
+        return self.send("GET", f"/demos/{demo}/report", headers={"Accept": "text/html"}).content
+
     def demo_path(self, demo: str) -> Json:
         """Get a demonstration's states, and its motion as it was recorded."""
         return self._json("GET", f"/demos/{demo}/path")

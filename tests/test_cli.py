@@ -79,7 +79,13 @@ def test_a_demonstration_with_hysteresis_tells_its_states_crossings_and_loss(ski
     code, said = skills(*add, "--hysteresis", "0.25")
     assert (code, "0 crossings; samples are 1.58, 1.60, 1.56 mm off" in said) == (0, True), said
     _, said = skills(*add, "--hysteresis", "0.25", "--json")
-    assert (json.loads(said)["hysteresis"], json.loads(said)["path_states"]) == (0.25, 18)
+    stored = json.loads(said)
+    assert (stored["hysteresis"], stored["path_states"]) == (0.25, 18)
+    code, said = skills("demo", "report", stored["id"])
+    assert (code, json.loads(said)["report"]["path_states"]) == (0, 18), said
+    assert skills("demo", "report", stored["id"], "--html", str(tmp_path / "report.html"))[0] == 0
+    page = (tmp_path / "report.html").read_text()
+    assert page.startswith("<!doctype html>") and "plover" in page
     code, said = skills(*add, "--hysteresis", "0.6")
     assert (code, "less than or equal to 0.5" in said) == (1, True), said
 

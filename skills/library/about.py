@@ -51,6 +51,7 @@ def about_recording(recording: Recording) -> dict[str, Any]:
             for name, signal in recording.scales[:MOST]
             if len(signal.values)
         ],
+        "left_out": [{"topic": topic, "because": why} for topic, why in recording.left_out[:MOST]],
         "base_frames": [asdict(base) for base in base_frames(recording)],
     }
 

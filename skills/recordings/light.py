@@ -18,8 +18,8 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import Writer
 
 from skills.errors import UnreadableRecording
-from skills.recordings.walker import RECOVER
-from skills.recordings.writer import NOTES
+from skills.recordings.source import RECOVER
+from skills.recordings.walker import NOTES
 from skills.style.recording import TopicInfo
 
 PICTURES = frozenset(

@@ -39,7 +39,7 @@ from skills.recordings.unpack import unpack
 from skills.style._arrays import Ints
 from skills.style.recording import Integrity
 
-__all__ = ["MAGIC", "NOTES", "RECOVER", "Channel", "Schema", "Stretch", "Walker"]
+__all__ = ["MAGIC", "NOTES", "Channel", "Schema", "Stretch", "Walker"]
 
 MAGIC = b"\x89MCAP0\r\n"
 

@@ -18,12 +18,12 @@ from skills.errors import BadRecording
 from skills.recordings import messages, topics
 from skills.recordings.archive import pack
 from skills.recordings.messages import DEFINITIONS, HASHES, Message
+from skills.recordings.walker import NOTES
 from skills.style._arrays import Floats
 from skills.style.recording import Joints, Motion, Recording, Signal
 
 __all__ = ["DEFINITIONS", "Written", "messages_of", "write_bag", "write_mcap", "write_messages"]
 
-NOTES = "suture-skills"  # the metadata record of an MCAP file that says what it was made from
 _LIBRARY = "suture-skills"
 _QOS = "offered_qos_profiles"
 _INSERTION = 2  # the one PSM joint that slides
