@@ -99,10 +99,10 @@ class GridWorld:
         nearest = self.cells_of(self.states_at(tip_mm))
         if hysteresis == 0 or len(nearest) == 0:
             return nearest
-        places = ((np.asarray(tip_mm, float) - self.origin_mm) / self.cell_mm).tolist()
+        places = (np.asarray(tip_mm, float) - self.origin_mm) / self.cell_mm
         (a, b, c), reach = nearest[0].tolist(), 0.5 + hysteresis
         entered, entries = 0, []  # the sample that entered the cell which each one is in
-        for index, (x, y, z) in enumerate(places):
+        for index, (x, y, z) in enumerate(zip(*places.T.tolist(), strict=True)):
             if abs(x - a) > reach or abs(y - b) > reach or abs(z - c) > reach:
                 entered, (a, b, c) = index, nearest[index].tolist()
             entries.append(entered)
