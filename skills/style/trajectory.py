@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike
 from skills.errors import BadPlan, BadSpeed, NoMotion, Unreachable
 from skills.style._arrays import Bytes, Floats, Ints, frozen
 from skills.style._spline import check_length, followed
+from skills.style.handoff import OtherArm
 from skills.style.kinematics import (
     DEFAULT_INSTRUMENT,
     angle_between,
@@ -32,7 +33,7 @@ from skills.style.kinematics import (
 )
 from skills.style.realign import turn
 
-A1, A2 = 1, 2
+TRANSFER, A1, A2 = 0, 1, 2
 
 MAX_SPEED_MM_S = 100.0  # ours: the joints allow 139 mm/s in the paper's grid, and nobody hands a needle on that fast
 RATE_HZ = (10.0, 2000.0)
@@ -81,12 +82,13 @@ class Trajectory:
         rotation_xyzw: The jaw's rotation there, unit quaternions, shape (T, 4).
         joints: Rows of `kinematics.JOINTS`, rad and mm, shape (T, 6).
         pass_index: Number of the pass, from 0, shape (T,).
-        phase: `A1` or `A2`, shape (T,).
+        phase: `TRANSFER` (to where A1 begins), `A1` or `A2`, shape (T,).
         speed_mm_s: Speed along A1 where its way is straight, after any slow-down.
         turn_rad_s: Peak rate of A2 after any slow-down.
         speed_ratio: Greatest joint speed as a part of its limit.
         acceleration_ratio: Greatest joint acceleration as a part of its limit.
         deviation_mm: How far A1 leaves its straight moves at most.
+        psm_m: PSM_M's motion beside it; None where its place is not known.
     """
 
     rate_hz: float
@@ -102,6 +104,7 @@ class Trajectory:
     speed_ratio: float
     acceleration_ratio: float
     deviation_mm: float
+    psm_m: OtherArm | None = None
 
     def __post_init__(self) -> None:
         instrument_of(self.instrument)
@@ -120,8 +123,10 @@ class Trajectory:
             raise NoMotion("A trajectory needs at least one sample.")
         if not (np.diff(self.stamps_s) > 0).all() or not np.isin(np.diff(self.pass_index), (0, 1)).all():
             raise BadPlan("A trajectory's stamps must grow and its passes follow one another.")
-        if self.pass_index[0] != 0 or not np.isin(self.phase, (A1, A2)).all():
-            raise BadPlan("A trajectory's passes count from 0 and its phases are 1 (A1) and 2 (A2).")
+        if self.pass_index[0] != 0 or not np.isin(self.phase, (TRANSFER, A1, A2)).all():
+            raise BadPlan("A trajectory's passes count from 0 and its phases are 0 (transfer), 1 (A1) and 2 (A2).")
+        if self.psm_m is not None and len(self.psm_m.joints) != count:
+            raise BadPlan(f"PSM_M has {len(self.psm_m.joints)} samples beside {count}; give one for each.")
 
     def __len__(self) -> int:
         """The number of samples."""

@@ -173,4 +173,4 @@ def test_false_values_are_refused_at_once():
     with pytest.raises(BadPlan, match="grow"):
         Trajectory(**changed | {"stamps_s": motion.stamps_s[::-1]})
     with pytest.raises(BadPlan, match="count from 0"):
-        Trajectory(**changed | {"phase": np.zeros(len(motion))})
+        Trajectory(**changed | {"phase": np.full(len(motion), 3)})
