@@ -6,11 +6,20 @@ READY := $(VENV)/.ready
 export SKILLS_SAMPLE_RECORDINGS ?= $(abspath $(wildcard ../shared/recordings))
 export SKILLS_PAPER_DATA ?= $(abspath $(wildcard ../shared/paper/data))
 
-.PHONY: demo test serve bench nightly lint lock clean
+.PHONY: demo test serve bench nightly lint lock wheelhouse fixture clean
 
 # uv where it is present, venv and pip otherwise; either way the same versions, checked by their hashes. One package,
 # movement-primitives, comes as source: setuptools is there first, and without Cython it is built with no compiler.
 SETUPTOOLS := sed -n '/^setuptools==/,/[^\\]$$/p' requirements.lock
+
+# `make demo WHEELHOUSE=build/wheelhouse` takes everything from that folder, and asks no network.
+ifdef WHEELHOUSE
+export PIP_NO_INDEX := 1
+export UV_OFFLINE := 1
+export PIP_FIND_LINKS := $(abspath $(WHEELHOUSE))
+export UV_FIND_LINKS := $(abspath $(WHEELHOUSE))
+endif
+
 $(READY): requirements.lock pyproject.toml
 	@if command -v uv >/dev/null 2>&1; then \
 	  uv venv -q --allow-existing --python $(PYTHON) $(VENV) && \
@@ -38,7 +47,7 @@ serve: $(READY)
 	@$(BIN)/skills serve --samples
 
 bench: $(READY)
-	@$(BIN)/python -m tests.bench
+	@$(BIN)/python -m tests.bench $(PARTS)
 
 nightly: $(READY)
 	@$(BIN)/python -m pytest -m nightly
@@ -51,6 +60,17 @@ lint: $(READY)
 # The lock holds versions and hashes, no addresses. Needs uv.
 lock:
 	uv pip compile pyproject.toml --group dev --python-version 3.11 --universal --generate-hashes --no-header --no-annotate -q -o requirements.lock
+
+# What `requirements.lock` names, for this platform, into build/wheelhouse; what comes as source stays source, so that the
+# hashes of the lock hold there too. With pip, for uv downloads nothing.
+wheelhouse:
+	@$(PYTHON) -m venv build/pip
+	@$(SETUPTOOLS) | build/pip/bin/python -m pip install -q --require-hashes -r /dev/stdin
+	@build/pip/bin/python -m pip download -q --no-deps --no-build-isolation --require-hashes -d build/wheelhouse -r requirements.lock
+
+# A populated installation of this version, which later ones must take over: once at each release (CONTRIBUTING.md).
+fixture: $(READY)
+	@$(BIN)/python -m tests.migrations.make_fixture
 
 clean:
 	rm -rf $(VENV) build

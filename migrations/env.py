@@ -18,6 +18,7 @@ context.configure(
     include_object=ours,
     render_as_batch=True,
     compare_type=False,
+    transactional_ddl=True,  # also on SQLite, where Alembic does not take it for granted: all revisions or none
 )
 with context.begin_transaction():
     context.run_migrations()

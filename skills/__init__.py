@@ -37,8 +37,8 @@ _CONTENTS = {
     "time_parametrise": "style.trajectory",
     "Playback": "style.playback",
     "play": "sim.player",
-    "PlaybackReport": "style.playback",
-    "judge": "style.playback",
+    "PlaybackReport": "style.playback_report",
+    "judge": "style.verdict",
 }
 __all__ = [*_CONTENTS, "__version__"]
 

@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, BinaryIO, Self
+from typing import Any, BinaryIO, Literal, Self
 
 import httpx2 as httpx
 
@@ -150,6 +150,18 @@ class Client:
         """Ask for a style to be trained: demos, learner, seed, release."""
         return self._json("POST", "/trainings", json={"surgeon": surgeon, "suture": suture, **_given(asked)})
 
+    def retrain(self, **asked: Any) -> Json:
+        """Ask for styles to be trained again, as one job: surgeon, suture, only_stale, learner, release."""
+        return self._json("POST", "/retrainings", json=_given(asked))
+
+    def retraining(self, job: str) -> Json:
+        """Look a batch up: its job, and in `styles` how many are in which state."""
+        return self._json("GET", f"/retrainings/{job}", params={"limit": 1})
+
+    def retrained(self, job: str, state: str | None = None) -> list[Json]:
+        """List the styles of a batch, all or those of one state: queued, done, failed, cancelled."""
+        return self._all(f"/retrainings/{job}", state=state)
+
     def job(self, job: str) -> Json:
         """Look a job up."""
         return self._json("GET", f"/jobs/{job}")
@@ -213,18 +225,38 @@ class Client:
     # ---- plans and playbacks
 
     def plan(self, surgeon: str, suture: str, suture_points: Sequence[Mapping[str, Any]], **asked: Any) -> Json:
-        """Stack a style at suture points: version, starts_mm, arm, frame, instrument, speed_mm_s, psm_m."""
+        """Stack a style at suture points.
+
+        Beside them: version, starts_mm, arm, frame, instrument, speed_mm_s, rate_hz, tip_offset_mm, psm_m, realignment.
+        """
         points = [dict(point) for point in suture_points]
         body = {"surgeon": surgeon, "suture": suture, "suture_points": points, **_given(asked)}
         return self._json("POST", "/plans", json=body)
+
+    def suture_points(self, scene: Path | bytes, arm: str | None = None, frame: str | None = None) -> Json:
+        """Read the Entry and Exit marks of a simulator's MCAP file, in an arm's base frame."""
+        return self._upload("/suture-points", scene, None, {"arm": arm, "frame": frame}, None)
 
     def plan_of(self, plan: str) -> Json:
         """Look a plan up."""
         return self._json("GET", f"/plans/{plan}")
 
-    def trajectory(self, plan: str) -> Json:
-        """Get a plan's motion, sampled."""
-        return self._json("GET", f"/plans/{plan}/trajectory")
+    def trajectory(self, plan: str, pass_index: int | None = None) -> Json:
+        """Get a plan's motion, sampled; or that of one pass, counted from 0."""
+        return self._json("GET", f"/plans/{plan}/trajectory", params=_given({"pass": pass_index}))
+
+    def replay_bag(self, plan: str, pass_index: int | None = None) -> bytes:
+        """Get the bag that a robot replays, a zip; or that of one pass, counted from 0.
+
+        Raises:
+            Problem: It is 409 while the plan may not be replayed, and says why.
+        """
+        how = {"headers": {"Accept": "application/zip"}, "params": _given({"pass": pass_index})}
+        return self.send("GET", f"/plans/{plan}/trajectory", **how).content
+
+    def compare(self, plan: str, demo: str, pass_index: int = 0) -> Json:
+        """Compare a pass of a plan, counted from 0, with a demonstration that is the recording of its replay."""
+        return self._json("GET", f"/plans/{plan}/comparison", params={"demo": demo, "pass": pass_index})
 
     def play(self, plan: str) -> Json:
         """Ask for a plan to be played in the simulator."""
@@ -237,6 +269,18 @@ class Client:
     def picture(self, playback: str) -> bytes:
         """Get the picture of a playback, a PNG."""
         return self.send("GET", f"/playbacks/{playback}/picture.png").content
+
+    def draw(self, playback: str) -> Json:
+        """Ask for the film and the plots of a playback: the job to wait for, which each new playback starts itself."""
+        return self._json("POST", f"/playbacks/{playback}/pictures")
+
+    def animation(self, playback: str, kind: Literal["mp4", "gif"] = "mp4") -> bytes:
+        """Get the film of a playback, once it is drawn."""
+        return self.send("GET", f"/playbacks/{playback}/animation.{kind}").content
+
+    def plot(self, playback: str, of: Literal["joints", "clearance"]) -> bytes:
+        """Get a plot of a playback over time, a PNG, once it is drawn."""
+        return self.send("GET", f"/playbacks/{playback}/{of}.png").content
 
     # ---- how
 

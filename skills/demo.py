@@ -13,7 +13,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import pairwise, product
 from pathlib import Path
 from typing import Any
@@ -32,7 +32,11 @@ PICTURES = Path("build/demo")
 START_S = 60.0
 SPACING_MM = (6.0, 0.0, 0.0)  # between suture points, along the wound
 N_POINTS = 5
-SAMPLE_APPROACH = (-0.94, 0.10, -0.33)  # invented, and said so: how PSM_M would wait for the needle
+SAMPLE_PSM_M = {  # invented, and the plan says so: how PSM_M would come for the needle, and where it would stand
+    "approach": [-0.94, 0.10, -0.33],
+    "base": {"position_mm": [160.0, 20.0, 20.0], "rotation_xyzw": [0.0, 0.300706, 0.0, 0.953717]},  # 35 degrees about y
+    "source": "invented for the samples",
+}
 REAL_STYLE = ("recorded-psm2", "simple-running")
 REAL_GRID = ("--grid", "fit", "--cell-mm", "2.5")  # its motion ends near the insertion's limit: 5 mm cells overstep it
 
@@ -46,13 +50,14 @@ def main() -> int:
     with tempfile.TemporaryDirectory(prefix="suture-skills-") as folder, running_service(Path(folder)) as client:
         styles = tell_styles(client)
         report = Table("style", "states", "DTW mm", "starts", "verdict", "train s", "plan s", "play s", box=None)
-        good = [check_style(client, surgeon, suture, report) for surgeon, suture in styles]
+        checked = [check_style(client, *style, report, film=style == styles[0]) for style in styles]
         out.print("\nLearnt, certified, released; stacked at five suture points; played back in PyBullet:")
         out.print(report)
         draw_samples(client, styles)
         real_recording(client)
+        save_film(client, checked[0][1], "-".join(styles[0]))
     out.print(f"\nPictures: {PICTURES}/  ({time.monotonic() - began:.1f} s in all). Research use only.")
-    return 0 if good and all(good) else 1
+    return 0 if all(good for good, _ in checked) else 1
 
 
 @contextmanager
@@ -100,17 +105,19 @@ def tell_styles(client: Client) -> list[tuple[str, str]]:
     return list(styles)
 
 
-def check_style(client: Client, surgeon: str, suture: str, report: Table) -> bool:
-    """Train, release, roll out, plan and play a style: whether everything is as it should be."""
+def check_style(client: Client, surgeon: str, suture: str, report: Table, *, film: bool) -> tuple[bool, str]:
+    """Train, release, roll out, plan and play a style: whether everything is as it should be, and the playback."""
     laps = [time.monotonic()]
     client.wait(client.train(surgeon, suture, release=True))
     policy = client.policy(surgeon, suture)
     laps.append(time.monotonic())
     followed = client.rollout(surgeon, suture, policy["start_mm"])
-    plan = client.plan(surgeon, suture, suture_points(policy), psm_m={"approach": SAMPLE_APPROACH})
+    plan = client.plan(surgeon, suture, suture_points(policy), psm_m=SAMPLE_PSM_M)
     laps.append(time.monotonic())
     playback = client.playback(client.wait(client.play(plan["id"]))["result"]["playback"])
     laps.append(time.monotonic())
+    if not film:
+        leave_out_film(client, playback["id"])
     (PICTURES / f"{surgeon}-{suture}-playback.png").write_bytes(client.picture(playback["id"]))
     coverage, total = policy["coverage"], followed["dtw_total_mm"]
     report.add_row(
@@ -122,7 +129,7 @@ def check_style(client: Client, surgeon: str, suture: str, report: Table) -> boo
         *(f"{after - before:.2f}" for before, after in pairwise(laps)),
     )
     reach_all = coverage["starts_reaching_goal"] == coverage["n_states"]
-    return bool(followed["finished"] and total == 0 and reach_all and playback["feasible"])
+    return bool(followed["finished"] and total == 0 and reach_all and playback["feasible"]), playback["id"]
 
 
 def suture_points(policy: Json) -> list[Json]:
@@ -146,6 +153,27 @@ def draw_samples(client: Client, styles: list[tuple[str, str]]) -> None:
         rollouts = [client.rollout(surgeon, suture, corner) for corner in corners]
         drawn.append((client.demo_path(policy["demos"][0]), policy, rollouts))
     draw_styles(drawn, PICTURES / "styles.png")
+
+
+def save_film(client: Client, playback: str, name: str) -> None:
+    """Wait for what is drawn of a playback after its verdict, and save it."""
+    client.wait(client.draw(playback))
+    drawn = {
+        "animation.mp4": client.animation(playback),
+        "animation.gif": client.animation(playback, "gif"),
+        "joints.png": client.plot(playback, "joints"),
+        "clearance.png": client.plot(playback, "clearance"),
+    }
+    for kind, content in drawn.items():
+        (PICTURES / f"{name}-{kind}").write_bytes(content)
+    files = ", ".join(f"{name}-{kind}" for kind in drawn)
+    out.print(f"\nThe film of {name} and its plots over time: {files}", soft_wrap=True)
+
+
+def leave_out_film(client: Client, playback: str) -> None:
+    """Cancel what would be drawn of a playback: one film is enough here, and the demo does not stay for others."""
+    with suppress(Problem):  # it has ended already
+        client.cancel(client.draw(playback)["id"])
 
 
 def real_recording(client: Client) -> None:
@@ -178,6 +206,7 @@ def real_recording(client: Client) -> None:
         out.print(f"Not played back: {refused}", soft_wrap=True)
         return
     playback = client.playback(client.wait(client.play(plan["id"]))["result"]["playback"])
+    leave_out_film(client, playback["id"])
     (PICTURES / "real-recording-playback.png").write_bytes(client.picture(playback["id"]))
     out.print(f"Played back at its own place: {verdict(playback)}")
 

@@ -5,8 +5,10 @@
     │   ├── BadRecording        the file: unreadable, no usable topic, mixed frames, not metres ...
     │   ├── BadPath             the demonstration in its grid: outside it, never leaving the goal ...
     │   ├── BadSettings         a learner, grid or request that cannot be meant
-    │   └── BadPlan             a plan or trajectory that the arm cannot follow
+    │   ├── BadPlan             a plan or trajectory that the arm cannot follow
+    │   └── BadBag              a bag for replay that is not what its plan and its verdict say
     ├── NotFound                no such thing here (and what there is instead)
+    │   └── NotDrawnYet         a picture that is being drawn, or that nobody asked for
     ├── Erased                  it was here and was erased for good
     ├── Conflict                it cannot be done in the present state
     ├── PreconditionFailed      it changed since the caller last looked
@@ -15,6 +17,7 @@
     ├── TooSlow                 the body of a request did not come in time
     ├── Corrupt                 what was stored is no longer what was stored
     ├── Busy                    the database or the queue cannot take it now
+    │   └── NotReady            a part of the installation cannot be used; the message says which
     ├── SimulationFailed        the simulator crashed, hung or answered nonsense
     └── Unanswered              a process of ours gave no answer; whoever asked it says so in words of its own
 
@@ -37,6 +40,10 @@ class BadInput(SkillsError):
 
 class NotFound(SkillsError):
     """No such thing here."""
+
+
+class NotDrawnYet(NotFound):
+    """A picture that is being drawn, or that nobody asked for; the message says which."""
 
 
 class Erased(SkillsError):
@@ -69,6 +76,10 @@ class Corrupt(SkillsError):
 
 class Busy(SkillsError):
     """The database or the queue cannot take it now."""
+
+
+class NotReady(Busy):
+    """A part of the installation cannot be used: its database, its queue, its workers."""
 
 
 class SimulationFailed(SkillsError):
@@ -186,3 +197,10 @@ class BadSpeed(BadPlan):
 
 class NoMotion(BadPlan):
     """A pass in which nothing moves."""
+
+
+# ---- replay -----------------------------------------------------------------------------------------------------
+
+
+class BadBag(BadInput):
+    """A bag for replay that is not whole, or not what its plan and its verdict say: no arm should follow it."""

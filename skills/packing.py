@@ -59,8 +59,13 @@ def read(file: IO[bytes], classes: Known) -> Any:
         Exception: Of any class, where the file holds anything else.
     """
     with np.load(file, allow_pickle=False) as archive:
-        tree = json.loads(archive["tree"].tobytes())
-        return build(tree, [archive[f"a{i}"] for i in range(len(archive.files) - 1)], classes)
+        return assemble(archive, classes)
+
+
+def assemble(archive: Mapping[str, np.ndarray[Any, Any]], classes: Known) -> Any:
+    """Build the value whose parts an archive holds."""
+    tree = json.loads(archive["tree"].tobytes())
+    return build(tree, [archive[f"a{i}"] for i in range(len(archive) - 1)], classes)
 
 
 def unfolded_bytes(file: IO[bytes]) -> int:

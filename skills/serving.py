@@ -12,6 +12,7 @@ from types import FrameType
 
 import uvicorn
 
+from skills import logs
 from skills.api.app import create_app, prepare_database
 from skills.client import Client
 from skills.db.session import Database
@@ -36,6 +37,7 @@ def prepare(settings: Settings) -> None:
 
 def serve(settings: Settings, *, samples: bool = False) -> None:
     """Serve until told to stop; the address must have been checked (`Settings.check_address`)."""
+    logs.configure(settings.log_level, as_json=settings.log_format == "json")
     warm_up(align_once)
     prepare(settings)
     server = uvicorn.Server(
@@ -44,7 +46,9 @@ def serve(settings: Settings, *, samples: bool = False) -> None:
             host=settings.host,
             port=settings.port,
             http=PunctualConnection,
+            log_config=None,  # what it says goes where ours goes
             log_level="warning",
+            access_log=False,
             timeout_graceful_shutdown=GRACE_S,
             server_header=False,
         )

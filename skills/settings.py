@@ -3,6 +3,7 @@
 from functools import cache
 from ipaddress import ip_address
 from pathlib import Path
+from typing import Literal
 
 from pydantic import Field
 from pydantic_settings import BaseSettings, SettingsConfigDict
@@ -41,9 +42,13 @@ class Settings(BaseSettings):
     reading_answer_bytes: int = Field(default=256 * MEBIBYTE, gt=0)  # 4 million poses
     playback_timeout_s: float = Field(default=120.0, gt=0)
     playback_memory_bytes: int = Field(default=1024 * MEBIBYTE, gt=0)
+    replay_tip_error_mm: float = Field(default=0.65, ge=0)  # a calibrated dVRK's; under it every pass shall succeed
+    replay_lower_bound: float = Field(default=0.95, ge=0, le=1)  # as surely: samples do at 0.99, at 3 mm at 0.28
     worker_threads: int = Field(default=2, ge=1, le=64)
     lease_s: float = Field(default=2.0, gt=0)  # a worker silent for longer is taken for dead
     job_attempts: int = Field(default=3, ge=1)
+    log_level: Literal["debug", "info", "warning", "error"] = "warning"  # "info" adds a line for each request and job
+    log_format: Literal["text", "json"] = "text"
 
     @property
     def engine_url(self) -> str:

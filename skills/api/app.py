@@ -1,6 +1,5 @@
 """The application: our calls, with one database, one engine, and problems for answers to what goes wrong."""
 
-import secrets
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
@@ -11,12 +10,26 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from skills import __version__
 from skills.api.answers import Encoded
+from skills.api.metrics import Metrics
+from skills.api.observed import Observed
 from skills.api.problems import TOO_LARGE, answer_refusals
-from skills.api.routes import catalogue, demos, operating, plans, policies, trainings
+from skills.api.routes import (
+    catalogue,
+    demos,
+    operating,
+    pictures,
+    plans,
+    policies,
+    retrainings,
+    suture_points,
+    trainings,
+    trajectories,
+)
 from skills.confined.limits import Limits
 from skills.db.session import Database
 from skills.jobs.engine import Engine
 from skills.library.catalogue import seed_catalogue
+from skills.logs import request_id
 from skills.recordings.confined import ConfinedReader
 from skills.settings import Settings
 
@@ -52,8 +65,13 @@ def create_app(settings: Settings) -> FastAPI:
     app.state.database = Database(settings.database_url)
     app.state.engine = Engine(settings)
     app.state.encoded = Encoded()
+    app.state.metrics = Metrics(app.state.database, settings.lease_s)
     for part in (catalogue.router, demos.uploads, demos.router, trainings.router, policies.router, plans.router):
         app.include_router(part)
+    app.include_router(trajectories.router)
+    app.include_router(suture_points.router)
+    app.include_router(pictures.router)
+    app.include_router(retrainings.router)
     app.include_router(operating.router)
     answer_refusals(app)
     return app
@@ -79,15 +97,15 @@ def confined_reader(settings: Settings) -> ConfinedReader:
 
 
 class Service(FastAPI):
-    """FastAPI with `Headers` around everything, its own answers to failures included."""
+    """FastAPI with `Headers` and `Observed` around everything, its own answers to failures included."""
 
     def build_middleware_stack(self) -> ASGIApp:
-        """Put `Headers` outermost: middleware that is added stands inside of what answers 413 and 500."""
-        return Headers(super().build_middleware_stack())
+        """Put these outermost: middleware that is added stands inside of what answers 413 and 500."""
+        return Observed(Headers(super().build_middleware_stack()), self.state.metrics.seen)
 
 
 class Headers:
-    """Name every request, and forbid a browser to make more of an answer than it is."""
+    """Give every answer its request's id, and forbid a browser to make more of it than it is."""
 
     def __init__(self, app: ASGIApp) -> None:
         self.app = app
@@ -107,7 +125,7 @@ class Headers:
                 if message["status"] == 413 and headers["content-type"] != TOO_LARGE.media_type:
                     in_plain_text, message["headers"] = True, list(TOO_LARGE.raw_headers)
                     headers = MutableHeaders(scope=message)
-                headers["X-Request-ID"] = secrets.token_hex(8)
+                headers["X-Request-ID"] = request_id.get() or ""
                 headers["X-Content-Type-Options"] = "nosniff"
                 headers.setdefault("Content-Security-Policy", "default-src 'self'; frame-ancestors 'none'")
             elif in_plain_text:

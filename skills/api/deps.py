@@ -50,6 +50,7 @@ def _actor() -> str:
 Db = Annotated[Database, Depends(_database)]
 Jobs = Annotated[Engine, Depends(_engine)]
 Read = Annotated[Reader, Depends(_reader)]
+Configured = Annotated[Settings, Depends(_settings)]
 Actor = Annotated[str, Depends(_actor)]
 Slug = Annotated[str, Path(pattern=SLUG)]
 Digest = Annotated[str, Path(pattern=DIGEST)]
@@ -65,7 +66,7 @@ def page(items: list[Any], limit: int, cursor: Any) -> dict[str, Any]:
 
 async def receive(
     request: Request,
-    settings: Annotated[Settings, Depends(_settings)],
+    settings: Configured,
     content_type: Annotated[str, Header()] = "",
     content_digest: Annotated[str | None, Header(max_length=500)] = None,
     content_encoding: Annotated[str | None, Header(max_length=100)] = None,

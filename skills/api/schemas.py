@@ -9,14 +9,16 @@ from pydantic import BaseModel, ConfigDict, Field, StrictBool, StrictInt, create
 from skills.api.deps import DIGEST, SLUG
 from skills.db import models as rows
 from skills.db.base import rfc3339 as at
-from skills.library.plans import Approach, PlanRequest
+from skills.library.plans import Beside, PlanRequest
 from skills.library.training import learner_of
 from skills.style.grid import MAX_HYSTERESIS, GridMode
+from skills.style.handoff import Enters
+from skills.style.kinematics import INSTRUMENTS, JAW_TIP_MM
 from skills.style.learning.irl import MaxEntIRL
 from skills.style.learning.learners import MAX_SEED, Learner
 from skills.style.learning.q_learning import CellQLearning, PhaseQLearning
 from skills.style.learning.value_iteration import ValueIteration
-from skills.style.plan import MAX_PASSES, SuturePoint
+from skills.style.plan import MAX_OUTSIDE_MM, MAX_PASSES, MAX_TIP_OFFSET_MM, RATE_HZ, SuturePoint
 
 
 class Schema(BaseModel):
@@ -114,6 +116,27 @@ class TrainingIn(Schema):
         return None if self.learner is None else learner_of(self.learner.model_dump())
 
 
+class RetrainingIn(Schema):
+    """Which styles are to be learnt again. Left out: all of them, with the phase learner, without a release."""
+
+    surgeon: SlugField | None = None
+    suture: SlugField | None = None
+    only_stale: StrictBool = Field(
+        default=False,
+        description="Leaves out every style whose newest version is what this would make of it: learnt from its newest "
+        "demonstration, with these settings, by this version of the learner.",
+    )
+    learner: LearnerIn | None = None
+    release: StrictBool = Field(
+        default=False, description="Releases a version that passes the gate and is not worse than the released one."
+    )
+
+    @property
+    def chosen(self) -> Learner | None:
+        """The learner as the core knows it."""
+        return None if self.learner is None else learner_of(self.learner.model_dump())
+
+
 class RolloutIn(Schema):
     """Where a rollout starts, in mm of the policy's frame; left out, `version` is the released one."""
 
@@ -135,10 +158,26 @@ class SuturePointIn(Schema):
     rotation_xyzw: tuple[Component, Component, Component, Component] = (0.0, 0.0, 0.0, 1.0)
 
 
-class WaitingArmIn(Schema):
-    """How PSM_M waits for the needle: its approach direction in the frame of the arm that was demonstrated."""
+class BaseIn(Schema):
+    """Where PSM_M's base, its remote centre, is in the base of the arm that was demonstrated, and how it is turned."""
 
-    approach: tuple[Component, Component, Component]
+    position_mm: Point
+    rotation_xyzw: tuple[Component, Component, Component, Component]
+
+
+class PsmMIn(Schema):
+    """The arm that takes the needle, in the frame of the arm that was demonstrated."""
+
+    approach: tuple[Component, Component, Component] | None = Field(
+        default=None, description="Its direction towards the needle; left out, the demonstrated one."
+    )
+    base: BaseIn | None = Field(
+        default=None,
+        description="Left out, the demonstrated one; where that is not known, PSM_M is in no scene or bag.",
+    )
+    instrument: Annotated[str, Field(pattern=f"^({'|'.join(INSTRUMENTS)})$")] | None = None
+    enters: Enters = "after_A1"
+    source: Name | None = Field(default=None, description="Where these numbers come from; the plan repeats it.")
 
 
 class PlanIn(Schema):
@@ -148,12 +187,21 @@ class PlanIn(Schema):
     suture: SlugField
     version: Annotated[StrictInt, Field(ge=1, le=2**31)] | None = None
     suture_points: Annotated[list[SuturePointIn], Field(min_length=1, max_length=MAX_PASSES)]
-    starts_mm: Annotated[list[Point | None], Field(max_length=MAX_PASSES)] | None = None
+    starts_mm: Annotated[list[Point | None], Field(max_length=MAX_PASSES)] | None = Field(
+        default=None,
+        description=f"Up to {MAX_OUTSIDE_MM:g} mm outside a pass's grid world a transfer leads into it.",
+    )
     arm: Name | None = None
     frame: Name | None = None
     instrument: Name | None = None
     speed_mm_s: Annotated[Number, Field(gt=0, le=1000)] = 20.0
-    psm_m: WaitingArmIn | None = Field(
+    rate_hz: Annotated[Number, Field(ge=RATE_HZ[0], le=RATE_HZ[1])] = 200.0
+    tip_offset_mm: Annotated[Number, Field(ge=0, le=MAX_TIP_OFFSET_MM)] = Field(
+        default=0.0,
+        description=f"How far down the jaw's approach from its hinge suture points and starts are meant; "
+        f"{JAW_TIP_MM:g} for the finger tips.",
+    )
+    psm_m: PsmMIn | None = Field(
         default=None, description="Left out, it is taken from the demonstration where that has PSM_M's pose."
     )
     realignment: StrictBool = Field(default=True, description="false plans A1 alone, without A2's turn.")
@@ -161,16 +209,27 @@ class PlanIn(Schema):
     @property
     def request(self) -> PlanRequest:
         """The request as the library knows it."""
-        given = {name: getattr(self, name) for name in ("surgeon", "suture", "version", "arm", "frame", "instrument")}
+        same = ("surgeon", "suture", "version", "starts_mm", "arm", "frame", "instrument", "speed_mm_s", "rate_hz")
         points = [SuturePoint(p.position_mm, p.rotation_xyzw) for p in self.suture_points]
-        approach: Approach | Literal["demonstrated"] = "demonstrated" if self.psm_m is None else self.psm_m.approach
         return PlanRequest(
             suture_points=points,
-            starts_mm=self.starts_mm,
-            speed_mm_s=self.speed_mm_s,
-            approach_m=approach if self.realignment else None,
-            **given,
+            tip_offset_mm=self.tip_offset_mm,
+            psm_m=None if self.psm_m is None else _beside(self.psm_m),
+            realignment=self.realignment,
+            **{name: getattr(self, name) for name in same},
         )
+
+
+def _beside(asked: PsmMIn) -> Beside:
+    base = asked.base
+    return Beside(
+        approach=asked.approach,
+        base_mm=None if base is None else base.position_mm,
+        base_xyzw=None if base is None else base.rotation_xyzw,
+        instrument=asked.instrument,
+        enters=asked.enters,
+        source="the request" if asked.source is None else f"the request: {asked.source}",
+    )
 
 
 class PlaybackIn(Schema):
@@ -255,6 +314,22 @@ def job_out(row: rows.Job) -> dict[str, Any]:
     }
 
 
+def retrained_out(row: rows.StyleToRetrain) -> dict[str, Any]:
+    """Write what became of one style of a batch."""
+    return {
+        "surgeon": row.demonstration.surgeon.slug,
+        "suture": row.demonstration.suture,
+        "demo": row.demonstration.sha256,
+        "stale_because": row.stale,
+        "state": row.state,
+        "reason": row.reason,
+        "policy_version": row.policy and row.policy.version,
+        "sha256": row.policy and row.policy.sha256,
+        "comparison": row.comparison,
+        "ended_at": at(row.ended_at),
+    }
+
+
 def plan_out(row: rows.Plan) -> dict[str, Any]:
     """Write a plan."""
     return {
@@ -269,14 +344,22 @@ def plan_out(row: rows.Plan) -> dict[str, Any]:
 
 
 def playback_out(row: rows.StoredPlayback) -> dict[str, Any]:
-    """Write a playback."""
+    """Write a playback; all of its pictures but the first are drawn after the verdict."""
+    here = f"/playbacks/{row.sha256}"
     return {
         "id": row.sha256,
         "sha256": row.sha256,
         "plan": row.plan.sha256,
         "feasible": row.feasible,
         "report": row.report,
-        "picture": f"/playbacks/{row.sha256}/picture.png",
+        "picture": f"{here}/picture.png",
+        "pictures": {
+            "picture": f"{here}/picture.png",
+            "animation_mp4": f"{here}/animation.mp4",
+            "animation_gif": f"{here}/animation.gif",
+            "joints": f"{here}/joints.png",
+            "clearance": f"{here}/clearance.png",
+        },
         "created_at": at(row.created_at),
     }
 

@@ -1,13 +1,19 @@
 """Training, and the policies that come of it."""
 
 import json
+import time
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from skills.cli.shell import AsJson, Surgeon, Suture, finished, out, refusing, service, show, triple
+from skills.cli.shell import AsJson, Surgeon, Suture, err, finished, out, refusing, service, show, triple
 from skills.errors import BadInput
+
+if TYPE_CHECKING:
+    from skills.client import Client
+
+WATCH_S = 0.3
 
 commands = typer.Typer()
 policies = typer.Typer(no_args_is_help=True, help="Learnt policies.")
@@ -27,6 +33,45 @@ def train(
     with service(works=True) as client:
         job = finished(client, client.train(surgeon, suture, seed=seed, release=release))
     show(job if as_json else job["result"], as_json, ("policy_version", "sha256", "releasable", "released"))
+
+
+@commands.command()
+@refusing
+def retrain(
+    surgeon: Annotated[str | None, typer.Option(help="This surgeon's styles only.")] = None,
+    suture: Annotated[str | None, typer.Option(help="Styles of this suture type only.")] = None,
+    only_stale: Annotated[bool, typer.Option("--only-stale", help="Only what has newer input or settings.")] = False,
+    release: Annotated[bool, typer.Option(help="Release what passes the gate and is not worse.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Learn many styles again, and wait for them; exit code 1 where one of them failed."""
+    with service(works=True) as client:
+        job = client.retrain(surgeon=surgeon, suture=suture, only_stale=only_stale, release=release)
+        ended = _watched(client, job["id"])
+        styles = client.retrained(job["id"])
+    if as_json:
+        out.print_json(json.dumps(ended | {"items": styles, "next": None}))
+    else:
+        out.print(", ".join(f"{number} {state}" for state, number in ended["styles"].items() if number) or "no styles")
+        if wanting := [style for style in styles if style["state"] != "done"]:
+            show(wanting, False, ("surgeon", "suture", "state", "reason"))
+    if ended["state"] != "succeeded":
+        raise typer.Exit(1)
+
+
+def _watched(client: "Client", job: str) -> dict[str, Any]:
+    """Wait for a batch to end, with a bar that moves by styles; nothing but its end ends the wait."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("styles"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=err) as progress:
+        batch = client.retraining(job)
+        bar = progress.add_task("styles", total=sum(batch["styles"].values()))
+        while batch["state"] in ("queued", "running"):
+            time.sleep(WATCH_S)
+            batch = client.retraining(job)
+            progress.update(bar, completed=sum(batch["styles"].values()) - batch["styles"]["queued"])
+    return batch
 
 
 @policies.command("show")

@@ -73,8 +73,16 @@ def finished(client: "Client", job: dict[str, Any]) -> dict[str, Any]:
 
 def triple(text: str) -> Triple:
     """Read x,y,z."""
-    try:
-        x, y, z = (float(part) for part in text.split(","))
-    except ValueError:
-        raise BadInput("Write three numbers with commas between them, such as 5,55,-125.") from None
+    x, y, z = numbers(text, 3)
     return x, y, z
+
+
+def numbers(text: str, count: int) -> list[float]:
+    """Read so many numbers with commas between them."""
+    try:
+        found = [float(part) for part in text.split(",")]
+    except ValueError:
+        found = []
+    if len(found) != count:
+        raise BadInput(f"Write {count} numbers with commas between them, not {text!r}.")
+    return found

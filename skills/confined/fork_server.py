@@ -47,10 +47,16 @@ class _Child:
 
 
 def main(folder: str, *modules: str) -> None:
-    """Be the fork server, until nobody is left to ask; its forks' temporary files go into the folder."""
+    """Be the fork server, until nobody is left to ask; its forks' temporary files go into the folder.
+
+    A module may be given as `module:function`: the function is called once, and readies what every fork is to find.
+    """
     tempfile.tempdir = folder
-    for module in modules:
-        importlib.import_module(module)
+    for given in modules:
+        module, _, function = given.partition(":")
+        imported = importlib.import_module(module)
+        if function:
+            getattr(imported, function)()
     gc.freeze()  # what is shared with every fork stays shared
     children: dict[int, _Child] = {}
     try:

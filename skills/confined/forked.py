@@ -48,7 +48,7 @@ class _Server:
 
 
 class ForkServer:
-    """Runs functions in forks of a process that has imported some modules."""
+    """Runs functions in forks of a process that has imported some modules, or called some `module:function` once."""
 
     def __init__(self, *modules: str) -> None:
         self._modules = modules

@@ -23,6 +23,7 @@ from skills.errors import Unanswered
 
 _FAILED, _OUT_OF_MEMORY, _TOO_MUCH = 1, 77, 78  # exit codes of ours; the shell's conventions leave them free
 _NOTED_BYTES = 2000
+_KEPT = ("PATH", "LD_LIBRARY_PATH", "NUMBA_CACHE_DIR", "XDG_CACHE_HOME", "HOME")
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 
@@ -48,8 +49,8 @@ class Limits:
 
 
 def environment() -> dict[str, str]:
-    """Pass on where modules and libraries are, one thread for all of them, and no secrets."""
-    kept = {name: os.environ[name] for name in ("PATH", "LD_LIBRARY_PATH") if name in os.environ}
+    """Pass on where modules, libraries and compiled loops are, one thread for all of them, and no secrets."""
+    kept = {name: os.environ[name] for name in _KEPT if name in os.environ}
     threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     return kept | threads | {"PYTHONPATH": os.pathsep.join(path or os.getcwd() for path in sys.path)}
 

@@ -1,8 +1,8 @@
 """The tables. A row is a label on a value: who, when, from what, and the value whole in one column.
 
-Append-only (triggers of the first migration refuse changes): recordings and their chunks, demonstrations, reward maps,
-policy versions, releases, plans, playbacks, events; a demonstration and a release can be withdrawn, once. Deleting is
-left to erasure alone.
+Append-only (triggers of the migrations refuse changes): recordings and their chunks, demonstrations, reward maps,
+policy versions, releases, plans, playbacks and their pictures, events; a demonstration and a release can be withdrawn,
+once. Deleting is left to erasure alone.
 """
 
 from datetime import datetime
@@ -27,18 +27,23 @@ from skills.packing import added_later
 from skills.style.certificate import Coverage
 from skills.style.demo import Demo, Partner, Pause
 from skills.style.grid import GridPath, GridWorld
+from skills.style.handoff import PsmM
 from skills.style.learning.learners import LEARNERS
 from skills.style.learning.q_learning import PhaseQLearning, Training
 from skills.style.learning.value_iteration import ValueIteration
+from skills.style.pictures import Pictures
 from skills.style.plan import Pass, SuturePlan, SuturePoint
 from skills.style.playback import Playback
 from skills.style.policy import Policy
 from skills.style.reward import RewardLevels, RewardMap
 
-stored(GridWorld, GridPath, RewardLevels, *LEARNERS.values(), Training, SuturePoint, Pass, Pause, Partner)
+stored(GridWorld, GridPath, RewardLevels, *LEARNERS.values(), Training, SuturePoint, Pass, Pause, Partner, PsmM)
 added_later(GridPath, "hysteresis")
 added_later(Demo, "pauses")
 added_later(Demo, "partner")
+added_later(Partner, "base_mm")
+added_later(Partner, "base_xyzw")
+added_later(Partner, "instrument")
 added_later(PhaseQLearning, "slip")
 added_later(ValueIteration, "slip")
 
@@ -122,7 +127,7 @@ class Demonstration(Base):
     sha256: Mapped[str] = mapped_column(Sha256, unique=True)
     recording_row: Mapped[int] = mapped_column(ForeignKey("recordings.row"), index=True)
     surgeon_row: Mapped[int] = mapped_column(ForeignKey("surgeons.row"))
-    suture: Mapped[str] = mapped_column(ForeignKey("suture_types.slug"), index=True)
+    suture: Mapped[str] = mapped_column(ForeignKey("suture_types.slug"))
     arm: Mapped[str]
     topic: Mapped[str]
     frame: Mapped[str]
@@ -139,7 +144,11 @@ class Demonstration(Base):
 
     recording: Mapped[StoredRecording] = relationship(lazy="joined", innerjoin=True)
     surgeon: Mapped[Surgeon] = relationship(lazy="joined", innerjoin=True)
-    __table_args__ = (Index("ix_demonstrations_style", "surgeon_row", "suture", "row"),)
+    __table_args__ = (
+        Index("ix_demonstrations_style", "surgeon_row", "suture", "row"),
+        Index("ix_demonstrations_surgeon", "surgeon_row", "row"),
+        Index("ix_demonstrations_suture", "suture", "row"),
+    )
 
 
 class StoredRewardMap(Base):
@@ -224,6 +233,17 @@ class StoredPlayback(Base):
     plan: Mapped[Plan] = relationship(lazy="joined", innerjoin=True)
 
 
+class StoredPictures(Base):
+    """What was drawn of a playback, after its verdict."""
+
+    __tablename__ = "playback_pictures"
+
+    row: Mapped[RowId]
+    playback_row: Mapped[int] = mapped_column(ForeignKey("playbacks.row"), unique=True)
+    drawn: Mapped[Pictures] = mapped_column(Packed(Pictures), deferred=True)
+    created_at: Mapped[datetime] = mapped_column(default=now)
+
+
 class Job(Base):
     """Work that was asked for. `identity` is the digest of its resolved inputs: one active or succeeded job each.
 
@@ -236,7 +256,7 @@ class Job(Base):
     id: Mapped[str] = mapped_column(String(32), unique=True)
     kind: Mapped[str] = mapped_column(String(20))
     identity: Mapped[str] = mapped_column(Sha256)
-    state: Mapped[str] = mapped_column(String(10), default="queued", index=True)
+    state: Mapped[str] = mapped_column(String(10), default="queued")
     progress: Mapped[float] = mapped_column(default=0.0)
     request: Mapped[dict[str, Any]]
     result: Mapped[dict[str, Any] | None]
@@ -252,6 +272,9 @@ class Job(Base):
     __table_args__ = (
         CheckConstraint("state IN ('queued', 'running', 'succeeded', 'failed', 'cancelled')", name="state"),
         CheckConstraint("progress >= 0 AND progress <= 1", name="progress"),
+        Index("ix_jobs_identity", "identity", "row"),
+        Index("ix_jobs_state", "state", "row"),
+        Index("ix_jobs_kind", "kind", "state"),  # what is counted at every scrape
         Index(
             "uq_jobs_identity_live",
             "identity",
@@ -259,6 +282,38 @@ class Job(Base):
             sqlite_where=text("state IN ('queued', 'running', 'succeeded')"),
             postgresql_where=text("state IN ('queued', 'running', 'succeeded')"),
         ),
+    )
+
+
+class StyleToRetrain(Base):
+    """One style of a batch: what it is learnt from, the part of the batch that it is in, and what became of it.
+
+    `tries` counts how often a worker has begun with it, `stale` says why it was in need, `comparison` is the new policy
+    version beside the released one.
+    """
+
+    __tablename__ = "retraining_styles"
+
+    row: Mapped[RowId]
+    job_row: Mapped[int] = mapped_column(ForeignKey("jobs.row"))
+    part_row: Mapped[int] = mapped_column(ForeignKey("jobs.row"))
+    demonstration_row: Mapped[int] = mapped_column(ForeignKey("demonstrations.row"), index=True)
+    stale: Mapped[list[Any]]
+    state: Mapped[str] = mapped_column(String(10), default="queued")
+    tries: Mapped[int] = mapped_column(default=0)
+    policy_row: Mapped[int | None] = mapped_column(ForeignKey("policy_versions.row"), index=True)
+    reason: Mapped[str | None] = mapped_column(String(2000))
+    comparison: Mapped[dict[str, Any] | None]
+    ended_at: Mapped[datetime | None]
+
+    demonstration: Mapped[Demonstration] = relationship(lazy="joined", innerjoin=True)
+    policy: Mapped[PolicyVersion | None] = relationship(lazy="selectin")  # joined, SQLite reads all there are
+    __table_args__ = (
+        CheckConstraint("state IN ('queued', 'done', 'failed', 'cancelled')", name="state"),
+        UniqueConstraint("job_row", "demonstration_row", name="uq_retraining_styles_demonstration"),
+        Index("ix_retraining_styles_job", "job_row", "row"),
+        Index("ix_retraining_styles_state", "job_row", "state", "row"),
+        Index("ix_retraining_styles_part", "part_row", "state"),
     )
 
 

@@ -10,11 +10,11 @@ import io
 from dataclasses import is_dataclass
 from typing import Any, Generic, TypeVar
 
-import numpy as np
 from sqlalchemy import Dialect, LargeBinary
 from sqlalchemy.types import TypeDecorator
 
 from skills import packing
+from skills.db import npz
 from skills.errors import Corrupt
 from skills.packing import Arrays, canonical, sha256
 
@@ -42,7 +42,7 @@ def digest(value: Any) -> str:
 def pack(value: Any) -> bytes:
     """Lay a value out as bytes."""
     out = io.BytesIO()
-    packing.write(out, value, _VALUES, np.savez_compressed)
+    packing.write(out, value, _VALUES, npz.save)
     body = out.getvalue()
     return FORMAT + hashlib.sha256(body).digest() + body
 
@@ -57,15 +57,27 @@ def unpack(data: bytes) -> Any:
     if head != FORMAT or hashlib.sha256(body).digest() != checksum:
         raise Corrupt("A stored value is not what was stored; restore it from a backup, nothing of it is used.")
     try:
-        return packing.read(io.BytesIO(body), _VALUES)
+        return packing.assemble(npz.load(body), _VALUES)
     except Exception as error:  # whole, but of a class unknown here, or of numbers that its class refuses
         raise Corrupt(
             "A stored value is none that this version knows; update the code, nothing of it is used."
         ) from error
 
 
+def unpack_as(kind: type[T], data: bytes) -> T:
+    """Build the value of one class that was packed.
+
+    Raises:
+        Corrupt: As for `unpack`, or it is of another class.
+    """
+    built = unpack(data)
+    if not isinstance(built, kind):
+        raise Corrupt(f"A stored value is a {type(built).__name__} where a {kind.__name__} should be.")
+    return built
+
+
 class Packed(TypeDecorator[T], Generic[T]):
-    """A column that holds a whole value of one class."""
+    """A column that holds a whole value of one class; it may be given packed, so that no transaction waits for that."""
 
     impl = LargeBinary
     cache_ok = True
@@ -75,16 +87,13 @@ class Packed(TypeDecorator[T], Generic[T]):
         self.value = value
         stored(value)
 
-    def process_bind_param(self, value: T | None, dialect: Dialect) -> bytes | None:
+    def process_bind_param(self, value: T | bytes | None, dialect: Dialect) -> bytes | None:
         """Pack."""
+        if isinstance(value, bytes) and value.startswith(FORMAT):
+            return value
         assert value is None or isinstance(value, self.value)
         return None if value is None else pack(value)
 
     def process_result_value(self, value: bytes | None, dialect: Dialect) -> T | None:
         """Unpack, and refuse what has changed."""
-        if value is None:
-            return None
-        built = unpack(value)
-        if not isinstance(built, self.value):
-            raise Corrupt(f"A stored value is a {type(built).__name__} where a {self.value.__name__} should be.")
-        return built
+        return None if value is None else unpack_as(self.value, value)

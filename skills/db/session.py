@@ -9,20 +9,16 @@ one state from its beginning to its end.
 import sqlite3
 from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib import resources
 from pathlib import Path
 from time import monotonic, sleep
 from typing import Any
 
-from alembic import command
-from alembic.config import Config
-from alembic.runtime.migration import MigrationContext
-from alembic.script import ScriptDirectory
 from sqlalchemy import URL, Connection, Engine, create_engine, event
 from sqlalchemy.engine import make_url
 from sqlalchemy.exc import OperationalError
 from sqlalchemy.orm import Session, sessionmaker
 
+from skills.db.schema import upgrade
 from skills.errors import Busy, Conflict
 
 BUSY_TIMEOUT_MS = 10_000
@@ -33,9 +29,15 @@ WAL_LIMIT_BYTES = 64 << 20  # the write-ahead log would stay as large as the lar
 class Database:
     """Sessions on one database."""
 
-    def __init__(self, url: str) -> None:
+    def __init__(self, url: str, *, patience_ms: int | None = None) -> None:
+        """Open a database; it connects when it is first used.
+
+        Args:
+            url: SQLAlchemy's, of a SQLite file or a PostgreSQL database.
+            patience_ms: How long to wait for locks and for connections; `BUSY_TIMEOUT_MS` unless it is given.
+        """
         self.url = url
-        self.engine = _open(url)
+        self.engine = _open(url, patience_ms or BUSY_TIMEOUT_MS)
         self._readers = sessionmaker(self.engine, expire_on_commit=False)
         self._writers = sessionmaker(self.engine.execution_options(writes=True), expire_on_commit=False)
 
@@ -58,14 +60,7 @@ class Database:
             Conflict: The database was written by a newer version of the code.
         """
         with self.engine.execution_options(writes=True).connect() as connection:
-            config = _alembic()
-            heads = ScriptDirectory.from_config(config)
-            current = MigrationContext.configure(connection).get_current_revision()
-            known = {script.revision for script in heads.walk_revisions()}
-            if current is not None and current not in known:
-                raise Conflict("This database was written by a newer version; update the code, nothing was changed.")
-            config.attributes["connection"] = connection
-            command.upgrade(config, "head")
+            upgrade(connection)
             connection.commit()
 
     def forget(self) -> None:
@@ -94,18 +89,12 @@ def _in_words() -> Iterator[None]:
         raise Busy("The database cannot take this now; try again in a moment.") from error
 
 
-def _alembic() -> Config:
-    config = Config()
-    config.set_main_option("script_location", str(resources.files("skills") / "migrations"))
-    return config
-
-
-def _open(url: str) -> Engine:
+def _open(url: str, patience_ms: int) -> Engine:
     parsed = make_url(url)
     if parsed.drivername == "postgresql":
         parsed = parsed.set(drivername="postgresql+psycopg")
     if parsed.get_backend_name() != "sqlite":
-        return _open_postgresql(parsed)
+        return _open_postgresql(parsed, patience_ms)
     if parsed.database:
         Path(parsed.database).parent.mkdir(parents=True, exist_ok=True)
     engine = create_engine(parsed, connect_args={"check_same_thread": False})
@@ -114,14 +103,14 @@ def _open(url: str) -> Engine:
     def _prepare(connection: Any, _record: object) -> None:
         connection.isolation_level = None  # the driver would begin transactions by its own rules
         for pragma in (
-            f"busy_timeout={BUSY_TIMEOUT_MS}",
+            f"busy_timeout={patience_ms}",
             "synchronous=FULL",
             "foreign_keys=ON",
             "secure_delete=ON",
             f"journal_size_limit={WAL_LIMIT_BYTES}",
         ):
             connection.execute(f"PRAGMA {pragma}")
-        _write_ahead(connection)
+        _write_ahead(connection, patience_ms)
 
     @event.listens_for(engine, "begin")
     def _begin(connection: Connection) -> None:
@@ -130,12 +119,12 @@ def _open(url: str) -> Engine:
     return engine
 
 
-def _write_ahead(connection: sqlite3.Connection) -> None:
+def _write_ahead(connection: sqlite3.Connection, patience_ms: int) -> None:
     """Switch a file to its write-ahead log; others that open the same new file now are waited for.
 
     SQLite does not wait by its busy timeout for this one change: both would hold a lock that the other needs.
     """
-    deadline = monotonic() + BUSY_TIMEOUT_MS / 1000
+    deadline = monotonic() + patience_ms / 1000
     while True:
         try:
             connection.execute("PRAGMA journal_mode=WAL")
@@ -146,9 +135,9 @@ def _write_ahead(connection: sqlite3.Connection) -> None:
             sleep(0.01)
 
 
-def _open_postgresql(url: URL) -> Engine:
-    options = f"-c lock_timeout={BUSY_TIMEOUT_MS}"
-    engine = create_engine(url, pool_pre_ping=True, connect_args={"options": options})
+def _open_postgresql(url: URL, patience_ms: int) -> Engine:
+    waits = {"options": f"-c lock_timeout={patience_ms}", "connect_timeout": max(2, patience_ms // 1000)}
+    engine = create_engine(url, pool_pre_ping=True, connect_args=waits)
 
     @event.listens_for(engine, "begin")
     def _begin(connection: Connection) -> None:

@@ -7,6 +7,7 @@ The row of a job in our database is the truth; the engine only sees to it that s
     lease       who has fallen silent, whatever the clocks say
     watch       what a worker does between jobs: show that it lives, tell, take over, read back
     warm        the compiled loops, ready before they are needed
+    memory      what is freed, kept for the next style
     worker      the worker process
     child       that process as a child of the service
 """

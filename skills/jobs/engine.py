@@ -20,7 +20,9 @@ if TYPE_CHECKING:
     from dbos import DBOSClient, DBOSConfig
 
 APPLICATION = "suture-skills"
-QUEUE = "jobs"
+QUEUE, ASIDE = "jobs", "aside"  # aside: what nobody waits for; one at a time, so that it holds up nothing else
+QUEUES = [QUEUE, ASIDE]
+DONE_ASIDE = ("pictures",)  # kinds of jobs
 WORKFLOW = "perform_job"
 STEPS = "1"  # the engine's "application version": to be changed with the sequence of steps in `workflows`, only then
 POLLING_S = 0.2
@@ -79,10 +81,10 @@ def prepare(settings: Settings) -> None:
         connection.close()
 
 
-def tell(client: "DBOSClient", row: int, attempt: int) -> None:
+def tell(client: "DBOSClient", row: int, attempt: int, queue: str = QUEUE) -> None:
     """Tell the engine of an attempt at a job; telling it again changes nothing."""
     client.enqueue(
-        {"queue_name": QUEUE, "workflow_name": WORKFLOW, "workflow_id": workflow_id(row, attempt)}, row, attempt
+        {"queue_name": queue, "workflow_name": WORKFLOW, "workflow_id": workflow_id(row, attempt)}, row, attempt
     )
 
 

@@ -15,9 +15,10 @@ from sqlalchemy import delete, select, update
 from skills.db.base import now
 from skills.db.models import Executor, Job
 from skills.db.session import Database
-from skills.jobs.engine import QUEUE, STEPS, drop, tell, workflow_id
+from skills.jobs.engine import ASIDE, DONE_ASIDE, QUEUE, QUEUES, STEPS, drop, tell, workflow_id
 from skills.jobs.lease import Leases
 from skills.jobs.workflows import ACTIVE, fail
+from skills.library.batches import BATCH
 
 AT_ONCE = 100  # rows looked at in a round: a round must stay much shorter than a lease
 FORGOTTEN_AFTER_LEASES = 30
@@ -43,11 +44,17 @@ class Live:
     row: int
     attempt: int
     told: bool
+    kind: str
 
     @property
     def workflow(self) -> str:
         """The name of its workflow."""
         return workflow_id(self.row, self.attempt)
+
+    @property
+    def queue(self) -> str:
+        """The queue that it waits in."""
+        return ASIDE if self.kind in DONE_ASIDE else QUEUE
 
 
 class Watch:
@@ -89,7 +96,7 @@ class Watch:
         for job in live:
             workflow = known.get(job.workflow)
             if workflow is None:
-                tell(self._client, job.row, job.attempt)
+                tell(self._client, job.row, job.attempt, job.queue)
             elif workflow.status in ENDINGS:
                 state, reason = ENDINGS[workflow.status]
                 fail(self._database, job.row, job.attempt, reason, state)
@@ -100,9 +107,9 @@ class Watch:
         with self._database.writing() as session:
             session.execute(delete(Executor).where(Executor.id == self._executor))
 
-    def at_work(self) -> bool:
-        """Tell whether this worker still holds work."""
-        return bool(self._pending(self._executor))
+    def at_work(self, *queues: str) -> bool:
+        """Tell whether this worker still holds work, of some queues or of any."""
+        return bool(self._pending(self._executor, list(queues or QUEUES)))
 
     def _take_over(self) -> None:
         """Give back the work of workers whose lease ran out; forget those silent for long.
@@ -125,7 +132,7 @@ class Watch:
     def _inherit(self, dead: list[str]) -> None:
         """Give back what the dead were working on; start over what only workers of another version could go on with."""
         left = self._client.list_workflows(
-            status=["PENDING", "ENQUEUED"], executor_id=dead, queue_name=QUEUE, load_input=False, load_output=False
+            status=["PENDING", "ENQUEUED"], executor_id=dead, queue_name=QUEUES, load_input=False, load_output=False
         )
         for workflow in left:
             if workflow.app_version != STEPS:
@@ -140,11 +147,12 @@ class Watch:
             session.execute(delete(Executor).where(Executor.id == executor, Executor.beat_at == beat_at))
 
     def _live(self) -> list[Live]:
-        """Read jobs that have not ended: what was never told first, then the oldest."""
-        query = select(Job.row, Job.attempt, Job.told_at.is_not(None)).where(Job.state.in_(ACTIVE))
+        """Read jobs that have not ended: what was never told first, then the oldest; of batches their parts alone."""
+        query = select(Job.row, Job.attempt, Job.told_at.is_not(None), Job.kind).where(Job.state.in_(ACTIVE))
+        query = query.where(Job.kind != BATCH)
         with self._database.reading() as session:
             rows = session.execute(query.order_by(Job.told_at.is_not(None), Job.row).limit(AT_ONCE)).all()
-        return [Live(row, attempt, told) for row, attempt, told in rows]
+        return [Live(*row) for row in rows]
 
     def _workflows(self, live: Sequence[Live]) -> list[WorkflowStatus]:
         if not live:
@@ -152,9 +160,9 @@ class Watch:
         names = [job.workflow for job in live]
         return self._client.list_workflows(workflow_ids=names, load_input=False, load_output=False)
 
-    def _pending(self, executor: str | None = None) -> list[WorkflowStatus]:
+    def _pending(self, executor: str | None = None, queues: list[str] = QUEUES) -> list[WorkflowStatus]:
         return self._client.list_workflows(
-            status="PENDING", queue_name=QUEUE, executor_id=executor, load_input=False, load_output=False
+            status="PENDING", queue_name=queues, executor_id=executor, load_input=False, load_output=False
         )
 
     def _start_over(self, workflow: str) -> None:

@@ -12,9 +12,12 @@ from types import FrameType
 
 from dbos import DBOS
 
+from skills import logs
 from skills.db.session import Database
-from skills.jobs.engine import POLLING_S, QUEUE, configuration, connect
+from skills.jobs.engine import ASIDE, POLLING_S, QUEUE, configuration, connect
 from skills.jobs.lease import Leases
+from skills.jobs.logged import logged
+from skills.jobs.memory import keep_freed_memory
 from skills.jobs.watch import Watch
 from skills.jobs.workflows import Perform, Work, register
 from skills.settings import Settings
@@ -36,8 +39,9 @@ def run_worker(settings: Settings, *, parent: int | None = None, perform: Perfor
         parent: The id of the process without which this one has no reason to live.
         perform: Carries a job out; `skills.library.perform_job` unless told otherwise.
     """
+    keep_freed_memory()
     stop = _stopped_by_signals()
-    perform = perform or _library()
+    perform = logged(perform or _library())
     executor = f"{os.getpid()}-{uuid.uuid4().hex}"  # never used again: the engine would run its work twice
     database = Database(settings.database_url)
     client = connect(settings)
@@ -70,15 +74,24 @@ def _engine(work: Work, executor: str, watch: Watch) -> Iterator[None]:
     register(work)
     DBOS(config=configuration(work.settings, executor))
     DBOS.launch()
-    DBOS.register_queue(QUEUE, worker_concurrency=work.settings.worker_threads, polling_interval_sec=POLLING_S)
+    for queue, at_once in ((QUEUE, work.settings.worker_threads), (ASIDE, 1)):
+        DBOS.register_queue(queue, worker_concurrency=at_once, polling_interval_sec=POLLING_S)
     try:
         yield
     finally:
-        drain = Thread(target=DBOS.destroy, kwargs={"workflow_completion_timeout_sec": DRAIN_S})
+        drain = Thread(target=DBOS.destroy, kwargs={"workflow_completion_timeout_sec": _patience_s(watch)})
         drain.start()
         while drain.is_alive():  # it beats while it drains, or others would take over what it finishes
             _survive(watch.beat)
             drain.join(ROUND_S)
+
+
+def _patience_s(watch: Watch) -> int:
+    """Choose how long to drain: what is done aside is cut at once, for it may take long and nobody waits for it."""
+    try:
+        return DRAIN_S if watch.at_work(QUEUE) else 0
+    except Exception:  # a database that is away for a while
+        return DRAIN_S
 
 
 def _survive(step: Callable[[], None]) -> None:
@@ -114,9 +127,10 @@ def _go_if_cut_short(watch: Watch) -> None:
 
 def main() -> None:
     """Run as a child of the process whose id is the argument, out of the way of what answers requests."""
-    logging.basicConfig(level=logging.WARNING, format="%(asctime)s worker %(levelname)s %(message)s")
+    settings = Settings()
+    logs.configure(settings.log_level, as_json=settings.log_format == "json")
     os.nice(NICENESS)
-    run_worker(Settings(), parent=int(sys.argv[1]))
+    run_worker(settings, parent=int(sys.argv[1]))
     logging.shutdown()
     os._exit(0)  # nobody waits for what is still being compiled
 

@@ -18,6 +18,7 @@ from skills.db.models import Job
 from skills.db.session import Database
 from skills.errors import Busy, SkillsError
 from skills.jobs.engine import WORKFLOW
+from skills.library.batches import PART, end_part
 from skills.settings import Settings
 
 ACTIVE = ("queued", "running")
@@ -83,10 +84,14 @@ def start(database: Database, row: int, attempt: int) -> bool:
 
 def fail(database: Database, row: int, attempt: int, reason: str, state: str = "failed") -> bool:
     """End a job without a result, unless it has ended or another attempt has it; tell whether it was so ended."""
-    changes = {"state": state, "error": reason[:LONGEST_REASON], "ended_at": now()}
+    reason = reason[:LONGEST_REASON]
+    changes = {"state": state, "error": reason, "ended_at": now()}
     with database.writing() as session:
         mine = (Job.row == row, Job.attempt == attempt, Job.state.in_(ACTIVE))
-        return session.execute(update(Job).where(*mine).values(**changes).returning(Job.row)).first() is not None
+        ended = session.execute(update(Job).where(*mine).values(**changes).returning(Job.kind, Job.request)).first()
+        if ended is not None and ended.kind == PART:
+            end_part(session, ended.request["retraining"], row, state, reason)
+        return ended is not None
 
 
 def register(work: Work) -> None:

@@ -18,7 +18,8 @@ from skills.library.catalogue import find_surgeon, find_suture_type
 from skills.library.events import record
 from skills.library.recordings import Reader, Upload, find_recording, keep, read_upload, recording_bytes
 from skills.library.releases import withdraw_resting_on
-from skills.packing import canonical, sha256
+from skills.library.verified import demo_identity
+from skills.packing import canonical
 from skills.recordings import read_recording
 from skills.style.demo import Demo, Recording, cut_demo
 from skills.style.grid import PAPER_GRID, GridMode, GridPath, choose_grid, discretize
@@ -126,20 +127,7 @@ def _store_demo(
     session: Session, stored: StoredRecording, made: Made, cut: Cut, actor: str
 ) -> tuple[Demonstration, bool]:
     surgeon, suture = find_surgeon(session, cut.surgeon), find_suture_type(session, cut.suture)
-    identity: dict[str, Any] = {
-        "recording": stored.sha256,
-        "surgeon": surgeon.slug,
-        "suture": suture.slug,
-        "arm": made.demo.arm,
-        "topic": made.demo.topic,
-        "segment_s": [made.demo.start_s, made.demo.end_s],
-        "grid": asdict(made.path.grid),
-    }
-    if made.demo.pauses:  # of a recording with presses, the same segment once had the samples in them
-        identity["left_out"] = [asdict(pause) for pause in made.demo.pauses]
-    if made.path.hysteresis:  # else left out, so that a demonstration is still known by the digest it always had
-        identity["hysteresis"] = made.path.hysteresis
-    demo_sha256 = sha256(canonical(identity))
+    demo_sha256 = demo_identity(stored.sha256, surgeon.slug, suture.slug, made.demo, made.path)
     known = session.scalar(select(Demonstration).where(Demonstration.sha256 == demo_sha256))
     if known is not None:
         if known.withdrawn_at is not None:

@@ -18,11 +18,13 @@ from skills.db.models import (
     PolicyVersion,
     RecordingChunk,
     Release,
+    StoredPictures,
     StoredPlayback,
     StoredRecording,
     StoredRewardMap,
     Surgeon,
 )
+from skills.library.batches import BATCH, forget_styles
 from skills.library.catalogue import find_surgeon, salted
 from skills.library.demos import find_demo
 from skills.library.events import record
@@ -37,8 +39,9 @@ def erase_surgeon(session: Session, slug: str, actor: str) -> list[Job]:
     surgeon = find_surgeon(session, slug)
     of_surgeon = Demonstration.surgeon_row == surgeon.row
     jobs = _jobs(session, surgeon)
-    _drop_jobs(session, jobs)
-    _erase(session, session.scalars(select(Demonstration).where(of_surgeon)).all())
+    demos = session.scalars(select(Demonstration).where(of_surgeon)).all()
+    _drop_jobs(session, jobs, demos)
+    _erase(session, demos)
     record(session, actor, "erase", "surgeon", surgeon.subject, surgeon)
     salt = secrets.token_hex(32)
     session.add(Erasure(salt=salt, digest=salted(salt, slug)))
@@ -56,7 +59,7 @@ def erase_demo(session: Session, demo_sha256: str, actor: str) -> list[Job]:
         for job in _jobs(session, demo.surgeon)
         if demo_sha256 in job.request.get("demos", ()) or job.request.get("plan") in plans
     ]
-    _drop_jobs(session, jobs)
+    _drop_jobs(session, jobs, [demo])
     record(session, actor, "erase", "demonstration", demo_sha256, demo.surgeon)
     _erase(session, [demo])
     return jobs
@@ -66,7 +69,8 @@ def _jobs(session: Session, surgeon: Surgeon) -> list[Job]:
     return list(session.scalars(select(Job).where(Job.surgeon_row == surgeon.row)))
 
 
-def _drop_jobs(session: Session, jobs: Sequence[Job]) -> None:
+def _drop_jobs(session: Session, jobs: Sequence[Job], demos: Sequence[Demonstration]) -> None:
+    forget_styles(session, [demo.row for demo in demos], [job.row for job in jobs if job.kind == BATCH])
     session.execute(delete(Job).where(Job.row.in_([job.row for job in jobs])))
 
 
@@ -75,7 +79,9 @@ def _erase(session: Session, demos: Sequence[Demonstration]) -> None:
     recordings = {demo.recording_row for demo in demos}
     policies = select(PolicyVersion.row).where(PolicyVersion.demonstration_row.in_(rows))
     plans = select(Plan.row).where(Plan.policy_row.in_(policies))
+    playbacks = select(StoredPlayback.row).where(StoredPlayback.plan_row.in_(plans))
     for statement in (
+        delete(StoredPictures).where(StoredPictures.playback_row.in_(playbacks)),
         delete(StoredPlayback).where(StoredPlayback.plan_row.in_(plans)),
         delete(Plan).where(Plan.policy_row.in_(policies)),
         delete(Release).where(Release.policy_row.in_(policies)),

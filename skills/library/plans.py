@@ -1,37 +1,47 @@
-"""Plans and their playback: grid worlds stacked at suture points, and the simulator's verdict on the motion."""
+"""Plans: grid worlds stacked at suture points."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from math import isfinite
-from typing import Any, Literal
+from typing import Any
 
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from skills.db.models import Job, Plan, StoredPlayback
+from skills.db.models import Plan
 from skills.db.session import Database
-from skills.errors import BadPlan, NotFound
-from skills.library import jobs, policies
+from skills.errors import BadPlan, NoApproach, NotFound
+from skills.library import policies
 from skills.library.events import record
-from skills.library.verified import learnt, plan_identity, planned
-from skills.packing import canonical, sha256
-from skills.settings import Settings
-from skills.style.demo import Demo
+from skills.library.verified import learnt, plan_identity
+from skills.style.handoff import Enters, PsmM
+from skills.style.kinematics import DEFAULT_INSTRUMENT
+from skills.style.partner import Partner
 from skills.style.plan import SuturePlan, SuturePoint, pose_xyzw, rotation_of, stack
-from skills.style.playback import judge
+from skills.style.timetable import seams, seconds_by_phase, transfers
 from skills.style.trajectory import Trajectory, time_parametrise
 
-RATE_HZ = 240.0  # ours: PyBullet's own step
 
-Approach = tuple[float, float, float]
+@dataclass(frozen=True)
+class Beside:
+    """What is asked of PSM_M, in the arm's frame; what is None is taken from the demonstration, where that has it.
+
+    `source` says where the given numbers come from.
+    """
+
+    approach: tuple[float, float, float] | None = None
+    base_mm: tuple[float, float, float] | None = None
+    base_xyzw: tuple[float, float, float, float] | None = None
+    instrument: str | None = None
+    enters: Enters = "after_A1"
+    source: str = "the request"
 
 
 @dataclass(frozen=True)
 class PlanRequest:
-    """What is asked for: a style, where its passes end and start, and what the arm should be.
+    """What is asked for: a style, where its passes end and start, and what the arms should be.
 
-    `approach_m` is PSM_M's approach in the arm's frame; "demonstrated" takes it from the demonstration, where that has
-    it, and None plans A1 alone.
+    Without `realignment` A1 alone is planned. Without `psm_m` it is all the demonstration's, and where that does not
+    know PSM_M, A1 alone.
     """
 
     surgeon: str
@@ -43,14 +53,18 @@ class PlanRequest:
     frame: str | None = None
     instrument: str | None = None
     speed_mm_s: float = 20.0
-    approach_m: Approach | Literal["demonstrated"] | None = "demonstrated"
+    rate_hz: float = 200.0
+    tip_offset_mm: float = 0.0
+    psm_m: Beside | None = None
+    realignment: bool = True
 
 
 def plan_sutures(database: Database, request: PlanRequest, actor: str) -> tuple[Plan, bool]:
     """Stack a style's policy at suture points and store the plan: (the row, whether it is new).
 
     Raises:
-        BadPlan: The arm, frame or instrument is not the demonstration's, or a pass is out of reach.
+        BadPlan: The arm, frame or instrument is not the demonstration's, or a pass is out of reach of either arm.
+        NoApproach: PSM_M is asked for, and neither request nor demonstration knows its approach.
     """
     with database.reading() as session:
         policy = policies.choose(session, request.surgeon, request.suture, request.version)
@@ -61,7 +75,6 @@ def plan_sutures(database: Database, request: PlanRequest, actor: str) -> tuple[
             raise BadPlan(
                 f"The policy was demonstrated with {name} '{have}'; a plan keeps it, so give that or leave it out."
             )
-    approach, source = _approach(request, demo)
     plan = stack(
         followed,
         request.suture_points,
@@ -71,12 +84,14 @@ def plan_sutures(database: Database, request: PlanRequest, actor: str) -> tuple[
         rotation=rotation_of(demo.rotation_xyzw),
         demo=demo,
         starts_mm=request.starts_mm,
-        approach_m=approach,
+        psm_m=_psm_m(request.psm_m, demo.partner) if request.realignment else None,
         speed_mm_s=request.speed_mm_s,
+        rate_hz=request.rate_hz,
+        tip_offset_mm=request.tip_offset_mm,
     )
     trajectory = trajectory_of(plan)
     identity = plan_identity(sha, plan)
-    about = describe_plan(plan, trajectory, source)
+    about = describe_plan(plan, trajectory)
     with database.writing() as session:
         known = session.scalar(select(Plan).where(Plan.sha256 == identity))
         if known is not None:
@@ -89,31 +104,58 @@ def plan_sutures(database: Database, request: PlanRequest, actor: str) -> tuple[
         return stored, True
 
 
-def _approach(request: PlanRequest, demo: Demo) -> tuple[Approach | None, str | None]:
-    """Choose PSM_M's approach, and say where it comes from: the request, else the demonstration."""
-    if request.approach_m != "demonstrated":
-        return request.approach_m, None if request.approach_m is None else "the request"
-    if demo.partner is None:
-        return None, None
-    return demo.partner.approach, f"the demonstration: {demo.partner.arm} at {demo.partner.at_s:g} s of its recording"
+def _psm_m(asked: Beside | None, partner: Partner | None) -> PsmM | None:
+    """Put together what is known of PSM_M, and say of each part where it comes from: the request comes first."""
+    if asked is None and partner is None:
+        return None
+    wanted, seen = asked or Beside(), _demonstrated(partner)
+    approach = wanted if wanted.approach is not None else seen
+    if approach.approach is None:
+        raise NoApproach("The demonstration does not say how PSM_M approaches; give psm_m.approach, or no psm_m.")
+    base = wanted if wanted.base_mm is not None else seen
+    return PsmM(
+        approach=approach.approach,
+        base_mm=base.base_mm,
+        base_xyzw=base.base_xyzw,
+        instrument=wanted.instrument or seen.instrument or DEFAULT_INSTRUMENT,
+        enters=wanted.enters,
+        approach_from=approach.source,
+        base_from=None if base.base_mm is None else base.source,
+    )
+
+
+def _demonstrated(partner: Partner | None) -> Beside:
+    """Write what a demonstration knows of PSM_M as if it had been asked for."""
+    if partner is None:
+        return Beside()
+    source = f"the demonstration: {partner.arm} at {partner.at_s:g} s of its recording"
+    return Beside(partner.approach, partner.base_mm, partner.base_xyzw, partner.instrument, source=source)
 
 
 def trajectory_of(plan: SuturePlan) -> Trajectory:
-    """Put a plan into time, at `RATE_HZ`; the same plan gives the same bytes."""
-    return time_parametrise(plan.pass_paths, speed_mm_s=plan.speed_mm_s, rate_hz=RATE_HZ, instrument=plan.instrument)
+    """Put a plan into time, at its own rate; the same plan gives the same bytes."""
+    return time_parametrise(
+        plan.pass_paths,
+        speed_mm_s=plan.speed_mm_s,
+        rate_hz=plan.rate_hz,
+        instrument=plan.instrument,
+        psm_m=plan.psm_m,
+    )
 
 
-def describe_plan(plan: SuturePlan, trajectory: Trajectory, source: str | None) -> dict[str, Any]:
-    """Write what a client is told of a plan, but for its digests; `source` is where PSM_M's approach comes from."""
+def describe_plan(plan: SuturePlan, trajectory: Trajectory) -> dict[str, Any]:
+    """Write what a client is told of a plan, but for its digests."""
+    moved = transfers(trajectory)
     return {
         "arm": plan.arm,
         "frame": plan.frame,
         "instrument": plan.instrument,
         "orientation": plan.orientation,
         "path": plan.path,
-        "psm_m": None if plan.approach_m is None else {"approach": list(plan.approach_m), "from": source},
-        "realignment": plan.approach_m is not None,
+        "psm_m": None if plan.psm_m is None else _describe_psm_m(plan.psm_m),
+        "realignment": plan.psm_m is not None,
         "speed_mm_s": plan.speed_mm_s,
+        "tip_offset_mm": plan.tip_offset_mm,
         "passes": [
             {
                 "position_mm": list(one.point.position_mm),
@@ -123,18 +165,33 @@ def describe_plan(plan: SuturePlan, trajectory: Trajectory, source: str | None) 
                 "path_mm": one.tip_mm.tolist(),
                 "jaw_xyzw": list(pose_xyzw(one.rotation)),
                 "target_xyzw": None if one.target_rotation is None else list(pose_xyzw(one.target_rotation)),
+                "transfer": None if transfer is None else asdict(transfer),
             }
-            for one in plan.passes
+            for one, transfer in zip(plan.passes, moved, strict=True)
         ],
         "trajectory": {
             "rate_hz": trajectory.rate_hz,
             "samples": len(trajectory),
             "duration_s": trajectory.duration_s,
+            "seconds_by_phase": seconds_by_phase(trajectory),
             "speed_used_mm_s": trajectory.speed_mm_s,
             "peak_joint_speed_ratio": trajectory.speed_ratio,
             "peak_joint_acceleration_ratio": trajectory.acceleration_ratio,
             "deviation_mm": trajectory.deviation_mm,
+            "psm_m_moves": trajectory.psm_m is not None,
+            "seams": [asdict(seam) for seam in seams(trajectory)],
         },
+    }
+
+
+def _describe_psm_m(psm_m: PsmM) -> dict[str, Any]:
+    return {
+        "approach": list(psm_m.approach),
+        "base_mm": None if psm_m.base_mm is None else list(psm_m.base_mm),
+        "base_xyzw": None if psm_m.base_xyzw is None else list(psm_m.base_xyzw),
+        "instrument": psm_m.instrument,
+        "enters": psm_m.enters,
+        "from": {"approach": psm_m.approach_from, "base": psm_m.base_from},
     }
 
 
@@ -144,58 +201,3 @@ def find_plan(session: Session, plan_sha256: str) -> Plan:
     if plan is None:
         raise NotFound("There is no such plan; POST /plans makes one.")
     return plan
-
-
-def request_playback(session: Session, plan_sha256: str, actor: str) -> tuple[Job, bool]:
-    """Ask for a plan to be played in the simulator: the job, and whether it is a new one."""
-    plan = find_plan(session, plan_sha256)
-    return jobs.ask(session, "playback", {"plan": plan.sha256}, plan.policy.surgeon, actor)
-
-
-def check_playback(
-    database: Database, request: dict[str, Any], settings: Settings
-) -> Callable[[Session, str], dict[str, Any]]:
-    """Play a plan in the simulator and judge it; the returned function stores both."""
-    from skills.sim.player import play
-
-    with database.reading() as session:
-        plan = planned(find_plan(session, request["plan"]))
-    trajectory = trajectory_of(plan)
-    measured = play(trajectory, timeout_s=settings.playback_timeout_s, memory_bytes=settings.playback_memory_bytes)
-    verdict = judge(measured, trajectory)
-    report = _finite(asdict(verdict))
-    report["failure_in_words"] = None if verdict.failure is None else str(verdict.failure)
-    identity = sha256(canonical([request["plan"], report]))
-
-    def store(session: Session, actor: str) -> dict[str, Any]:
-        known = session.scalar(select(StoredPlayback).where(StoredPlayback.sha256 == identity))
-        if known is None:
-            plan = find_plan(session, request["plan"])
-            known = StoredPlayback(
-                sha256=identity, plan=plan, feasible=verdict.feasible, report=report, measured=measured
-            )
-            session.add(known)
-            record(session, actor, "play", "playback", identity, plan.policy.surgeon)
-            session.flush()
-        return {"playback": known.sha256, "feasible": known.feasible}
-
-    return store
-
-
-def find_playback(session: Session, playback_sha256: str) -> StoredPlayback:
-    """Find a playback by its digest."""
-    playback = session.scalar(select(StoredPlayback).where(StoredPlayback.sha256 == playback_sha256))
-    if playback is None:
-        raise NotFound("There is no such playback; POST /playbacks asks for one.")
-    return playback
-
-
-def _finite(data: Any) -> Any:
-    """Write NaN and infinity, which JSON does not have, as null, and tuples as lists."""
-    if isinstance(data, float):
-        return data if isfinite(data) else None
-    if isinstance(data, dict):
-        return {name: _finite(value) for name, value in data.items()}
-    if isinstance(data, list | tuple):
-        return [_finite(value) for value in data]
-    return data

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from sqlalchemy import func, select
-from sqlalchemy.orm import Session
+from sqlalchemy import exists, select
+from sqlalchemy.orm import Session, aliased
 
 from skills.db.base import rfc3339
 from skills.db.models import PolicyVersion, Release
@@ -66,13 +66,15 @@ def list_versions(
 
 def list_served(session: Session, limit: int, after: int | None) -> Sequence[Release]:
     """List what is served, one release per style, in the order of release."""
-    newest = (
-        select(func.max(Release.row))
-        .where(Release.withdrawn_at.is_(None))
-        .group_by(Release.surgeon_row, Release.suture)
+    later = aliased(Release)
+    superseded = exists().where(
+        later.surgeon_row == Release.surgeon_row,
+        later.suture == Release.suture,
+        later.row > Release.row,
+        later.withdrawn_at.is_(None),
     )
-    query = select(Release).where(Release.row.in_(newest), Release.row > (after or 0)).order_by(Release.row)
-    return session.scalars(query.limit(limit)).all()
+    query = select(Release).where(Release.row > (after or 0), Release.withdrawn_at.is_(None), ~superseded)
+    return session.scalars(query.order_by(Release.row).limit(limit)).all()
 
 
 def find_version(session: Session, surgeon: str, suture: str, version: int) -> PolicyVersion:

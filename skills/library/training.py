@@ -1,16 +1,16 @@
 """Training a style: from its demonstration to a certified policy version, and to its release if that was asked."""
 
-from collections.abc import Callable
-from dataclasses import asdict
-from typing import Any
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, NamedTuple, cast
 
-from sqlalchemy import func, select
+from sqlalchemy import LargeBinary, Table, bindparam, func, insert, select, type_coerce
 from sqlalchemy.orm import Session
 
-from skills.db.models import Demonstration, Job, PolicyVersion, StoredRewardMap
-from skills.db.packed import digest
+from skills.db.models import Demonstration, Job, PolicyVersion, StoredRewardMap, Surgeon
+from skills.db.packed import digest, pack, unpack_as
 from skills.db.session import Database
-from skills.errors import BadInput, BadSettings, Conflict
+from skills.errors import BadInput, BadSettings, Conflict, NotFound
 from skills.library import jobs, releases
 from skills.library.catalogue import check_consent, find_surgeon, find_suture_type
 from skills.library.demos import find_demo, newest_demo
@@ -26,8 +26,20 @@ from skills.style.learning.learners import LEARNER_VERSION, LEARNERS, Learner, r
 from skills.style.learning.q_learning import PhaseQLearning
 from skills.style.plan import rotation_of
 from skills.style.policy import Policy, learn_policy, rollout_from
+from skills.style.reward import RewardMap
 
 Store = Callable[[Session, str], dict[str, Any]]
+
+# Statements that every style goes through, built once: to build one takes as long as to run it.
+_VERSIONS, _DEMOS = (cast(Table, one.__table__) for one in (PolicyVersion, Demonstration))
+KNOWN = select(_VERSIONS.c.row, _VERSIONS.c.version).where(_VERSIONS.c.sha256 == bindparam("sha256"))
+STANDING = select(
+    _DEMOS.c.withdrawn_at,
+    select(func.max(_VERSIONS.c.version))
+    .where(_VERSIONS.c.surgeon_row == _DEMOS.c.surgeon_row, _VERSIONS.c.suture == _DEMOS.c.suture)
+    .scalar_subquery(),
+).where(_DEMOS.c.row == bindparam("demonstration"))
+ADD = insert(_VERSIONS).returning(_VERSIONS.c.row, _VERSIONS.c.version)
 CERTIFICATE_NOTE = (
     "Checked on the grid: every greedy action against exact dynamic programming, and every start by following it; "
     "the demonstrated pass against the arm's joint limits in closed form. It says nothing about the arm's accuracy. "
@@ -93,21 +105,45 @@ def learner_of(described: dict[str, Any]) -> Learner:
     return LEARNERS[kind](**settings)
 
 
+@dataclass(frozen=True, eq=False)
+class Lesson:
+    """A demonstration as it is learnt from, its values still packed, and whose it is."""
+
+    row: int
+    sha256: str
+    surgeon: Surgeon
+    suture: str
+    demo: bytes
+    reward: bytes
+
+
+@dataclass(frozen=True, eq=False)
+class Learnt:
+    """A policy that was learnt and certified, packed already, so that no transaction has to wait for that."""
+
+    lesson: Lesson
+    training: str
+    sha256: str
+    manifest: dict[str, Any]
+    policy: bytes
+    coverage: bytes
+
+
+class Stored(NamedTuple):
+    """Where a policy version stands."""
+
+    row: int
+    version: int
+
+
 def train_style(database: Database, request: dict[str, Any], _settings: Settings) -> Store:
     """Learn, certify and measure what was asked for; the returned function stores it."""
     with database.reading() as session:
-        demonstration = find_demo(session, request["demos"][0])
-        stored = select(StoredRewardMap).where(StoredRewardMap.demonstration_row == demonstration.row)
-        reward, demo = session.scalars(stored).one().map, demonstration.demo
-    policy = learn_policy(reward, learner_of(request["learner"]), request["seed"])
-    certificate, covered = certify(policy)
-    reasons = refusals(policy, certificate, demo)
-    manifest = describe_policy(policy, certificate, covered, demo, request, reasons)
-    identity = policy_identity(manifest, policy)
+        (lesson,) = lessons(session, [find_demo(session, request["demos"][0]).row])
+    learnt = learn_style(lesson, request)
 
     def store(session: Session, actor: str) -> dict[str, Any]:
-        demonstration = find_demo(session, request["demos"][0])
-        version = _store(session, demonstration, policy, covered, manifest, identity, request)
+        version = session.get_one(PolicyVersion, store_style(session, learnt).row)
         released, kept_back = False, None
         if request["release"]:
             try:
@@ -126,38 +162,74 @@ def train_style(database: Database, request: dict[str, Any], _settings: Settings
     return store
 
 
-def _store(
-    session: Session,
-    demonstration: Demonstration,
-    policy: Policy,
-    covered: Coverage,
-    manifest: dict[str, Any],
-    identity: str,
-    request: dict[str, Any],
-) -> PolicyVersion:
-    known = session.scalar(select(PolicyVersion).where(PolicyVersion.sha256 == identity))
-    if known is not None:
-        return known
-    if demonstration.withdrawn_at is not None:
-        raise Conflict("The demonstration was withdrawn while it was being learnt.")
-    style = (PolicyVersion.surgeon_row == demonstration.surgeon_row, PolicyVersion.suture == demonstration.suture)
-    last = session.scalar(select(func.max(PolicyVersion.version)).where(*style)) or 0
-    version = PolicyVersion(
-        sha256=identity,
-        training=sha256(canonical(request)),
-        surgeon=demonstration.surgeon,
-        suture=demonstration.suture,
-        version=last + 1,
-        demonstration=demonstration,
-        manifest=manifest,
-        releasable=not manifest["grid_certificate"]["refused_because"],
-        learnt=policy,
-        covered=covered,
+def lessons(session: Session, demonstrations: Sequence[int]) -> list[Lesson]:
+    """Read what is learnt from, in the order of the rows."""
+    of = Demonstration
+    packed = type_coerce(of.demo, LargeBinary), type_coerce(StoredRewardMap.map, LargeBinary)
+    query = (
+        select(of.row, of.sha256, Surgeon, of.suture, *packed)
+        .join(Surgeon, Surgeon.row == of.surgeon_row)
+        .join(StoredRewardMap, StoredRewardMap.demonstration_row == of.row)
+        .where(of.row.in_(demonstrations))
     )
-    session.add(version)
-    record(session, "worker", "train", "policy-version", identity, demonstration.surgeon)
-    session.flush()
-    return version
+    return [Lesson(*row) for row in session.execute(query.order_by(of.row))]
+
+
+def learn_style(lesson: Lesson, request: dict[str, Any]) -> Learnt:
+    """Learn, certify and measure a style from a demonstration, as a training asks for it; no transaction is open.
+
+    Raises:
+        Conflict: The surgeon's consent does not cover it.
+        Corrupt: The demonstration is not what was stored.
+        BadSettings: It cannot be learnt with these settings.
+    """
+    check_consent(lesson.surgeon, "training")
+    demo, reward = unpack_as(Demo, lesson.demo), unpack_as(RewardMap, lesson.reward)
+    policy = learn_policy(reward, learner_of(request["learner"]), request["seed"])
+    certificate, covered = certify(policy)
+    manifest = describe_policy(policy, certificate, covered, demo, request, refusals(policy, certificate, demo))
+    return Learnt(
+        lesson=lesson,
+        training=sha256(canonical(request)),
+        sha256=policy_identity(manifest, policy),
+        manifest=manifest,
+        policy=pack(policy),
+        coverage=pack(covered),
+    )
+
+
+def store_style(session: Session, learnt: Learnt) -> Stored:
+    """Store what was learnt as the next version of its style, once.
+
+    Raises:
+        NotFound: The demonstration was erased meanwhile.
+        Conflict: It was withdrawn meanwhile.
+    """
+    lesson = learnt.lesson
+    known = session.execute(KNOWN, {"sha256": learnt.sha256}).first()
+    if known is not None:
+        return Stored(*known)
+    found = session.execute(STANDING, {"demonstration": lesson.row}).first()
+    if found is None:
+        raise NotFound("The demonstration was erased while it was being learnt.")
+    withdrawn_at, last = found
+    if withdrawn_at is not None:
+        raise Conflict("The demonstration was withdrawn while it was being learnt.")
+    values = {
+        "sha256": learnt.sha256,
+        "training": learnt.training,
+        "surgeon_row": lesson.surgeon.row,
+        "suture": lesson.suture,
+        "version": (last or 0) + 1,
+        "demonstration_row": lesson.row,
+        "manifest": learnt.manifest,
+        "releasable": not learnt.manifest["grid_certificate"]["refused_because"],
+        "learnt": learnt.policy,
+        "covered": learnt.coverage,
+    }
+    stored = session.execute(ADD, values).one()
+    record(session, "worker", "train", "policy-version", learnt.sha256, lesson.surgeon)
+    return Stored(*stored)
 
 
 def refusals(policy: Policy, certificate: Certificate, demo: Demo) -> list[str]:

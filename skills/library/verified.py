@@ -4,6 +4,7 @@ A column is guarded by its own checksum (`skills.db.packed`); this guards what b
 said of it, a plan and the policy that it follows. What does not agree is refused; nothing takes its place.
 """
 
+from dataclasses import asdict
 from typing import Any
 
 from skills.db.models import Plan, PolicyVersion
@@ -12,6 +13,8 @@ from skills.errors import Corrupt
 from skills.library.kept import Kept
 from skills.packing import canonical, sha256
 from skills.style.certificate import Coverage
+from skills.style.demo import Demo
+from skills.style.grid import GridPath
 from skills.style.plan import SuturePlan
 from skills.style.policy import Policy
 
@@ -54,6 +57,24 @@ def planned(plan: Plan) -> SuturePlan:
     if plan_identity(plan.policy.sha256, plan.plan) != plan.sha256:
         raise Corrupt("A stored plan is not what was planned; restore it from a backup or plan again.")
     return plan.plan
+
+
+def demo_identity(recording_sha256: str, surgeon: str, suture: str, demo: Demo, path: GridPath) -> str:
+    """Compute a demonstration's digest: over its recording, its style, the part of it and the grid."""
+    identity: dict[str, Any] = {
+        "recording": recording_sha256,
+        "surgeon": surgeon,
+        "suture": suture,
+        "arm": demo.arm,
+        "topic": demo.topic,
+        "segment_s": [demo.start_s, demo.end_s],
+        "grid": asdict(path.grid),
+    }
+    if demo.pauses:  # of a recording with presses, the same segment once had the samples in them
+        identity["left_out"] = [asdict(pause) for pause in demo.pauses]
+    if path.hysteresis:  # else left out, so that a demonstration is still known by the digest it always had
+        identity["hysteresis"] = path.hysteresis
+    return sha256(canonical(identity))
 
 
 def policy_identity(manifest: dict[str, Any], policy: Policy) -> str:

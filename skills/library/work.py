@@ -9,15 +9,20 @@ from sqlalchemy.orm import Session
 from skills.db.base import now
 from skills.db.models import Job
 from skills.db.session import Database
+from skills.library.batch_work import retrain_part
+from skills.library.batches import PART
 from skills.library.events import record
-from skills.library.plans import check_playback
+from skills.library.pictures import draw_pictures
+from skills.library.playbacks import check_playback
 from skills.library.training import train_style
 from skills.settings import Settings
 
 Store = Callable[[Session, str], dict[str, Any]]  # in a transaction, for whoever asked
 MAKERS: dict[str, Callable[[Database, dict[str, Any], Settings], Store]] = {
     "training": train_style,
+    PART: retrain_part,
     "playback": check_playback,
+    "pictures": draw_pictures,
 }
 
 

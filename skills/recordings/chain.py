@@ -1,13 +1,13 @@
 """Find the records in bytes that hold one behind the other.
 
-    bytes --follow--> Chain: where each message begins and how long it is
+    bytes --Chain.follow--> where each message begins, how long it is, whose it is and when it was logged
 
-A record's end is known from its head only, so a chain is followed link by link; but where all the bytes that could be
-a message's opcode are looked at together, nearly every link is found at once.
+A record's end is known from its head only, so a chain is followed link by link from the first byte on: through messages
+by a compiled loop, and over every other record by hand.
 """
 
 import struct
-from dataclasses import dataclass
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -15,11 +15,11 @@ from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from skills.errors import UnreadableRecording
+from skills.recordings import _kernels
 from skills.recordings.source import HEAD
 from skills.style._arrays import Ints
 
 RECORD_LIMIT = 300_000  # of all records but messages: 5,600 chunks with 50 indexes each, as rosbag2 writes, are 286,000
-SMALL_BYTES = 4096  # so few are followed one by one
 
 MESSAGE: Final = struct.Struct("<HIQQ")  # channel, sequence number, log time, publish time; then the content
 DEFINITIONS = (Opcode.SCHEMA, Opcode.CHANNEL)
@@ -27,109 +27,101 @@ PRIVATE = 0x80  # opcodes from here on are nobody's business (specification, "Op
 
 Bytes = NDArray[np.uint8]
 
-_RUNS = 1000  # beyond it records are followed one by one
-_ROUNDS = 3
-_NONE: Final = np.zeros(0, dtype=np.int64)
 
-
-@dataclass(frozen=True, eq=False)
 class Chain:
-    """Records that stand one behind the other.
+    """Records that stand one behind the other, followed from the first byte on, piece by piece.
 
     Attributes:
-        messages: Where the heads of messages begin, shape (N,).
-        lengths: The length of each message's content, its times included, shape (N,).
-        others: Opcode, beginning and end of the content of every other record.
+        others: Opcode, beginning and end of the content of every record that is no message.
         end: Where the last whole record ends.
     """
 
-    messages: Ints
-    lengths: Ints
-    others: list[tuple[int, int, int]]
-    end: int
+    def __init__(self, data: Bytes) -> None:
+        """Begin with bytes that begin with a record's head, shape (B,); what they are may be written piece by piece."""
+        self.others: list[tuple[int, int, int]] = []
+        self.end = 0
+        self._data = looked_at(data)
+        self._count = 0
+        most = len(data) // (HEAD.size + MESSAGE.size)
+        self._messages, self._lengths = np.empty(most, np.int64), np.empty(most, np.int64)
+        self._channels, self._log_ns = np.empty(most, np.uint16), np.empty(most, np.uint64)
+
+    def follow(self, to: int) -> None:
+        """Follow on, up to a byte or the first record that is not whole before it or no message or definition.
+
+        Raises:
+            UnreadableRecording: More other records than any recorder writes.
+        """
+        data = self._data[:to]
+        view, found = data.data, (self._messages, self._lengths, self._channels, self._log_ns)
+        while True:
+            self._count, self.end = map(int, _kernels.follow_compiled(data, self.end, self._count, *found))
+            before = len(self.others)
+            while (other := _other(view, self.end)) is not None:
+                self.others.append(other)
+                check_records(len(self.others))
+                self.end = other[2]
+            if len(self.others) == before:
+                break
+
+    @property
+    def messages(self) -> Ints:
+        """Where the heads of messages begin, shape (N,)."""
+        return self._messages[: self._count]
+
+    @property
+    def lengths(self) -> Ints:
+        """The length of each message's content, shape (N,)."""
+        return self._lengths[: self._count]
+
+    @property
+    def channels(self) -> NDArray[np.uint16]:
+        """The number of each message's channel, shape (N,)."""
+        return self._channels[: self._count]
+
+    @property
+    def log_ns(self) -> NDArray[np.uint64]:
+        """When each was logged, unsigned nanoseconds, shape (N,)."""
+        return self._log_ns[: self._count]
+
+    @cached_property
+    def counts(self) -> Ints:
+        """How many messages each channel has, by its number; ask when all is followed."""
+        return np.bincount(self.channels)
+
+    def of(self, number: int) -> Ints:
+        """Say which messages are of one channel that has some, in the order of the file."""
+        end = int(self._ends[number])
+        return self._by_channel[end - int(self.counts[number]) : end]
+
+    @cached_property
+    def _by_channel(self) -> Ints:
+        return np.argsort(self.channels, kind="stable")
+
+    @cached_property
+    def _ends(self) -> Ints:
+        return np.cumsum(self.counts)
 
 
 def follow(data: Bytes) -> Chain:
     """Follow records that stand one behind the other, up to the first that is not whole or no message or definition.
 
-    Every place that could be a message's head is looked at at once; where one ends at the next, nothing is to be done.
-
     Args:
         data: Bytes that begin with a record's head, shape (B,).
+
+    Raises:
+        UnreadableRecording: More other records than any recorder writes.
     """
-    if len(data) <= SMALL_BYTES:
-        return follow_one_by_one(data)
-    found = np.flatnonzero(data[: max(0, len(data) - HEAD.size + 1)] == int(Opcode.MESSAGE))
-    said = numbers_at(data, found + 1, "<u8")
-    fits = (said >= MESSAGE.size) & (said <= (len(data) - HEAD.size - found).astype(np.uint64))
-    found, lengths, ends = _without_inner(found[fits], said[fits].astype(np.int64))
-    runs: list[slice] = []
-    others: list[tuple[int, int, int]] = []
-    at = 0
-    while at < len(data):
-        first = int(np.searchsorted(found, at))
-        if first < len(found) and found[first] == at:
-            run = int(np.searchsorted(ends, first))
-            last = int(ends[run]) if run < len(ends) else len(found) - 1
-            runs.append(slice(first, last + 1))
-            at = int(found[last] + HEAD.size + lengths[last])
-        elif (other := _other(data.data, at)) is not None:
-            others.append(other)
-            at = other[2]
-        elif _is_message(data.data, at):
-            return follow_one_by_one(data)
-        else:
-            break
-        if len(runs) + len(others) > _RUNS:
-            return follow_one_by_one(data)
-    return Chain(_along(found, runs), _along(lengths, runs), others, at)
+    chain = Chain(data)
+    chain.follow(len(data))
+    return chain
 
 
-def _without_inner(found: Ints, lengths: Ints) -> tuple[Ints, Ints, Ints]:
-    """Leave out what only looks like a head and stands inside a message; also say after which the next does not follow.
-
-    It goes by the message before it, which may be none either: whoever misses a message must look for himself.
-    """
-    for _ in range(_ROUNDS):
-        after = found + HEAD.size + lengths
-        ends = np.flatnonzero(after[:-1] != found[1:])
-        inner = ends[ends + 2 < len(found)]
-        inner = inner[after[inner] == found[inner + 2]] + 1
-        if not len(inner):
-            break
-        found, lengths = np.delete(found, inner), np.delete(lengths, inner)
-    return found, lengths, np.flatnonzero((found + HEAD.size + lengths)[:-1] != found[1:])
-
-
-def _along(column: Ints, runs: list[slice]) -> Ints:
-    return column[runs[0]] if len(runs) == 1 else np.concatenate([_NONE, *(column[run] for run in runs)])
-
-
-def follow_one_by_one(data: Bytes) -> Chain:
-    """Follow records as `follow` does, one after the other."""
-    messages: list[int] = []
-    lengths: list[int] = []
-    others: list[tuple[int, int, int]] = []
-    at, size, view, unpack_head = 0, len(data), data.data, HEAD.unpack_from
-    while at + HEAD.size <= size:
-        _, length = unpack_head(view, at)
-        if _is_message(view, at):
-            messages.append(at)
-            lengths.append(length)
-            at += HEAD.size + length
-        elif (other := _other(view, at)) is not None:
-            others.append(other)
-            at = other[2]
-            check_records(len(others))
-        else:
-            break
-    return Chain(np.array(messages, dtype=np.int64), np.array(lengths, dtype=np.int64), others, at)
-
-
-def numbers_at(data: Bytes, places: Ints, kind: str) -> NDArray[np.uint64]:
-    """Read a number at each place, aligned or not."""
-    size = np.dtype(kind).itemsize
-    return np.ndarray((max(0, len(data) - size + 1),), kind, data, 0, (1,))[places]
+def looked_at(data: Bytes) -> Bytes:
+    """Show bytes that cannot be written to: what the compiled loops are compiled for."""
+    shown = data.view()
+    shown.setflags(write=False)
+    return shown
 
 
 def check_records(count: int) -> None:
@@ -139,15 +131,6 @@ def check_records(count: int) -> None:
             f"The file has more than {RECORD_LIMIT} records beside its messages. Record with larger chunks.",
             records=count,
         )
-
-
-def _is_message(data: memoryview, at: int) -> bool:
-    """Say whether a whole message begins here."""
-    begin = at + HEAD.size
-    if begin > len(data) or data[at] != Opcode.MESSAGE:
-        return False
-    _, length = HEAD.unpack_from(data, at)
-    return bool(MESSAGE.size <= length <= len(data) - begin)
 
 
 def _other(data: memoryview, at: int) -> tuple[int, int, int] | None:

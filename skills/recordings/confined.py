@@ -7,20 +7,24 @@ refusal of the file. The recording, or the refusal, comes back through a file, a
 import json
 import logging
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from io import BytesIO
 from threading import BoundedSemaphore
 from typing import IO, Any, BinaryIO, Self
 
+import numpy as np
+
 from skills import errors, packing
+from skills.compiled import check_kept, kept_in, make_ready
 from skills.confined.forked import ForkServer
 from skills.confined.limits import Limits
 from skills.errors import BadInput, Busy, SkillsError, TooLarge, Unanswered, UnknownFormat, UnreadableRecording
-from skills.recordings import read_recording
+from skills.recordings import _kernels, read_recording, write_mcap
 from skills.style.recording import BaseFrame, Joints, Label, Motion, Recording, Signal, TopicInfo
 
-PARSE = f"{__name__}:parse"
+PARSE, READY = f"{__name__}:parse", f"{__name__}:get_ready"
 WAITING = 24  # of the 40 threads that answer requests; the others go on answering
 MAX_MESSAGE = 5000
 
@@ -71,7 +75,7 @@ class ConfinedReader:
     def __init__(self, limits: Limits, *, answer_bytes: int, at_once: int, target: str = PARSE) -> None:
         self.limits = limits
         self.answer_bytes = answer_bytes
-        self.server = ForkServer(__name__)
+        self.server = ForkServer(READY)
         self._target = target
         self._turns = BoundedSemaphore(at_once)
         self._places = BoundedSemaphore(WAITING)
@@ -85,11 +89,12 @@ class ConfinedReader:
         """End it, and what is being read."""
         self.server.close()
 
-    def __call__(self, file: BinaryIO, **how: Any) -> Recording:
+    def __call__(self, file: BinaryIO, *, target: str | None = None, **how: Any) -> Recording:
         """Read a recording as `read_recording` does.
 
         Args:
             file: A real file, not one that is only in memory; left open.
+            target: What reads instead, as `module:function`; it is called as `parse` is.
             how: Further arguments of `read_recording`.
 
         Raises:
@@ -99,7 +104,7 @@ class ConfinedReader:
         """
         with self._turn():
             try:
-                with self.server.run(self._target, file, how, self.limits) as answer:
+                with self.server.run(target or self._target, file, how, self.limits) as answer:
                     return _recording(answer, self.answer_bytes)
             except Unanswered as error:
                 words = "\n".join(getattr(error, "__notes__", ()))
@@ -148,10 +153,25 @@ def _unreadable(cause: str, did: str) -> UnreadableRecording:
 # ---- inside the process ----------------------------------------------------------------------------------------
 
 
+def get_ready() -> None:
+    """Read the shortest recording there is, so that every fork finds the compiled loops loaded."""
+    folder = kept_in(_kernels.follow_compiled)
+    check_kept(folder)
+    stamps_ns, tip_mm = np.array([0, 1]), np.zeros((2, 3))
+    motion = Motion("PSM1", "/PSM1/measured_cp", "ECM", stamps_ns, tip_mm, np.tile([0.0, 0.0, 0.0, 1.0], (2, 1)))
+    data = write_mcap(Recording("mcap", "full", (motion,)))
+    make_ready(lambda: read_recording(BytesIO(data)), folder)
+
+
 def parse(file: BinaryIO, answer: BinaryIO, **how: Any) -> None:
     """Read a recording, and write it or its refusal."""
+    answered(read_recording, file, answer, **how)
+
+
+def answered(read: Callable[..., Recording], file: BinaryIO, answer: BinaryIO, **how: Any) -> None:
+    """Read with one of our readers, and write what it gave or refused."""
     try:
-        value: Recording | Refusal = read_recording(file, **how)
+        value: Recording | Refusal = read(file, **how)
     except SkillsError as error:
         value = Refusal.of(error)
     except MemoryError:

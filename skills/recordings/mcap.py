@@ -17,17 +17,18 @@ else is beside it: a topic of it that cannot be used is left out, and `left_out`
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import BinaryIO
+from functools import cached_property
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from skills.errors import MixedFrames, NoUsableTopic, SkillsError, UnreadableRecording
 from skills.recordings import topics
-from skills.recordings.cdr import Columns, Decoder, Wanted, fields_of
+from skills.recordings.cdr import Columns, Decoder, Field, Taken, Wanted, decode_together, fields_of, joined
 from skills.recordings.source import RECOVER
 from skills.recordings.topics import Kind, Meaning
-from skills.recordings.walker import MAGIC, Channel, Schema, Stretch, Walker
+from skills.recordings.walker import MAGIC, Channel, Part, Schema, Stretch, Walker
 from skills.style._arrays import Floats, Ints
 from skills.style.recording import Joints, Motion, Recording, Signal, TopicInfo, recorded_motion
 
@@ -87,8 +88,14 @@ class _Topic:
 
     name: str
     meaning: Meaning
-    log_ns: list[NDArray[np.uint64]] = field(default_factory=list)
-    columns: list[Columns] = field(default_factory=list)
+    parts: list[Columns | Taken] = field(default_factory=list)
+
+    @cached_property
+    def columns(self) -> list[Columns]:
+        """All of it as columns, made when it is complete; the parts are let go."""
+        columns = joined(self.parts)
+        self.parts.clear()
+        return columns
 
     @property
     def is_needed(self) -> bool:
@@ -105,29 +112,35 @@ class _Log:
     decoders: dict[int, Decoder | None] = field(default_factory=dict)
     left_out: dict[str, str] = field(default_factory=dict)
     foreign: list[Channel] = field(default_factory=list)
+    fields: dict[int, tuple[Field, ...]] = field(default_factory=dict)
 
-    def take(self, stretch: Stretch) -> None:
-        """Decode and keep messages, if their topic is used."""
-        number = stretch.channel.number
-        if number not in self.decoders:
-            self.decoders[number] = self._decoder(stretch.channel)
-        decoder = self.decoders[number]
-        if decoder is None or stretch.channel.topic in self.left_out:
-            return
-        topic = self.topics[stretch.channel.topic]
-        try:
-            topic.columns.append(decoder.decode(stretch.data, stretch.begin, stretch.length))
-            topic.log_ns.append(stretch.log_ns)
-        except SkillsError as error:
-            self.leave_out(topic, error)
+    def take(self, part: Part) -> None:
+        """Decode and keep the messages of a part whose topics are used."""
+        channels = [self.walker.channels[number] for number in part.numbers]
+        used = {channel.number: decoder for channel in channels if (decoder := self._decoder_of(channel)) is not None}
+        together = decode_together(used, part.data, part.chain)
+        for number, decoder in used.items():
+            channel = self.walker.channels[number]
+            topic = self.topics[channel.topic]
+            if topic.name in self.left_out:  # since the channel before, which had the same topic
+                continue
+            try:
+                topic.parts.append(together[number] if number in together else _alone(decoder, part.of(channel)))
+            except SkillsError as error:
+                self.leave_out(topic, error)
+
+    def _decoder_of(self, channel: Channel) -> Decoder | None:
+        """Return what decodes a channel; None where it is not used."""
+        if channel.number not in self.decoders:
+            self.decoders[channel.number] = self._decoder(channel)
+        return None if channel.topic in self.left_out else self.decoders[channel.number]
 
     def leave_out(self, topic: _Topic, error: SkillsError) -> None:
         """Do without a topic that cannot be used, unless the demonstration rests on it."""
         if topic.is_needed:
             raise error
         self.left_out[topic.name] = str(error)
-        topic.columns.clear()
-        topic.log_ns.clear()
+        topic.parts.clear()
 
     def type_of(self, channel: Channel) -> str:
         """Return the message type of a channel; a channel without schema has none."""
@@ -147,16 +160,22 @@ class _Log:
         wanted = _POSITION if meaning.kind in (Kind.JAW, Kind.GRIPPER) else _WANTED[message_type]
         try:
             _check_encoding(channel, schema)
-            return Decoder(channel.topic, fields_of(schema.name, _text(schema)), wanted)
+            if channel.schema not in self.fields:
+                self.fields[channel.schema] = fields_of(schema.name, _text(schema))
+            return Decoder(channel.topic, self.fields[channel.schema], wanted)
         except SkillsError as error:
             self.leave_out(topic, error)
             return None
 
 
+def _alone(decoder: Decoder, stretch: Stretch) -> Columns:
+    return decoder.decode(stretch.data, stretch.begin, stretch.length)
+
+
 def _read_log(file: BinaryIO) -> _Log:
     log = _Log(Walker(file))
-    for stretch in log.walker.stretches():
-        log.take(stretch)
+    for part in log.walker.parts():
+        log.take(part)
     if log.foreign:
         channel, integrity = log.foreign[0], log.walker.integrity
         schema = log.walker.schemas[channel.schema]
@@ -194,7 +213,7 @@ def _recording(log: _Log) -> Recording:
     motions, masters, joints, tools = [], [], [], []
     signals: dict[Kind, dict[str, Signal]] = {kind: {} for kind in Kind}
     for topic in sorted(log.topics.values(), key=lambda topic: topic.name):
-        if not topic.columns:
+        if not topic.parts:
             continue
         kind, whose = topic.meaning.kind, topic.meaning.whose
         try:
@@ -286,7 +305,7 @@ def _signal(topic: _Topic) -> Signal:
 
 def _tool(topic: _Topic) -> str:
     """Return the last instrument that was named."""
-    log_ns = np.concatenate(topic.log_ns)
+    log_ns = np.concatenate([columns.log_ns for columns in topic.columns])
     said = [columns.labels[k] for columns in topic.columns for k in columns.label_of.tolist()]
     last: str = said[len(said) - 1 - int(np.argmax(log_ns[::-1]))]
     if len(last) > TOOL_LIMIT or not last.isprintable():
@@ -296,26 +315,31 @@ def _tool(topic: _Topic) -> str:
 
 def _in_order(topic: _Topic) -> tuple[Ints, Floats]:
     """Return stamps, shape (T,), and values, shape (T, K), in the order of their log time."""
-    log_ns = np.concatenate(topic.log_ns)
+    log_ns = np.concatenate([columns.log_ns for columns in topic.columns])
     widths = sorted({columns.values.shape[1] for columns in topic.columns})
     if len(widths) > 1:
         raise NoUsableTopic(
             f"{topic.name} has messages with {widths[0]} and with {widths[1]} values; record them apart.",
             topic=topic.name,
         )
-    stamps_ns = np.concatenate(list(_stamps(topic)))
-    values = np.concatenate([columns.values for columns in topic.columns])
+    stamps_ns = _concatenated(list(_stamps(topic)))
+    values = _concatenated([columns.values for columns in topic.columns])
     if (log_ns[1:] >= log_ns[:-1]).all():
         return stamps_ns, values
     order = np.argsort(log_ns, kind="stable")
     return stamps_ns[order], values[order]
 
 
+def _concatenated(arrays: list[NDArray[Any]]) -> NDArray[Any]:
+    """Join arrays; most often there is only one."""
+    return arrays[0] if len(arrays) == 1 else np.concatenate(arrays)
+
+
 def _stamps(topic: _Topic) -> Iterable[Ints]:
-    for log_ns, columns in zip(topic.log_ns, topic.columns, strict=True):
+    for columns in topic.columns:
         if columns.stamps_ns is not None:
             yield columns.stamps_ns
-        elif log_ns.max() < 2**63:
-            yield log_ns.astype(np.int64)
+        elif columns.log_ns.max() < 2**63:
+            yield columns.log_ns.astype(np.int64)
         else:
             raise UnreadableRecording(f"{topic.name} was logged after the year 2262.", topic=topic.name)

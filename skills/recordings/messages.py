@@ -97,17 +97,18 @@ def joint_state(
     positions: Sequence[float],
     names: Sequence[str] = (),
     *,
+    velocities: Sequence[float] = (),
     frame: str = "",
     log_ns: int | None = None,
 ) -> Message:
-    """Write the positions of joints, rad or m, and nothing of their velocities and efforts."""
+    """Write the positions of joints, rad or m, and their velocities where they are given; nothing of their efforts."""
     body = _Body()
     body.header(stamp_ns, frame)
     body.put("I", len(names))
     for name in names:
         body.text(name)
     body.numbers("d", positions)
-    body.numbers("d", ())
+    body.numbers("d", velocities)
     body.numbers("d", ())
     return Message(stamp_ns if log_ns is None else log_ns, topic, JOINT_STATE, bytes(body.data))
 

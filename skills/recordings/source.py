@@ -4,15 +4,16 @@ A number is little-endian; a text has its length before it, as bytes and maps of
 """
 
 import struct
-import zlib
 from typing import BinaryIO, Final
+
+from isal.isal_zlib import crc32
 
 from skills.errors import UnreadableRecording
 
 RECOVER = "`mcap recover FILE -o NEW` writes what can be saved into a new file."
 HEAD: Final = struct.Struct("<BQ")  # of a record: opcode, length of the content
 
-_BLOCK_BYTES = 2**20
+_BLOCK_BYTES = 2**16
 
 
 class Source:
@@ -20,9 +21,10 @@ class Source:
 
     def __init__(self, file: BinaryIO) -> None:
         self._file = file
-        self._begin = file.tell()
         self._data = b""
         self._at = 0
+        self._summed = 0
+        self._checksum = 0
         self.position = 0
 
     def peek(self, size: int) -> memoryview:
@@ -32,6 +34,7 @@ class Source:
             UnreadableRecording: The file ends before.
         """
         if len(self._data) - self._at < size:
+            self.checksum()
             rest = self._data[self._at :]
             pieces, missing = [rest], size - len(rest)
             while missing > 0:  # piece by piece: a length that lies must not cost more memory than the file has bytes
@@ -40,7 +43,7 @@ class Source:
                     raise UnreadableRecording(f"The MCAP file is truncated: it ends within a record. {RECOVER}")
                 pieces.append(piece)
                 missing -= len(piece)
-            self._data, self._at = b"".join(pieces), 0
+            self._data, self._at, self._summed = b"".join(pieces), 0, 0
         return memoryview(self._data)[self._at :]
 
     def take(self, size: int) -> memoryview:
@@ -64,14 +67,15 @@ class Source:
         """Show the opcode of the next record."""
         return self.peek(HEAD.size)[0]
 
-    def checksum_of(self, begin: int, end: int) -> int:
-        """Compute the CRC-32 of a part of what was read; few files have one of so much, so it is read again."""
-        back, checksum = self._file.tell(), 0
-        self._file.seek(self._begin + begin)
-        for at in range(begin, end, _BLOCK_BYTES):
-            checksum = zlib.crc32(self._file.read(min(_BLOCK_BYTES, end - at)), checksum)
-        self._file.seek(back)
-        return checksum
+    def checksum(self) -> int:
+        """Compute the CRC-32 of all that was taken since the beginning, or since it was begun anew."""
+        self._checksum = crc32(memoryview(self._data)[self._summed : self._at], self._checksum)
+        self._summed = self._at
+        return self._checksum
+
+    def begin_checksum(self) -> None:
+        """Compute the CRC-32 of what is taken from here on."""
+        self._checksum, self._summed = 0, self._at
 
     def rest(self) -> bytes:
         """Show whether anything is left."""

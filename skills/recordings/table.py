@@ -22,13 +22,17 @@ from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 
-from skills.errors import BadColumns, BadSettings, NotFinite, NoUsableTopic, UnreadableRecording
+from skills.errors import BadColumns, BadSettings, NotFinite, NotMetres, NoUsableTopic, UnreadableRecording
 from skills.style._arrays import Floats, Ints
-from skills.style.recording import Recording, Signal, TopicInfo, recorded_motion
+from skills.style.kinematics import CANNULA_MM, INSTRUMENTS
+from skills.style.recording import Motion, Recording, Signal, TopicInfo, recorded_motion
 
 TOPIC = "table"
 DEFAULT_FRAME = "PSM_base"  # relative to the remote centre of motion
 DEFAULT_ARM = "PSM"
+# The tip is further from the remote centre than the wrist, for that bends by less than a right angle. What reaches
+# 290 mm reaches 11.4 inches: a path in inches never comes so far.
+OUTSIDE_MM = min(CANNULA_MM - instrument.wrist_offset_mm for instrument in INSTRUMENTS.values())
 
 if TYPE_CHECKING:
     from _csv import Reader as _Rows
@@ -81,19 +85,19 @@ def read_table(
     """
     table = _read(file, rate_hz)
     stamps_ns = _stamps_ns(table, rate_hz)
+    motion = recorded_motion(
+        arm=arm,
+        topic=TOPIC,
+        frame=frame,
+        stamps_ns=stamps_ns,
+        tip_mm=_tip_mm(table),
+        rotation_xyzw=_rotation_xyzw(table),
+    )
+    _check_outside(motion)
     return Recording(
         format="csv",
         integrity="none",
-        motions=(
-            recorded_motion(
-                arm=arm,
-                topic=TOPIC,
-                frame=frame,
-                stamps_ns=stamps_ns,
-                tip_mm=_tip_mm(table),
-                rotation_xyzw=_rotation_xyzw(table),
-            ),
-        ),
+        motions=(motion,),
         jaws=tuple((arm, signal) for signal in [_signal(table, "jaw_rad", stamps_ns)] if signal is not None),
         clutch=_signal(table, "clutch", stamps_ns),
         topics=(TopicInfo(TOPIC, "text/csv", table.rows),),
@@ -229,6 +233,23 @@ def _stamps_ns(table: _Table, rate_hz: float | None) -> Ints:
 
 def _tip_mm(table: _Table) -> Floats:
     return 1000.0 * table.stacked(_METRES) if "x_m" in table.columns else table.stacked(_MILLIMETRES)
+
+
+def _check_outside(motion: Motion) -> None:
+    """Refuse a path that never leaves the cannula: its numbers are in another unit, or from another origin."""
+    if not motion.frame.endswith("_base"):
+        return
+    away_mm = np.sqrt(np.einsum("ij,ij->i", motion.tip_mm, motion.tip_mm))
+    furthest = int(np.argmax(away_mm))
+    if away_mm[furthest] < OUTSIDE_MM:
+        at_s = (int(motion.stamps_ns[furthest]) - int(motion.stamps_ns[0])) / 1e9
+        raise NotMetres(
+            f"The tip is never further from the remote centre than {away_mm[furthest]:.3g} mm (at {at_s:.3f} s); with "
+            f"less than {OUTSIDE_MM:.3g} mm its wrist is inside the cannula. Give the positions in the unit that the "
+            "columns name, not in inches; or name the frame, if they are not from the remote centre.",
+            sample=furthest,
+            furthest_mm=float(away_mm[furthest]),
+        )
 
 
 def _rotation_xyzw(table: _Table) -> Floats | None:

@@ -11,14 +11,13 @@ claimed before anything is unpacked; a recorder is far from all of them (MCAP sp
 """
 
 import struct
-import zlib
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import accumulate, pairwise
 from typing import BinaryIO, Final
 
 import numpy as np
+from isal.isal_zlib import crc32
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
@@ -27,19 +26,18 @@ from skills.recordings.chain import (
     DEFINITIONS,
     MESSAGE,
     PRIVATE,
-    SMALL_BYTES,
     Bytes,
     Chain,
     check_records,
     follow,
-    numbers_at,
 )
+from skills.recordings.shapes import SLACK_BYTES
 from skills.recordings.source import HEAD, RECOVER, Fields, Source
 from skills.recordings.unpack import unpack
 from skills.style._arrays import Ints
 from skills.style.recording import Integrity
 
-__all__ = ["MAGIC", "NOTES", "Channel", "Schema", "Stretch", "Walker"]
+__all__ = ["MAGIC", "NOTES", "Channel", "Part", "Schema", "Stretch", "Walker"]
 
 MAGIC = b"\x89MCAP0\r\n"
 
@@ -53,12 +51,10 @@ NOTES_LIMIT_BYTES = 2**16
 
 NOTES = "suture-skills"  # the metadata record in which our own writer says what a file was made from
 
-
 _CHUNK: Final = struct.Struct("<QQQI")  # first and last time, size, checksum; then its compression and its bytes
 _STATISTICS: Final = struct.Struct("<QHIIIIQQI")
-_PART_BYTES = 4 * 2**20  # small enough for a processor's cache, large enough for numpy to pay
-_FOOTER_BYTES = HEAD.size + 16  # up to its checksum
-_SLACK = bytes(8)
+_PART_BYTES = 8 * 2**20  # small enough for a processor's cache, large enough for numpy to pay
+_FOOTER: Final = struct.Struct("<QQ")  # where the summary and its offsets begin; then its checksum
 _SUMMARY = (
     *(Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS, Opcode.SUMMARY_OFFSET),
     *(Opcode.CHUNK_INDEX, Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX),
@@ -87,7 +83,7 @@ class Channel:
 
 @dataclass(frozen=True, eq=False)
 class Stretch:
-    """Some messages of one channel, in the order of the file.
+    """Some messages of one channel, in the order of the file; its bytes are there until the walk goes on.
 
     Attributes:
         channel: Whose they are.
@@ -105,12 +101,30 @@ class Stretch:
 
 
 @dataclass(frozen=True, eq=False)
-class _Part:
-    """Some MiB of records, and whether checksums of their chunks cover them; `_SLACK` stands behind the data."""
+class Part:
+    """Some MiB of records; its bytes are there until the walk goes on.
+
+    Attributes:
+        data: Bytes of the file, unpacked, shape (B,); 8 bytes that are none of the file's stand behind them.
+        chain: Where the records are.
+        has_checksum: Whether checksums of their chunks cover them.
+    """
 
     data: Bytes
     chain: Chain
     has_checksum: bool
+
+    @property
+    def numbers(self) -> list[int]:
+        """The channels that have messages here, ascending."""
+        numbers: list[int] = np.flatnonzero(self.chain.counts).tolist()
+        return numbers
+
+    def of(self, channel: Channel) -> Stretch:
+        """Show the messages of one channel that has some here."""
+        which = self.chain.of(channel.number)
+        contents = self.chain.messages[which] + (HEAD.size + MESSAGE.size)
+        return Stretch(channel, self.data, self.chain.log_ns[which], contents, self.chain.lengths[which])
 
 
 class Walker:
@@ -155,31 +169,38 @@ class Walker:
         Raises:
             UnreadableRecording: Truncated, corrupt, not whole, or over a limit.
         """
+        for part in self.parts():
+            yield from (part.of(self.channels[number]) for number in part.numbers)
+
+    def parts(self) -> Iterator[Part]:
+        """Walk: give one part of the file after the other, as `stretches` does."""
         self._begin()
         for part in self._parts():
-            yield from self._taken(part)
+            self._take(part)
+            yield part
         self._read_summary()
 
-    def _parts(self) -> Iterator["_Part"]:
-        """Give the records of the data section some MiB at a time."""
-        waiting: list[bytes] = []
-        size, of_checksum = 0, False
+    def _parts(self) -> Iterator[Part]:
+        """Give the records of the data section some MiB at a time, each time in the same space."""
+        space, end, covered = np.empty(_PART_BYTES + SLACK_BYTES, np.uint8), 0, False
+        chain = Chain(space)
         for data, has_checksum in self._data_section():
-            if waiting and (has_checksum != of_checksum or size + len(data) > _PART_BYTES):
-                yield self._part(waiting, of_checksum)
-                waiting, size = [], 0
-            waiting.append(data)
-            size += len(data)
-            of_checksum = has_checksum
-        if waiting:
-            yield self._part(waiting, of_checksum)
-
-    def _part(self, pieces: list[bytes], has_checksum: bool) -> "_Part":
-        data = np.frombuffer(b"".join([*pieces, _SLACK]), np.uint8)
-        chain = follow(data[: -len(_SLACK)])
-        _check_ends(chain, pieces)
-        self._count(len(chain.others))
-        return _Part(data, chain, has_checksum)
+            if end and (has_checksum != covered or end + len(data) > _PART_BYTES):
+                yield Part(space[: end + SLACK_BYTES], chain, covered)
+                chain, end = Chain(space), 0
+            if len(data) + SLACK_BYTES > len(space):
+                space = np.empty(len(data) + SLACK_BYTES, np.uint8)
+                chain = Chain(space)
+            space[end : end + len(data)] = np.frombuffer(data, np.uint8)
+            end += len(data)
+            covered = has_checksum
+            chain.follow(end)
+            if chain.end != end:
+                raise UnreadableRecording(
+                    f"A chunk holds something else than whole messages and definitions. {RECOVER}"
+                )
+        if end:
+            yield Part(space[: end + SLACK_BYTES], chain, covered)
 
     # ---- the file's records
 
@@ -196,14 +217,14 @@ class Walker:
     def _data_section(self) -> Iterator[tuple[bytes, bool]]:
         """Give bytes that hold whole records, and whether a checksum of their own covers them."""
         while True:
-            ends = self._source.position
-            if self._source.next_opcode() in (*DEFINITIONS, Opcode.MESSAGE):
+            opcode = self._source.next_opcode()
+            if opcode == Opcode.DATA_END:
+                self._check_data_end(self._source.checksum())
+                return
+            if opcode in (*DEFINITIONS, Opcode.MESSAGE):
                 yield self._run(), False
                 continue
             opcode, length = self._source.head()
-            if opcode == Opcode.DATA_END:
-                self._check_data_end(self._source.take(length), ends)
-                return
             if opcode == Opcode.CHUNK:
                 yield self._chunk(length)
             elif opcode == Opcode.METADATA:
@@ -220,10 +241,7 @@ class Walker:
         _, length = HEAD.unpack_from(self._source.peek(HEAD.size))
         if length > CHUNK_LIMIT_BYTES:
             raise UnreadableRecording(f"A message or definition of {length} bytes is over the limit. {RECOVER}")
-        block = np.frombuffer(self._source.peek(HEAD.size + length), np.uint8)
-        size = max(HEAD.size + length, SMALL_BYTES)
-        while (end := follow(block[:size]).end) > size // 2 and size < len(block):
-            size *= 4  # so that a look ahead costs no more than what it finds
+        end = follow(np.frombuffer(self._source.peek(HEAD.size + length), np.uint8)).end
         if end == 0:
             raise UnreadableRecording(f"A message is shorter than its own times. {RECOVER}")
         return bytes(self._source.take(end))
@@ -239,7 +257,7 @@ class Walker:
         compression, stored = fields.text(), fields.long_bytes()
         self._check_size(size)
         data = unpack(stored, compression, size)
-        if checksum and zlib.crc32(data) != checksum:
+        if checksum and crc32(data) != checksum:
             raise UnreadableRecording(f"The checksum (CRC) of chunk {self._chunks} is wrong. {RECOVER}")
         return data, checksum != 0
 
@@ -264,15 +282,17 @@ class Walker:
         if fields.text() == NOTES and not self.notes:
             self.notes.update(fields.texts())
 
-    def _check_data_end(self, content: memoryview, ends: int) -> None:
-        said = Fields(content).number(4)
-        if said and said != self._source.checksum_of(0, ends):
+    def _check_data_end(self, checksum: int) -> None:
+        _, length = self._source.head()
+        said = Fields(self._source.take(length)).number(4)
+        if said and said != checksum:
             raise UnreadableRecording(f"The checksum (CRC) of the data section is wrong. {RECOVER}")
         self._whole_checksum = said != 0
 
     def _read_summary(self) -> None:
         """Check what follows the messages: its own checksum, the counts in it, and that nothing comes after it."""
         begins = self._source.position
+        self._source.begin_checksum()
         while True:
             opcode, length = self._source.head()
             if opcode == Opcode.FOOTER:
@@ -286,16 +306,15 @@ class Walker:
                 self._define(opcode, self._definition(opcode, length))
             else:
                 self._source.skip(length)
-        self._check_footer(self._source.take(length), begins)
+        self._check_footer(length, begins)
 
-    def _check_footer(self, content: memoryview, begins: int) -> None:
+    def _check_footer(self, length: int, begins: int) -> None:
         """Check where the summary is said to begin, and its checksum, which covers the footer up to itself."""
-        fields = Fields(content)
-        said_begins, _, said = fields.number(8), fields.number(8), fields.number(4)
-        ends = self._source.position - 4
-        there = begins if ends - begins > _FOOTER_BYTES else 0
-        checksum = self._source.checksum_of(begins, ends) if said else 0
-        if len(content) != 20 or said_begins not in (0, there) or said != checksum:
+        said_begins, _ = _FOOTER.unpack(self._source.take(_FOOTER.size))
+        there = begins if self._source.position - begins > HEAD.size + _FOOTER.size else 0
+        checksum = self._source.checksum()
+        said = Fields(self._source.take(4)).number(4)
+        if length != _FOOTER.size + 4 or said_begins not in (0, there) or said not in (0, checksum):
             raise UnreadableRecording(f"The summary at the end of the file is damaged. {RECOVER}")
         if self._source.take(len(MAGIC)) != MAGIC or self._source.rest():
             raise UnreadableRecording("Bytes follow the end of the MCAP file; give one file, not several joined.")
@@ -325,25 +344,17 @@ class Walker:
 
     # ---- records of messages, from a chunk or between chunks
 
-    def _taken(self, part: "_Part") -> Iterator[Stretch]:
-        """Take in what a part defines, and give its messages by channel."""
-        data, chain = part.data, part.chain
-        defined_at = self._take_definitions(data, chain.others)
-        numbers = numbers_at(data, chain.messages + HEAD.size, "<u2")
-        order = np.argsort(numbers, kind="stable")
-        numbers, heads, lengths = numbers[order], chain.messages[order], chain.lengths[order]
-        log_ns = numbers_at(data, heads + HEAD.size + 6, "<u8")
-        edges = [0, *(np.flatnonzero(numbers[1:] != numbers[:-1]) + 1).tolist(), len(numbers)]
-        for begin, end in pairwise(edges):
-            if begin == end:
-                break
-            number, here = int(numbers[begin]), slice(begin, end)
-            if number not in self.channels or heads[begin] < defined_at.get(number, 0):
+    def _take(self, part: Part) -> None:
+        """Take in what a part defines, and count its messages."""
+        chain = part.chain
+        self._count(len(chain.others))
+        defined_at = self._take_definitions(part.data, chain.others)
+        for number in part.numbers:
+            known = number in self.channels
+            if not known or (number in defined_at and chain.messages[chain.of(number)[0]] < defined_at[number]):
                 raise UnreadableRecording(f"A message belongs to channel {number}, which is not defined. {RECOVER}")
-            self.counts[number] += end - begin
-            contents = heads[here] + HEAD.size + MESSAGE.size
-            yield Stretch(self.channels[number], data, log_ns[here], contents, lengths[here] - MESSAGE.size)
-        self._with_checksum += len(numbers) if part.has_checksum else 0
+            self.counts[number] += int(chain.counts[number])
+        self._with_checksum += len(chain.messages) if part.has_checksum else 0
         if self.counts.total() > MESSAGE_LIMIT:
             raise UnreadableRecording(
                 f"The file has more than {MESSAGE_LIMIT} messages; give it in parts.", messages=self.counts.total()
@@ -387,12 +398,3 @@ class Walker:
             what = "schemas" if opcode == Opcode.SCHEMA else "channels"
             raise UnreadableRecording(f"Two {what} have the number {number}. {RECOVER}")
         return number
-
-
-def _check_ends(chain: Chain, pieces: list[bytes]) -> None:
-    """Every piece must hold whole records and nothing else."""
-    *begins, size = accumulate(len(piece) for piece in pieces)
-    others = {begin - HEAD.size for _, begin, _ in chain.others}
-    heads = set(chain.messages[np.searchsorted(chain.messages[:-1], begins)].tolist() if len(chain.messages) else [])
-    if chain.end != size or not set(begins) <= heads | others | {size}:
-        raise UnreadableRecording(f"A chunk holds something else than whole messages and definitions. {RECOVER}")

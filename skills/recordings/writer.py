@@ -22,7 +22,10 @@ from skills.recordings.walker import NOTES
 from skills.style._arrays import Floats
 from skills.style.recording import Joints, Motion, Recording, Signal
 
-__all__ = ["DEFINITIONS", "Written", "messages_of", "write_bag", "write_mcap", "write_messages"]
+__all__ = [
+    *("DEFINITIONS", "Written", "bag_folder", "messages_of", "metadata_of"),
+    *("write_bag", "write_mcap", "write_messages"),
+]
 
 _LIBRARY = "suture-skills"
 _QOS = "offered_qos_profiles"
@@ -81,13 +84,17 @@ def write_messages(said: Iterable[Message], file: IO[bytes], notes: Mapping[str,
 
 
 def write_bag(said: Iterable[Message], name: str = "bag", notes: Mapping[str, str] | None = None) -> bytes:
-    """Return messages as a zipped bag folder, `NAME/metadata.yaml` and `NAME/NAME.mcap`, as `ros2 bag` opens it."""
+    """Return messages as a zipped bag folder, as `ros2 bag` opens it."""
+    out = io.BytesIO()
+    pack({member: io.BytesIO(data) for member, data in bag_folder(said, name, notes).items()}, out)
+    return out.getvalue()
+
+
+def bag_folder(said: Iterable[Message], name: str, notes: Mapping[str, str] | None = None) -> dict[str, bytes]:
+    """Return messages as the files of a bag folder: `NAME/metadata.yaml` and `NAME/NAME.mcap`."""
     file = io.BytesIO()
     written = write_messages(said, file, notes)
-    file.seek(0)
-    out = io.BytesIO()
-    pack({f"{name}/metadata.yaml": io.BytesIO(_metadata(written, f"{name}.mcap")), f"{name}/{name}.mcap": file}, out)
-    return out.getvalue()
+    return {f"{name}/metadata.yaml": metadata_of(written, f"{name}.mcap"), f"{name}/{name}.mcap": file.getvalue()}
 
 
 def messages_of(recording: Recording) -> list[Message]:
@@ -161,7 +168,7 @@ def _samples(signal: Signal) -> Iterator[tuple[int, float]]:
     return zip(signal.stamps_ns.tolist(), signal.values.tolist(), strict=True)
 
 
-def _metadata(written: Written, file: str) -> bytes:
+def metadata_of(written: Written, file: str) -> bytes:
     """Return metadata.yaml as ROS 2 Jazzy writes it, which is its version 9."""
     start_ns, count = written.first_ns or 0, sum(written.counts.values())
     duration_ns = written.last_ns - start_ns

@@ -1,12 +1,13 @@
 """The still picture of a plan: the simulator's photograph with the passes drawn into it. Metres; no simulator here.
 
-What lies behind a surface of the photograph is drawn pale. Everything is done at twice the size and then halved, which
-smooths the edges that the simulator's renderer leaves.
+What lies behind a surface of the photograph is drawn pale. Everything is done at a larger scale and then shrunk, which
+smooths the edges that the simulator's renderer leaves. `skills.sim.film` draws its frames with the same pen.
 """
 
 import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from math import radians, tan
 
 import numpy as np
@@ -14,18 +15,29 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from skills.style._arrays import Floats
+from skills.style.kinematics import Bools
 
 WIDTH, HEIGHT = 640, 480
-_SCALE = 2
+_SCALE = 2.0
 _DOT_EVERY_M = 0.005  # the paper's cell
+_BEHIND_M = 0.001
 # Told apart by the colour-blind too (Okabe and Ito).
-PASS_COLOURS = ((213, 94, 0), (0, 114, 178), (204, 121, 167), (230, 159, 0), (86, 180, 233), (0, 0, 0))
-GOAL_COLOUR = (0, 158, 115)
+Colour = tuple[int, int, int]
+PASS_COLOURS: tuple[Colour, ...] = (
+    (213, 94, 0),
+    (0, 114, 178),
+    (204, 121, 167),
+    (230, 159, 0),
+    (86, 180, 233),
+    (0, 0, 0),
+)
+GOAL_COLOUR: Colour = (0, 158, 115)
+WHITE: Colour = (255, 255, 255)
 
 
 @dataclass(frozen=True)
 class Camera:
-    """Where the picture is taken from: around and above a target, z up."""
+    """Where the picture is taken from: around and above a target, z up; it is taken `scale` times as large."""
 
     target_m: tuple[float, float, float]
     distance_m: float
@@ -34,8 +46,9 @@ class Camera:
     field_deg: float = 45.0
     near_m: float = 0.01
     far_m: float = 2.0
-    width: int = WIDTH * _SCALE
-    height: int = HEIGHT * _SCALE
+    width: int = int(WIDTH * _SCALE)
+    height: int = int(HEIGHT * _SCALE)
+    scale: float = _SCALE
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,27 +61,83 @@ class Photograph:
     projection: Floats
 
 
+class Sheet:
+    """A photograph to draw into. Places are metres in the camera's world, sizes pixels of the finished picture."""
+
+    def __init__(self, taken: Photograph, camera: Camera) -> None:
+        self._taken = taken
+        self._camera = camera
+        self._image = Image.fromarray(taken.rgb)
+        self._pen = ImageDraw.Draw(self._image, "RGBA")
+
+    def line(self, path: Floats, colour: Colour, width: float = 1.5, strength: float = 0.9) -> None:
+        """Draw a line along a path, shape (K, 3), pale where something is in front."""
+        pixels, hidden = self._project(path)
+        where = [tuple(pixel) for pixel in pixels.tolist()]
+        for begin, end in _runs(hidden[:-1]):
+            alpha = strength * (0.3 if hidden[begin] else 1.0)
+            fill = (*colour, round(255 * alpha))
+            self._pen.line(where[begin : end + 1], fill=fill, width=round(width * self._camera.scale), joint="curve")
+
+    def dots(self, places: Floats, colour: Colour, radius: float = 2.6, strength: float = 1.0) -> None:
+        """Draw dots, pale where something is in front."""
+        pixels, hidden = self._project(places)
+        for pixel, pale in zip(pixels, hidden.tolist(), strict=True):
+            self._dot(pixel, radius, (*colour, round(255 * strength * (0.35 if pale else 1.0))))
+
+    def label(self, place: Floats, colour: Colour, text: str, size: float = 10.0) -> None:
+        """Put a short text on a disc with a white rim, in front of everything."""
+        pixels, _ = self._project(place[None])
+        self._dot(pixels[0], size * 0.8, (*WHITE, 255))
+        self._dot(pixels[0], size * 0.7, (*colour, 255))
+        font = ImageFont.load_default(size=size * self._camera.scale)
+        self._pen.text(tuple(pixels[0].tolist()), text, fill=(*WHITE, 255), font=font, anchor="mm")
+
+    def finished(self) -> Image.Image:
+        """Shrink the drawing to the size of the finished picture."""
+        size = round(self._camera.width / self._camera.scale), round(self._camera.height / self._camera.scale)
+        return self._image.resize(size, Image.Resampling.LANCZOS)
+
+    def _dot(self, centre: Floats, radius: float, fill: tuple[int, int, int, int]) -> None:
+        x, y, r = float(centre[0]), float(centre[1]), radius * self._camera.scale
+        self._pen.ellipse((x - r, y - r, x + r, y + r), fill=fill)
+
+    def _project(self, points: Floats) -> tuple[Floats, Bools]:
+        """Find the pixels of points, shape (K, 2), and whether they are behind the seen surface, shape (K,)."""
+        taken, camera = self._taken, self._camera
+        ahead = np.concatenate([points, np.ones((len(points), 1))], axis=1) @ taken.view.T
+        clip = ahead @ taken.projection.T
+        ndc = clip[:, :3] / clip[:, 3:]
+        height, width = taken.depth.shape
+        pixels = np.stack([(ndc[:, 0] + 1) / 2 * width, (1 - ndc[:, 1]) / 2 * height], axis=1)
+        column = np.clip(pixels[:, 0].astype(int), 0, width - 1)
+        row = np.clip(pixels[:, 1].astype(int), 0, height - 1)
+        near, far = camera.near_m, camera.far_m
+        surface = far * near / (far - (far - near) * taken.depth[row, column])
+        return pixels, -ahead[:, 2] - surface >= _BEHIND_M
+
+
 def draw(photograph: Callable[[Camera], Photograph], paths: Sequence[Floats]) -> bytes:
-    """Take a photograph that shows all passes and draw them into it; a PNG of 640 x 480.
+    """Take a photograph that shows all passes and draw them into it, numbered from 0; a PNG of 640 x 480.
 
     Args:
         photograph: Takes it.
         paths: The tip's way in each pass, metres in the camera's world, each of shape (K, 3).
     """
-    camera = _facing(np.concatenate(paths))
-    taken = photograph(camera)
-    image = Image.fromarray(taken.rgb)
-    pen = ImageDraw.Draw(image, "RGBA")
+    camera = facing(np.concatenate(paths))
+    sheet = Sheet(photograph(camera), camera)
     for number, path in enumerate(paths):
-        _draw_path(pen, taken, camera, path, PASS_COLOURS[number % len(PASS_COLOURS)])
+        colour = colour_of(number)
+        sheet.line(thinned(path), colour)
+        sheet.dots(stepping_stones(path), colour)
     for number, path in enumerate(paths):
-        _draw_goal(pen, taken, camera, path[-1], str(number + 1))
+        sheet.label(path[-1], GOAL_COLOUR, str(number))
     out = io.BytesIO()
-    image.resize((WIDTH, HEIGHT), Image.Resampling.LANCZOS).save(out, "PNG", optimize=True)
+    sheet.finished().save(out, "PNG", optimize=True)
     return out.getvalue()
 
 
-def _facing(points: Floats) -> Camera:
+def facing(points: Floats) -> Camera:
     """Stand so far away that all points are in the middle two thirds of the picture."""
     low, high = points.min(axis=0), points.max(axis=0)
     x, y, z = ((low + high) / 2).tolist()
@@ -77,44 +146,25 @@ def _facing(points: Floats) -> Camera:
     return Camera(target_m=(x, y, z), distance_m=distance)
 
 
-def _project(points: Floats, taken: Photograph, camera: Camera) -> tuple[Floats, Floats]:
-    """Find the pixels of points, shape (K, 2), and their distance behind the seen surface in metres, shape (K,)."""
-    ahead = np.concatenate([points, np.ones((len(points), 1))], axis=1) @ taken.view.T
-    clip = ahead @ taken.projection.T
-    ndc = clip[:, :3] / clip[:, 3:]
-    height, width = taken.depth.shape
-    pixels = np.stack([(ndc[:, 0] + 1) / 2 * width, (1 - ndc[:, 1]) / 2 * height], axis=1)
-    column = np.clip(pixels[:, 0].astype(int), 0, width - 1)
-    row = np.clip(pixels[:, 1].astype(int), 0, height - 1)
-    near, far = camera.near_m, camera.far_m
-    surface = far * near / (far - (far - near) * taken.depth[row, column])
-    return pixels, -ahead[:, 2] - surface
+def colour_of(number: int) -> Colour:
+    """Choose a pass's colour."""
+    return PASS_COLOURS[number % len(PASS_COLOURS)]
 
 
-def _draw_path(
-    pen: ImageDraw.ImageDraw, taken: Photograph, camera: Camera, path: Floats, colour: tuple[int, int, int]
-) -> None:
-    """Draw a line along the path and a dot every 5 mm, pale where something is in front."""
-    pixels, behind = _project(path, taken, camera)
-    step = max(1, len(path) // 400)
-    for k in range(0, len(path) - step, step):
-        seen = behind[k] < 0.001
-        line = [tuple(pixels[k]), tuple(pixels[k + step])]
-        pen.line(line, fill=(*colour, 230 if seen else 70), width=3)
+def thinned(path: Floats, most: int = 400) -> Floats:
+    """Keep so many points of a path at most, its ends among them."""
+    kept = np.unique(np.linspace(0, len(path) - 1, min(len(path), most)).round().astype(int))
+    return np.asarray(path[kept])
+
+
+def stepping_stones(path: Floats) -> Floats:
+    """Find a point of a path every 5 mm of its length."""
     walked = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1)))
-    for k in np.unique(np.searchsorted(walked, np.arange(0.0, walked[-1] + 1e-9, _DOT_EVERY_M))):
-        _dot(pen, pixels[min(k, len(path) - 1)], 2.6, (*colour, 255 if behind[min(k, len(path) - 1)] < 0.001 else 90))
+    at = np.searchsorted(walked, np.arange(0.0, walked[-1] + 1e-9, _DOT_EVERY_M))
+    return np.asarray(path[np.unique(np.minimum(at, len(path) - 1))])
 
 
-def _draw_goal(pen: ImageDraw.ImageDraw, taken: Photograph, camera: Camera, goal: Floats, label: str) -> None:
-    """Mark where the needle is handed over, with the number of the pass."""
-    pixels, _ = _project(goal[None], taken, camera)
-    _dot(pen, pixels[0], 8.0, (255, 255, 255, 255))
-    _dot(pen, pixels[0], 7.0, (*GOAL_COLOUR, 255))
-    font = ImageFont.load_default(size=10 * _SCALE)
-    pen.text((float(pixels[0, 0]), float(pixels[0, 1])), label, fill=(255, 255, 255, 255), font=font, anchor="mm")
-
-
-def _dot(pen: ImageDraw.ImageDraw, centre: Floats, radius: float, fill: tuple[int, int, int, int]) -> None:
-    x, y, r = float(centre[0]), float(centre[1]), radius * _SCALE
-    pen.ellipse((x - r, y - r, x + r, y + r), fill=fill)
+def _runs(marks: Bools) -> list[tuple[int, int]]:
+    """Split marks into runs of equal ones, as (begin, end)."""
+    cuts = [0, *(np.flatnonzero(np.diff(marks)) + 1).tolist(), len(marks)]
+    return [(begin, end) for begin, end in pairwise(cuts) if end > begin]

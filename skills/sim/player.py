@@ -1,5 +1,6 @@
 """Play a trajectory in the simulator: metres and PyBullet on the other side, millimetres and values on ours."""
 
+import re
 from typing import Any
 
 import numpy as np
@@ -7,12 +8,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from skills.errors import BadInput, SimulationFailed
 from skills.sim import confined, scene, wire
+from skills.style._arrays import Floats, Ints
 from skills.style.kinematics import JAW_TIP_MM, matrix_of
-from skills.style.playback import Playback, WaitingArm
+from skills.style.needle import psm_m_poses
+from skills.style.playback import Playback, link_pairs
 from skills.style.trajectory import Trajectory
 
-SIMULATOR = "skills.sim.scene:simulate"
+SIMULATOR = "skills.sim.passes:simulate"
 PAD_BELOW_MM = 5.0  # ours: how far the finger tips stay above a pad whose height nobody gave
+CLEARANCE_EVERY = 4  # samples: 0.33 mm of the tip's way at 20 mm/s and 240 Hz, and what moves is allowed for
 _PNG = b"\x89PNG\r\n\x1a\n"
 
 
@@ -20,45 +24,63 @@ def play(
     trajectory: Trajectory,
     *,
     pad_top_mm: float | None = None,
-    psm_m: WaitingArm | None = None,
+    clearance_every: int = CLEARANCE_EVERY,
     timeout_s: float = 60.0,
     memory_bytes: int = 1 << 30,
     target: str = SIMULATOR,
 ) -> Playback:
     """Play a trajectory in a process of its own and bring back what was measured.
 
-    The same trajectory gives the same measurements to the last bit, all but `seconds_per_step`.
+    PSM_M is in the scene where the trajectory has its motion. The same trajectory gives the same measurements to the
+    last bit, all but `seconds_per_step`.
 
     Args:
         trajectory: What to play.
         pad_top_mm: Height of the suture pad's top in the PSM base frame; by default `PAD_BELOW_MM` under the lowest
             finger tip (`default_pad_top`).
-        psm_m: The other arm, waiting; None where its place is not known.
+        clearance_every: Distances are measured at every so many samples; and at the first and last of each phase, and
+            at every sample where they are small or may have become so between two looks.
         timeout_s: Wall time after which the simulator is killed.
         memory_bytes: What the simulator may use.
         target: The simulator, as `module:function`, from bytes to bytes.
 
     Raises:
-        BadInput: The pad's height is not finite, or PSM_M has not one pose for each pass.
+        BadInput: The pad's height is not finite, or `clearance_every` is below 1.
         SimulationFailed: PyBullet is missing, or it crashed, hung, ran out of memory or answered nonsense.
     """
     pad = default_pad_top(trajectory) if pad_top_mm is None else float(pad_top_mm)
     if not np.isfinite(pad):
         raise BadInput("The pad's height must be a number; give it in mm in the PSM base frame.", pad_top_mm=pad)
+    if clearance_every < 1:
+        raise BadInput("Distances are measured at every so many samples; give 1 or more.", given=clearance_every)
     if target == SIMULATOR:
         scene.require_pybullet()
-    answer = confined.run(target, _request(trajectory, pad, psm_m), timeout_s=timeout_s, memory_bytes=memory_bytes)
-    return _playback(wire.unpack(answer), trajectory, pad, psm_m is not None)
+    asked = request(trajectory, pad, clearance_every)
+    answer = confined.run(target, asked, timeout_s=timeout_s, memory_bytes=memory_bytes)
+    return _playback(wire.unpack(answer), trajectory, pad)
 
 
 def default_pad_top(trajectory: Trajectory) -> float:
-    """Put the pad a little under the lowest finger tip, in mm; a trajectory's tip is the hinge, not the fingers."""
-    approach = matrix_of(trajectory.rotation_xyzw)[:, 2, 2]
-    fingers = trajectory.tip_mm[:, 2] + JAW_TIP_MM * np.minimum(approach, 0.0)
-    return float(fingers.min()) - PAD_BELOW_MM
+    """Put the pad a little under the lowest finger tip of either arm, in mm; a tip is the hinge, not the fingers."""
+    lowest = _lowest_finger(trajectory.tip_mm, matrix_of(trajectory.rotation_xyzw))
+    if trajectory.psm_m is not None:
+        lowest = min(lowest, _lowest_finger(*psm_m_poses(trajectory, np.arange(len(trajectory)))))
+    return lowest - PAD_BELOW_MM
 
 
-def _request(trajectory: Trajectory, pad_top_mm: float, psm_m: WaitingArm | None) -> bytes:
+def _lowest_finger(tip_mm: Floats, rotation: Floats) -> float:
+    return float((tip_mm[:, 2] + JAW_TIP_MM * np.minimum(rotation[:, 2, 2], 0.0)).min())
+
+
+def looks(trajectory: Trajectory, every: int) -> Ints:
+    """Choose the samples at which distances are measured first: every so many, and both ends of each phase."""
+    ends = np.flatnonzero(np.diff(trajectory.pass_index * 3 + trajectory.phase))
+    count = len(trajectory)
+    return np.unique(np.concatenate([np.arange(0, count, every), ends, ends + 1, [count - 1]])).astype(np.int64)
+
+
+def request(trajectory: Trajectory, pad_top_mm: float, every: int = CLEARANCE_EVERY) -> bytes:
+    """Write what the simulator is asked for."""
     asked: dict[str, ArrayLike] = {
         "tip_mm": trajectory.tip_mm,
         "rotation_xyzw": trajectory.rotation_xyzw,
@@ -68,41 +90,50 @@ def _request(trajectory: Trajectory, pad_top_mm: float, psm_m: WaitingArm | None
         "rate_hz": trajectory.rate_hz,
         "instrument": trajectory.instrument,
         "pad_top_mm": pad_top_mm,
+        "looks": looks(trajectory, every),
     }
-    if psm_m is not None:
-        if len(psm_m.joints) != trajectory.passes:
-            raise BadInput(
-                f"PSM_M has {len(psm_m.joints)} poses for {trajectory.passes} passes; give one for each.",
-                poses=len(psm_m.joints),
-                passes=trajectory.passes,
-            )
+    if (m := trajectory.psm_m) is not None:
         asked |= {
-            "m_base_mm": psm_m.base_mm,
-            "m_base_xyzw": psm_m.base_xyzw,
-            "m_joints": psm_m.joints,
-            "m_enters_after_a1": psm_m.enters_after_a1,
+            "m_base_mm": m.base_mm,
+            "m_base_xyzw": m.base_xyzw,
+            "m_joints": m.joints,
+            "m_instrument": m.instrument,
         }
     return wire.pack(asked)
 
 
-def _playback(answer: dict[str, NDArray[Any]], trajectory: Trajectory, pad_top_mm: float, with_m: bool) -> Playback:
+# ---- what comes back -------------------------------------------------------------------------------------------
+
+
+def _playback(answer: dict[str, NDArray[Any]], trajectory: Trajectory, pad_top_mm: float) -> Playback:
     """Check every number that came back; none is believed."""
-    count = len(trajectory)
+    count, with_m = len(trajectory), trajectory.psm_m is not None
     picture = _checked(answer, "picture_png", np.uint8, (None,)).tobytes()
     if not picture.startswith(_PNG):
         raise _nonsense("picture_png")
-    return Playback(
-        tip_mm=_checked(answer, "tip_mm", np.float64, (count, 3)),
-        rotation_xyzw=_checked(answer, "rotation_xyzw", np.float64, (count, 4)),
-        joints=_checked(answer, "joints", np.float64, (count, 6)),
-        tracking_mm=_checked(answer, "tracking_mm", np.float64, (count,)),
-        clearance_pad_mm=_checked(answer, "clearance_pad_mm", np.float64, (count,)),
-        clearance_psm_m_mm=_checked(answer, "clearance_psm_m_mm", np.float64, (count,)) if with_m else None,
-        pad_top_mm=pad_top_mm,
-        picture_png=picture,
-        engine=_text(answer, "engine"),
-        seconds_per_step=float(_checked(answer, "seconds_per_step", np.float64, ())),
-    )
+    looked_at = _checked(answer, "looked_at", np.int64, (None,))
+    seen = len(looked_at)
+    low, high = trajectory.tip_mm[:, :2].min(axis=0), trajectory.tip_mm[:, :2].max(axis=0)
+    try:
+        return Playback(
+            tip_mm=_checked(answer, "tip_mm", np.float64, (count, 3)),
+            rotation_xyzw=_checked(answer, "rotation_xyzw", np.float64, (count, 4)),
+            joints=_checked(answer, "joints", np.float64, (count, 6)),
+            tracking_mm=_checked(answer, "tracking_mm", np.float64, (count,)),
+            efforts=_checked(answer, "efforts", np.float64, (count, 6)),
+            contact_n=_checked(answer, "contact_n", np.float64, (count,)),
+            looked_at=looked_at,
+            clearances_mm=_checked(answer, "clearances_mm", np.float64, (seen, len(link_pairs(with_m)))),
+            shaft_off_mm=_checked(answer, "shaft_off_mm", np.float64, (seen,)),
+            psm_m_tip_mm=_checked(answer, "psm_m_tip_mm", np.float64, (seen, 3)) if with_m else None,
+            pad_mm=np.append((low + high) / 2, pad_top_mm),
+            picture_png=picture,
+            engine=_text(answer, "engine"),
+            files=_digests(answer),
+            seconds_per_step=float(_checked(answer, "seconds_per_step", np.float64, ())),
+        )
+    except BadInput:
+        raise _nonsense("looked_at") from None
 
 
 def _checked(answer: dict[str, NDArray[Any]], name: str, dtype: Any, shape: tuple[int | None, ...]) -> NDArray[Any]:
@@ -114,6 +145,16 @@ def _checked(answer: dict[str, NDArray[Any]], name: str, dtype: Any, shape: tupl
     if array.dtype.kind == "f" and not np.isfinite(array).all():
         raise _nonsense(name)
     return array
+
+
+def _digests(answer: dict[str, NDArray[Any]]) -> dict[str, str]:
+    names, digests = (answer.get(name, np.empty(0)) for name in ("files", "digests"))
+    if any(part.dtype.kind != "U" or part.ndim != 1 for part in (names, digests)) or len(names) != len(digests):
+        raise _nonsense("files")
+    found = {str(name): str(digest) for name, digest in zip(names, digests, strict=True)}
+    if not all(re.fullmatch(r"\w+\.urdf", name) and re.fullmatch("[0-9a-f]{64}", found[name]) for name in found):
+        raise _nonsense("files")
+    return found
 
 
 def _text(answer: dict[str, NDArray[Any]], name: str) -> str:

@@ -1,22 +1,13 @@
 """The scene in PyBullet: PSM_A, the pad, the needle and, where its place is known, PSM_M. Metres on this side.
 
-The only module that imports pybullet, and only when a scene is made. `simulate` is the whole of it from outside:
-bytes in, bytes out, in a process of its own (`skills.sim.confined`).
-
-Two passes over the trajectory:
-
-* kinematic: `resetJointState` puts the joints exactly where they shall be; we read back the joints, the frame of the
-  link `tool_frame` and the distances between surfaces.
-* servo: the motors follow under gravity with the arm's real greatest efforts. The motor's law is
-  v = gain (q_target - q) / dt + v_target; with the target at the step's start and the step's own speed it is exact.
+The only module that imports pybullet, and only when a scene is made. What is done in it is in `skills.sim.passes`.
 """
 
 import importlib.util
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib.metadata import version
+from hashlib import sha256
 from importlib.resources import as_file, files
 from types import ModuleType
 from typing import Any
@@ -25,16 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skills.errors import SimulationFailed
-from skills.sim import pictures, wire
-from skills.style._arrays import Floats, Ints
+from skills.sim import pictures
+from skills.style._arrays import Floats
+from skills.style.handoff import HELD_MM, HOLDING_RAD, OPEN_RAD
 from skills.style.kinematics import INSERTION, JOINTS, Instrument, instrument_of
-from skills.style.playback import CLEARANCE_SEEN_MM
-from skills.style.trajectory import A1
+from skills.style.playback import CLEARANCE_SEEN_MM, FINGERS, LINKS, pad_scale
 
 MM = 1e-3
+PLACE, TURN = 4, 5  # of a link's state: its frame; 0 and 1 would be its centre of mass
+EFFORT = 3  # of a joint's state
 POSITION_GAIN, VELOCITY_GAIN = 0.3, 1.0
-JAW_OPENING_RAD = 0.06  # of each finger: as if a needle were between them
-FINGERS = ("finger_1_hinge", "finger_2_hinge")
 FINGER_EFFORT = 0.16  # Nm
 PSM_M_COLOUR = (0.35, 0.55, 0.35, 1.0)
 
@@ -51,26 +42,6 @@ def require_pybullet() -> None:
             "`pip install pybullet==3.2.7`; elsewhere build it from source.",
             cause="not installed",
         )
-
-
-def simulate(request: bytes) -> bytes:
-    """Play what `skills.sim.player` asks for and answer with what was measured."""
-    asked = wire.unpack(request)
-    with opened(str(asked["instrument"]), float(asked["rate_hz"])) as scene:
-        scene.place_pad(asked["tip_mm"], float(asked["pad_top_mm"]))
-        if "m_joints" in asked:
-            scene.place_psm_m(asked["m_base_mm"], asked["m_base_xyzw"])
-        measured = _kinematic_pass(scene, asked)
-        tracking, seconds = _servo_pass(scene, asked)
-        scene.pose(asked["joints"][_pictured(asked)])
-        picture = pictures.draw(scene.photograph, _paths(asked))
-        measured |= {
-            "tracking_mm": tracking,
-            "seconds_per_step": np.array(seconds),
-            "picture_png": np.frombuffer(picture, np.uint8),
-            "engine": np.array(f"PyBullet {version('pybullet')}"),
-        }
-        return wire.pack(measured)
 
 
 @contextmanager
@@ -90,13 +61,15 @@ def opened(instrument: str, rate_hz: float) -> Iterator["Scene"]:
 
 
 @dataclass(frozen=True)
-class _Body:
-    """A loaded arm: its number, and the indices of its joints and links by name."""
+class Body:
+    """A loaded arm: its number, and the indices of its joints and links; `surfaces` are those of `playback.LINKS`."""
 
     number: int
     joints: tuple[int, ...]
     fingers: tuple[int, ...]
     tool: int
+    shaft: int
+    surfaces: tuple[int, ...]
 
 
 class Scene:
@@ -106,24 +79,34 @@ class Scene:
         self.bullet: Any = bullet
         self.client = client
         self.tool = tool
-        self.arm = self._load_arm(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
+        self.files: dict[str, str] = {}
+        self.arm = self._load_arm(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), tool, HOLDING_RAD)
         self.pad: int | None = None
-        self.psm_m: _Body | None = None
+        self.pad_mm = np.zeros(3)
+        self.psm_m: Body | None = None
         self.needle: int | None = None
+        self._driven = [*self.arm.joints, *self.arm.fingers]
+        self._efforts = [*tool.arm.effort, FINGER_EFFORT, FINGER_EFFORT]
+        self._position_gains, self._velocity_gains = [POSITION_GAIN] * 8, [VELOCITY_GAIN] * 8
 
     # -- what is in it --
 
     def place_pad(self, tip_mm: Floats, top_mm: float) -> None:
-        """Lay the pad under the middle of the path, its wound along the path's longer side."""
+        """Lay the pad under the middle of the path, its wound along the path's longer side, as large as that asks."""
         low, high = tip_mm.min(axis=0), tip_mm.max(axis=0)
         middle = (low + high) / 2
         turned = np.pi / 2 if high[1] - low[1] > high[0] - low[0] else 0.0
         quaternion = [0.0, 0.0, float(np.sin(turned / 2)), float(np.cos(turned / 2))]
-        self.pad = self._load("suture_pad.urdf", np.array([middle[0], middle[1], top_mm]), quaternion)
+        self.pad_mm = np.array([middle[0], middle[1], top_mm])
+        self.pad = self._load("suture_pad.urdf", self.pad_mm, quaternion, scale=pad_scale(tip_mm))
 
-    def place_psm_m(self, base_mm: Floats, base_xyzw: Floats) -> None:
-        """Set up PSM_M, in green; the arms go through each other, and their distance is measured."""
-        self.psm_m = self._load_arm(base_mm, base_xyzw)
+    def place_psm_m(self, base_mm: Floats, base_xyzw: Floats, instrument: str | None = None) -> None:
+        """Set up PSM_M, in green and with its jaws open, by default with PSM_A's instrument.
+
+        The arms go through each other, and their distance is measured.
+        """
+        tool = instrument_of(instrument) if instrument else self.tool
+        self.psm_m = self._load_arm(base_mm, base_xyzw, tool, OPEN_RAD)
         links = range(-1, self.bullet.getNumJoints(self.psm_m.number, physicsClientId=self.client))
         for link in links:
             for own in links:
@@ -132,62 +115,68 @@ class Scene:
                 )
             self.bullet.changeVisualShape(self.psm_m.number, link, rgbaColor=PSM_M_COLOUR, physicsClientId=self.client)
 
-    def pose(self, joints: Floats, body: _Body | None = None) -> None:
+    def pose(self, joints: Floats, body: Body | None = None) -> None:
         """Put an arm's joints (rad, insertion mm) exactly there, at rest."""
         arm = body or self.arm
-        reset = self.bullet.resetJointState
-        for index, value in zip(arm.joints, _in_metres(joints), strict=True):
-            reset(arm.number, index, value, physicsClientId=self.client)
+        # One call for all joints takes a fifth of the time of one for each.
+        self.bullet.resetJointStatesMultiDof(
+            arm.number, arm.joints, in_metres(joints)[:, None].tolist(), physicsClientId=self.client
+        )
 
     # -- what is seen --
 
     def read_joints(self) -> list[float]:
         """Read PSM_A's joints, rad and mm."""
-        states = self.bullet.getJointStates(self.arm.number, self.arm.joints, physicsClientId=self.client)
-        values = [float(state[0]) for state in states]
+        values = [float(state[0]) for state in self.joint_states()]
         values[INSERTION] /= MM
         return values
 
+    def joint_states(self) -> Any:
+        """Read PSM_A's joints as PyBullet has them: position, speed, reaction, effort of each."""
+        return self.bullet.getJointStates(self.arm.number, self.arm.joints, physicsClientId=self.client)
+
     def read_tip(self) -> tuple[NDArray[Any], NDArray[Any]]:
         """Read PSM_A's tool frame: position in mm and quaternion."""
-        state = self.bullet.getLinkState(
-            self.arm.number, self.arm.tool, computeForwardKinematics=1, physicsClientId=self.client
-        )
-        return np.array(state[4]) / MM, np.array(state[5])  # [0] and [1] would be the centre of mass
+        place, quaternion = self.frame_of(self.arm, self.arm.tool)
+        return np.array(place) / MM, np.array(quaternion)
 
-    def clearance_mm(self, other: int) -> float:
-        """Measure the distance between PSM_A's surfaces and another body's; negative inside."""
-        points = self.bullet.getClosestPoints(
-            self.arm.number, other, CLEARANCE_SEEN_MM * MM, physicsClientId=self.client
-        )
-        return min((float(point[8]) / MM for point in points), default=CLEARANCE_SEEN_MM)
+    def frame_of(self, body: Body, link: int) -> Any:
+        """Read the frame of a link as PyBullet has it: position and quaternion."""
+        state = self.bullet.getLinkState(body.number, link, 0, 1, self.client)
+        return state[PLACE], state[TURN]
 
-    def drive(self, start: Floats, velocity: Floats) -> None:
-        """Let the motors move PSM_A through one time step that begins at `start`, rad and mm, and per second."""
-        arm = self.arm
+    def closest(self, body: int, other: int) -> Any:
+        """Read the nearest points of all links of two bodies that are near each other, as PyBullet has them."""
+        return self.bullet.getClosestPoints(body, other, CLEARANCE_SEEN_MM * MM, physicsClientId=self.client)
+
+    def pressed_n(self) -> float:
+        """Read with what force the pad pushes PSM_A back."""
+        points = self.bullet.getContactPoints(self.arm.number, self.pad, physicsClientId=self.client)
+        return float(sum(point[9] for point in points))
+
+    def drive(self, start: list[float], velocity: list[float]) -> None:
+        """Let the motors move PSM_A through one time step that begins at `start`.
+
+        Args:
+            start: Joints and fingers as PyBullet has them (`in_metres`), 8 numbers.
+            velocity: Their speeds in this step.
+        """
         self.bullet.setJointMotorControlArray(
-            arm.number,
-            [*arm.joints, *arm.fingers],
+            self.arm.number,
+            self._driven,
             self.bullet.POSITION_CONTROL,
-            targetPositions=[*_in_metres(start), JAW_OPENING_RAD, JAW_OPENING_RAD],
-            targetVelocities=[*_in_metres(velocity), 0.0, 0.0],
-            forces=[*self.tool.arm.effort, FINGER_EFFORT, FINGER_EFFORT],
-            positionGains=[POSITION_GAIN] * 8,
-            velocityGains=[VELOCITY_GAIN] * 8,
+            targetPositions=start,
+            targetVelocities=velocity,
+            forces=self._efforts,
+            positionGains=self._position_gains,
+            velocityGains=self._velocity_gains,
             physicsClientId=self.client,
         )
         self.bullet.stepSimulation(physicsClientId=self.client)
 
-    def photograph(self, camera: pictures.Camera) -> pictures.Photograph:
-        """Take a picture of the scene as it stands, with the needle between the jaws."""
-        tip_mm, quaternion = self.read_tip()
-        approach = np.array(self.bullet.getMatrixFromQuaternion(quaternion)).reshape(3, 3)[:, 2]
-        if self.needle is None:
-            self.needle = self._load("needle.urdf", np.zeros(3), [0.0, 0.0, 0.0, 1.0])
-        held = (tip_mm + 9.0 * approach) * MM
-        self.bullet.resetBasePositionAndOrientation(
-            self.needle, held.tolist(), quaternion.tolist(), physicsClientId=self.client
-        )
+    def photograph(self, camera: pictures.Camera, needle: tuple[Floats, Floats] | None = None) -> pictures.Photograph:
+        """Take a picture of the scene as it stands, the needle in a pose (mm, quaternion) or between PSM_A's jaws."""
+        self._place_needle(*(needle or self._in_jaws()))
         view = self.bullet.computeViewMatrixFromYawPitchRoll(
             camera.target_m, camera.distance_m, camera.yaw_deg, camera.pitch_deg, 0.0, 2
         )
@@ -211,23 +200,37 @@ class Scene:
             projection=np.array(projection).reshape(4, 4).T,
         )
 
+    def _in_jaws(self) -> tuple[Floats, Floats]:
+        tip_mm, quaternion = self.read_tip()
+        approach = np.array(self.bullet.getMatrixFromQuaternion(quaternion)).reshape(3, 3)[:, 2]
+        return tip_mm + HELD_MM * approach, quaternion
+
+    def _place_needle(self, place_mm: Floats, quaternion: Floats) -> None:
+        if self.needle is None:
+            self.needle = self._load("needle.urdf", np.zeros(3), [0.0, 0.0, 0.0, 1.0])
+        self.bullet.resetBasePositionAndOrientation(
+            self.needle, (place_mm * MM).tolist(), quaternion.tolist(), physicsClientId=self.client
+        )
+
     # -- loading --
 
-    def _load(self, name: str, position_mm: Floats, quaternion: Sequence[float]) -> int:
+    def _load(self, name: str, position_mm: Floats, quaternion: Sequence[float], scale: float = 1.0) -> int:
         with as_file(files("skills") / "urdf" / name) as path:
+            self.files[name] = sha256(path.read_bytes()).hexdigest()
             return int(
                 self.bullet.loadURDF(
                     str(path),
                     basePosition=(np.asarray(position_mm) * MM).tolist(),
                     baseOrientation=list(quaternion),
                     useFixedBase=1,
+                    globalScaling=scale,
                     # Otherwise cylinders are hulls, a millimetre too thick.
                     flags=self.bullet.URDF_USE_IMPLICIT_CYLINDER,
                     physicsClientId=self.client,
                 )
             )
 
-    def _load_arm(self, position_mm: Floats, quaternion: Floats) -> _Body:
+    def _load_arm(self, position_mm: Floats, quaternion: Floats, tool: Instrument, opening_rad: float) -> Body:
         number = self._load("psm.urdf", position_mm, np.asarray(quaternion).tolist())
         found = [
             self.bullet.getJointInfo(number, index, physicsClientId=self.client)
@@ -235,14 +238,16 @@ class Scene:
         ]
         by_joint = {info[1].decode(): int(info[0]) for info in found}
         by_link = {info[12].decode(): int(info[0]) for info in found}
-        arm = _Body(
+        arm = Body(
             number=number,
             joints=tuple(by_joint[f"outer_{name}"] for name in JOINTS),
-            fingers=tuple(by_joint[name] for name in FINGERS),
+            fingers=tuple(by_joint[f"{name}_hinge"] for name in FINGERS),
             tool=by_link["tool_frame"],
+            shaft=by_link["roll_link"],
+            surfaces=tuple(by_link[name] for name in LINKS),
         )
         self.bullet.changeDynamics(number, -1, linearDamping=0.0, angularDamping=0.0, physicsClientId=self.client)
-        lower, upper = _in_metres(self.tool.lower), _in_metres(self.tool.upper)
+        lower, upper = in_metres(tool.lower).tolist(), in_metres(tool.upper).tolist()
         for joint, index in enumerate(arm.joints):
             # The file has the Classic's limits, a Si has others. In a call of its own: with damping it has no effect.
             self.bullet.changeDynamics(
@@ -253,70 +258,12 @@ class Scene:
                 physicsClientId=self.client,
             )
         for index in arm.fingers:
-            self.bullet.resetJointState(number, index, JAW_OPENING_RAD, physicsClientId=self.client)
+            self.bullet.resetJointState(number, index, opening_rad, physicsClientId=self.client)
         return arm
 
 
-# ---- the two passes --------------------------------------------------------------------------------------------
-
-
-def _kinematic_pass(scene: Scene, asked: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """Put the joints at every sample and look."""
-    wanted = asked["joints"]
-    count = len(wanted)
-    joints, tip, rotation = np.empty((count, 6)), np.empty((count, 3)), np.empty((count, 4))
-    pad, other = np.empty(count), np.full(count, CLEARANCE_SEEN_MM)
-    for k in range(count):
-        scene.pose(wanted[k])
-        joints[k] = scene.read_joints()
-        tip[k], rotation[k] = scene.read_tip()
-        pad[k] = CLEARANCE_SEEN_MM if scene.pad is None else scene.clearance_mm(scene.pad)
-        if scene.psm_m is not None and _psm_m_is_there(scene, scene.psm_m, asked, k):
-            other[k] = scene.clearance_mm(scene.psm_m.number)
-    measured = {"joints": joints, "tip_mm": tip, "rotation_xyzw": rotation, "clearance_pad_mm": pad}
-    return measured if scene.psm_m is None else measured | {"clearance_psm_m_mm": other}
-
-
-def _psm_m_is_there(scene: Scene, psm_m: _Body, asked: dict[str, NDArray[Any]], k: int) -> bool:
-    """Bring PSM_M to its pose of this pass where a pass begins; tell whether it has entered."""
-    number: Ints = asked["pass_index"]
-    if k == 0 or number[k] != number[k - 1]:
-        scene.pose(asked["m_joints"][number[k]], psm_m)
-    return not (bool(asked["m_enters_after_a1"]) and asked["phase"][k] == A1)
-
-
-def _servo_pass(scene: Scene, asked: dict[str, NDArray[Any]]) -> tuple[Floats, float]:
-    """Let the motors follow; measure the tip's error at each sample, mm, and the seconds of a step."""
-    wanted, tips, number = asked["joints"], asked["tip_mm"], asked["pass_index"]
-    rate = float(asked["rate_hz"])
-    error = np.empty(len(wanted))
-    steps, seconds = 0, 0.0
-    for k in range(len(wanted)):
-        if k == 0 or number[k] != number[k - 1]:
-            scene.pose(wanted[k])
-        else:
-            began = time.perf_counter()
-            scene.drive(wanted[k - 1], (wanted[k] - wanted[k - 1]) * rate)
-            seconds += time.perf_counter() - began
-            steps += 1
-        error[k] = np.linalg.norm(scene.read_tip()[0] - tips[k])
-    return error, seconds / max(1, steps)
-
-
-def _in_metres(joints: Floats) -> list[float]:
-    """Make a row of joints PyBullet's: the insertion in metres."""
-    values = np.asarray(joints, float).tolist()
-    values[INSERTION] *= MM
-    return list(values)
-
-
-def _paths(asked: dict[str, NDArray[Any]]) -> list[Floats]:
-    """List the way of the tip in A1 of each pass, in metres, each of shape (K, 3)."""
-    number, tip, first = asked["pass_index"], asked["tip_mm"] * MM, asked["phase"] == A1
-    return [tip[(number == one) & first] for one in range(int(number[-1]) + 1)]
-
-
-def _pictured(asked: dict[str, NDArray[Any]]) -> int:
-    """Choose the sample that is pictured: half-way through A1 of the last pass."""
-    last = np.flatnonzero((asked["pass_index"] == asked["pass_index"][-1]) & (asked["phase"] == A1))
-    return int(last[len(last) // 2]) if len(last) else len(asked["joints"]) - 1
+def in_metres(joints: Floats) -> Floats:
+    """Make joints, shape (..., 6), PyBullet's: the insertion in metres."""
+    values = np.array(joints, float)
+    values[..., INSERTION] *= MM
+    return values

@@ -208,7 +208,7 @@ def inverse(
     tip, turned = _poses(tip_mm, rotation)
     if not len(tip):
         return np.empty((0, 6))
-    solutions = _solutions(tip, turned, tool)
+    solutions = solutions_of(tip, turned, tool)
     allowed = _within_limits(solutions, tool)
     reached = allowed.any(axis=1)
     if not reached.all():
@@ -222,7 +222,7 @@ def reachable(tip_mm: ArrayLike, rotation: ArrayLike, instrument: str = DEFAULT_
     """Tell which poses the arm can take within its joint limits, shape (T,); arguments as for `inverse`."""
     tool = instrument_of(instrument)
     tip, turned = _poses(tip_mm, rotation)
-    return np.asarray(_within_limits(_solutions(tip, turned, tool), tool).any(axis=1))
+    return np.asarray(_within_limits(solutions_of(tip, turned, tool), tool).any(axis=1))
 
 
 def joint_margins(joints: ArrayLike, instrument: str = DEFAULT_INSTRUMENT) -> Floats:
@@ -245,7 +245,7 @@ def _poses(tip_mm: ArrayLike, rotation: ArrayLike) -> tuple[Floats, Floats]:
     return tip, turned
 
 
-def _solutions(tip: Floats, rotation: Floats, tool: Instrument) -> Floats:
+def solutions_of(tip: Floats, rotation: Floats, tool: Instrument) -> Floats:
     """List every solution of every pose regardless of limits, shape (T, 6, 6): two wrists, three turns of roll.
 
     The wrist's pitch axis z5 is normal to both the tip's position and the wrist's yaw axis z6, because shaft, wrist

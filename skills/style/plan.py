@@ -4,18 +4,25 @@ A pass moves the whole grid world so that the policy's *goal* lies at the suture
 is turned. In the moved grid the policy is rolled out from the pass's start; what comes out is a path in the arm's
 frame: through the centres of its cells, as in the paper, or, where the demonstration is given, fitted to what was
 recorded within the same cells (`smooth`). Between passes the surgeon inserts and grasps the needle by hand (M1, M2).
+
+A start outside its grid world is brought to the nearest place in it by a straight transfer, which is ours; from there
+the policy goes on. A suture point is where the arm's tip goes, its hinge; with a `tip_offset_mm` it is where the point
+that far down the jaw's approach goes, such as the finger tips, as the jaw is held during A1.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from math import dist
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from skills.errors import BadPlan, OutsideGrid
+from skills.errors import BadPlan, BadSpeed, OutsideGrid
 from skills.style._arrays import Floats, Ints, frozen
 from skills.style.demo import Demo
+from skills.style.grid import GridWorld
+from skills.style.handoff import PsmM
 from skills.style.kinematics import POINTING_DOWN, matrix_of, quaternion_of
 from skills.style.policy import Policy, rollout
 from skills.style.realign import realign
@@ -23,6 +30,9 @@ from skills.style.smooth import Trace, fit_to_demo, trace
 from skills.style.trajectory import PassPath
 
 MAX_PASSES = 200
+RATE_HZ = (100.0, 200.0)  # of the plans that a robot's controller follows
+MAX_OUTSIDE_MM = 50.0  # ours, as wide as the paper's grid: what starts further away is of another place or frame
+MAX_TIP_OFFSET_MM = 50.0  # ours: finger tips are 10.2 mm from the hinge, and no instrument's are a hand away
 UNTURNED = (0.0, 0.0, 0.0, 1.0)
 NEGLIGIBLE_MM = 1e-9
 
@@ -44,10 +54,11 @@ class Pass:
 
     Attributes:
         point: The suture point.
-        start_mm: Where A1 starts, shape (3,).
+        start_mm: Where the tip starts, shape (3,); a transfer leads from there to the path where that begins elsewhere.
         states: The states of the grid world that it goes through, shape (T,).
-        tip_mm: The path, from the start to the suture point, shape (K, 3). Fitted: about four points to a cell, each
-            in one of those states, in their order. Else the start (where it is not a centre) and the states' centres.
+        tip_mm: The tip's path, from the start, or where it enters the grid world, to the suture point, shape (K, 3).
+            Fitted: about four points to a cell, each in one of those states, in their order. Else where it begins
+            (where that is not a centre) and the states' centres.
         rotation: The jaw's [n o a] during A1, shape (3, 3).
         target_rotation: Where A2 turns it, shape (3, 3), or None where PSM_M's approach is not known.
     """
@@ -74,7 +85,11 @@ class Pass:
 
 @dataclass(frozen=True, eq=False)
 class SuturePlan:
-    """Passes in order, with all that a playback needs to know."""
+    """Passes in order, with all that a playback needs to know.
+
+    `psm_m` is None where A1 alone is planned; `rate_hz` is the one rate at which the plan is sampled; a suture point is
+    `tip_offset_mm` from the tip, down the jaw's approach.
+    """
 
     arm: str
     frame: str
@@ -82,13 +97,22 @@ class SuturePlan:
     speed_mm_s: float
     orientation: Orientation
     path: PathKind
-    approach_m: tuple[float, float, float] | None  # PSM_M's approach in the arm's frame; None: A1 alone
+    psm_m: PsmM | None
     passes: tuple[Pass, ...]
+    rate_hz: float = 200.0
+    tip_offset_mm: float = 0.0
+
+    def __post_init__(self) -> None:
+        low, high = RATE_HZ
+        if not low <= self.rate_hz <= high:
+            raise BadSpeed(f"A plan is sampled at {low:g} to {high:g} Hz.", rate_hz=self.rate_hz)
+        if not 0 <= self.tip_offset_mm <= MAX_TIP_OFFSET_MM:
+            raise BadPlan(f"The tip's offset is 0 to {MAX_TIP_OFFSET_MM:g} mm.", tip_offset_mm=self.tip_offset_mm)
 
     @property
     def pass_paths(self) -> tuple[PassPath, ...]:
         """The passes as what `time_parametrise` takes."""
-        return tuple(PassPath(one.tip_mm, one.rotation, one.target_rotation) for one in self.passes)
+        return tuple(PassPath(one.tip_mm, one.rotation, one.target_rotation, one.start_mm) for one in self.passes)
 
 
 def stack(
@@ -101,8 +125,10 @@ def stack(
     rotation: ArrayLike | None,
     demo: Demo | None = None,
     starts_mm: Sequence[ArrayLike | None] | None = None,
-    approach_m: tuple[float, float, float] | None = None,
+    psm_m: PsmM | None = None,
     speed_mm_s: float = 20.0,
+    rate_hz: float = 200.0,
+    tip_offset_mm: float = 0.0,
 ) -> SuturePlan:
     """Stack a policy's grid world at suture points and roll it out in each (Fig. 7).
 
@@ -115,13 +141,17 @@ def stack(
         rotation: The jaw's [n o a] at the demonstration, shape (3, 3), held during A1; None: straight down is assumed.
         demo: The demonstration that the policy was learnt from, to fit passes to; None: from centre to centre.
         starts_mm: Where each pass starts, in the arm's frame; None: the demonstrated start, moved with the grid.
-        approach_m: PSM_M's approach in the arm's frame; None: no A2.
+        psm_m: The arm that takes the needle; None: no A2.
         speed_mm_s: Wanted speed of the tip during A1, where its way is straight.
+        rate_hz: Samples per second, 100 to 200.
+        tip_offset_mm: How far down the jaw's approach from the tip, the hinge, suture points and given starts are
+            meant, as the jaw is held during A1; `JAW_TIP_MM` for the finger tips.
 
     Raises:
         BadPlan: No points, too many, as many starts as points not given, a start from which the goal is not reached,
-            or another demonstration than the policy's.
-        OutsideGrid: A start lies outside its pass's grid world.
+            another demonstration than the policy's, or an offset that no instrument has.
+        BadSpeed: The rate is not one of a plan.
+        OutsideGrid: A start lies more than `MAX_OUTSIDE_MM` outside its pass's grid world.
     """
     if not 1 <= len(points) <= MAX_PASSES:
         raise BadPlan(f"A plan has 1 to {MAX_PASSES} suture points.", points=len(points))
@@ -130,13 +160,14 @@ def stack(
         raise BadPlan("Give one start for each suture point, or none.", points=len(points), starts=len(starts))
     jaw = POINTING_DOWN if rotation is None else frozen(rotation, np.float64, (3, 3), "rotation")
     recorded = None if demo is None else trace(demo, policy.path)
-    passes = tuple(
-        _pass(policy, recorded, number, point, start, jaw, approach_m)
-        for number, (point, start) in enumerate(zip(points, starts, strict=True))
-    )
     seen: Orientation = "assumed tool-down" if rotation is None else "demonstrated"
     path: PathKind = "cell centres" if recorded is None else "fitted"
-    return SuturePlan(arm, frame, instrument, speed_mm_s, seen, path, approach_m, passes)
+    plan = SuturePlan(arm, frame, instrument, speed_mm_s, seen, path, psm_m, (), rate_hz, tip_offset_mm)
+    passes = tuple(
+        _pass(policy, recorded, number, point, start, jaw, plan)
+        for number, (point, start) in enumerate(zip(points, starts, strict=True))
+    )
+    return replace(plan, passes=passes)
 
 
 def _pass(
@@ -146,29 +177,44 @@ def _pass(
     point: SuturePoint,
     start_mm: ArrayLike | None,
     jaw: Floats,
-    approach_m: tuple[float, float, float] | None,
+    plan: SuturePlan,
 ) -> Pass:
     grid, goal = policy.path.grid, policy.path.grid.centres_mm(policy.path.goal)
-    place = frozen(point.position_mm, np.float64, (3,), "position_mm")
     turned = matrix_of(np.array([point.rotation_xyzw]))[0]
-    demonstrated = grid.centres_mm(policy.path.start)
-    start = turned @ (demonstrated - goal) + place if start_mm is None else frozen(start_mm, np.float64, (3,), "start")
-    unmoved = demonstrated if start_mm is None else turned.T @ (start - place) + goal
-    try:
-        followed = rollout(policy, unmoved)
-    except OutsideGrid as error:
-        raise OutsideGrid(
-            f"Pass {number} starts outside its grid world; start it nearer to its suture point.", suture_pass=number
-        ) from error
-    if not followed.finished:
-        raise BadPlan(f"From its start pass {number} does not reach the goal.", suture_pass=number)
-    path = followed.tip_mm if recorded is None else fit_to_demo(followed, recorded, unmoved).tip_mm
-    tip = (path - goal) @ turned.T + place
-    if np.abs(tip[0] - start).max() > NEGLIGIBLE_MM:
-        tip = np.concatenate((start[None], tip))
     held = turned @ jaw
-    target = None if approach_m is None else realign(held, approach_m).rotation
+    hinge = -plan.tip_offset_mm * held[:, 2]  # from a place that is meant to where the tip is then
+    place = frozen(point.position_mm, np.float64, (3,), "position_mm") + hinge
+    begin = grid.centres_mm(policy.path.start)  # in the grid as it was learnt, like all that is not of the arm's frame
+    start = turned @ (begin - goal) + place
+    if start_mm is not None:
+        start = frozen(start_mm, np.float64, (3,), "start") + hinge
+        begin = _entered(grid, turned.T @ (start - place) + goal, number)
+    followed = rollout(policy, begin)
+    if not followed.finished:
+        raise BadPlan(f"From its start pass {number} does not reach the goal.", **{"pass": number})
+    path = followed.tip_mm if recorded is None else fit_to_demo(followed, recorded, begin).tip_mm
+    if np.abs(path[0] - begin).max() > NEGLIGIBLE_MM:
+        path = np.concatenate((begin[None], path))
+    tip = (path - goal) @ turned.T + place
+    target = None if plan.psm_m is None else realign(held, plan.psm_m.approach).rotation
     return Pass(point, start, followed.states, tip, held, target)
+
+
+def _entered(grid: GridWorld, start_mm: Floats, number: int) -> Floats:
+    """Take a start where it lies in its grid, else the nearest place between the outermost cells' centres.
+
+    Raises:
+        OutsideGrid: It is more than `MAX_OUTSIDE_MM` away.
+    """
+    entered = np.clip(start_mm, grid.centres_mm(0), grid.centres_mm(grid.n_states - 1))
+    outside_mm = dist(start_mm, entered)
+    if not outside_mm <= MAX_OUTSIDE_MM:
+        raise OutsideGrid(
+            f"Pass {number} starts outside its grid world, {outside_mm:.1f} mm from it; {MAX_OUTSIDE_MM:g} mm are "
+            "bridged, so start it nearer to its suture point.",
+            **{"pass": number, "outside_mm": outside_mm, "limit_mm": MAX_OUTSIDE_MM},
+        )
+    return start_mm if grid.holds(grid.cells_at(start_mm)).all() else entered
 
 
 def rotation_of(rotation_xyzw: Floats | None) -> Floats | None:

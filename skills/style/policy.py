@@ -5,6 +5,7 @@ A *greedy* action is the first one of largest Q value. `rollout` follows them fr
 
 from dataclasses import dataclass
 from functools import cached_property
+from math import dist
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,6 +18,8 @@ from skills.style.grid import GridPath
 from skills.style.learning.learners import Learner, learn_values
 from skills.style.learning.q_learning import Training
 from skills.style.reward import RewardLevels, RewardMap
+
+GUIDED_MM = 50.0  # ours: as far outside its grid as a plan may start; metres given for millimetres are further off
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +133,7 @@ class Step:
     """What a policy says of a position: nothing moves by it.
 
     `phase` is the one after counting the position, `action` is None where it is done or nothing is promised, and
-    `correction_mm` leads from the position to the nearest waypoint that it should be at, where that is not here.
+    `correction_mm` leads from the position to the waypoint that it should be at, where that is not here.
     """
 
     phase: int
@@ -145,16 +148,24 @@ class Step:
 def next_step(policy: Policy, position_mm: ArrayLike, phase: int | None) -> Step:
     """Say what to do at a position, (3,) mm, reached in a phase; None: it is the start of a pass.
 
+    Off the path the correction leads back: in phase 0 to the nearest waypoint, later to the one just passed. From there
+    the policy goes on to the goal. Outside the grid it promises no action, and the correction is all that it says.
+
     Raises:
-        OutsideGrid: The position is not in the grid, or there is no such phase.
+        BadInput: The position is not three finite numbers.
+        OutsideGrid: It is further than `GUIDED_MM` outside the grid, or there is no such phase.
     """
     domain, grid = policy.domain, policy.path.grid
     here = frozen(position_mm, np.float64, (3,), "position_mm")
-    state = int(grid.states_at(here))
     if phase is not None and not 0 <= phase < domain.phases:
         raise OutsideGrid(f"The policy has the phases 0 to {domain.phases - 1}.", phase=phase)
+    state = _state_at(policy, here)
+    if state is None:
+        phase = 0 if phase is None else phase
+        return Step(phase, None, None, None, False, 0.0, _correction(policy, here, phase))
     phase, done = domain.start(state) if phase is None else domain.enter(phase, state)
-    correction = None if done else _correction(policy, here, state, phase)
+    on_path = state == policy.path.states[phase - 1] if phase > 0 else state in policy.path.states
+    correction = None if done or on_path else _correction(policy, here, phase)
     row = None if done else policy.row(phase, state)
     if row is None or policy.greedy[row] < 0:
         done = done or (row is not None and policy.greedy[row] == FINISHED)
@@ -166,12 +177,31 @@ def next_step(policy: Policy, position_mm: ArrayLike, phase: int | None) -> Step
     return Step(phase, action, _xyz(grid.centres_mm(after)), next_phase, False, confidence, correction)
 
 
-def _correction(policy: Policy, here: Floats, state: int, phase: int) -> tuple[float, float, float] | None:
-    """Point from a position off the path to the waypoint just passed, or to the nearest one where none was."""
+def _state_at(policy: Policy, here: Floats) -> int | None:
+    """Find the state of a position, or None outside the grid.
+
+    Raises:
+        OutsideGrid: It is so far outside that no hand is to be led back from there.
+    """
+    grid = policy.path.grid
+    try:
+        return int(grid.states_at(here))
+    except OutsideGrid:
+        outside_mm = dist(here, np.clip(here, grid.centres_mm(0), grid.centres_mm(grid.n_states - 1)))
+        if not outside_mm <= GUIDED_MM:
+            raise OutsideGrid(
+                f"The position is {outside_mm:.4g} mm outside the grid; a hand is led back from at most {GUIDED_MM:g} "
+                "mm. Give millimetres in the frame of the policy.",
+                outside_mm=outside_mm,
+            ) from None
+        return None
+
+
+def _correction(policy: Policy, here: Floats, phase: int) -> tuple[float, float, float]:
+    """Point from a position to the waypoint just passed, or to the nearest one where none was."""
     tip = policy.path.tip_mm
-    on_path = state == policy.path.states[phase - 1] if phase > 0 else state in policy.path.states
     nearest = phase - 1 if phase > 0 else np.abs(tip - here).max(axis=1).argmin()
-    return None if on_path else _xyz(tip[nearest] - here)
+    return _xyz(tip[nearest] - here)
 
 
 def _xyz(values: Floats) -> tuple[float, float, float]:

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from skills.errors import NoApproach
 from skills.style._arrays import Floats, frozen
+from skills.style.handoff import unit_approach
 from skills.style.kinematics import check_rotation, quaternion_of
 
 _TOO_PARALLEL = 0.1  # of a unit vector's part across a_M: with less, its direction there is a matter of round-off
@@ -58,9 +58,7 @@ def realign(rotation: ArrayLike, approach_m: ArrayLike, toward: ArrayLike | None
     """
     present = frozen(rotation, np.float64, (3, 3), "rotation")
     check_rotation(present[None])
-    a_m = _unit(frozen(approach_m, np.float64, (3,), "approach_m"))
-    if a_m is None:
-        raise NoApproach("PSM_M's approach has no length; give its direction in PSM_A's base frame.")
+    a_m = unit_approach(approach_m)
     a_star = _across(a_m, present, toward)
     options = [_toward(present, sign * a_m, a_star, sign) for sign in (1, -1)]
     return options[1] if options[1].angle_rad < options[0].angle_rad - _TIE_RAD else options[0]

@@ -1,78 +1,51 @@
-"""A plan in time: where the tip, the jaw and the joints of PSM_A are at every tick of the controller.
+"""A plan in time: where the tip, the jaw and the joints of PSM_A, and of PSM_M beside it, are at every tick.
 
-A pass is A1, the tip along its polyline with the jaw held, and then A2, the jaw turning with the tip held. Between
-passes the surgeon performs M1 and M2 by hand: time goes by, no samples are ours, and the arm's pose may jump.
+A pass is a transfer, A1, the tip along its polyline with the jaw held, and A2, the jaw turning with the tip held
+(`skills.style.passes`). Between passes the surgeon performs M1 and M2 by hand: time goes by, and the next pass goes on
+from the pose in which the last one ended. So within a trajectory nothing leaps, but the stamps between passes.
 
 The law of motion is ours, the paper only asks for no jerky movements:
 
 * A1 is a cubic spline through the polyline's points, at rest at both ends and slower in bends. Each point is passed
   exactly, on a tick. Between points it leaves the straight move by at most 1.25 mm, because moves are divided until it
   does not (`_spline`). Stopping at every point would not leave it at all, but takes longer.
-* A2 turns about one axis as a minimum-jerk law, whose peak rate is 1.875 times its mean.
-* Where a joint would exceed its speed or acceleration limit, A1 or A2 of all passes is slowed until none does.
+* Transfers, A2 and all that PSM_M does are minimum-jerk moves from rest to rest (`moves`).
+* Where a joint of either arm would exceed its speed or acceleration limit, that phase of all passes is slowed until
+  none does.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import ceil, isfinite, radians, sqrt
+from itertools import pairwise
+from math import isfinite, radians, sqrt
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from skills.errors import BadPlan, BadSpeed, NoMotion, Unreachable
+from skills.errors import BadPlan, BadSpeed, NoMotion
 from skills.style._arrays import Bytes, Floats, Ints, frozen
 from skills.style._spline import check_length, followed
-from skills.style.handoff import OtherArm
-from skills.style.kinematics import (
-    DEFAULT_INSTRUMENT,
-    angle_between,
-    check_rotation,
-    instrument_of,
-    inverse,
-    quaternion_of,
-)
-from skills.style.realign import turn
+from skills.style.handoff import OtherArm, PsmM
+from skills.style.kinematics import DEFAULT_INSTRUMENT, instrument_of, quaternion_of
+from skills.style.moves import A1, A2, TRANSFER, Pace, Pose, Poses, held, joined, move
+from skills.style.other_arm import other_arm
+from skills.style.passes import PassPath, Way, ways
+from skills.style.solving import Ticks, solve
 
-TRANSFER, A1, A2 = 0, 1, 2
+__all__ = ["A1", "A2", "MAX_SPEED_MM_S", "TRANSFER", "PassPath", "Trajectory", "joint_ratios", "time_parametrise"]
 
 MAX_SPEED_MM_S = 100.0  # ours: the joints allow 139 mm/s in the paper's grid, and nobody hands a needle on that fast
 RATE_HZ = (10.0, 2000.0)
 PEAK_TURN_RAD_S = radians(45)
-SAME_POINT_MM = 1e-6
-FAR_MM = 1e4  # ten metres: no point of a PSM's, but one whose squares do not overflow
 _HEADROOM = 0.98  # each slow-down aims this far below the limits, so that it rarely needs another
 _ATTEMPTS = 20
 
-
-@dataclass(frozen=True, eq=False)
-class PassPath:
-    """One pass before it has a time.
-
-    Attributes:
-        tip_mm: Points of A1 in the PSM base frame, shape (K, 3), K >= 1; one point alone means that A1 is nothing.
-        rotation: The jaw's [n o a] held during A1, shape (3, 3).
-        target_rotation: Where A2 turns it, shape (3, 3), or None for a pass without A2.
-    """
-
-    tip_mm: Floats
-    rotation: Floats
-    target_rotation: Floats | None = None
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "tip_mm", frozen(self.tip_mm, np.float64, (None, 3), "tip_mm"))
-        object.__setattr__(self, "rotation", frozen(self.rotation, np.float64, (3, 3), "rotation"))
-        check_rotation(self.rotation[None])
-        if (np.abs(self.tip_mm) > FAR_MM).any():
-            raise BadPlan("A point is more than ten metres away; give millimetres in the PSM base frame.")
-        if self.target_rotation is not None:
-            target = frozen(self.target_rotation, np.float64, (3, 3), "target_rotation")
-            check_rotation(target[None])
-            object.__setattr__(self, "target_rotation", target)
+Paces = tuple[Pace, Pace, Pace]  # of each phase
 
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """All passes of a plan, sampled.
+    """All passes of a plan, sampled; from one sample to the next no pose leaps, whatever the stamps do.
 
     Attributes:
         rate_hz: Samples per second within a pass.
@@ -84,9 +57,9 @@ class Trajectory:
         pass_index: Number of the pass, from 0, shape (T,).
         phase: `TRANSFER` (to where A1 begins), `A1` or `A2`, shape (T,).
         speed_mm_s: Speed along A1 where its way is straight, after any slow-down.
-        turn_rad_s: Peak rate of A2 after any slow-down.
-        speed_ratio: Greatest joint speed as a part of its limit.
-        acceleration_ratio: Greatest joint acceleration as a part of its limit.
+        turn_rad_s: Peak rate of A2 after any slow-down; where PSM_M needs longer to come in, A2 turns slower still.
+        speed_ratio: Greatest joint speed, of either arm, as a part of its limit.
+        acceleration_ratio: Greatest joint acceleration, of either arm, as a part of its limit.
         deviation_mm: How far A1 leaves its straight moves at most.
         psm_m: PSM_M's motion beside it; None where its place is not known.
     """
@@ -155,38 +128,59 @@ def time_parametrise(
     rate_hz: float = 240.0,
     instrument: str = DEFAULT_INSTRUMENT,
     pause_s: float = 1.0,
+    psm_m: PsmM | None = None,
 ) -> Trajectory:
-    """Give passes a time: smooth, through every point, within the arm's limits. The same passes give the same bytes.
+    """Give passes a time: smooth, through every point, within the arms' limits. The same passes give the same bytes.
 
     Args:
         passes: The passes in order.
-        speed_mm_s: Speed along A1 where its way is straight; lower in bends, and lower where the joints' limits ask.
+        speed_mm_s: Speed along A1 where its way is straight, and greatest speed of a transfer and of PSM_M; lower in
+            bends, and lower where the joints' limits ask.
         rate_hz: Samples per second.
         instrument: Number of the instrument.
         pause_s: Seconds between passes, for M1 and M2 by hand; rounded to whole ticks, at least one.
+        psm_m: The other arm; where its base is known it moves beside this one.
 
     Raises:
         BadSpeed: Speed, rate or pause is NaN, not positive, or over its limit.
         NoMotion: There is no pass, or one in which nothing moves.
-        Unreachable: The first pass and sample that the arm cannot take; `numbers` has both, joint, value and limit.
+        BadPlan: PSM_M should take the needle in a pass without A2.
+        Unreachable: The first sample that an arm cannot take; `numbers` names pass, phase, joint, value and limit.
     """
     if not (isfinite(speed_mm_s) and 0 < speed_mm_s <= MAX_SPEED_MM_S):
         raise BadSpeed(f"Speed must be above 0 and at most {MAX_SPEED_MM_S:g} mm/s.", speed_mm_s=speed_mm_s)
     _check_rate(rate_hz)
     if not (isfinite(pause_s) and 0 <= pause_s <= 3600):
         raise BadSpeed("The pause between passes must be 0 to 3600 s.", pause_s=pause_s)
-    if not passes:
-        raise NoMotion("A plan needs at least one pass.")
-    clock = _Clock(speed_mm_s, PEAK_TURN_RAD_S, rate_hz)
-    polylines = [_polyline(one, number) for number, one in enumerate(passes)]
+    routes = ways(passes, psm_m)
+    paces = (Pace(speed_mm_s, PEAK_TURN_RAD_S, rate_hz),) * 3
     for _ in range(_ATTEMPTS):
-        sampled = [_sample(one, line, clock) for one, line in zip(passes, polylines, strict=True)]
-        joints = [_solve(one, number, instrument) for number, one in enumerate(sampled)]
-        slower = _slow_down(sampled, joints, clock, instrument)
-        if slower == clock:
-            return _assemble(sampled, joints, clock, instrument, pause_s)
-        clock = slower
-    raise BadSpeed("No speed keeps this plan within the joints' limits; move it away from the limits of the wrist.")
+        motion = _solved([_sample(one, paces) for one in routes], instrument, psm_m)
+        speed, acceleration = _ratios(motion, rate_hz, instrument)
+        slower = _slowed(paces, motion.ticks.phase, speed, acceleration)
+        if slower == paces:
+            break
+        paces = slower
+    else:
+        raise BadSpeed("No speed keeps this plan within the joints' limits; move it away from the limits of the wrist.")
+    pause = max(1, round(pause_s * rate_hz))
+    ticks = motion.ticks
+    return Trajectory(
+        rate_hz=rate_hz,
+        instrument=instrument,
+        stamps_s=(np.arange(len(motion.joints)) + ticks.pass_index * (pause - 1)) / rate_hz,
+        tip_mm=motion.poses.tip_mm,
+        rotation_xyzw=quaternion_of(motion.poses.rotation),
+        joints=motion.joints,
+        pass_index=ticks.pass_index,
+        phase=ticks.phase,
+        speed_mm_s=paces[A1].speed_mm_s,
+        turn_rad_s=paces[A2].turn_rad_s,
+        speed_ratio=float(speed.max()),
+        acceleration_ratio=float(acceleration.max()),
+        deviation_mm=motion.deviation_mm,
+        psm_m=motion.psm_m,
+    )
 
 
 def joint_ratios(
@@ -207,131 +201,88 @@ def joint_ratios(
     return speed, np.abs(after - before) * rate_hz / tool.acceleration
 
 
-# ---- one pass --------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class _Clock:
-    """How fast A1 runs, how fast A2 turns at its peak, and how often we look."""
-
-    speed_mm_s: float
-    turn_rad_s: float
-    rate_hz: float
-
-
-@dataclass(frozen=True, eq=False)
-class _Sampled:
-    """One pass in ticks from its own beginning."""
-
-    tip_mm: Floats
-    rotation: Floats
-    phase: Bytes
-    deviation_mm: float
-
-
 def _check_rate(rate_hz: float) -> None:
     low, high = RATE_HZ
     if not (isfinite(rate_hz) and low <= rate_hz <= high):
         raise BadSpeed(f"The rate must be {low:g} to {high:g} Hz.", rate_hz=rate_hz)
 
 
-def _polyline(one: PassPath, number: int) -> Floats:
-    """Drop repeated points, shape (K, 3).
-
-    Raises:
-        NoMotion: Nothing moves in this pass.
-    """
-    points = one.tip_mm
-    if not len(points):
-        raise NoMotion(f"Pass {number} has no points.", **{"pass": number})
-    moves = np.linalg.norm(np.diff(points, axis=0), axis=1) > SAME_POINT_MM
-    # The last of equal points is kept, so that the pass ends exactly on its last one.
-    kept: Floats = points[np.append(moves, True)]
-    if len(kept) < 2 and one.target_rotation is None:
-        raise NoMotion(f"Pass {number} neither moves nor turns; give it two points or a target.", **{"pass": number})
-    return kept
+# ---- one pass --------------------------------------------------------------------------------------------------
 
 
-def _sample(one: PassPath, line: Floats, clock: _Clock) -> _Sampled:
-    """Run through one pass by the clock: A1, then A2 from the next tick on."""
-    tip, deviation_mm = followed(line, clock.speed_mm_s / clock.rate_hz)
-    turned = _turned(one, clock)
-    rotation = np.concatenate([np.broadcast_to(one.rotation, (len(tip), 3, 3)), turned])
-    phase = np.repeat(np.array([A1, A2], np.int8), [len(tip), len(turned)])
-    return _Sampled(np.concatenate([tip, np.repeat(tip[-1:], len(turned), axis=0)]), rotation, phase, deviation_mm)
+@dataclass(frozen=True, eq=False)
+class _Sampled:
+    """One pass in ticks: the poses of each arm, and how many ticks each phase has."""
+
+    poses: tuple[Poses, ...]
+    counts: tuple[int, int, int]
+    deviation_mm: float
 
 
-def _turned(one: PassPath, clock: _Clock) -> Floats:
-    """Sample A2 as a minimum-jerk turn, shape (T, 3, 3), without its first moment, which is the end of A1."""
-    if one.target_rotation is None:
-        return np.empty((0, 3, 3))
-    angle = float(angle_between(one.rotation[None], one.target_rotation[None])[0])
-    ticks = max(1, ceil(1.875 * angle / clock.turn_rad_s * clock.rate_hz))
-    check_length(ticks)
-    u = np.arange(1, ticks + 1) / ticks
-    turned = turn(one.rotation, one.target_rotation, u**3 * (10 - 15 * u + 6 * u * u))
-    turned[-1] = one.target_rotation
-    return turned
-
-
-def _solve(one: _Sampled, number: int, instrument: str) -> Floats:
-    """Solve the joints of one pass; an unreachable sample is named with its pass."""
-    try:
-        return inverse(one.tip_mm, one.rotation, instrument)
-    except Unreachable as error:
-        phase = int(one.phase[int(str(error.numbers["sample"]))])
-        raise Unreachable(
-            f"Pass {number}, A{phase}: {error}", **{"pass": number, "phase": phase, **error.numbers}
-        ) from None
+def _sample(one: Way, paces: Paces) -> _Sampled:
+    """Run through one pass; where one phase ends and the next begins is one tick, at rest."""
+    legs = [move(start, end, paces[TRANSFER]) for start, end in pairwise(one.transfer)]
+    parts = [tuple(poses[:-1] for poses in leg) for leg in legs]  # a leg's last pose is the first of what follows
+    begin = one.transfer[-1]
+    tip, deviation_mm = followed(one.line, paces[A1].speed_mm_s / paces[A1].rate_hz)
+    along = Poses(tip, np.tile(begin[0].rotation, (len(tip), 1, 1)))
+    parts.append((along, *(held(pose, len(tip)) for pose in begin[1:])))
+    before = sum(len(leg[0]) for leg in parts[:-1])
+    turning = 0
+    if one.handed is not None:
+        turned = move((Pose(one.line[-1], begin[0].rotation), *begin[1:]), one.handed, paces[A2], least_ticks=1)
+        parts.append(tuple(poses[1:] for poses in turned))
+        turning = len(turned[0]) - 1
+    poses = tuple(joined(of_arm) for of_arm in zip(*parts, strict=True))
+    return _Sampled(poses, (before, len(tip), turning), deviation_mm)
 
 
 # ---- all passes ------------------------------------------------------------------------------------------------
 
 
-def _slow_down(sampled: Sequence[_Sampled], joints: Sequence[Floats], clock: _Clock, instrument: str) -> _Clock:
-    """Slow A1 or A2 down where a joint exceeds a limit; the same clock comes back where none does.
+@dataclass(frozen=True, eq=False)
+class _Motion:
+    """All passes in ticks, solved."""
 
-    Speed grows with the clock, acceleration with its square.
+    poses: Poses
+    ticks: Ticks
+    joints: Floats
+    psm_m: OtherArm | None
+    deviation_mm: float
+
+
+def _solved(sampled: Sequence[_Sampled], instrument: str, psm_m: PsmM | None) -> _Motion:
+    """Put the passes one after another and solve the joints of both arms."""
+    counts = np.array([one.counts for one in sampled])
+    check_length(int(counts.sum()))
+    phase = np.repeat(np.tile(np.array([TRANSFER, A1, A2], np.int8), len(counts)), counts.ravel())
+    ticks = Ticks(np.repeat(np.arange(len(counts)), counts.sum(axis=1)), phase)
+    poses = [joined(of_arm) for of_arm in zip(*(one.poses for one in sampled), strict=True)]
+    joints = solve(poses[0], ticks, instrument)
+    other = None if psm_m is None or len(poses) == 1 else other_arm(poses[1], ticks, psm_m)
+    return _Motion(poses[0], ticks, joints, other, max(one.deviation_mm for one in sampled))
+
+
+def _ratios(motion: _Motion, rate_hz: float, instrument: str) -> tuple[Floats, Floats]:
+    """Measure the greatest speed and acceleration of any joint of either arm, parts of their limits, both (T,)."""
+    moving = [(motion.joints, instrument)]
+    if motion.psm_m is not None:
+        moving.append((motion.psm_m.joints, motion.psm_m.instrument))
+    ratios = [joint_ratios(q, motion.ticks.pass_index, rate_hz, tool) for q, tool in moving]
+    speed, acceleration = (np.max([one[i].max(axis=1) for one in ratios], axis=0) for i in (0, 1))
+    return speed, acceleration
+
+
+def _slowed(paces: Paces, phase: Bytes, speed: Floats, acceleration: Floats) -> Paces:
+    """Slow each phase down in which a joint exceeds a limit; the same paces come back where none does.
+
+    Speed grows with the pace, acceleration with its square.
     """
-    factor = {A1: 1.0, A2: 1.0}
-    for one, q in zip(sampled, joints, strict=True):
-        speed, acceleration = joint_ratios(q, np.zeros(len(q), np.int64), clock.rate_hz, instrument)
-        for phase in factor:
-            of_phase = one.phase == phase
-            if of_phase.any():
-                worst = max(float(speed[of_phase].max()), sqrt(float(acceleration[of_phase].max())))
-                factor[phase] = max(factor[phase], worst)
-    slower = [1.0 if factor[phase] <= 1.0 else _HEADROOM / factor[phase] for phase in (A1, A2)]
-    return _Clock(clock.speed_mm_s * slower[0], clock.turn_rad_s * slower[1], clock.rate_hz)
-
-
-def _assemble(
-    sampled: Sequence[_Sampled],
-    joints: Sequence[Floats],
-    clock: _Clock,
-    instrument: str,
-    pause_s: float,
-) -> Trajectory:
-    """Put the passes one after another."""
-    counts = [len(q) for q in joints]
-    check_length(sum(counts))
-    pause = max(1, round(pause_s * clock.rate_hz))
-    number = np.repeat(np.arange(len(counts)), counts)
-    tick = np.arange(sum(counts)) + number * (pause - 1)
-    q = np.concatenate(joints)
-    speed, acceleration = joint_ratios(q, number, clock.rate_hz, instrument)
-    return Trajectory(
-        rate_hz=clock.rate_hz,
-        instrument=instrument,
-        stamps_s=tick / clock.rate_hz,
-        tip_mm=np.concatenate([one.tip_mm for one in sampled]),
-        rotation_xyzw=np.concatenate([quaternion_of(one.rotation) for one in sampled]),
-        joints=q,
-        pass_index=number,
-        phase=np.concatenate([one.phase for one in sampled]),
-        speed_mm_s=clock.speed_mm_s,
-        turn_rad_s=clock.turn_rad_s,
-        speed_ratio=float(speed.max()),
-        acceleration_ratio=float(acceleration.max()),
-        deviation_mm=max(one.deviation_mm for one in sampled),
+    transfer, a1, a2 = (
+        _HEADROOM / worst if worst > 1.0 else 1.0
+        for worst in (
+            max(float(speed[phase == one].max(initial=0)), sqrt(float(acceleration[phase == one].max(initial=0))))
+            for one in (TRANSFER, A1, A2)
+        )
     )
+    return paces[TRANSFER].slowed(transfer), paces[A1].slowed(a1), paces[A2].slowed(a2)

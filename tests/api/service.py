@@ -15,6 +15,7 @@ from skills.api.app import create_app
 from skills.client import Client
 from skills.db.base import Base
 from skills.db.models import Job
+from skills.library.batches import BATCH, PART
 from skills.settings import Settings
 from tests import backends
 from tests.library import cases
@@ -38,8 +39,10 @@ class Service:
     def work(self) -> list[dict[str, Any]]:
         """Carry all waiting jobs out, as a worker does, and look at them."""
         with self.database.reading() as session:
-            jobs = session.scalars(select(Job).where(Job.state.in_(("queued", "running")))).all()
-        return [self.client.job(cases.work(self.database, job).id) for job in jobs]
+            active = Job.state.in_(("queued", "running")), Job.kind != BATCH  # its parts are what is worked on
+            jobs = session.scalars(select(Job).where(*active)).all()
+        done = [cases.work(self.database, job) for job in jobs]
+        return [self.client.job(job.id) for job in done if job.kind != PART]
 
     def train(self, **asked: Any) -> dict[str, Any]:
         """Train kestrel's style, and give the job back."""

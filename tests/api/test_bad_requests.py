@@ -24,13 +24,19 @@ SOUND: dict[tuple[str, str], Any] = {
         **KESTREL, "demos": ["0" * 64], "seed": 0, "release": True,
         "learner": {"kind": "phase-q-learning", "alpha": 1.0, "gamma": 0.1, "max_steps": 1},
     },
+    ("POST", "/retrainings"): {
+        **KESTREL, "only_stale": False, "release": False, "learner": {"kind": "phase-q-learning", "alpha": 1.0},
+    },
     ("POST", "/policies/{surgeon}/{suture}/rollouts"): {"start_mm": [0.0, 50.0, -120.0], "version": 1},
     ("POST", "/policies/{surgeon}/{suture}/next"): {"position_mm": [0.0, 50.0, -120.0], "phase": 0},
     ("POST", "/plans"): {
         **KESTREL, "version": 1,
         "suture_points": [{"position_mm": [5.0, 55.0, -125.0], "rotation_xyzw": [0.0, 0.0, 0.0, 1.0]}],
         "starts_mm": [[0.0, 50.0, -120.0]], "arm": "PSM", "frame": "PSM_base", "instrument": "400006",
-        "speed_mm_s": 20.0, "psm_m": {"approach": [-0.94, 0.1, -0.33]},
+        "speed_mm_s": 20.0, "rate_hz": 150.0, "tip_offset_mm": 0.0, "psm_m": {
+            "approach": [-0.94, 0.1, -0.33], "instrument": "400006", "enters": "start", "source": "invented",
+            "base": {"position_mm": [160.0, 20.0, 20.0], "rotation_xyzw": [0.0, 0.3, 0.0, 0.95]},
+        },
     },
     ("POST", "/playbacks"): {"plan": "0" * 64},
 }  # fmt: skip
@@ -38,7 +44,7 @@ TOKENS = (
     "NaN", "Infinity", "-Infinity", "1e400", "9" * 400, "-" + "9" * 400, '"\\ud800"', '"\\u0000"', '"a\\u0000b"', "{}",
     '{"a": 1}', '[["b"]]', f'"{CANARY}"', '"' + "x" * 5000 + '"', "1.5e308", '"; DROP TABLE jobs; --"',
 )  # fmt: skip
-FREE_TEXT = {"name", "family", "description", "also_called", "protocol"}
+FREE_TEXT = {"name", "family", "description", "also_called", "protocol", "source"}
 NUMBERS_ONLY = ("true", '"1"')  # where a number belongs
 WHOLE_ONLY = ("1.5", "true", '"1"', "1e400", "-1")
 BODIES = (

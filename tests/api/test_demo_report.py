@@ -2,6 +2,7 @@
 
 import base64
 import hashlib
+import io
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -9,14 +10,16 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from skills.recordings import write_mcap
+from skills.recordings import read_recording, write_mcap
 from skills.seeds.recordings import sample_recordings
+from skills.style.kinematics import matrix_of, quaternion_of
 from skills.style.recording import Motion, Recording
 from tests.api.service import CSV, GOAL_MM, KESTREL, Service, assert_problem
 from tests.library import cases
 from tests.style import sessions
 
 PAGE = {"Accept": "text/html"}
+BASE_MM, BASE_XYZW = [160.0, 20.0, 20.0], [0.0, 0.3007057995, 0.0, 0.9537169507]  # of PSM1 in PSM2's, invented
 NUMBERS = (
     "duration_s", "samples", "rate_hz", "longest_gap_s", "duplicate_stamps", "path_length_mm", "extent_mm",
     "speed_median_mm_s", "speed_peak_mm_s", "jerk_rms_mm_s3", "log_dimensionless_jerk", "clutch_presses", "clutched_s",
@@ -195,6 +198,21 @@ def beside() -> bytes:
     return write_mcap(Recording(format="mcap", integrity="full", motions=motions))
 
 
+def with_bases() -> bytes:
+    """The same, and PSM1's pose in its own base, which stands 160 mm beside PSM2's and is tilted by 35 degrees."""
+    recording = read_recording(io.BytesIO(beside()))
+    other = recording.motion_of(topic="/PSM1/measured_cp")
+    base = matrix_of([BASE_XYZW])[0]
+    local = replace(
+        other,
+        topic="/PSM1/local/measured_cp",
+        frame="PSM1_base",
+        tip_mm=(other.tip_mm - BASE_MM) @ base,
+        rotation_xyzw=quaternion_of(base.T @ matrix_of(other.rotation_xyzw)),
+    )
+    return write_mcap(replace(recording, motions=(*recording.motions, local)))
+
+
 def plan(service: Service, **asked: object) -> dict:
     return service.client.plan(**KESTREL, suture_points=[{"position_mm": GOAL_MM}], **asked)
 
@@ -205,7 +223,9 @@ def test_a_plan_takes_psm_ms_approach_from_the_demonstration_and_says_so(here: S
     assert partner["approach"] == pytest.approx([-1.0, 0.0, 0.0])
     made = plan(here)
     assert made["psm_m"]["approach"] == pytest.approx([-1.0, 0.0, 0.0])
-    assert made["psm_m"]["from"] == f"the demonstration: PSM1 at {partner['at_s']:g} s of its recording"
+    seen = f"the demonstration: PSM1 at {partner['at_s']:g} s of its recording"
+    assert made["psm_m"]["from"] == {"approach": seen, "base": None}
+    assert (made["psm_m"]["base_mm"], made["trajectory"]["psm_m_moves"]) == (None, False)
     assert made["realignment"]
     x, y, z, w = made["passes"][0]["target_xyzw"]
     normal = np.array([1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)])
@@ -214,8 +234,23 @@ def test_a_plan_takes_psm_ms_approach_from_the_demonstration_and_says_so(here: S
 
 def test_a_given_approach_comes_before_the_demonstrated_one(here: Service, two_arms: dict):
     made = plan(here, psm_m={"approach": [0.0, -1.0, 0.0]})
-    assert made["psm_m"] == {"approach": [0.0, -1.0, 0.0], "from": "the request"}
+    assert made["psm_m"]["approach"] == [0.0, -1.0, 0.0]
+    assert made["psm_m"]["from"] == {"approach": "the request", "base": None}
     assert made["id"] != plan(here)["id"]
+
+
+def test_psm_ms_base_is_the_demonstrated_one_where_both_bases_were_recorded(here: Service):
+    here.client.add_demo(with_bases(), **KESTREL, arm="PSM2")
+    here.train(release=True)
+    made = plan(here)
+    assert made["psm_m"]["base_mm"] == pytest.approx(BASE_MM, abs=1e-6)
+    np.testing.assert_allclose(matrix_of([made["psm_m"]["base_xyzw"]])[0], matrix_of([BASE_XYZW])[0], atol=1e-9)
+    assert made["psm_m"]["from"]["base"] == made["psm_m"]["from"]["approach"]
+    assert made["psm_m"]["from"]["base"].startswith("the demonstration: PSM1 at ")
+    assert made["trajectory"]["psm_m_moves"]
+    given = plan(here, psm_m={"base": {"position_mm": [150.0, 25.0, 15.0], "rotation_xyzw": BASE_XYZW}})
+    assert given["psm_m"]["from"] == {"approach": made["psm_m"]["from"]["approach"], "base": "the request"}
+    assert given["psm_m"]["base_mm"] == [150.0, 25.0, 15.0]
 
 
 def test_a1_alone_is_planned_where_that_is_asked_for(here: Service, two_arms: dict):

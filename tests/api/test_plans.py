@@ -1,12 +1,10 @@
 """Plans, their motion, and the simulator's verdict."""
 
-import csv
-import io
-
 import numpy as np
 import pytest
 
 from tests.api.service import GOAL_MM, KESTREL, Service, assert_problem
+from tests.db.test_packed import forged
 
 POINTS = [[5.0, 55.0, -125.0], [11.0, 55.0, -125.0], [17.0, 55.0, -125.0]]
 QUARTER = [0.0, 0.0, 0.7071067811865476, 0.7071067811865476]  # about z
@@ -71,17 +69,129 @@ def test_a_plan_that_the_arm_cannot_follow_is_refused(still: Service, asked: dic
     assert still.counts() == before
 
 
-def test_the_trajectory_is_the_same_as_json_and_as_a_table(still: Service):
-    made = plan(still, *POINTS[:2])
-    path = f"/plans/{made['id']}/trajectory"
-    as_json = still.http.get(path).json()
-    table = list(csv.reader(io.StringIO(still.http.get(path, headers={"Accept": "text/csv"}).text)))
-    assert table[0] == as_json["columns"]
-    assert [[float(cell) for cell in row] for row in table[1:]] == as_json["rows"]
-    assert len(as_json["rows"]) == made["trajectory"]["samples"]
-    at = as_json["columns"].index("x_mm")
-    np.testing.assert_allclose(as_json["rows"][-1][at : at + 3], POINTS[1], atol=1e-6)
-    assert_problem(still.http.get(path, headers={"Accept": "application/zip"}), 415)
+# ---- PSM_M, starts and time -------------------------------------------------------------------------------------
+
+APPROACH = [-0.94, 0.10, -0.33]
+BASE = {"position_mm": [160.0, 20.0, 20.0], "rotation_xyzw": [0.0, 0.3007057995, 0.0, 0.9537169507]}  # 35 degrees
+
+
+def test_with_psm_ms_base_it_moves_too_and_the_plan_says_where_all_of_it_comes_from(still: Service):
+    asked = {"approach": APPROACH, "base": BASE, "source": "invented for a test"}
+    made = plan(still, *POINTS, psm_m=asked)
+    assert made["psm_m"] == {
+        "approach": APPROACH,
+        "base_mm": BASE["position_mm"],
+        "base_xyzw": BASE["rotation_xyzw"],
+        "instrument": "400006",
+        "enters": "after_A1",
+        "from": {"approach": "the request: invented for a test", "base": "the request: invented for a test"},
+    }
+    assert made["trajectory"]["psm_m_moves"]
+    alone = plan(still, *POINTS, psm_m={"approach": APPROACH})
+    assert alone["psm_m"]["from"] == {"approach": "the request", "base": None}
+    assert not alone["trajectory"]["psm_m_moves"]
+    assert alone["trajectory"]["duration_s"] < made["trajectory"]["duration_s"]
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"psm_m": {"approach": APPROACH, "base": BASE, "enters": "start"}},
+        {"psm_m": {"approach": APPROACH, "base": BASE, "instrument": "420006"}},
+        {"psm_m": {"approach": APPROACH, "base": BASE | {"position_mm": [161.0, 20.0, 20.0]}}},
+        {"psm_m": {"approach": APPROACH, "base": BASE, "source": "measured"}},
+        {"psm_m": {"approach": APPROACH, "base": BASE}, "rate_hz": 100.0},
+        {"psm_m": {"approach": APPROACH, "base": BASE}, "tip_offset_mm": 10.2},
+    ],
+)
+def test_another_psm_m_rate_or_tip_is_another_plan(still: Service, other: dict):
+    known = plan(still, GOAL_MM, psm_m={"approach": APPROACH, "base": BASE})
+    assert plan(still, GOAL_MM, **other)["id"] != known["id"]
+
+
+def test_a_plan_tells_its_transfers_its_seams_and_its_seconds(still: Service):
+    made = plan(still, *POINTS, psm_m={"approach": APPROACH, "base": BASE}, rate_hz=100.0)
+    first, *others = [one["transfer"] for one in made["passes"]]
+    assert first is None
+    start, end = np.array(made["passes"][1]["start_mm"]), np.array(POINTS[0])
+    for one in others:
+        assert one["length_mm"] == pytest.approx(np.linalg.norm(start - end), abs=1e-6)
+        assert one["duration_s"] > 1.875 * one["length_mm"] / 20.0
+    motion = made["trajectory"]
+    assert motion["rate_hz"] == 100.0
+    assert sum(motion["seconds_by_phase"].values()) == pytest.approx(motion["samples"] / 100.0)
+    assert [seam["after_pass"] for seam in motion["seams"]] == [0, 1]
+    for seam in motion["seams"]:
+        assert seam["pause_s"] == pytest.approx(1.0)
+        assert seam["leap_mm"] == 0.0
+        assert seam["joint_leap"] < 1e-9
+
+
+def test_a_start_outside_the_grid_is_reached_by_a_transfer(still: Service):
+    inside = plan(still, GOAL_MM, starts_mm=[[-30.0, 25.0, -120.0]])
+    outside = plan(still, GOAL_MM, starts_mm=[[-60.0, 25.0, -120.0]])
+    (one,) = outside["passes"]
+    assert one["start_mm"] == [-60.0, 25.0, -120.0]
+    assert one["states"] == inside["passes"][0]["states"]
+    assert one["path_mm"] == inside["passes"][0]["path_mm"]
+    assert one["transfer"]["length_mm"] == pytest.approx(30.0)
+    refused = still.http.post(
+        "/plans",
+        json=KESTREL | {"suture_points": [{"position_mm": GOAL_MM}], "starts_mm": [[-81.0, 25.0, -120.0]]},
+    )
+    problem = assert_problem(refused, 422, "outside-grid")
+    assert problem["numbers"] == {"pass": 0, "outside_mm": 51.0, "limit_mm": 50.0}
+
+
+def test_a_suture_point_may_be_where_the_finger_tips_go(still: Service):
+    made = plan(still, GOAL_MM, tip_offset_mm=10.2)
+    x, y, z = GOAL_MM
+    assert made["passes"][0]["path_mm"][-1] == pytest.approx([x, y, z + 10.2])  # the jaw points down
+    assert (made["passes"][0]["position_mm"], made["tip_offset_mm"]) == (GOAL_MM, 10.2)
+
+
+@pytest.mark.parametrize(
+    ("asked", "kind", "words"),
+    [
+        ({"psm_m": {}}, "no-approach", "does not say how psm_m approaches"),
+        ({"psm_m": {"base": BASE}}, "no-approach", "does not say how psm_m approaches"),
+        ({"psm_m": {"approach": APPROACH, "base": BASE, "instrument": "470006"}}, "invalid-request", ""),
+        (
+            {"psm_m": {"approach": APPROACH, "base": BASE | {"position_mm": [500.0, 0.0, 0.0]}}},
+            "unreachable",
+            "Pass 0, A1, PSM_M: Sample 0",
+        ),
+        ({"psm_m": {"approach": APPROACH, "base": BASE | {"rotation_xyzw": [0, 0, 0, 0]}}}, "improper-rotation", ""),
+        ({"psm_m": {"approach": APPROACH, "base": {"position_mm": [1, 2, 3]}}}, "invalid-request", ""),
+        ({"psm_m": {"approach": APPROACH, "enters": "never"}}, "invalid-request", ""),
+        ({"rate_hz": 99.0}, "invalid-request", ""),
+        ({"rate_hz": 240.0}, "invalid-request", ""),
+        ({"tip_offset_mm": 51.0}, "invalid-request", ""),
+    ],
+)
+def test_a_psm_m_that_cannot_come_and_a_rate_that_no_plan_has_are_refused(
+    still: Service, asked: dict, kind: str, words: str
+):
+    before = still.counts()
+    body = KESTREL | {"suture_points": [{"position_mm": GOAL_MM}]} | asked
+    problem = assert_problem(still.http.post("/plans", json=body), 422, kind)
+    assert words.lower() in problem["detail"].lower(), problem["detail"]
+    assert still.counts() == before
+
+
+def test_a_plan_stored_before_psm_m_moved_is_refused_and_nothing_falls_over(trained: Service):
+    made = plan(trained, GOAL_MM)
+    before = {"arm": "PSM", "frame": "PSM_base", "instrument": "400006", "speed_mm_s": 20.0, "approach_m": None}
+    before |= {"orientation": "assumed tool-down", "path": "fitted", "passes": {"tuple": []}}
+    trained.tamper("UPDATE plans SET plan = :old", old=forged({"value": "SuturePlan", "of": before}))
+    assert trained.client.plan_of(made["id"]) == made  # what was told of it can still be looked up
+    assert_problem(trained.http.get(f"/plans/{made['id']}/trajectory"), 503, "corrupt")
+    trained.client.play(made["id"])
+    [job] = trained.work()
+    assert (job["state"], job["result"]) == ("failed", None)
+    assert plan(trained, POINTS[1])["id"] != made["id"]
+    trained.client.erase_surgeon("kestrel")
+    assert_problem(trained.http.get(f"/plans/{made['id']}"), 404)
 
 
 def test_a_plan_is_played_in_the_simulator_and_found_feasible(trained: Service):

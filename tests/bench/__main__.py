@@ -1,150 +1,35 @@
-"""`make bench`: how fast it is, as ratios within one run, for timings vary from run to run and machine to machine."""
+"""`make bench [PARTS="reading learning ..."]`: how fast it is, as ratios within one run, for timings vary."""
 
-import hashlib
-import time
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from io import BytesIO
+import sys
 
-import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from skills.recordings import read_recording
-from skills.report.sources import paper_source
-from skills.seeds.recordings import sample_recordings
-from skills.settings import Settings
-from skills.style.certificate import certify
-from skills.style.demo import cut_demo
-from skills.style.evaluation import dtw
-from skills.style.grid import PAPER_GRID, discretize
-from skills.style.kinematics import POINTING_DOWN, forward, inverse
-from skills.style.learning import _kernels
-from skills.style.learning.learners import Learner
-from skills.style.learning.q_learning import CellQLearning, PhaseQLearning
-from skills.style.policy import Policy, learn_policy
-from skills.style.reward import RewardMap, sparse_reward
-from tests.bench.plain_c import plain_c
+from tests.bench.batches import batches
+from tests.bench.doubt import doubting
+from tests.bench.kinematics import kinematics
+from tests.bench.learning import learning
+from tests.bench.playing import playing
 from tests.bench.reading import reading
-from tests.measured import measured
+from tests.bench.scaling import scaling
 
-ROUNDS = 5
-
-
-def best_s(work: Callable[[], object], rounds: int = ROUNDS) -> float:
-    """Take the best of some rounds, in seconds of this thread's processor time; the first call only warms up."""
-    work()
-    times = []
-    for _ in range(rounds):
-        began = time.thread_time()
-        work()
-        times.append(time.thread_time() - began)
-    return min(times)
-
-
-def learning(name: str, reward: RewardMap, table: Table) -> None:
-    """Time both learners, and the certificate beside the learning."""
-    for learner in (PhaseQLearning(), CellQLearning()):
-        policy = learn_policy(reward, learner)
-        took, both = best_s(lambda: learn_policy(reward, learner)), best_s(lambda: learn_and_certify(reward, learner))  # noqa: B023
-        training = policy.training
-        table.add_row(f"{learner.kind}, {name}", f"{took * 1e3:.1f} ms", f"{training.steps} moves")
-        table.add_row("  with the certificate", f"{both * 1e3:.1f} ms", f"{both / took:.2f} x the learning alone")
-
-
-def learn_and_certify(reward: RewardMap, learner: Learner) -> None:
-    """Do what a training does."""
-    certify(learn_policy(reward, learner))
-
-
-def compiled(reward: RewardMap, table: Table) -> None:
-    """Compare the compiled kernel with the same function as plain Python."""
-    learner = CellQLearning(episodes=20)
-    fast = best_s(lambda: learn_policy(reward, learner))
-    kept = _kernels.run_episodes_compiled
-    try:
-        _kernels.run_episodes_compiled = _kernels.run_episodes
-        slow = best_s(lambda: learn_policy(reward, learner), rounds=1)
-    finally:
-        _kernels.run_episodes_compiled = kept
-    table.add_row("plain Python, 20 episodes", f"{slow * 1e3:.1f} ms", f"{slow / fast:.0f} x the compiled one")
-
-
-def against_c(reward: RewardMap, table: Table) -> None:
-    """Compare the paper's budget of moves with a plain C scan of the 27 actions, compiled here and now; in turn."""
-    steps = learn_policy(reward, CellQLearning()).training.steps
-    scan = plain_c()
-    if scan is None:
-        table.add_row("the paper's budget, cell state", "no C compiler here", "")
-        return
-    pairs = [
-        (best_s(lambda: learn_policy(reward, CellQLearning())), best_s(lambda: scan(reward))) for _ in range(ROUNDS)
-    ]
-    ours, theirs = (min(times) for times in zip(*pairs, strict=True))
-    table.add_row("the paper's budget, cell state", f"{ours / steps * 1e9:.1f} ns a move", f"{steps} moves")
-    table.add_row("  plain C, -O3", f"{theirs / steps * 1e9:.1f} ns a move", f"ours takes {ours / theirs:.2f} of it")
-
-
-def two_threads(reward: RewardMap, table: Table) -> None:
-    """Learn the same styles on one thread and on two, in turn: the loops let go of the interpreter.
-
-    Beside it what two threads of this machine can do at all, hashing: others may be using its cores.
-    """
-    learner, data = CellQLearning(episodes=200_000), bytes(64 << 20)
-    learning = _gain(lambda seed: learn_policy(reward, learner, seed))
-    hashing = _gain(lambda _: hashlib.sha256(data))
-    table.add_row("four policies, two threads", "", f"{learning:.2f} x one thread's rate")
-    table.add_row("  four hashes, two threads", "", f"{hashing:.2f} x one thread's rate")
-
-
-def _gain(work: Callable[[int], object]) -> float:
-    """Do some work four times, on one thread and on two, in turn: how much faster two are at best."""
-    took: dict[int, list[float]] = {1: [], 2: []}
-    for threads in (1, 2) * ROUNDS:
-        began = time.perf_counter()
-        with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(work, range(4)))
-        took[threads].append(time.perf_counter() - began)
-    return min(took[1]) / min(took[2])
-
-
-def sizes(table: Table) -> None:
-    """Learn and certify winding paths in larger grids, each in an interpreter of its own."""
-    for side, waypoints in ((11, 40), (21, 100), (51, 400), (101, 400)):
-        cost, path = measured(side, waypoints), f"{waypoints} waypoints"
-        learning, certificate = f"peak {cost.learning_mib:.0f} MiB", f"peak {cost.certificate_mib:.0f} MiB"
-        table.add_row(f"{side} cells a side, {path}", f"{cost.learning_s * 1e3:.0f} ms", learning)
-        table.add_row("  certificate", f"{cost.certificate_s * 1e3:.0f} ms", certificate)
-
-
-def kinematics(policy: Policy, table: Table) -> None:
-    """Time the closed form over the paper's whole grid."""
-    tips = PAPER_GRID.centres_mm(np.arange(PAPER_GRID.n_states))
-    rotations = np.broadcast_to(POINTING_DOWN, (len(tips), 3, 3))
-    joints = inverse(tips, rotations)
-    back, forth = best_s(lambda: inverse(tips, rotations)), best_s(lambda: forward(joints))
-    table.add_row("inverse kinematics, a pose", f"{back / len(tips) * 1e6:.2f} us", f"{back / forth:.1f} x forward")
-    rng = np.random.default_rng(0)
-    long = rng.normal(size=(1000, 3)), rng.normal(size=(1200, 3))
-    warped, summed = best_s(lambda: dtw(*long)), best_s(lambda: np.abs(long[0][:, None] - long[1]).sum(-1))
-    table.add_row("DTW, 1000 x 1200 points", f"{warped * 1e3:.1f} ms", f"{warped / summed:.1f} x its distances alone")
+PARTS = {
+    "reading": reading,
+    "learning": learning,
+    "motion": kinematics,
+    "playback": playing,
+    "doubt": doubting,
+    "batches": batches,
+    "scaling": scaling,
+}
 
 
 def main() -> None:
-    """Print the table."""
-    sample = next(s for s in sample_recordings() if s.surgeon == "wren")
+    """Print a table of the parts that are asked for, or of all."""
     table = Table("what", "time", "in proportion", box=None)
-    reading(table)
-    demo = cut_demo(read_recording(BytesIO(sample.data)), start_s=sample.segments[0][0], end_s=sample.segments[0][1])
-    reward = sparse_reward(discretize(demo.tip_mm, PAPER_GRID))
-    theirs = paper_source(Settings().paper_data)
-    learning(*(("the paper's user", sparse_reward(theirs.path)) if theirs else ("the loop of wren", reward)), table)
-    compiled(reward, table)
-    against_c(reward, table)
-    two_threads(reward, table)
-    sizes(table)
-    kinematics(learn_policy(reward, PhaseQLearning()), table)
-    Console(width=100).print(table)
+    for name in sys.argv[1:] or PARTS:
+        PARTS[name](table)
+    Console(width=110).print(table)
 
 
 if __name__ == "__main__":

@@ -1,9 +1,7 @@
 """How fast recordings are read, beside unpacking their chunks alone and beside libraries that decode each message."""
 
 import struct
-from collections.abc import Callable
 from io import BytesIO
-from time import thread_time
 
 import zstandard
 from mcap.stream_reader import StreamReader
@@ -13,6 +11,7 @@ from rich.table import Table
 from skills.recordings.mcap import read_mcap
 from skills.style.demo import cut_demo
 from skills.style.grid import discretize, fit_grid
+from tests.bench.timing import best_s, in_turn
 from tests.recordings import large, records
 
 ROUNDS = 9
@@ -25,7 +24,7 @@ def reading(table: Table) -> None:
     chunks = _chunks(session)
     size = sum(size for _, size in chunks)
     messages = sum(topic.messages for topic in read_mcap(BytesIO(session)).topics)
-    unpacking, ours = _in_turn(lambda: _unpack(chunks), lambda: read_mcap(BytesIO(session)))
+    unpacking, ours = in_turn(lambda: _unpack(chunks), lambda: read_mcap(BytesIO(session)), rounds=ROUNDS)
     table.add_row("reading four arms, 60 s at 200 Hz", f"{ours * 1e3:.0f} ms", f"{size / ours / 1e6:.0f} MB/s unpacked")
     table.add_row("  unpacking its chunks alone", f"{unpacking * 1e3:.0f} ms", f"{size / unpacking / 1e6:.0f} MB/s")
     after = ours - unpacking
@@ -38,8 +37,8 @@ def reading(table: Table) -> None:
 def _libraries(ours_s: float, table: Table) -> None:
     session = large.four_arms(LIBRARY_S)
     messages = sum(topic.messages for topic in read_mcap(BytesIO(session)).topics)
-    walking = _best(lambda: sum(1 for _ in StreamReader(BytesIO(session), validate_crcs=True).records)) / messages
-    decoding = _best(lambda: sum(1 for _ in read_ros2_messages(BytesIO(session)))) / messages
+    walking = best_s(lambda: sum(1 for _ in StreamReader(BytesIO(session), validate_crcs=True).records), 2) / messages
+    decoding = best_s(lambda: sum(1 for _ in read_ros2_messages(BytesIO(session))), 2) / messages
     table.add_row("  mcap, records only", f"{walking * 1e9:.0f} ns a message", f"{walking / ours_s:.0f} x ours")
     table.add_row("  mcap-ros2-support", f"{decoding * 1e9:.0f} ns a message", f"{decoding / ours_s:.0f} x ours")
 
@@ -51,7 +50,7 @@ def _long(table: Table) -> None:
         tip_mm = cut_demo(read_mcap(BytesIO(data))).tip_mm
         discretize(tip_mm, fit_grid(tip_mm))
 
-    table.add_row("10^6 poses: read, cut, discretised", f"{_best(work, rounds=3):.2f} s", "")
+    table.add_row("10^6 poses: read, cut, discretised", f"{best_s(work, 3):.2f} s", "")
 
 
 def _chunks(data: bytes) -> list[tuple[bytes, int]]:
@@ -67,20 +66,3 @@ def _chunks(data: bytes) -> list[tuple[bytes, int]]:
 def _unpack(chunks: list[tuple[bytes, int]]) -> None:
     for stored, size in chunks:
         zstandard.ZstdDecompressor().decompress(stored, max_output_size=size)
-
-
-def _in_turn(one: Callable[[], object], other: Callable[[], object]) -> tuple[float, float]:
-    """Take the best of some rounds of each, in turn, so that both see the same machine."""
-    pairs = [(_best(one, rounds=1), _best(other, rounds=1)) for _ in range(ROUNDS)]
-    ours, theirs = zip(*pairs, strict=True)
-    return min(ours), min(theirs)
-
-
-def _best(work: Callable[[], object], rounds: int = 2) -> float:
-    """Take the best of some rounds, in seconds of this thread's processor time."""
-    times = []
-    for _ in range(rounds):
-        began = thread_time()
-        work()
-        times.append(thread_time() - began)
-    return min(times)

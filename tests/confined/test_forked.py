@@ -70,6 +70,23 @@ def test_a_fork_has_nothing_of_ours(server, given, monkeypatch):
     assert (seen["threads"], seen["own group"]) == (1, True)
 
 
+def test_what_is_to_be_ready_is_called_once_in_the_server_and_every_fork_finds_it(given):
+    server = ForkServer("tests.confined.faults:get_ready")
+    try:
+        assert [json.loads(run(server, "who_got_ready", given)) for _ in range(3)] == 3 * [[server.pid]]
+    finally:
+        server.close()
+
+
+def test_a_fork_is_told_where_compiled_loops_are_kept(given, monkeypatch):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "/somewhere")
+    server = ForkServer("tests.confined.faults")
+    try:
+        assert "NUMBA_CACHE_DIR" in json.loads(run(server, "surroundings", given))["environment"]
+    finally:
+        server.close()
+
+
 def test_it_cannot_change_what_it_is_given(server, given):
     with pytest.raises(Unanswered, match="code 1"):
         run(server, "write_to_what_is_given", given)

@@ -12,16 +12,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as some
 
-from skills.db import packed  # the tables declare what may be stored
+from skills.db import npz, packed  # the tables declare what may be stored
 from skills.db.packed import FORMAT, Packed, digest, pack, unpack
 from skills.errors import Corrupt
 from skills.recordings import read_recording
 from skills.style.certificate import certify
 from skills.style.demo import Demo, Partner, Pause, cut_demo
 from skills.style.grid import PAPER_GRID, GridWorld, discretize
+from skills.style.handoff import PsmM
 from skills.style.learning.irl import MaxEntIRL
 from skills.style.learning.q_learning import CellQLearning, PhaseQLearning
 from skills.style.learning.value_iteration import ValueIteration
+from skills.style.pictures import Pictures
 from skills.style.plan import SuturePoint, stack
 from skills.style.playback import Playback
 from skills.style.policy import learn_policy
@@ -40,18 +42,23 @@ PLAN = stack(
     frame="PSM2_base",
     instrument="400006",
     rotation=None,
-    approach_m=(-0.94, 0.10, -0.33),
+    psm_m=PsmM((-0.94, 0.10, -0.33)),
 )
 PLAYBACK = Playback(
     tip_mm=np.array([[1.0, np.nan, np.inf], [-0.0, 5e-324, 1e308]]),
     rotation_xyzw=np.zeros((2, 4)),
     joints=np.asfortranarray(np.arange(12.0).reshape(2, 6)),
     tracking_mm=np.zeros(2),
-    clearance_pad_mm=np.zeros(2),
-    clearance_psm_m_mm=None,
-    pad_top_mm=-150.5,
+    efforts=np.full((2, 6), np.nan),
+    contact_n=np.zeros(2),
+    looked_at=np.array([0, 1]),
+    clearances_mm=np.zeros((2, 4)),
+    shaft_off_mm=np.zeros(2),
+    psm_m_tip_mm=None,
+    pad_mm=np.array([0.0, 55.5, -150.5]),
     picture_png=bytes(range(256)),
     engine="none \u00e9 \u2603",
+    files={"psm.urdf": "0" * 64},
     seconds_per_step=0.1 + 0.2,
 )
 VALUES = [
@@ -66,10 +73,12 @@ VALUES = [
     PHASED,
     ValueIteration(),
     MaxEntIRL(),
-    replace(PLAN, approach_m=None),
+    replace(PLAN, psm_m=None),
     PLAN,
+    replace(PLAN, psm_m=PsmM((1.0, 0.0, 0.0), (160.0, 20.0, 20.0), (0.0, 0.0, 0.0, 1.0), "420006", "start", "a", "b")),
     certify(POLICY)[1],
     PLAYBACK,
+    Pictures(b"mp4", b"gif", b"joints", b"clearance"),
 ]
 ARRAYS = some.arrays(
     st.sampled_from([np.float64, np.int64, np.int8, np.bool_, np.float32]),
@@ -160,7 +169,7 @@ def test_a_digest_knows_every_bit_the_shape_and_the_type(array: np.ndarray, data
 def test_a_digest_is_of_the_value_and_not_of_its_compression(monkeypatch: pytest.MonkeyPatch):
     before = digest(POLICY)
     small = pack(POLICY)
-    monkeypatch.setattr(np, "savez_compressed", np.savez)
+    monkeypatch.setattr(npz, "save", np.savez)
     large = pack(POLICY)
     assert len(large) > len(small)
     assert digest(POLICY) == digest(unpack(large)) == digest(unpack(small)) == before
@@ -240,3 +249,39 @@ def test_a_demonstration_without_pauses_and_partner_has_the_digest_it_always_had
     paused = replace(demo, pauses=(Pause(0.1, 0.2, "clutch"),))
     partner = replace(demo, partner=Partner("PSM1", 0.4, (1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 1.0)))
     assert len({digest(demo), digest(paused), digest(partner)}) == 3
+
+
+def test_a_partner_whose_base_is_not_known_has_the_digest_it_had_before_bases_were_and_is_read_again():
+    seconds = np.arange(5) / 10
+    partner = Partner("PSM1", 0.4, (1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 1.0))
+    tip_mm = np.stack([10 * seconds, 0 * seconds, 0 * seconds], axis=1)
+    demo = Demo("PSM2", "/t", "f", 0.0, 0.4, seconds, tip_mm, partner=partner)
+    assert digest(demo) == "562c6343a03d262c24c31623ac1294b888c9eccbfc861ac629b0e262c0daa9a0"
+    before = {"arm": "PSM1", "at_s": 0.4, "position_mm": {"tuple": [1, 2, 3]}, "rotation_xyzw": {"tuple": [0, 0, 0, 1]}}
+    assert unpack(forged({"value": "Partner", "of": before})) == partner
+    known = replace(partner, base_mm=(1.0, 2.0, 3.0), base_xyzw=(0.0, 0.0, 0.0, 1.0), instrument="400006")
+    assert unpack(pack(known)) == known
+    assert digest(replace(demo, partner=known)) != digest(demo)
+
+
+def test_a_plan_from_before_psm_m_moved_is_refused_and_nothing_of_it_is_used():
+    kept = ("arm", "frame", "instrument", "speed_mm_s", "orientation", "path")
+    before = {name: getattr(PLAN, name) for name in kept} | {"approach_m": None, "passes": {"tuple": []}}
+    with pytest.raises(Corrupt, match="none that this version knows"):
+        unpack(forged({"value": "SuturePlan", "of": before}))
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"rate_hz": 100.0},
+        {"tip_offset_mm": 10.2},
+        {"psm_m": None},
+        {"psm_m": replace(PLAN.psm_m, enters="start")},
+        {"psm_m": replace(PLAN.psm_m, instrument="420006")},
+        {"psm_m": replace(PLAN.psm_m, base_mm=(1.0, 2.0, 3.0), base_xyzw=(0.0, 0.0, 0.0, 1.0))},
+        {"psm_m": replace(PLAN.psm_m, approach_from="elsewhere")},
+    ],
+)
+def test_a_plans_digest_is_over_all_that_it_knows_of_psm_m_and_of_time(other):
+    assert digest(replace(PLAN, **other)) != digest(PLAN)

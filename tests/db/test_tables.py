@@ -8,11 +8,13 @@ from sqlalchemy.exc import DatabaseError, IntegrityError
 
 from skills.db import models
 from skills.db.base import Base, now
-from skills.db.models import Erasure, StoredPlayback
+from skills.db.models import Erasure, StoredPictures, StoredPlayback
 from skills.db.session import Database
+from skills.style.pictures import Pictures
 from tests import backends
 from tests.db.test_packed import PLAYBACK
 from tests.library import cases
+from tests.library.styles import retrain
 
 FROZEN = (
     "recordings",
@@ -21,11 +23,12 @@ FROZEN = (
     "policy_versions",
     "plans",
     "playbacks",
+    "playback_pictures",
     "events",
     "erasures",
 )
 WITHDRAWABLE = ("demonstrations", "releases")
-FREE = {"surgeons", "suture_types", "jobs", "executors"}
+FREE = {"surgeons", "suture_types", "jobs", "retraining_styles", "executors"}
 
 
 @pytest.fixture(scope="module", params=backends.BACKENDS)
@@ -37,8 +40,12 @@ def full(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
     cases.add_demo(database)
     cases.train(database, release=True)
     plan = cases.add_plan(database)
+    retrain(database)
     with database.writing() as session:
-        session.add(StoredPlayback(sha256="0" * 64, plan_row=plan.row, feasible=True, report={}, measured=PLAYBACK))
+        played = StoredPlayback(sha256="0" * 64, plan_row=plan.row, feasible=True, report={}, measured=PLAYBACK)
+        session.add(played)
+        session.flush()
+        session.add(StoredPictures(playback_row=played.row, drawn=Pictures(b"mp4", b"gif", b"png", b"png")))
         session.add(Erasure(salt="0" * 64, digest="0" * 64))
     yield database
     database.close()
@@ -105,7 +112,7 @@ def test_every_reference_to_another_table_is_enforced(full: Database):
 
 
 def test_what_something_rests_on_cannot_be_deleted(full: Database):
-    for table in ("recordings", "surgeons", "demonstrations", "policy_versions", "plans"):
+    for table in ("recordings", "surgeons", "demonstrations", "policy_versions", "plans", "playbacks"):
         with pytest.raises(IntegrityError), full.writing() as session:
             session.execute(text(f"DELETE FROM {table}"))
 

@@ -24,4 +24,10 @@ def test_the_demo_does_the_main_job_and_exits_with_0(tmp_path: Path) -> None:
     assert (learnt if real else "No real recording:") in printed
     assert ("Played back at its own place: feasible" in printed) == real
     assert len(list(pictures.glob("*-playback.png"))) >= len(styles)
-    assert all(picture.read_bytes().startswith(b"\x89PNG") for picture in pictures.iterdir())
+    begins = {".png": b"\x89PNG", ".gif": b"GIF89a", ".mp4": b"\0\0\0"}
+    assert all(picture.read_bytes().startswith(begins[picture.suffix]) for picture in pictures.iterdir())
+    drawn = [
+        f"kestrel-simple-running-{kind}" for kind in ("animation.mp4", "animation.gif", "joints.png", "clearance.png")
+    ]
+    assert f"The film of kestrel-simple-running and its plots over time: {', '.join(drawn)}" in printed
+    assert all((pictures / name).is_file() for name in drawn)

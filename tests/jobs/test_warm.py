@@ -7,8 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from skills.compiled import check_kept, kept_in
 from skills.errors import BadSettings
-from skills.jobs.warm import check_kept, kept_in
+from skills.recordings._kernels import follow_compiled
+from skills.style.learning._kernels import warp_compiled
 from tests.style.test_kernel_cache import start, told
 
 WARM = """
@@ -63,7 +65,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_a_folder_of_ones_own_is_taken_and_so_is_the_one_beside_the_code(folder):
     check_kept(folder)
-    check_kept(kept_in())
+    check_kept(kept_in(warp_compiled))
+    check_kept(kept_in(follow_compiled))
 
 
 @pytest.mark.parametrize("mode", [0o777, 0o775, 0o1777, 0o702], ids=oct)
@@ -114,5 +117,5 @@ def test_nothing_starts_that_would_load_machine_code_from_where_others_write(tmp
 
 
 def test_nowhere_to_keep_them_is_said():
-    logged = told(start("from skills.jobs.warm import check_kept\ncheck_kept(None)\ntell()"))["logged"]
+    logged = told(start("from skills.compiled import check_kept\ncheck_kept(None)\ntell()"))["logged"]
     assert "every process compiles them for itself; set NUMBA_CACHE_DIR to a folder of this user's own" in logged

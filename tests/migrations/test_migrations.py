@@ -14,7 +14,8 @@ from sqlalchemy import inspect, text
 from sqlalchemy.exc import DatabaseError
 
 from skills.db.base import Base
-from skills.db.session import Database, _alembic
+from skills.db.schema import alembic_config
+from skills.db.session import Database
 from skills.errors import Conflict
 from skills.library.demos import find_demo, withdraw_demo
 from skills.library.erasure import erase_demo
@@ -23,6 +24,7 @@ from skills.library.policies import find_by_digest
 from skills.library.verified import learnt, planned
 from tests import backends
 from tests.library import cases
+from tests.library.styles import ask_retraining, retrain
 
 NOT_OURS = "jobs_of_the_engine"
 
@@ -39,7 +41,7 @@ def database(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Databas
 
 def go(database: Database, how: Callable[[Config, str], None], where: str) -> None:
     with database.engine.execution_options(writes=True).connect() as connection:
-        config = _alembic()
+        config = alembic_config()
         config.attributes["connection"] = connection
         how(config, where)
         connection.commit()
@@ -86,7 +88,8 @@ def test_every_revision_goes_down_and_up_on_tables_with_rows_in_them(database: D
     cases.add_demo(database)
     cases.train(database, release=True)
     cases.add_plan(database)
-    for script in ScriptDirectory.from_config(_alembic()).walk_revisions():
+    retrain(database)
+    for script in ScriptDirectory.from_config(alembic_config()).walk_revisions():
         go(database, command.downgrade, script.down_revision or "base")
     assert tables(database) == {"alembic_version"}
     database.migrate()
@@ -117,6 +120,24 @@ def test_what_the_first_version_stored_is_kept_whole_and_still_guarded(database:
     with database.writing() as session:
         withdraw_demo(session, demo.sha256, "test")
     assert_guarded(database, "withdrawn_at", "NULL")
+
+
+def test_batches_go_with_their_table_and_those_that_had_not_ended_are_cancelled(database: Database):
+    database.migrate()
+    cases.add_surgeon(database)
+    cases.add_demo(database)
+    version = cases.train(database)
+    before = shape(database)
+    done, waiting = retrain(database), ask_retraining(database, release=True)
+    go(database, command.downgrade, "0003")
+    states = {job["kind"]: job["state"] for job in rows(database, "jobs") if job["row"] >= waiting.row}
+    assert states == {"retraining": "cancelled", "retraining-part": "cancelled"}
+    assert [job["state"] for job in rows(database, "jobs") if job["row"] == done.row] == ["succeeded"]
+    database.migrate()
+    assert shape(database) == before
+    with database.reading() as session:
+        assert learnt(find_by_digest(session, version.sha256)).path.hysteresis == 0
+    assert retrain(database, release=True).state == "succeeded"
 
 
 def rows(database: Database, table: str) -> list[dict[str, object]]:

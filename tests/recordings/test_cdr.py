@@ -12,9 +12,10 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.typesys import Stores, get_typestore
 
 from skills.errors import UnreadableRecording
-from skills.recordings import topics
+from skills.recordings import cdr, topics
 from skills.recordings.cdr import SHAPES_LIMIT, SLACK_BYTES, Decoder, Wanted, fields_of
 from skills.recordings.mcap import _WANTED
+from tests.recordings import records
 from tests.recordings.definitions import DEFINITIONS
 
 NUMBERS = st.floats(allow_nan=False, width=64)
@@ -60,9 +61,9 @@ MESSAGES = {
 def columns_of(messages, name, wanted, definition=None):
     """Decode messages by columns, as they would lie in a file."""
     lengths = np.array([len(message) for message in messages], dtype=np.int64)
-    gaps = 5 * np.arange(1, len(messages) + 1)
-    begin = np.cumsum(lengths) - lengths + gaps
-    data = b"".join(b"gap56" + message for message in messages) + bytes(SLACK_BYTES)
+    head = records.message(0, 5, b"")
+    begin = np.cumsum(lengths) - lengths + len(head) * np.arange(1, len(messages) + 1)
+    data = b"".join(head + message for message in messages) + bytes(SLACK_BYTES)
     decoder = Decoder("/a", fields_of(name, definition or DEFINITIONS[name]), wanted)
     return decoder.decode(np.frombuffer(data, np.uint8), begin, lengths)
 
@@ -133,14 +134,14 @@ VALUES = {
 
 
 @st.composite
-def defined(draw, depth=0):
+def defined(draw, outer="a/T"):
     """Draw a definition as lines, the definitions within it, and a strategy for its messages."""
     lines, others, fields = [], {}, {}
     for number in range(draw(st.integers(1, 4))):
-        field, inside = f"f{number}", depth < 2 and draw(st.integers(0, 3)) == 0
+        field, inside = f"f{number}", len(outer) < len("a/T") + 2 and draw(st.integers(0, 3)) == 0
         if inside:
-            inner, more, values = draw(defined(depth=depth + 1))
-            name = f"a/T{depth}{number}{len(others)}{draw(st.integers(0, 10**6))}"
+            name = f"{outer}{number}"
+            inner, more, values = draw(defined(name))
             others |= {name: inner, **more}
             lines.append(f"{name} {field}  # inner")
             fields[field] = values
@@ -246,6 +247,16 @@ def test_other_encapsulations_are_refused():
     for kind in (2, 3, 6, 7, 0x0100):
         with pytest.raises(UnreadableRecording, match="plain CDR"):
             columns_of([struct.pack(">H", kind) + pose_bytes()[2:]], topics.POSE, _WANTED[topics.POSE])
+
+
+def test_lengths_behind_what_is_wanted_tell_no_messages_apart(monkeypatch):
+    header = {"stamp": {"sec": 1, "nanosec": 2}, "frame_id": ""}
+    said = {"header": header, "name": [], "position": [1.0, 2.0]}
+    split = [{"velocity": 3 * [0.0], "effort": [0.0]}, {"velocity": [0.0], "effort": 3 * [0.0]}]
+    messages = encoded([said | rest for rest in split], topics.JOINT_STATE)
+    assert len(messages[0]) == len(messages[1])
+    monkeypatch.setattr(cdr, "SHAPES_LIMIT", 1)
+    assert columns_of(messages, topics.JOINT_STATE, _WANTED[topics.JOINT_STATE]).values.tolist() == 2 * [[1.0, 2.0]]
 
 
 def test_padding_that_is_not_zero_tells_no_messages_apart():

@@ -1,19 +1,20 @@
 """Reading apart: the same recording or the same refusal as without, and whatever else happens is a refusal too."""
 
 import io
+import json
 import logging
 import tempfile
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields, is_dataclass
-from typing import IO, Any
+from typing import IO, Any, BinaryIO
 
 import numpy as np
 import pytest
 
 from skills.confined.limits import Limits
 from skills.errors import BadColumns, BadInput, Busy, SkillsError, UnreadableRecording
-from skills.recordings import confined, read_recording
+from skills.recordings import _kernels, confined, read_recording, write_mcap
 from skills.recordings.confined import KNOWN, ConfinedReader, Refusal
 from skills.style import recording as values
 from tests.recordings import bags
@@ -82,6 +83,48 @@ def test_numbers_that_are_no_json_come_back_as_they_would_be_shown():
     numbers = Refusal.of(refused).read().numbers
     assert numbers == {"share": float("inf"), "stamp": "3", "names": ["a", None]}
 
+
+# ---- compiled loops
+
+
+def signatures() -> list[int]:
+    return [len(loop.signatures) for loop in (_kernels.follow_compiled, _kernels.take_compiled)]
+
+
+def tell_signatures(given: BinaryIO, answer: BinaryIO) -> None:
+    """Tell for how many signatures the loops are compiled, before reading and after it."""
+    before = signatures()
+    read_recording(given)
+    answer.write(json.dumps([before, signatures()]).encode())
+
+
+@pytest.mark.parametrize(
+    "data", [BAG, bags.unchunked(bags.straight(40), checksum=True), write_mcap(bags.recording(20))]
+)
+def test_a_fork_finds_every_loop_loaded_and_needs_no_other(reader, data):
+    with tempfile.TemporaryFile() as file:
+        file.write(data)
+        with reader.server.run(f"{__name__}:tell_signatures", file, {}, LIMITS) as answer:
+            assert json.load(answer) == [[1, 1], [1, 1]]
+
+
+def test_machine_code_is_not_loaded_from_where_others_write(tmp_path, monkeypatch, capfd):
+    tmp_path.chmod(0o777)
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    with ConfinedReader(LIMITS, answer_bytes=MOST, at_once=1) as unsafe, pytest.raises(Busy):
+        read(unsafe, BAG)
+    assert "other users can write" in capfd.readouterr().err
+
+
+def test_an_empty_folder_for_machine_code_is_filled_before_anything_is_read(tmp_path, monkeypatch):
+    tmp_path.chmod(0o700)
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    with ConfinedReader(LIMITS, answer_bytes=MOST, at_once=1) as first:
+        assert same(read_recording(io.BytesIO(BAG)), read(first, BAG))
+    assert len(list(tmp_path.rglob("_kernels.*.nbc"))) == 2
+
+
+# ---- nonsense
 
 NONSENSE = [
     *("garbage", "nothing", "with_pickles", "unfolding", "another_value", "a_class_that_is_not_named"),

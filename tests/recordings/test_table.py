@@ -18,7 +18,8 @@ from skills.errors import (
     UnreadableRecording,
 )
 from skills.recordings import read_recording
-from skills.recordings.table import quaternion_of_rpy, read_table
+from skills.recordings.table import OUTSIDE_MM, quaternion_of_rpy, read_table
+from skills.style.kinematics import CANNULA_MM, INSERTION, INSTRUMENTS, forward
 
 
 def read(text, **how):
@@ -33,7 +34,9 @@ def test_a_table_in_metres_and_one_in_millimetres_say_the_same():
 
 
 def test_seconds_since_1970_keep_their_nanoseconds():
-    stamps = read("t_s,x_m,y_m,z_m\n1760000000.123456789,0,0,0\n1760000000.123456790,0,0,0\n").motion_of().stamps_ns
+    stamps = (
+        read("t_s,x_m,y_m,z_m\n1760000000.123456789,0,0,-0.1\n1760000000.123456790,0,0,-0.1\n").motion_of().stamps_ns
+    )
     assert stamps.tolist() == [1760000000123456789, 1760000000123456790]
 
 
@@ -48,7 +51,7 @@ def test_jaw_clutch_and_frame_come_along():
 
 
 def test_the_frame_is_the_remote_centres_unless_another_is_given():
-    assert read("t_s,x_m,y_m,z_m\n0,0,0,0\n").motion_of().frame == "PSM_base"
+    assert read("t_s,x_m,y_m,z_m\n0,0,0,-0.1\n").motion_of().frame == "PSM_base"
 
 
 def test_the_papers_header_needs_a_rate():
@@ -88,7 +91,7 @@ def test_roll_pitch_yaw_turn_about_fixed_axes_x_then_y_then_z():
 def test_any_table_is_read_to_the_last_digit(rows):
     stamps = np.cumsum([row[0] for row in rows]).tolist()
     lines = [f"{t // 10**9}.{t % 10**9:09d},{x!r},{y!r},{z!r}" for t, (_, x, y, z) in zip(stamps, rows, strict=True)]
-    motion = read("\n".join(["t_s,x_mm,y_mm,z_mm", *lines])).motion_of()
+    motion = read("\n".join(["t_s,x_mm,y_mm,z_mm", *lines]), frame="camera").motion_of()
     assert motion.stamps_ns.tolist() == stamps
     assert motion.tip_mm.tolist() == [list(row[1:]) for row in rows]
 
@@ -125,6 +128,33 @@ def test_a_table_that_cannot_be_meant_is_refused_with_its_place(text, error, mes
         read(text)
 
 
+def in_inches(tip_mm):
+    rows = [f"{k / 100},{x / 25.4:.4f},{y / 25.4:.4f},{z / 25.4:.4f}" for k, (x, y, z) in enumerate(tip_mm)]
+    return "\n".join(["t_s,x_mm,y_mm,z_mm", *rows])
+
+
+def test_inches_in_columns_of_millimetres_are_refused_wherever_an_arm_reaches():
+    for instrument in INSTRUMENTS.values():
+        joints = np.random.default_rng(5).uniform(instrument.lower, instrument.upper, (200, 6))
+        joints[:, INSERTION] = instrument.upper[INSERTION]
+        with pytest.raises(NotMetres, match=r"inside the cannula.*not in inches"):
+            read(in_inches(forward(joints, instrument.name)[0]))
+    with pytest.raises(NotMetres, match=r"than 4\.72 mm \(at 0\.010 s\)"):
+        read(in_inches([(0, 0, -100), (0, 0, -120), (0, 0, -110)]))
+
+
+def test_every_path_outside_the_cannula_is_taken_as_it_is_and_so_is_one_that_only_begins_inside():
+    for instrument in INSTRUMENTS.values():
+        joints = np.random.default_rng(6).uniform(instrument.lower, instrument.upper, (200, 6))
+        joints[:, INSERTION] = CANNULA_MM
+        assert (np.linalg.norm(forward(joints, instrument.name)[0], axis=1) > OUTSIDE_MM).all()
+    assert len(read("t_s,x_mm,y_mm,z_mm\n0,0,0,-5\n1,0,0,-20\n").motion_of().tip_mm) == 2
+
+
+def test_small_numbers_in_another_frame_may_be_millimetres():
+    assert len(read(in_inches([(0, 0, -100), (0, 0, -120)]), frame="ECM").motion_of().tip_mm) == 2
+
+
 @pytest.mark.parametrize("rate_hz", [0.0, -1.0, float("nan"), float("inf"), 1e9])
 def test_a_rate_that_is_none_is_refused(rate_hz):
     with pytest.raises(BadSettings):
@@ -137,13 +167,13 @@ def test_a_time_said_twice_is_refused():
 
 
 def test_an_absurd_exponent_costs_neither_time_nor_memory():
-    assert read("t_s,x_m,y_m,z_m\n1e-999999999,0,0,0\n").motion_of().stamps_ns.tolist() == [0]
+    assert read("t_s,x_m,y_m,z_m\n1e-999999999,0,0,-0.1\n").motion_of().stamps_ns.tolist() == [0]
     with pytest.raises(NotFinite):
         read("t_s,x_m,y_m,z_m\n1e999999999,0,0,0\n")
 
 
 def test_the_callers_file_stays_open():
-    file = io.BytesIO(b"t_s,x_m,y_m,z_m\n0,0,0,0\n")
+    file = io.BytesIO(b"t_s,x_m,y_m,z_m\n0,0,0,-0.1\n")
     read_table(file)
     assert not file.closed
 

@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skills.errors import UnreadableRecording
-from skills.recordings import chain, topics, walker
-from skills.recordings.chain import follow, follow_one_by_one
+from skills.recordings import chain, source, topics, walker
+from skills.recordings.chain import Chain, follow
 from skills.recordings.unpack import unpack
 from skills.recordings.walker import Walker
 from tests.recordings import records
@@ -44,39 +44,58 @@ def refused(data: bytes, match: str):
 
 HEADS = st.sampled_from([b"\5", b"\5\x16\0\0\0\0\0\0\0", b"\5\x1f\0\0\0\0\0\0\0\0", b"\0", b"\5\0\0\0\0\0\0\0\0", b"x"])
 CONTENTS = st.lists(HEADS, max_size=12).map(b"".join)
-MESSAGES = CONTENTS.map(lambda content: message(1, 5, content))
-OTHERS = st.tuples(st.sampled_from([3, 4, 0x80, 0xFF]), CONTENTS).map(lambda pair: record(*pair))
 ENDS = st.sampled_from(
     [b"", b"\5", b"\5\x16\0\0\0\0\0\0\0", b"\5\xff\0\0\0\0\0\0\0" + bytes(40), b"\6" + bytes(8), b"\3"]
 )
 
 
-def same(one, other):
-    np.testing.assert_array_equal(one.messages, other.messages)
-    np.testing.assert_array_equal(one.lengths, other.lengths)
-    assert (one.others, one.end) == (other.others, other.end)
+def followed(data: bytes):
+    return follow(np.frombuffer(data, np.uint8))
 
 
 @settings(max_examples=200, deadline=None)
-@given(st.lists(st.one_of(MESSAGES, MESSAGES, OTHERS), max_size=30), ENDS)
-def test_looking_everywhere_at_once_finds_what_following_one_by_one_finds(pieces, end):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(chain, "SMALL_BYTES", 0)
-        found = follow(np.frombuffer(b"".join(pieces) + end, np.uint8))
-    data = np.frombuffer(b"".join(pieces) + end, np.uint8)
-    same(found, follow_one_by_one(data))
-    assert found.end == len(data) - len(end)
+@given(st.lists(st.tuples(st.sampled_from([5, 5, 3, 4, 0x80, 0xFF]), CONTENTS), max_size=40), ENDS)
+def test_what_was_put_one_behind_the_other_is_found_and_nothing_else(said, end):
+    pieces = [
+        message(k, 7 * k, content) if kind == 5 else record(kind, content) for k, (kind, content) in enumerate(said)
+    ]
+    found, begins = followed(b"".join(pieces) + end), np.cumsum([0, *map(len, pieces)]).tolist()
+    expected = [(begins[k], len(content), k, 7 * k) for k, (kind, content) in enumerate(said) if kind == 5]
+    told = (found.messages, found.lengths, found.channels, found.log_ns)
+    assert list(zip(*(column.tolist() for column in told), strict=True)) == expected
+    others = [(kind, begins[k] + 9, begins[k + 1]) for k, (kind, _) in enumerate(said) if kind != 5]
+    assert (found.others, found.end) == (others, begins[-1])
 
 
-def test_many_false_heads_are_no_trouble():
-    data = np.frombuffer(3000 * message(1, 5, 4 * b"\5\x16\0\0\0\0\0\0\0"), np.uint8)
-    same(follow(data), follow_one_by_one(data))
-    assert len(follow(data).messages) == 3000
+def test_whole_heads_in_every_content_are_no_messages():
+    inner = b"".join(message(7, 9, bytes(20)) for _ in range(20))
+    assert set(followed(1000 * (ONE + message(1, 5, inner))).channels.tolist()) == {1}
 
 
-def test_many_other_records_are_no_trouble():
-    data = np.frombuffer(3000 * (ONE + record(0x80, b"")), np.uint8)
-    same(follow(data), follow_one_by_one(data))
+@pytest.mark.parametrize("byte", range(1, 9))
+def test_a_length_that_lies_ends_the_chain(byte):
+    data = bytearray(200 * ONE)
+    data[100 * len(ONE) + byte] = 0xFF
+    before = followed(bytes(data[: 101 * len(ONE)]))
+    assert (before.end, len(before.messages)) == (100 * len(ONE), 100)
+
+
+def test_a_chain_is_followed_piece_by_piece_and_a_piece_ends_with_its_last_record():
+    data = np.frombuffer(3 * ONE + record(0x80, b"abc") + ONE, np.uint8)
+    chain = Chain(data)
+    ends = []
+    for to in (len(ONE), 2 * len(ONE) + 5, 3 * len(ONE), len(data) - len(ONE) - 1, len(data)):
+        chain.follow(to)
+        ends.append(chain.end)
+    assert ends == [len(ONE), 2 * len(ONE), 3 * len(ONE), 3 * len(ONE), len(data)]
+    assert chain.messages.tolist() == followed(data.tobytes()).messages.tolist()
+    assert chain.others == followed(data.tobytes()).others
+
+
+def test_many_other_records_cost_little():
+    began = time.process_time()
+    assert len(followed(100_000 * (ONE + record(0x80, b""))).others) == 100_000
+    assert time.process_time() - began < 3.0
 
 
 # ---- whole files ------------------------------------------------------------------------------------------------
@@ -175,6 +194,19 @@ def test_every_checksum_is_checked():
             walked(bytes(damaged))
 
 
+@pytest.mark.parametrize("block", [16, 1000, 2**16])
+def test_a_checksum_covers_a_file_that_is_read_in_many_blocks(block, monkeypatch):
+    monkeypatch.setattr(source, "_BLOCK_BYTES", block)
+    attachment = record(records.ATTACHMENT, bytes(50_000))
+    data = whole(attachment + DEFINED + 2000 * ONE + attachment + chunk(2000 * ONE), checksum=True)
+    assert walked(data)[0].integrity == "full"
+    for at in np.random.default_rng(4).integers(60, 150_000, 20).tolist():
+        flipped = bytearray(data)
+        flipped[at] ^= 4
+        with pytest.raises(UnreadableRecording):
+            walked(bytes(flipped))
+
+
 def test_integrity_says_what_checksums_cover():
     body = DEFINED + ONE
     sealed = [*records.parts_of(whole(chunk(body)))[:-1], Part(records.STATISTICS, b"")]
@@ -219,6 +251,46 @@ def test_what_our_own_writer_noted_is_read_and_what_others_noted_is_not():
     for name, expected in ((walker.NOTES, {"made from": "abc"}), ("other", {})):
         metadata = record(records.METADATA, records.text(name) + struct.pack("<I", len(noted)) + noted)
         assert walked(whole(metadata))[0].notes == expected
+
+
+# ---- indexes ----------------------------------------------------------------------------------------------------
+
+
+def index(offsets, number=1):
+    """Say where a chunk's messages of one channel are to be, as writers do behind the chunk."""
+    entries = b"".join(struct.pack("<QQ", 5, offset) for offset in offsets)
+    return record(records.MESSAGE_INDEX, struct.pack("<HI", number, len(entries)) + entries)
+
+
+BODY = DEFINED + 3 * ONE
+OFFSETS = [len(DEFINED), len(DEFINED + ONE), len(DEFINED + 2 * ONE)]
+
+
+@pytest.mark.parametrize(
+    "indexed",
+    [
+        index(OFFSETS),
+        index(OFFSETS[:2]),
+        index([*OFFSETS, OFFSETS[0]]),
+        index([OFFSETS[0], OFFSETS[0] + 1]),
+        index([len(BODY), 2**64 - 1]),
+        index(OFFSETS, number=2),
+        index([]),
+        record(records.MESSAGE_INDEX, b""),
+    ],
+    ids=["right", "one missing", "one twice", "overlapping", "beyond the end", "other channel", "empty", "none"],
+)
+def test_what_an_index_says_changes_nothing(indexed):
+    bare = whole(chunk(BODY) + chunk(3 * ONE))
+    assert walked(whole(chunk(BODY) + indexed + chunk(3 * ONE) + indexed))[1] == walked(bare)[1]
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.binary(max_size=60), st.integers(0, 2))
+def test_no_bytes_of_an_index_change_anything(said, before):
+    parts = [chunk(BODY), chunk(3 * ONE), chunk(ONE)]
+    parts.insert(before + 1, record(records.MESSAGE_INDEX, said))
+    assert walked(whole(b"".join(parts)))[1] == [("/a", 5, b"\0\1\0\0\1")] * 7
 
 
 # ---- limits -----------------------------------------------------------------------------------------------------

@@ -79,7 +79,13 @@ def answer(request: bytes) -> dict[str, Any]:
         "rotation_xyzw": asked["rotation_xyzw"],
         "joints": asked["joints"],
         "tracking_mm": np.zeros(count),
-        "clearance_pad_mm": np.full(count, 5.0),
+        "efforts": np.zeros((count, 6)),
+        "contact_n": np.zeros(count),
+        "looked_at": asked["looks"],
+        "clearances_mm": np.full((len(asked["looks"]), 4), 5.0),
+        "shaft_off_mm": np.zeros(len(asked["looks"])),
+        "files": np.array(["psm.urdf"]),
+        "digests": np.array(["0" * 64]),
         "picture_png": np.frombuffer(b"\x89PNG\r\n\x1a\n", np.uint8),
         "engine": np.array("none"),
         "seconds_per_step": np.array(1e-5),
@@ -94,6 +100,27 @@ def not_a_number(request: bytes) -> bytes:
     wrong = answer(request)
     wrong["tracking_mm"][3] = np.nan
     return wire.pack(wrong)
+
+
+def nan_joint(request: bytes) -> bytes:
+    wrong = answer(request)
+    wrong["joints"][3, 2] = np.nan
+    return wire.pack(wrong)
+
+
+def nan_clearance(request: bytes) -> bytes:
+    wrong = answer(request)
+    wrong["clearances_mm"][3, 1] = np.nan
+    return wire.pack(wrong)
+
+
+def looked_the_other_way(request: bytes) -> bytes:
+    wrong = answer(request)
+    return wire.pack(wrong | {"looked_at": wrong["looked_at"][::-1]})
+
+
+def no_such_file(request: bytes) -> bytes:
+    return wire.pack(answer(request) | {"files": np.array(["../psm.urdf"])})
 
 
 def too_short(request: bytes) -> bytes:
@@ -112,5 +139,5 @@ def no_picture(request: bytes) -> bytes:
 
 def incomplete(request: bytes) -> bytes:
     short = answer(request)
-    del short["clearance_pad_mm"]
+    del short["clearances_mm"]
     return wire.pack(short)

@@ -3,17 +3,22 @@
 import importlib.util
 import subprocess
 import sys
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from skills.db import models  # noqa: F401 - it declares what has a digest
+from skills.db.packed import digest
 from skills.errors import BadInput, SimulationFailed
 from skills.sim import scene
 from skills.sim.player import default_pad_top, play
+from skills.style.handoff import OtherArm
 from skills.style.kinematics import POINTING_DOWN
-from skills.style.playback import Playback, WaitingArm, judge
-from skills.style.trajectory import PassPath, time_parametrise
+from skills.style.playback import PSM_M, Playback
+from skills.style.trajectory import PassPath, Trajectory, time_parametrise
+from skills.style.verdict import judge
+from tests.bench.playing import stacked
 from tests.style.motions import hand_off, small_trajectory
 
 needs_pybullet = pytest.mark.skipif(
@@ -38,7 +43,10 @@ def test_a_small_plan_is_feasible(played):
     assert report.fk_error_mm < 1e-4
     assert report.fk_error_deg < 1e-3
     assert report.tracking_max_mm < 1e-3
-    assert report.clearance_pad_mm == pytest.approx(4.95, abs=0.1)  # 5 mm, and the open fingers' corners
+    assert report.shaft_off_mm < 1e-4
+    assert report.clearance_pad_mm == pytest.approx(5.0, abs=0.1)  # the fingers are a little open, and round
+    assert report.peak_contact_n == 0.0
+    assert 0.0 < report.peak_effort_ratio < 0.5
     assert report.clearance_psm_m_mm is None
     assert report.engine == "PyBullet 3.2.7"
     assert played.picture_png.startswith(b"\x89PNG")
@@ -48,18 +56,7 @@ def test_a_small_plan_is_feasible(played):
 def test_the_same_trajectory_gives_the_same_report_and_bytes_in_another_process(played):
     again = play(TRAJECTORY)
     assert judge(again, TRAJECTORY) == judge(played, TRAJECTORY)
-    for field in fields(Playback):
-        if field.name != "seconds_per_step":
-            one, other = getattr(played, field.name), getattr(again, field.name)
-            assert np.asarray(one).tobytes() == np.asarray(other).tobytes(), field.name
-
-
-@needs_pybullet
-def test_jaws_in_the_pad_are_named():
-    report = judge(play(TRAJECTORY, pad_top_mm=-140.0), TRAJECTORY)
-    assert report.failure is not None
-    assert (report.failure.quantity, report.failure.sample, report.failure.phase) == ("clearance to the pad", 0, 1)
-    assert report.clearance_pad_mm < -3.0
+    assert digest(replace(again, seconds_per_step=0.0)) == digest(replace(played, seconds_per_step=0.0))
 
 
 @needs_pybullet
@@ -78,30 +75,76 @@ def test_the_picture_shows_every_pass(played):
     assert len(np.unique(image.reshape(-1, 3), axis=0)) > 500
 
 
+def with_psm_m(motion: Trajectory, base_mm: list[float], joints: np.ndarray) -> Trajectory:
+    """Set PSM_M beside a motion, its base turned as PSM_A's is."""
+    return replace(motion, psm_m=OtherArm(base_mm, [0.0, 0.0, 0.0, 1.0], "400006", joints))
+
+
 @needs_pybullet
 def test_psm_m_beside_it_is_at_the_distance_worked_by_hand():
     still = time_parametrise([hand_off(with_a2=False)], rate_hz=60.0)
     last = still.joints[-1:]
     # The same pose, 40 mm along x: two parallel shafts of 8 mm, whose lines are 40 mm sqrt(1 - s_x^2) apart.
-    beside = WaitingArm([40.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0], last, enters_after_a1=False)
+    beside = with_psm_m(still, [40.0, 0.0, 0.0], np.tile(last, (len(still), 1)))
     along_x = np.cos(last[0, 1]) * np.sin(last[0, 0])
-    playback = play(still, psm_m=beside)
-    assert playback.clearance_psm_m_mm is not None
-    assert playback.clearance_psm_m_mm[-1] == pytest.approx(40.0 * np.sqrt(1 - along_x**2) - 8.0, abs=1e-3)
-    report = judge(playback, still)
+    playback = play(beside)
+    column = [str(pair) for pair in playback.link_pairs].index("PSM_A roll_link to PSM_M roll_link")
+    assert playback.clearances_mm[-1, column] == pytest.approx(40.0 * np.sqrt(1 - along_x**2) - 8.0, abs=1e-3)
+    report = judge(playback, beside)
     # On the way the yaws differ by 13 degrees, and above the remote centres the shafts cross.
     assert report.failure is not None
-    assert report.failure.quantity == "clearance to PSM_M"
+    assert report.failure.quantity == "clearance of PSM_A roll_link to PSM_M roll_link"
+    assert report.psm_m_fk_error_mm < 1e-4
 
 
 @needs_pybullet
-def test_psm_m_in_the_way_is_named_and_one_that_enters_after_a1_is_not():
-    still = time_parametrise([hand_off(with_a2=False)], rate_hz=60.0)
-    pose = [1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0], still.joints[-1:]
-    failure = judge(play(still, psm_m=WaitingArm(*pose, enters_after_a1=False)), still).failure
-    assert failure is not None
-    assert failure.quantity == "clearance to PSM_M"
-    assert judge(play(still, psm_m=WaitingArm(*pose)), still).feasible
+def test_a_hand_off_with_both_arms_is_feasible_and_says_how_near_which_links_came():
+    both = stacked(passes=2, rate_hz=100.0)
+    report = judge(play(both), both)
+    assert report.feasible, report.failure
+    assert report.psm_m_in_scene
+    assert [arm.name for arm in report.arms] == ["PSM_A", PSM_M]
+    assert report.ends[0].n_to_a_m_deg == pytest.approx(0.0, abs=1e-6)
+    assert report.ends[0].a_to_a_m_deg == pytest.approx(90.0, abs=1e-6)
+    at_hand_off = next(one for one in report.clearances if one.phase == "A2" and one.other == PSM_M)
+    # A quarter of the needle's circle apart, and PSM_M's fingers open, one of them towards PSM_A's wrist.
+    assert (at_hand_off.link, at_hand_off.other_link) == ("wrist_pitch_link", "finger_2")
+    assert at_hand_off.least_mm == pytest.approx(7.3, abs=0.1)
+    assert at_hand_off.at_least_mm <= at_hand_off.least_mm
+    assert {one.phase for one in report.needle} == {"transfer", "A1", "A2"}
+
+
+@needs_pybullet
+def test_looking_at_every_sample_finds_nothing_nearer_than_the_bounds_allow():
+    both = stacked(passes=1, rate_hz=100.0)
+    seldom, always = judge(play(both, clearance_every=12), both), judge(play(both, clearance_every=1), both)
+    assert always.looks == len(both)
+    assert always.moved_between_looks_mm < seldom.moved_between_looks_mm
+    everywhere = {(one.phase, one.body, one.link, one.other, one.other_link): one for one in always.clearances}
+    for one in seldom.clearances:
+        true_mm = everywhere[one.phase, one.body, one.link, one.other, one.other_link].least_mm
+        assert one.at_least_mm - 1e-6 <= true_mm <= one.least_mm + 1e-6
+
+
+@needs_pybullet
+def test_where_surfaces_are_close_every_sample_is_looked_at():
+    one = time_parametrise([hand_off(with_a2=False)], rate_hz=60.0)
+    low = play(one, pad_top_mm=default_pad_top(one) + 4.0)
+    near = np.flatnonzero(np.diff(low.looked_at) == 1)
+    assert len(low.looked_at) > len(one) / 4 + 10
+    assert low.clearances_mm[near].min() == low.clearances_mm.min()
+
+
+@needs_pybullet
+def test_a_long_row_of_passes_has_a_pad_under_all_of_it():
+    far = time_parametrise([hand_off(-25.0 * k, with_a2=False) for k in range(6)], rate_hz=20.0, speed_mm_s=40.0)
+    report = judge(play(far, pad_top_mm=-150.0), far)
+    ends = [one.sample for one in report.clearances if one.link == "finger_1"]
+    assert report.feasible, report.failure
+    assert ends
+    sunk = judge(play(far, pad_top_mm=-135.0), far)
+    assert sunk.failure is not None
+    assert sunk.failure.sample == 0
 
 
 @needs_pybullet
@@ -145,6 +188,10 @@ def test_a_sound_answer_is_taken_whoever_gives_it():
         ("nothing", "nonsense"),
         ("pickled", "nonsense"),
         ("not_a_number", "nonsense"),
+        ("nan_joint", "nonsense"),
+        ("nan_clearance", "nonsense"),
+        ("looked_the_other_way", "nonsense"),
+        ("no_such_file", "nonsense"),
         ("too_short", "nonsense"),
         ("whole_numbers", "nonsense"),
         ("no_picture", "nonsense"),
@@ -168,11 +215,11 @@ def test_without_pybullet_the_message_says_what_to_install(monkeypatch):
         play(TRAJECTORY)
 
 
-def test_a_pad_without_a_height_and_a_pass_without_psm_m_are_refused():
+def test_a_pad_without_a_height_and_distances_at_no_sample_are_refused():
     with pytest.raises(BadInput, match="height"):
         play(TRAJECTORY, pad_top_mm=float("nan"))
-    with pytest.raises(BadInput, match="one for each"):
-        play(TRAJECTORY, psm_m=WaitingArm([0, 0, 0], [0, 0, 0, 1], np.zeros((1, 6))))
+    with pytest.raises(BadInput, match="every so many"):
+        play(TRAJECTORY, clearance_every=0)
 
 
 def test_the_pad_lies_under_the_finger_tips_and_not_under_the_hinge():

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skills.style.handoff import HELD_MM, NEEDLE_RADIUS_MM, hand_off
+from skills.style.handoff import HELD_MM, NEEDLE_RADIUS_MM, TAKEN_MM, hand_off
 from skills.style.kinematics import POINTING_DOWN, check_rotation, matrix_of
 from skills.style.realign import realign
 
@@ -17,7 +17,7 @@ def test_a_case_worked_by_hand():
     rotation = realign(POINTING_DOWN, approach).rotation
     tip, jaws = hand_off(np.zeros((1, 3)), rotation[None], approach)
     # Held 9 mm below the hinge; a quarter circle further is one radius along +y and one across, along a_M x a_A = +x.
-    assert np.allclose(tip[0] + HELD_MM * approach, [NEEDLE_RADIUS_MM, NEEDLE_RADIUS_MM, -HELD_MM])
+    assert np.allclose(tip[0] + TAKEN_MM * approach, [NEEDLE_RADIUS_MM, NEEDLE_RADIUS_MM, -HELD_MM])
     assert np.allclose(jaws[0, :, 2], approach)
     assert np.allclose(jaws[0, :, 0], [1, 0, 0])
 
@@ -34,7 +34,7 @@ def test_psm_m_holds_a_needle_that_runs_along_its_hinge(turned, approach):
     assert np.allclose(a_m, approach / np.linalg.norm(approach))
     # Both grips lie on one circle in the plane normal to PSM_A's approach, whose tangents there are n_A and n_M.
     held = np.array([10.0, 50.0, -120.0]) + HELD_MM * rotation[:, 2]
-    taken = tip[0] + HELD_MM * a_m
+    taken = tip[0] + TAKEN_MM * a_m
     centre = held + NEEDLE_RADIUS_MM * n_m
     assert abs((taken - held) @ rotation[:, 2]) < 1e-9
     assert np.isclose(np.linalg.norm(taken - centre), NEEDLE_RADIUS_MM)

@@ -58,7 +58,8 @@ def read_only(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A copy of the package, beside whose code nothing can be kept, whoever runs the tests."""
     installed = tmp_path_factory.mktemp("installed")
     shutil.copytree(PROJECT / "skills", installed / "skills", ignore=shutil.ignore_patterns("__pycache__", "*.mcap"))
-    (installed / "skills" / "style" / "learning" / "__pycache__").touch()
+    for part in ("style/learning", "recordings"):
+        (installed / "skills" / part / "__pycache__").touch()
     return installed
 
 

@@ -65,3 +65,48 @@ def test_in_the_arms_own_frame_it_is_found_through_the_camera(recorded):
     turn, shift = sessions.BASES[M]  # as they were written, which the recording does not say
     np.testing.assert_allclose(demo.partner.position_mm, turn @ other.tip_mm[at] + shift, atol=1e-6)
     np.testing.assert_allclose(demo.partner.approach, turn @ matrix_of(other.rotation_xyzw[[at]])[0][:, 2], atol=1e-9)
+
+
+# ---- its base ---------------------------------------------------------------------------------------------------
+
+
+def test_where_both_arms_bases_stand_in_one_frame_the_other_ones_is_told_in_this_ones(recorded):
+    value, _ = recorded
+    partner = cut(value).partner
+    turn, shift = sessions.BASES[M]  # of its base in this arm's, as it was written
+    np.testing.assert_allclose(partner.base_mm, shift, atol=1e-6)
+    np.testing.assert_allclose(matrix_of([partner.base_xyzw])[0], turn, atol=1e-9)
+
+
+def test_psm_m_planned_with_that_base_stands_where_it_was_recorded(recorded):
+    value, _ = recorded
+    demo = cut(value)
+    here = value.motion_of(topic=f"/{M}/local/measured_cp")
+    at = int(np.abs(value.seconds(here.stamps_ns) - demo.partner.at_s).argmin())
+    base = matrix_of([demo.partner.base_xyzw])[0]
+    np.testing.assert_allclose(base @ here.tip_mm[at] + demo.partner.base_mm, demo.partner.position_mm, atol=1e-6)
+
+
+def test_in_the_cameras_frame_no_base_is_told(recorded):
+    value, _ = recorded
+    partner = cut(value, f"/{A}/measured_cp").partner
+    assert (partner.base_mm, partner.base_xyzw) == (None, None)
+
+
+def test_a_base_that_moved_is_not_told(recorded):
+    value, _ = recorded
+    local = f"/{M}/local/measured_cp"
+    drift = np.linspace(0, 10, len(value.motion_of(topic=local).tip_mm))[:, None]
+    moved = tuple(replace(m, tip_mm=m.tip_mm + drift) if m.topic == local else m for m in value.motions)
+    partner = cut(replace(value, motions=moved)).partner
+    assert partner.arm == M
+    assert (partner.base_mm, partner.base_xyzw) == (None, None)
+
+
+@pytest.mark.parametrize(
+    ("named", "number"), [("LARGE_NEEDLE_DRIVER:400006", "400006"), ("MEGA_NEEDLE_DRIVER:400309", None), ("", None)]
+)
+def test_its_instrument_is_told_where_its_constants_are_known(recorded, named, number):
+    value, _ = recorded
+    partner = cut(replace(value, tools=((A, "LARGE_NEEDLE_DRIVER:420006"), (M, named)))).partner
+    assert partner.instrument == number

@@ -5,10 +5,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from skills.errors import BadInput, BadPlan, ImproperRotation, NoApproach, OutsideGrid
+from skills.errors import BadInput, BadPlan, BadSpeed, ImproperRotation, NoApproach, OutsideGrid
 from skills.style.demo import Demo
-from skills.style.kinematics import POINTING_DOWN, matrix_of
-from skills.style.plan import MAX_PASSES, SuturePoint, pose_xyzw, rotation_of, stack
+from skills.style.handoff import PsmM
+from skills.style.kinematics import JAW_TIP_MM, POINTING_DOWN, matrix_of
+from skills.style.plan import MAX_OUTSIDE_MM, MAX_PASSES, SuturePoint, pose_xyzw, rotation_of, stack
 from skills.style.policy import rollout, rollout_from
 from skills.style.smooth import fit_to_demo, trace
 from skills.style.trajectory import PassPath
@@ -97,7 +98,7 @@ def test_the_jaw_is_the_demonstrated_one_where_it_is_known():
 
 def test_with_psm_ms_approach_the_jaws_normal_ends_parallel_to_it():
     approach_m = (0.6, 0.0, -0.8)
-    plan = stacked([SuturePoint((0, 0, -120), QUARTER_ABOUT_Z)], approach_m=approach_m)
+    plan = stacked([SuturePoint((0, 0, -120), QUARTER_ABOUT_Z)], psm_m=PsmM(approach_m))
     normal = plan.passes[0].target_rotation[:, 0]
     assert abs(normal @ approach_m) == pytest.approx(1, abs=1e-9)
     assert plan.passes[0].target_rotation[:, 2] @ approach_m == pytest.approx(0, abs=1e-9)
@@ -105,7 +106,7 @@ def test_with_psm_ms_approach_the_jaws_normal_ends_parallel_to_it():
 
 
 def test_a_plan_gives_the_paths_that_take_their_time():
-    plan = stacked([SuturePoint((0, 0, -120)), SuturePoint((8, 0, -120))], approach_m=(1.0, 0, 0))
+    plan = stacked([SuturePoint((0, 0, -120)), SuturePoint((8, 0, -120))], psm_m=PsmM((1.0, 0, 0)))
     assert all(isinstance(one, PassPath) for one in plan.pass_paths)
     assert [one.tip_mm.tolist() for one in plan.pass_paths] == [one.tip_mm.tolist() for one in plan.passes]
 
@@ -138,6 +139,72 @@ def test_with_its_demonstration_a_pass_is_the_fitted_path_moved(place_mm, turn_x
         assert one.tip_mm[0] == pytest.approx(one.start_mm, abs=EXACT_MM)
 
 
+# ---- starts outside, and where the tip is -----------------------------------------------------------------------
+
+
+@settings(deadline=None, max_examples=40)
+@given(places_mm, turns_xyzw, st.tuples(*[st.floats(-75, 75)] * 3))
+def test_from_a_start_outside_its_grid_a_pass_enters_at_the_nearest_place_and_goes_on_from_there(place, turn, off_mm):
+    policy, grid = learnt(NAME), named_path(NAME).grid
+    low, high = grid.centres_mm(0), grid.centres_mm(grid.n_states - 1)
+    here = (low + high) / 2 + off_mm
+    entered = np.clip(here, low, high)
+    outside_mm = np.linalg.norm(here - entered)
+    turned, goal_mm = matrix_of([turn])[0], policy.path.tip_mm[-1]
+    start_mm = turned @ (here - goal_mm) + place
+    if outside_mm > MAX_OUTSIDE_MM + 1e-6:
+        with pytest.raises(OutsideGrid, match="Pass 0 starts outside"):
+            stacked([SuturePoint(place, turn)], starts_mm=[start_mm])
+        return
+    if outside_mm > MAX_OUTSIDE_MM - 1e-6:
+        return
+    (one,) = stacked([SuturePoint(place, turn)], starts_mm=[start_mm]).passes
+    inside = np.abs(here - entered).max() < grid.cell_mm / 2 - 1e-6
+    assert one.start_mm == pytest.approx(start_mm, abs=1e-9)
+    if inside or outside_mm > grid.cell_mm:
+        begin = here if inside else entered
+        assert one.tip_mm[0] == pytest.approx(turned @ (begin - goal_mm) + place, abs=1e-9)
+        assert one.states.tolist() == rollout(policy, begin).states.tolist()
+
+
+def test_the_nearest_place_is_worked_by_hand():
+    grid = named_path(NAME).grid  # its centres end at `high`
+    high = grid.centres_mm(grid.n_states - 1)
+    off = np.array([30.0, 0.0, 40.0])
+    at_home = [SuturePoint(tuple(named_path(NAME).tip_mm[-1]))]
+    plan = stacked(at_home, starts_mm=[high + off])
+    assert plan.passes[0].tip_mm[0] == pytest.approx(high)
+    assert plan.pass_paths[0].start_mm == pytest.approx(high + off)
+    with pytest.raises(OutsideGrid, match=r"50\.1 mm from it") as refused:
+        stacked(at_home, starts_mm=[high + 1.002 * off])
+    assert refused.value.numbers["outside_mm"] == pytest.approx(50.1)
+
+
+def test_a_suture_point_may_be_where_the_finger_tips_go():
+    point, start = SuturePoint((0.0, 50.0, -130.0), QUARTER_ABOUT_Z), (5.0, 50.0, -130.0)
+    hinge = stacked([point], starts_mm=[start])
+    fingers = stacked([point], starts_mm=[start], tip_offset_mm=JAW_TIP_MM)
+    up = np.array([0.0, 0.0, JAW_TIP_MM])  # the tool points down, so the hinge is above the place that is meant
+    for one, other in zip(hinge.passes, fingers.passes, strict=True):
+        assert other.tip_mm == pytest.approx(one.tip_mm + up, abs=1e-9)
+        assert other.start_mm == pytest.approx(one.start_mm + up, abs=1e-9)
+        assert other.point == one.point
+        assert other.tip_mm[-1] + JAW_TIP_MM * other.rotation[:, 2] == pytest.approx(point.position_mm, abs=1e-9)
+    assert (hinge.tip_offset_mm, fingers.tip_offset_mm) == (0.0, JAW_TIP_MM)
+
+
+@pytest.mark.parametrize("wrong", [{"tip_offset_mm": -1.0}, {"tip_offset_mm": 51.0}, {"tip_offset_mm": np.nan}])
+def test_an_offset_that_no_instrument_has_is_refused(wrong):
+    with pytest.raises(BadPlan, match="offset"):
+        stacked([SuturePoint((0, 0, -120))], **wrong)
+
+
+@pytest.mark.parametrize("rate_hz", [99.0, 201.0, np.nan, np.inf])
+def test_a_plan_is_sampled_at_100_to_200_hz(rate_hz):
+    with pytest.raises(BadSpeed, match="100 to 200"):
+        stacked([SuturePoint((0, 0, -120))], rate_hz=rate_hz)
+
+
 def test_a_plan_says_which_path_it_has():
     assert stacked([SuturePoint((0, 0, -120))]).path == "cell centres"
     assert stacked([SuturePoint((0, 0, -120))], demo=hand_along(NAME)).path == "fitted"
@@ -155,7 +222,7 @@ def test_a_start_outside_its_grid_world_is_refused_with_the_number_of_the_pass()
     points = [SuturePoint((0, 0, -120)), SuturePoint((8, 0, -120))]
     with pytest.raises(OutsideGrid, match="Pass 1 starts outside its grid world") as refusal:
         stacked(points, starts_mm=[None, (500, 0, 0)])
-    assert refusal.value.numbers == {"suture_pass": 1}
+    assert (refusal.value.numbers["pass"], refusal.value.numbers["limit_mm"]) == (1, 50.0)
 
 
 @pytest.mark.parametrize("starts_mm", [[], [None], [None, None, None]])
@@ -190,7 +257,7 @@ def test_a_turn_that_is_none_is_refused():
     with pytest.raises(ImproperRotation):
         stacked([SuturePoint((0, 0, -120), (0, 0, 0, 0))])
     with pytest.raises(NoApproach):
-        stacked([SuturePoint((0, 0, -120))], approach_m=(0, 0, 0))
+        stacked([SuturePoint((0, 0, -120))], psm_m=PsmM((0, 0, 0)))
 
 
 # ---- rotations --------------------------------------------------------------------------------------------------

@@ -7,7 +7,10 @@ from hypothesis import strategies as st
 
 from skills.errors import BadInput, OutsideGrid
 from skills.style.domain import FINISHED, OUTSIDE
-from skills.style.policy import next_step, rollout, rollout_from
+from skills.style.grid import PAPER_GRID, GridPath
+from skills.style.learning.q_learning import PhaseQLearning
+from skills.style.policy import GUIDED_MM, learn_policy, next_step, rollout, rollout_from
+from skills.style.reward import sparse_reward
 from tests.style.paths import WALKS, follow, learnt, named_path
 
 STAY = 13
@@ -200,8 +203,73 @@ def test_a_phase_that_the_policy_does_not_have_is_refused(phase):
         next_step(learnt("an angle"), named_path("an angle").tip_mm[0], phase)
 
 
-def test_a_step_from_outside_the_grid_is_refused():
+@pytest.mark.parametrize(("phase", "after", "waypoint"), [(None, 0, 0), (0, 0, 0), (1, 1, 0), (3, 3, 2), (6, 6, 5)])
+def test_outside_the_grid_nothing_is_promised_but_the_way_back(phase, after, waypoint):
+    policy, path = learnt("an angle"), named_path("an angle")
+    here = path.tip_mm[0] + [-40.0, -20.0, 0.5]  # the grid ends 7.5 mm from there
+    step = next_step(policy, here, phase)
+    assert (step.phase, step.action, step.next_position_mm, step.next_phase) == (after, None, None, None)
+    assert (step.done, step.confidence) == (False, 0.0)
+    np.testing.assert_allclose(here + step.correction_mm, path.tip_mm[waypoint], rtol=0, atol=1e-12)  # mm
+
+
+@settings(deadline=None)
+@given(
+    name=st.sampled_from([*WALKS]),
+    phased=st.booleans(),
+    data=st.data(),
+)
+def test_from_wherever_a_hand_is_the_correction_and_then_the_actions_lead_to_the_goal(name, phased, data):
+    policy, path = learnt(name, phased=phased), named_path(name)
+    offset = st.tuples(*3 * [st.floats(-GUIDED_MM / 2, GUIDED_MM / 2)])
+    here = path.tip_mm[data.draw(st.integers(0, len(path.states) - 1))] + data.draw(offset)
+    step = next_step(policy, here, data.draw(st.none() | st.integers(0, policy.domain.phases - 1)))
+    phase = step.phase
+    if step.correction_mm is not None:
+        assert not step.done
+        here = here + step.correction_mm
+        step = next_step(policy, here, phase)
+        assert step.correction_mm is None  # it leads onto the path, not towards it
+    for _ in range(policy.domain.n_rows):
+        if step.done:
+            break
+        assert step.action is not None
+        here, phase = step.next_position_mm, step.phase
+        step = next_step(policy, here, phase)
+        assert step.correction_mm is None
+    assert step.done
+    assert path.grid.states_at(here) == path.goal
+
+
+@settings(deadline=None)
+@given(
+    name=st.sampled_from([*WALKS]),
+    state=st.integers(0, 10_000),
+    phase=st.none() | st.integers(0, 5),
+)
+def test_a_correction_is_given_wherever_the_hand_is_off_its_path_and_only_there(name, state, phase):
+    policy, path = learnt(name), named_path(name)
+    here = path.grid.centres_mm(state % path.grid.n_states)
+    step = next_step(policy, here, None if phase is None else phase % policy.domain.phases)
+    meant = path.states if step.phase == 0 else path.states[step.phase - 1]
+    assert (step.correction_mm is None) == (step.done or path.grid.states_at(here) in np.atleast_1d(meant))
+
+
+def test_metres_given_for_millimetres_are_refused_and_no_hand_is_led_by_them():
+    path = GridPath(PAPER_GRID, [551, 430, 442])
+    policy = learn_policy(sparse_reward(path), PhaseQLearning())
+    with pytest.raises(OutsideGrid, match=r"outside the grid.*millimetres"):
+        next_step(policy, path.tip_mm[0] / 1000, 1)
+    assert next_step(policy, path.tip_mm[0] + [0, 0, -50], 1).correction_mm == pytest.approx((0, 0, 50), abs=1e-9)
+
+
+@pytest.mark.parametrize("here", [(500, 0, 0), (1e300, 0, 0), (0, -1e300, 1e300)])
+def test_a_place_that_no_hand_can_be_at_is_refused(here):
     with pytest.raises(OutsideGrid):
-        next_step(learnt("an angle"), (500, 0, 0), 1)
+        next_step(learnt("an angle"), here, 1)
+
+
+@pytest.mark.parametrize("here", [(np.nan, 0, 0), (0, np.inf, 0), (0, 0), [(0, 0, 0)]])
+def test_what_is_no_place_is_refused(here):
     with pytest.raises(BadInput):
-        next_step(learnt("an angle"), (np.nan, 0, 0), 1)
+        next_step(learnt("an angle"), here, 1)

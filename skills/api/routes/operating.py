@@ -1,11 +1,13 @@
-"""Whether it lives, and whether it can work."""
+"""Whether it lives, whether it can work, and its figures."""
 
 from typing import Any
 
-from fastapi import APIRouter
-from sqlalchemy import text
+from fastapi import APIRouter, Request, Response
+from fastapi.responses import PlainTextResponse
 
-from skills.api.deps import Db
+from skills.api.metrics import CONTENT_TYPE, Metrics
+from skills.jobs.readiness import refuse_unready
+from skills.settings import Settings
 
 router = APIRouter(tags=["operating"])
 
@@ -17,8 +19,14 @@ def alive() -> dict[str, str]:
 
 
 @router.get("/readyz")
-def ready(db: Db) -> dict[str, Any]:
-    """Say that the database answers; 503 where it does not."""
-    with db.reading() as session:
-        session.execute(text("SELECT 1 FROM suture_types LIMIT 1"))
-    return {"status": "ready"}
+def ready(request: Request) -> dict[str, Any]:
+    """Try the database, the job queue and its workers; 503 where one cannot be used, with its name."""
+    settings: Settings = request.app.state.settings
+    return {"status": "ready", "workers": refuse_unready(settings)}
+
+
+@router.get("/metrics", response_class=PlainTextResponse)
+def metrics(request: Request) -> Response:
+    """Give the figures of this process and of the installation, for Prometheus."""
+    figures: Metrics = request.app.state.metrics
+    return Response(figures.text(), media_type=CONTENT_TYPE)

@@ -14,6 +14,7 @@ from skills.api.schemas import TrainingIn, job_out
 from skills.db.models import Job
 from skills.db.session import Database
 from skills.library import jobs as asked
+from skills.library.batches import to_tell
 from skills.library.training import request_training
 from skills.settings import MEBIBYTE
 
@@ -92,7 +93,9 @@ def cancel_job(job: JobId, db: Db, jobs: Jobs, actor: Actor) -> dict[str, Any]:
     """Cancel a job that has not ended."""
     with db.writing() as session:
         cancelled = asked.cancel(session, job, actor)
-    jobs.cancel(cancelled.row, cancelled.attempt)
+        told = to_tell(session, cancelled)
+    for row, attempt in told:
+        jobs.cancel(row, attempt)
     return job_out(cancelled)
 
 

@@ -1,7 +1,7 @@
 """The compiled loops: ordinary Python first, compiled by numba where it is called `*_compiled`.
 
 Arrays and numbers in, nothing allocated, nothing raised. The plain function and the compiled one agree to the last
-bit; a test says so. This is the only file that knows numba.
+bit; a test says so.
 
 Random bits come from xorshift64 (Marsaglia 2003), whose state, `rng`, is one uint64 that is not 0, shape (1,); an
 action is drawn from the low half of 64 bits, and whether to explore or to slip from the high half.
@@ -10,8 +10,8 @@ action is drawn from the low half of 64 bits, and whether to explore or to slip 
 from typing import Any
 
 import numpy as np
-from numba import njit
-from numba.extending import register_jitable
+
+from skills.compiled import compiled, inner
 
 UNKNOWN, OFF_GRID = -2, -1  # in a model: never tried; would leave the grid, and stays
 # Whole numbers without a sign; one of these and a number of Python's would give a float.
@@ -19,7 +19,7 @@ NONE, ONE, THREE, SEVEN, NINE, THIRTEEN, SEVENTEEN = (np.uint64(n) for n in (0, 
 ACTIONS, HALF, LOW_HALF = np.uint64(27), np.uint64(32), np.uint64(0xFFFFFFFF)
 
 
-@register_jitable
+@inner
 def next_random(x: Any) -> Any:
     """Draw the next 64 random bits, uint64, after others."""
     x ^= x << THIRTEEN
@@ -28,7 +28,7 @@ def next_random(x: Any) -> Any:
     return x
 
 
-@register_jitable
+@inner
 def any_action(bits: Any) -> Any:
     """Turn random bits into one of the 27 actions, uint64."""
     return ((bits & LOW_HALF) * ACTIONS) >> HALF
@@ -267,19 +267,6 @@ def warp(distance: Any, cost: Any) -> None:
     for i in range(distance.shape[0]):
         for j in range(distance.shape[1]):
             cost[i + 1, j + 1] = distance[i, j] + min(cost[i, j], cost[i, j + 1], cost[i + 1, j])
-
-
-def compiled(loop: Any) -> Any:
-    """Compile a loop at its first call, and keep its machine code for other processes.
-
-    Call it with the same types always: two processes that compile it for different ones at once can keep one's code
-    under the other's name. Where numba can write to no folder, each process compiles for itself; `skills.jobs.warm`
-    says so.
-    """
-    try:
-        return njit(nogil=True, cache=True)(loop)
-    except RuntimeError:  # numba's way to say that it has nowhere to write
-        return njit(nogil=True)(loop)
 
 
 run_episodes_compiled = compiled(run_episodes)

@@ -1,0 +1,44 @@
+"""Which revision the tables are at, and the way up to another."""
+
+from functools import cache
+from importlib import resources
+
+from alembic import command
+from alembic.config import Config
+from alembic.runtime.migration import MigrationContext
+from alembic.script import ScriptDirectory
+from sqlalchemy import Connection
+
+from skills.errors import Conflict
+
+
+def alembic_config() -> Config:
+    """Tell Alembic where our migrations are."""
+    config = Config()
+    config.set_main_option("script_location", str(resources.files("skills") / "migrations"))
+    return config
+
+
+@cache
+def revisions() -> tuple[str, ...]:
+    """List the revisions that this version knows, the newest first."""
+    return tuple(script.revision for script in ScriptDirectory.from_config(alembic_config()).walk_revisions())
+
+
+def revision_of(connection: Connection) -> str | None:
+    """Read the revision that the tables are at; None where there are none."""
+    return MigrationContext.configure(connection).get_current_revision()
+
+
+def upgrade(connection: Connection, to: str = "head") -> None:
+    """Bring the tables to a revision, within the caller's transaction.
+
+    Raises:
+        Conflict: They are of a newer version of the code.
+    """
+    current = revision_of(connection)
+    if current is not None and current not in revisions():
+        raise Conflict("This database was written by a newer version; update the code, nothing was changed.")
+    config = alembic_config()
+    config.attributes["connection"] = connection
+    command.upgrade(config, to)

@@ -1,0 +1,257 @@
+"""Carrying out a part of a batch: its styles one after another, each for itself.
+
+A style that cannot be learnt ends with its reason, and the others go on. A worker that is killed leaves its part to the
+next one, which goes on where it stopped; what it had begun comes last then, one by one, for it may be what killed it.
+
+What takes long is committed alone. Quick styles are committed a few together, each under a savepoint of its own: on
+SQLite a commit waits for the disk and holds the one write lock meanwhile, so that with one for each style several
+workers leave no room for anybody else's.
+"""
+
+import logging
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass
+from itertools import zip_longest
+from threading import RLock
+from time import monotonic
+from typing import Any, cast
+
+from sqlalchemy import JSON, Table, bindparam, select, update
+from sqlalchemy.orm import Session
+
+from skills.db.base import now
+from skills.db.models import Job, PolicyVersion, Release, StyleToRetrain
+from skills.db.session import Database
+from skills.errors import Busy, Conflict, SkillsError
+from skills.library import batches, releases
+from skills.library.training import Learnt, Lesson, learn_style, lessons, store_style
+from skills.settings import Settings
+
+TOGETHER = 5  # styles
+TOGETHER_S = 0.1  # so long at most does a result wait for the next one, and a cancelled batch go on
+LONGEST_REASON = 2000  # characters, as the column has it
+TURN = RLock()  # in one interpreter two threads learn quick styles no faster than one, and take 40 % more time for it
+NEARLY_ONE = 1 - 1e-9  # what progress adds up to before the end, so that no rounding brings it above 1
+
+# Statements that every style goes through, built once: to build one takes as long as to run it.
+_STYLES, _JOBS = (cast(Table, one.__table__) for one in (StyleToRetrain, Job))
+STATE = select(_STYLES.c.state).where(_STYLES.c.row == bindparam("style"))
+BEGIN = update(_STYLES).where(_STYLES.c.row == bindparam("style")).values(tries=_STYLES.c.tries + 1)
+OUTCOME = (
+    update(_STYLES)
+    .where(_STYLES.c.row == bindparam("style"))
+    .values(
+        state=bindparam("became"),
+        policy_row=bindparam("policy"),
+        reason=bindparam("why"),
+        comparison=bindparam("compared", type_=JSON(none_as_null=True)),
+        ended_at=bindparam("now"),
+    )
+)
+RUNNING = (
+    update(_JOBS)
+    .where(_JOBS.c.row == bindparam("batch"), _JOBS.c.state == "queued")
+    .values(state="running", started_at=bindparam("now"))
+)
+FURTHER = update(_JOBS).where(_JOBS.c.row == bindparam("batch")).values(progress=_JOBS.c.progress + bindparam("step"))
+SERVED = (
+    select(PolicyVersion.version, PolicyVersion.sha256, PolicyVersion.manifest)
+    .join(Release, Release.policy_row == PolicyVersion.row)
+    .where(Release.surgeon_row == bindparam("surgeon"), Release.suture == bindparam("suture"))
+    .where(Release.withdrawn_at.is_(None))
+    .order_by(Release.row.desc())
+    .limit(1)
+)
+
+log = logging.getLogger(__name__)
+Store = Callable[[Session, str], dict[str, Any]]
+
+
+@dataclass(frozen=True, eq=False)
+class _Style:
+    """One style of a part that waits: what it is learnt from, and how often somebody has begun with it."""
+
+    row: int
+    tries: int
+    lesson: Lesson
+
+
+_Group = Sequence[_Style]  # begun with in one transaction, one after another
+
+
+@dataclass(frozen=True)
+class _Batch:
+    """What is asked for of every style of a batch."""
+
+    row: int
+    request: dict[str, Any]
+    asked_by: str
+
+    def training_of(self, lesson: Lesson) -> dict[str, Any]:
+        """Ask for one style as `request_training` does: an equal training gives the same version."""
+        same = {name: self.request[name] for name in ("learner", "learner_version", "seed", "release")}
+        return {"surgeon": lesson.surgeon.slug, "suture": lesson.suture, "demos": [lesson.sha256], **same}
+
+
+def retrain_part(database: Database, request: dict[str, Any], _settings: Settings) -> Store:
+    """Train the styles of a part that are still queued.
+
+    A style that is refused has failed; one at which the service fails stays queued, for the next try at this part.
+    """
+    with database.reading() as session:
+        job = session.get_one(Job, request["retraining"])
+        batch = _Batch(job.row, job.request, job.asked_by)
+    broken: dict[int, Exception] = {}
+    while waiting := [style for style in _waiting(database, request["part"]) if style.row not in broken]:
+        groups = _groups(waiting)
+        with database.writing() as session:
+            _begin(session, batch, groups[0])
+        for group, then in zip_longest(groups, groups[1:], fillvalue=()):
+            try:
+                if _train(database, batch, group, then):
+                    continue
+            except Busy:
+                raise
+            except Exception as error:
+                log.exception("A style of retraining %d cannot be trained now.", batch.row)
+                if len(group) == 1:
+                    broken[group[0].row] = error
+            break  # cancelled, erased, ended by another worker, or broken: see what is left
+    if broken:
+        raise next(iter(broken.values()))
+
+    def store(session: Session, _actor: str) -> dict[str, Any]:
+        batches.settle(session, batch.row)
+        return {}
+
+    return store
+
+
+def _waiting(database: Database, part: int) -> list[_Style]:
+    """Read what a part has left, what was begun with least often first."""
+    of = StyleToRetrain
+    left = select(of.demonstration_row, of.row, of.tries).where(of.part_row == part, of.state == "queued")
+    with database.reading() as session:
+        rows = session.execute(left.order_by(of.tries, of.row)).all()
+        read = {lesson.row: lesson for lesson in lessons(session, [demonstration for demonstration, *_ in rows])}
+    return [_Style(row, tries, read[demonstration]) for demonstration, row, tries in rows]
+
+
+def _groups(styles: Sequence[_Style]) -> list[_Group]:
+    """Take styles together, but those alone that somebody has begun with before."""
+    new, begun = [s for s in styles if s.tries == 0], [[s] for s in styles if s.tries > 0]
+    return [*(new[first : first + TOGETHER] for first in range(0, len(new), TOGETHER)), *begun]
+
+
+def _train(database: Database, batch: _Batch, group: _Group, then: _Group) -> bool:
+    """Learn some styles and commit what came of each; tell whether all were still waited for."""
+    ended: list[tuple[_Style, Learnt | SkillsError]] = []
+    quick, since_s = True, monotonic()
+    for style in group:
+        with TURN if quick else nullcontext():
+            began_s = monotonic()
+            ended.append((style, _learn(batch, style)))
+        quick = monotonic() - began_s < TOGETHER_S
+        if style is not group[-1] and monotonic() - since_s > TOGETHER_S:
+            if not _commit(database, batch, ended, ()):
+                return False
+            ended, since_s = [], monotonic()
+    return _commit(database, batch, ended, then)
+
+
+def _learn(batch: _Batch, style: _Style) -> Learnt | SkillsError:
+    try:
+        return learn_style(style.lesson, batch.training_of(style.lesson))
+    except SkillsError as refused:
+        return refused
+
+
+def _commit(
+    database: Database, batch: _Batch, ended: Sequence[tuple[_Style, Learnt | SkillsError]], then: _Group
+) -> bool:
+    """End styles, each for itself, and begin with the next ones; tell whether all were still waited for."""
+    with database.writing() as session:
+        wanted = [style for style in ended if session.scalar(STATE, {"style": style[0].row}) == "queued"]
+        for style, learnt in wanted:
+            session.execute(OUTCOME, {"style": style.row, "now": now(), **_outcome(session, batch, learnt)})
+        if wanted:
+            session.execute(FURTHER, {"batch": batch.row, "step": len(wanted) * NEARLY_ONE / batch.request["styles"]})
+        if len(wanted) == len(ended) and then:
+            _begin(session, batch, then)
+        return len(wanted) == len(ended)
+
+
+def _begin(session: Session, batch: _Batch, group: _Group) -> None:
+    """Note which styles are begun with, before anything is."""
+    session.execute(BEGIN, [{"style": style.row} for style in group])
+    session.execute(RUNNING, {"batch": batch.row, "now": now()})
+
+
+def _outcome(session: Session, batch: _Batch, learnt: Learnt | SkillsError) -> dict[str, Any]:
+    if isinstance(learnt, SkillsError):
+        return {"became": "failed", "policy": None, "compared": None, "why": str(learnt)[:LONGEST_REASON]}
+    try:
+        with session.begin_nested():
+            return _kept(session, batch, learnt)
+    except SkillsError as refused:
+        return _outcome(session, batch, refused)
+
+
+# ---- what is released --------------------------------------------------------------------------------------------
+
+
+def _kept(session: Session, batch: _Batch, learnt: Learnt) -> dict[str, Any]:
+    """Store what was learnt, compare it with what is released, and release it if that was asked and it is not worse."""
+    stored = store_style(session, learnt)
+    after = {"version": stored.version, "sha256": learnt.sha256, **figures(learnt.manifest)}
+    comparison = compare(_released(session, learnt.lesson), after)
+    if batch.request["release"]:
+        comparison |= _release(session, stored.row, comparison["worse_because"], batch.asked_by)
+    return {"became": "done", "policy": stored.row, "compared": comparison, "why": None}
+
+
+def _released(session: Session, lesson: Lesson) -> dict[str, Any] | None:
+    found = session.execute(SERVED, {"surgeon": lesson.surgeon.row, "suture": lesson.suture}).first()
+    return None if found is None else {"version": found[0], "sha256": found[1], **figures(found[2])}
+
+
+def figures(manifest: dict[str, Any]) -> dict[str, Any]:
+    """Take from what is said of a policy by what it is compared; shares are of the path's and of all states."""
+    metrics, coverage = manifest["metrics"], manifest["coverage"]
+    return {
+        "demos": manifest["demos"],
+        "dtw_total_mm": metrics["dtw_total_mm"],
+        "exact_share": metrics["exact_states"] / metrics["path_states"],
+        "reaching_share": coverage["starts_reaching_goal"] / coverage["n_states"],
+    }
+
+
+def compare(released: dict[str, Any] | None, trained: dict[str, Any]) -> dict[str, Any]:
+    """Set a new policy version beside the released one, each measured against its own demonstration; NaN is worse."""
+    worse = []
+    if released is not None:
+        if not trained["dtw_total_mm"] <= released["dtw_total_mm"]:
+            worse.append(f"DTW {trained['dtw_total_mm']:g} mm against {released['dtw_total_mm']:g}")
+        if not trained["exact_share"] >= released["exact_share"]:
+            worse.append(f"{trained['exact_share']:.1%} of the path exact against {released['exact_share']:.1%}")
+        if not trained["reaching_share"] >= released["reaching_share"]:
+            worse.append(f"{trained['reaching_share']:.1%} of starts arrive against {released['reaching_share']:.1%}")
+    return {
+        "released": released,
+        "trained": trained,
+        "same_demonstration": None if released is None else released["demos"] == trained["demos"],
+        "worse_because": worse,
+        "now_released": False,
+        "not_released_because": None,
+    }
+
+
+def _release(session: Session, policy: int, worse: list[str], actor: str) -> dict[str, Any]:
+    if worse:
+        return {"not_released_because": f"It is worse than the released version: {'; '.join(worse)}."}
+    try:
+        releases.release(session, session.get_one(PolicyVersion, policy), actor)
+    except Conflict as refused:
+        return {"not_released_because": str(refused)}
+    return {"now_released": True}

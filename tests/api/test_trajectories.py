@@ -1,0 +1,122 @@
+"""The motion of a plan: as numbers, and as the bag that a robot replays, which is not given to everybody."""
+
+import csv
+import io
+import json
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from sqlalchemy import select
+
+from skills.client import Problem
+from skills.db.models import Job
+from skills.recordings.replay_check import verify_bag
+from tests.api.service import GOAL_MM, KESTREL, Service, assert_problem
+from tests.library import cases
+
+ZIP = {"Accept": "application/zip"}
+POINTS = [[5.0, 55.0, -125.0], [11.0, 55.0, -125.0]]
+
+
+def plan(service: Service, *points: list[float], **asked: object) -> dict:
+    return service.client.plan(**KESTREL, suture_points=[{"position_mm": p} for p in points], **asked)
+
+
+def play(service: Service, made: dict) -> dict:
+    """Play a plan in the simulator, and give the verdict."""
+    pytest.importorskip("pybullet", reason="PyBullet has no wheel here: no plan can be played, so none is replayed")
+    asked = service.client.play(made["id"])["id"]
+    with service.database.reading() as session:
+        job = session.scalars(select(Job).where(Job.id == asked)).one()
+    done = cases.work(service.database, job)  # that one alone: pictures of it are drawn by another, and take seconds
+    assert done.state == "succeeded", done.error
+    return service.client.playback(done.result["playback"])
+
+
+# ---- as numbers
+
+
+def test_the_trajectory_is_the_same_as_json_and_as_a_table(still: Service):
+    made = plan(still, *POINTS)
+    path = f"/plans/{made['id']}/trajectory"
+    as_json = still.client.trajectory(made["id"])
+    table = list(csv.reader(io.StringIO(still.http.get(path, headers={"Accept": "text/csv"}).text)))
+    assert table[0] == as_json["columns"]
+    assert [[float(cell) for cell in row] for row in table[1:]] == as_json["rows"]
+    assert len(as_json["rows"]) == made["trajectory"]["samples"]
+    assert as_json["rate_hz"] == made["trajectory"]["rate_hz"]
+    at = as_json["columns"].index("x_mm")
+    np.testing.assert_allclose(as_json["rows"][-1][at : at + 3], POINTS[1], atol=1e-6)
+
+
+def test_one_pass_alone_is_a_part_of_the_whole(still: Service):
+    made = plan(still, *POINTS)
+    whole = still.client.trajectory(made["id"])["rows"]
+    first, second = (still.client.trajectory(made["id"], number)["rows"] for number in (0, 1))
+    assert first + second == whole
+    assert {row[1] for row in second} == {1}
+    path = f"/plans/{made['id']}/trajectory"
+    assert_problem(still.http.get(path, params={"pass": 2}), 422, "bad-plan")
+    for none in (-1, 200, "one"):
+        assert_problem(still.http.get(path, params={"pass": none}), 422, "invalid-request")
+
+
+def test_what_is_asked_for_first_is_given_and_what_is_there_already_is_not_sent_again(still: Service):
+    path = f"/plans/{plan(still, GOAL_MM)['id']}/trajectory"
+    first = still.http.get(path, headers={"Accept": "image/png, text/csv;q=0.9, application/json"})
+    assert first.headers["content-type"].startswith("text/csv")
+    assert still.http.get(path).headers["content-type"] == "application/json"
+    again = still.http.get(path, headers={"Accept": "text/csv", "If-None-Match": first.headers["etag"]})
+    assert (again.status_code, again.content) == (304, b"")
+    assert_problem(still.http.get(path, headers={"Accept": "image/png"}), 415, "unknown-format")
+    for accept in ("application/json", "text/csv", "application/zip"):
+        nowhere = still.http.get(f"/plans/{'0' * 64}/trajectory", headers={"Accept": accept})
+        assert_problem(nowhere, 404, "not-found")
+
+
+# ---- as a bag
+
+
+def test_a_bag_is_given_once_its_own_plan_was_played_and_for_as_long_as_all_of_it_stands(
+    trained: Service, tmp_path: Path
+):
+    made, other = plan(trained, GOAL_MM), plan(trained, GOAL_MM, speed_mm_s=10.0)
+    path = f"/plans/{made['id']}/trajectory"
+
+    def refused() -> str:
+        return assert_problem(trained.http.get(path, headers=ZIP), 409, "conflict")["detail"]
+
+    assert "POST /playbacks" in refused()
+    assert play(trained, other)["feasible"]
+    assert "POST /playbacks" in refused()  # another plan's playback does not count
+    verdict = play(trained, made)
+    assert verdict["feasible"], verdict["report"]
+
+    answer = trained.http.get(path, headers=ZIP)
+    assert answer.status_code == 200, answer.text
+    assert answer.headers["content-type"] == "application/zip"
+    assert answer.headers["content-disposition"] == f'attachment; filename="replay-{made["id"][:12]}.zip"'
+    assert answer.content == trained.client.replay_bag(made["id"])
+    file = tmp_path / "bag.zip"
+    file.write_bytes(answer.content)
+    lines = verify_bag(file)
+    assert verdict["id"][:12] in lines[1]
+    with zipfile.ZipFile(file) as archive:
+        assert json.loads(archive.read("verdict.json"))["report"] == verdict["report"]
+    file.write_bytes(trained.client.replay_bag(made["id"], 0))
+    assert len(verify_bag(file)) == len(lines)
+
+    trained.client.withdraw(**KESTREL)
+    assert "none is released" in refused()
+    with pytest.raises(Problem, match="none is released"):
+        trained.client.replay_bag(made["id"])
+    assert trained.http.get(path).status_code == 200  # the numbers alone move nothing
+    trained.client.release(**KESTREL, version=1)
+    assert trained.http.get(path, headers=ZIP).content == answer.content
+    trained.client.put_surgeon("kestrel", consent={"uses": ["training"]})
+    assert "does not cover export" in refused()
+    trained.client.put_surgeon("kestrel", consent={"uses": ["training", "export"]})
+    trained.client.withdraw_demo(trained.client.demos()[0]["id"])
+    assert "demonstration" in refused()

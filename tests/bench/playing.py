@@ -1,0 +1,139 @@
+"""How fast plans are checked, beside PyBullet's own calls alone, and two checks at once beside one after the other."""
+
+import hashlib
+import time
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from rich.table import Table
+
+from skills.sim import passes, player, scene, wire
+from skills.style.handoff import HOLDING_RAD, PsmM
+from skills.style.playback import CLEARANCE_SEEN_MM
+from skills.style.trajectory import Trajectory, time_parametrise
+from skills.style.verdict import judge
+from tests.bench.timing import gain, in_turn
+from tests.style.motions import PSM_M, hand_off
+
+PASSES, RATE_HZ = 20, 240.0
+ROUNDS = 3
+LEANING = np.radians(35.0)
+BESIDE = PsmM(PSM_M, (160.0, 20.0, 20.0), (0.0, float(np.sin(LEANING / 2)), 0.0, float(np.cos(LEANING / 2))))
+
+
+def stacked(passes: int = PASSES, rate_hz: float = RATE_HZ) -> Trajectory:
+    """Stack passes two millimetres apart, PSM_M beside them."""
+    return time_parametrise([hand_off(-2.0 * k) for k in range(passes)], rate_hz=rate_hz, psm_m=BESIDE)
+
+
+def playing(table: Table) -> None:
+    """Check twenty passes at 240 Hz with both arms: distances at every fourth sample, and the servo pass."""
+    trajectory = stacked()
+    asked = wire.unpack(player.request(trajectory, player.default_pad_top(trajectory)))
+    ours, bare, quick = in_turn(
+        lambda: measure(asked), lambda: plain(asked), lambda: plain(asked, at_once=True), rounds=ROUNDS
+    )
+    samples = f"{len(trajectory)} samples, {len(asked['looks'])} looks; no process start"
+    table.add_row(f"{PASSES} passes checked, {RATE_HZ:.0f} Hz", f"{ours:.2f} s", samples)
+    table.add_row("  PyBullet's calls alone", f"{bare:.2f} s", f"ours takes {ours / bare:.2f} of it")
+    table.add_row("  with six joints in one call, too", f"{quick:.2f} s", f"ours takes {ours / quick:.2f} of it")
+    began = time.perf_counter()
+    playback = player.play(trajectory)
+    played = time.perf_counter() - began
+    table.add_row("  with process, picture and transport", f"{played:.2f} s", "by the clock")
+    began = time.perf_counter()
+    assert judge(playback, trajectory).feasible
+    table.add_row("  the verdict", f"{time.perf_counter() - began:.2f} s", "")
+    two_at_once(stacked(passes=PASSES // 4), table)
+
+
+def two_at_once(trajectory: Trajectory, table: Table) -> None:
+    """Check the same plan twice, in turn and at once, whole: with process and picture.
+
+    Beside it what two threads of this machine can do at all, hashing: others may be using its cores.
+    """
+    data = bytes(256 << 20)
+    checking = gain(lambda: player.play(trajectory), 2, ROUNDS)
+    hashing = gain(lambda: hashlib.sha256(data), 2, ROUNDS)
+    table.add_row(f"two checks of {trajectory.passes} passes at once", "", f"{checking:.2f} x one after the other")
+    table.add_row("  two hashes at once", "", f"{hashing:.2f} x one after the other")
+
+
+def measure(asked: dict[str, Any]) -> None:
+    """Do what a check does in the simulator, but for the picture."""
+    instrument, rate_hz = str(asked["instrument"]), float(asked["rate_hz"])
+    with scene.opened(instrument, rate_hz) as one:
+        one.place_pad(asked["tip_mm"], float(asked["pad_top_mm"]))
+        one.place_psm_m(asked["m_base_mm"], asked["m_base_xyzw"], instrument)
+        passes.kinematic_pass(one, asked)
+    with scene.opened(instrument, rate_hz) as one:
+        one.place_pad(asked["tip_mm"], float(asked["pad_top_mm"]))
+        passes.servo_pass(one, asked)
+
+
+def plain(asked: dict[str, Any], at_once: bool = False) -> None:
+    """Make the same calls of PyBullet and nothing else: what they answer is thrown away.
+
+    `at_once` puts six joints in one call (`resetJointStatesMultiDof`), as `measure` does; the plain way is six calls.
+    """
+    instrument, rate_hz = str(asked["instrument"]), float(asked["rate_hz"])
+    arm_rows, m_rows = (scene.in_metres(asked[name]).tolist() for name in ("joints", "m_joints"))
+    with scene.opened(instrument, rate_hz) as one:
+        one.place_pad(asked["tip_mm"], float(asked["pad_top_mm"]))
+        one.place_psm_m(asked["m_base_mm"], asked["m_base_xyzw"], instrument)
+        _plain_kinematic(one, arm_rows, m_rows, set(asked["looks"].tolist()), at_once)
+    with scene.opened(instrument, rate_hz) as one:
+        one.place_pad(asked["tip_mm"], float(asked["pad_top_mm"]))
+        _plain_servo(one, arm_rows, rate_hz)
+
+
+def _plain_kinematic(
+    one: scene.Scene, arm_rows: list[list[float]], m_rows: list[list[float]], due: set[int], at_once: bool
+) -> None:
+    bullet, client, arm, m, pad = one.bullet, one.client, one.arm, one.psm_m, one.pad
+    assert m is not None
+    seen_m = CLEARANCE_SEEN_MM * scene.MM
+    reset, together = bullet.resetJointState, bullet.resetJointStatesMultiDof
+
+    def put(body: scene.Body, row: list[float]) -> None:
+        if at_once:
+            together(body.number, body.joints, [[value] for value in row], physicsClientId=client)
+        else:
+            for joint, value in zip(body.joints, row, strict=True):
+                reset(body.number, joint, value, physicsClientId=client)
+
+    for k, row in enumerate(arm_rows):
+        put(arm, row)
+        bullet.getJointStates(arm.number, arm.joints, physicsClientId=client)
+        bullet.getLinkState(arm.number, arm.tool, 0, 1, physicsClientId=client)
+        if k in due:
+            put(m, m_rows[k])
+            bullet.getLinkState(m.number, m.tool, 0, 1, physicsClientId=client)
+            bullet.getClosestPoints(arm.number, pad, seen_m, physicsClientId=client)
+            bullet.getClosestPoints(arm.number, m.number, seen_m, physicsClientId=client)
+            bullet.getClosestPoints(m.number, pad, seen_m, physicsClientId=client)
+            bullet.getLinkState(arm.number, arm.shaft, 0, 1, physicsClientId=client)
+
+
+def _plain_servo(one: scene.Scene, rows: list[list[float]], rate_hz: float) -> None:
+    bullet, client, arm, pad = one.bullet, one.client, one.arm, one.pad
+    driven = [*arm.joints, *arm.fingers]
+    forces = [*one.tool.arm.effort, scene.FINGER_EFFORT, scene.FINGER_EFFORT]
+    fingers = [HOLDING_RAD] * 2
+    for row, following in pairwise(rows):
+        bullet.setJointMotorControlArray(
+            arm.number,
+            driven,
+            bullet.POSITION_CONTROL,
+            targetPositions=row + fingers,
+            targetVelocities=[(b - a) * rate_hz for a, b in zip(row, following, strict=True)] + [0.0, 0.0],
+            forces=forces,
+            positionGains=[scene.POSITION_GAIN] * 8,
+            velocityGains=[scene.VELOCITY_GAIN] * 8,
+            physicsClientId=client,
+        )
+        bullet.stepSimulation(physicsClientId=client)
+        bullet.getJointStates(arm.number, arm.joints, physicsClientId=client)
+        bullet.getLinkState(arm.number, arm.tool, 0, 1, physicsClientId=client)
+        bullet.getContactPoints(arm.number, pad, physicsClientId=client)

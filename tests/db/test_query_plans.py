@@ -1,0 +1,161 @@
+"""What is asked often is answered by an index: the plans of the statements that the library really runs."""
+
+import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+from sqlalchemy import event, text
+from sqlalchemy.orm import Session
+
+from skills.db.session import Database
+from skills.jobs.watch import Watch
+from skills.library import batches, catalogue, demos, jobs, policies, retraining, training
+from skills.library.condition import condition_of
+from tests import backends
+from tests.library import hospital
+
+IN_ORDER = {"surgeons", "demonstrations", "demonstrations, further on", "what is served", "jobs"}  # nothing is sought
+STYLE = ("surgeon-0003", "figure-of-eight")
+Plan = list[str]
+
+
+@pytest.fixture(scope="module", params=backends.BACKENDS)
+def filled(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Database]:
+    url = backends.fresh(request.param, tmp_path_factory.mktemp("hospital"))
+    database = Database(url)
+    hospital.fill(database, 5)
+    yield database
+    database.close()
+    backends.drop(url)
+
+
+def newest(session: Session) -> Any:
+    return demos.newest_demo(session, catalogue.find_surgeon(session, STYLE[0]).row, STYLE[1])
+
+
+def served(session: Session) -> Any:
+    found = policies.policy_of(session, *STYLE)
+    return found.policy.learnt, found.policy.covered, found.policy.demonstration
+
+
+def batch(session: Session) -> Any:
+    found = session.scalar(text("SELECT id FROM jobs WHERE kind = 'retraining'"))
+    return retraining.find_retraining(session, found)
+
+
+HOT: dict[str, Callable[[Session], object]] = {
+    "a surgeon": lambda s: catalogue.find_surgeon(s, STYLE[0]),
+    "surgeons": lambda s: catalogue.list_surgeons(s, 10, None),
+    "surgeons, further on": lambda s: catalogue.list_surgeons(s, 10, "surgeon-0002"),
+    "demonstrations": lambda s: demos.list_demos(s, 10, None, None, None),
+    "demonstrations, further on": lambda s: demos.list_demos(s, 10, 30, None, None),
+    "demonstrations of a surgeon": lambda s: demos.list_demos(s, 10, 30, STYLE[0], None),
+    "demonstrations of a suture type": lambda s: demos.list_demos(s, 10, 30, None, STYLE[1]),
+    "demonstrations of a style": lambda s: demos.list_demos(s, 10, 30, *STYLE),
+    "a demonstration": lambda s: demos.find_demo(s, newest(s).sha256),
+    "what is served": lambda s: policies.list_served(s, 10, 20),
+    "a released policy": served,
+    "a style's versions": lambda s: policies.list_versions(s, *STYLE, 10, 5),
+    "a version": lambda s: policies.find_version(s, *STYLE, 1),
+    "a version by its digest": lambda s: policies.find_by_digest(s, policies.policy_of(s, *STYLE).policy.sha256),
+    "a training": lambda s: training.request_training(s, *STYLE, "test"),
+    "a surgeon's stale styles": lambda s: retraining.request_retraining(s, "test", surgeon=STYLE[0], only_stale=True),
+    "jobs": lambda s: jobs.list_jobs(s, 10, 50, None),
+    "jobs of a state": lambda s: jobs.list_jobs(s, 10, 50, "failed"),
+    "the newest of equal jobs": lambda s: jobs.newest(s, "pictures", {}),
+    "a batch's styles": lambda s: retraining.list_styles(s, batch(s), 10, 20, None),
+    "a batch's styles of a state": lambda s: retraining.list_styles(s, batch(s), 10, 20, "failed"),
+    "how far a batch is": lambda s: batches.count(s, batch(s).row),
+}
+
+
+@pytest.mark.parametrize("what", HOT)
+def test_what_is_asked_often_is_answered_by_an_index(filled: Database, what: str):
+    with filled.reading() as session, noted(session) as asked:
+        HOT[what](session)
+        session.flush()
+        assert asked
+        for statement, values in asked:
+            assert wasteful(session, statement, values, walks=what in IN_ORDER) == [], statement
+
+
+def test_what_a_watch_looks_at_is_found_by_its_state(filled: Database):
+    with noted(filled) as asked:
+        assert len(Watch(filled, None, "test", None, None)._live()) == hospital.WAITING
+    with filled.reading() as session:
+        for statement, values in asked:
+            assert wasteful(session, statement, values, sorts=True) == []
+
+
+def test_the_figures_are_counted_in_an_index_alone(filled: Database):
+    with filled.reading() as session, noted(session) as asked:
+        condition_of(session, 2.0)
+        counting = [one for one in asked if "count(" in one[0]]
+        assert len(counting) == 1
+        (plan,) = [plan_of(session, *one) for one in counting]
+    assert "ix_jobs_kind" in json.dumps(plan)
+    assert "Seq Scan" not in json.dumps(plan)
+
+
+def test_an_index_that_is_missing_is_noticed(filled: Database):
+    with filled.reading() as session, noted(session) as asked:
+        session.execute(text("DROP INDEX ix_demonstrations_suture"))  # undone at the end of this transaction
+        find = catalogue.find_suture_type(session, STYLE[1])
+        asked.clear()
+        demos.list_demos(session, 10, None, None, find.slug)  # nobody has asked for the plan of just this one before
+        assert [wasteful(session, *one) for one in asked] != [[]]
+
+
+@contextmanager
+def noted(where: Session | Database) -> Iterator[list[tuple[str, Any]]]:
+    """Note the SELECT statements that are run, and their values, but for the plans of them."""
+    engine = where.engine if isinstance(where, Database) else where.get_bind().engine
+    asked: list[tuple[str, Any]] = []
+
+    def note(_conn: object, _cursor: object, statement: str, values: Any, _context: object, many: bool) -> None:
+        if statement.startswith(("SELECT", "WITH")) and not many:
+            asked.append((statement, values))
+
+    event.listen(engine, "before_cursor_execute", note)
+    try:
+        yield asked
+    finally:
+        event.remove(engine, "before_cursor_execute", note)
+
+
+def plan_of(session: Session, statement: str, values: Any) -> Any:
+    """Ask the database how it would answer; PostgreSQL without its habit of reading small tables whole."""
+    connection = session.connection()
+    if connection.dialect.name == "sqlite":
+        return [row[3] for row in connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {statement}", values)]
+    for habit in ("seqscan", "bitmapscan"):
+        connection.exec_driver_sql(f"SET LOCAL enable_{habit} = off")
+    return connection.exec_driver_sql(f"EXPLAIN (FORMAT JSON) {statement}", values).scalar()
+
+
+def wasteful(session: Session, statement: str, values: Any, *, walks: bool = False, sorts: bool = False) -> list[str]:
+    """Name the steps of a plan that read a whole table, or sort for one page what an index has in order.
+
+    Args:
+        walks: It may go along a table in the order of its key, for one page.
+        sorts: It may sort.
+    """
+    paged = "LIMIT" in statement
+    plan = plan_of(session, statement, values)
+    if isinstance(plan[0], str):
+        whole = [step for step in plan if step.startswith("SCAN") and not step.startswith("SCAN anon")]  # a result
+        scans = [] if paged and walks else whole
+        return scans + [step for step in plan if "ORDER BY" in step and paged and not sorts]
+    return list(_wasteful(plan[0]["Plan"], paged and walks, sorts or not paged))
+
+
+def _wasteful(node: dict[str, Any], walks: bool, sorts: bool) -> Iterator[str]:
+    kind = node["Node Type"]
+    if kind == "Seq Scan" or (kind.startswith("Index") and "Index Cond" not in node and not walks):
+        yield f"{kind} of {node['Relation Name']} by {node.get('Index Name')}"
+    if "Sort" in kind and not sorts:
+        yield f"{kind} by {node['Sort Key']}"
+    for child in node.get("Plans", ()):
+        yield from _wasteful(child, walks, sorts)

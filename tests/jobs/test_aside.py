@@ -1,0 +1,42 @@
+"""What nobody waits for is done aside: one at a time, and never in the way of what people do wait for."""
+
+from itertools import pairwise
+
+from tests.jobs.house import House, until
+
+GRACE_S = 5.0
+
+
+def test_pictures_are_drawn_one_after_the_other_and_hold_up_nothing(house: House):
+    pictures = [house.ask("pictures", seconds=1.5) for _ in range(3)]
+    house.begun(pictures[0])
+    waited_for = [house.ask() for _ in range(house.settings.worker_threads + 1)]
+    for row in waited_for:
+        assert house.ended(row, 5.0).state == "succeeded"
+    assert house.job(pictures[-1]).state == "queued"
+    assert not house.noted("begins", pictures[-1])
+    jobs = [house.ended(row) for row in pictures]
+    assert all(job.state == "succeeded" for job in jobs)
+    assert all((after.started_at - before.started_at).total_seconds() >= 1.5 for before, after in pairwise(jobs))
+    assert [len(house.noted("begins", row)) for row in pictures] == [1, 1, 1]
+
+
+def test_pictures_of_a_worker_that_died_are_drawn_by_another(empty_house: House):
+    house = empty_house
+    with house.workers(2) as workers:
+        row = house.ask("pictures", seconds=0.6)
+        first = house.begun(row)
+        workers[first].kill()
+        until(lambda: house.job(row).state == "succeeded", house.settings.lease_s + GRACE_S)
+        assert house.noted("wrote", row) == [house.job(row).result["by"]] != [first]
+
+
+def test_a_worker_that_is_told_to_go_does_not_stay_for_pictures(empty_house: House):
+    house = empty_house
+    with house.workers(1) as workers:
+        row = house.ask("pictures", seconds=30.0)
+        worker = workers[house.begun(row)]
+        worker.terminate()
+        took_s = until(lambda: worker.poll() is not None, GRACE_S)
+        print(f"told to go, to gone: {took_s:.2f} s")
+    assert house.job(row).state == "running"  # and taken over from, as from any that died

@@ -1,0 +1,30 @@
+"""What is freed stays with the process, so that the next style finds it."""
+
+import resource
+import subprocess
+import sys
+
+import pytest
+
+CODE = """
+import resource, sys
+import numpy as np
+from skills.jobs.memory import keep_freed_memory
+kept = keep_freed_memory()
+def work():
+    for _ in range(50):
+        several = [np.ones(400_000) for _ in range(4)]
+work()
+before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+work()
+print(kept, resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+"""
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="a C library other than glibc")
+def test_arrays_of_megabytes_cost_no_pages_the_second_time():
+    run = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True, check=True, timeout=60)
+    kept, faults = run.stdout.split()
+    a_pass = 50 * 4 * 400_000 * 8 // resource.getpagesize()
+    assert kept == "True"
+    assert int(faults) < a_pass / 10, "every page was asked for again"

@@ -1,0 +1,88 @@
+"""Many styles at little cost: one hand-off, demonstrated by many surgeons for many suture types."""
+
+from itertools import count, islice
+
+from sqlalchemy import select, text
+
+from skills.db.models import Job, StyleToRetrain, SutureType
+from skills.db.session import Database
+from skills.library import demos
+from skills.library.batches import PART
+from skills.library.catalogue import put_surgeon, seed_catalogue
+from skills.library.demos import Cut, Made, make_demo
+from skills.library.recordings import find_recording, keep
+from skills.library.retraining import request_retraining
+from skills.recordings import read_recording
+from tests.library import cases
+
+
+def add_styles(database: Database, number: int) -> list[tuple[str, str]]:
+    """Add so many styles, twelve of a surgeon: their surgeons and suture types."""
+    with database.writing() as session:
+        seed_catalogue(session)
+    with database.reading() as session:
+        sutures = session.scalars(select(SutureType.slug).order_by(SutureType.slug)).all()
+    pairs = ((f"surgeon-{n}", suture) for n in count() for suture in sutures)
+    styles = list(islice(pairs, number))
+    made, sha256 = made_once(database)
+    with database.writing() as session:
+        for surgeon in sorted({surgeon for surgeon, _ in styles}):
+            put_surgeon(session, surgeon, {}, "test")
+        stored = find_recording(session, sha256)
+        for surgeon, suture in styles:
+            demos._store_demo(session, stored, made, Cut(surgeon, suture), "test")
+    return styles
+
+
+def made_once(database: Database) -> tuple[Made, str]:
+    upload = cases.upload(cases.hand_off())
+    recording = read_recording(upload.file)
+    with database.writing() as session:
+        keep(session, upload, recording, "test")
+    return make_demo(recording, Cut("anybody", cases.SUTURE)), upload.sha256
+
+
+def ask_retraining(database: Database, **asked: object) -> Job:
+    with database.writing() as session:
+        return request_retraining(session, "test", **asked)[0]
+
+
+def parts_of(database: Database, job: Job) -> list[Job]:
+    with database.reading() as session:
+        mine = select(StyleToRetrain.part_row).where(StyleToRetrain.job_row == job.row)
+        return list(session.scalars(select(Job).where(Job.row.in_(mine), Job.kind == PART).order_by(Job.row)))
+
+
+def look(database: Database, job: Job) -> Job:
+    with database.reading() as session:
+        return session.get_one(Job, job.row)
+
+
+def styles_of(database: Database, job: Job) -> list[StyleToRetrain]:
+    with database.reading() as session:
+        mine = select(StyleToRetrain).where(StyleToRetrain.job_row == job.row)
+        return list(session.scalars(mine.order_by(StyleToRetrain.row)))
+
+
+def states_of(database: Database, job: Job) -> list[str]:
+    return [style.state for style in styles_of(database, job)]
+
+
+def retrain(database: Database, **asked: object) -> Job:
+    """Ask for a batch and carry all of its parts out, as a worker does."""
+    job = ask_retraining(database, **asked)
+    for part in parts_of(database, job):
+        cases.work(database, part)
+    return look(database, job)
+
+
+def damage(database: Database, demonstration: int) -> None:
+    """Change a byte of a stored reward map, as somebody with the database in his hands would."""
+    on_sqlite = database.engine.dialect.name == "sqlite"
+    before = "DROP TRIGGER reward_maps_append_only" + ("" if on_sqlite else " ON reward_maps")
+    broken = "CAST('broken' AS BLOB)" if on_sqlite else "'broken'::bytea"
+    with database.writing() as session:
+        session.execute(text(before))
+        session.execute(
+            text(f"UPDATE reward_maps SET map = {broken} WHERE demonstration_row = :row"), {"row": demonstration}
+        )

@@ -1,0 +1,341 @@
+"""Backups: under traffic, between the back ends, damaged, of other versions; and who was erased stays erased."""
+
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from sqlalchemy import inspect, select, text
+
+from skills.db import archive
+from skills.db.base import Base
+from skills.db.models import Demonstration, Erasure, Executor, Job, Surgeon
+from skills.db.schema import alembic_config, revisions
+from skills.db.session import Database
+from skills.errors import Conflict, Corrupt, Erased
+from skills.library.backup import (
+    Erasures,
+    back_up,
+    erasures_of,
+    keep_erasures,
+    read_erasures,
+    restore,
+)
+from skills.library.catalogue import put_surgeon
+from skills.library.demos import withdraw_demo
+from skills.library.erasure import erase_demo, erase_surgeon
+from skills.library.inspection import inspect_installation
+from skills.library.policies import policy_of
+from tests import backends
+from tests.api.service import Service
+from tests.jobs.house import House
+from tests.library import cases
+
+OTHER = {"sqlite": "postgresql", "postgresql": "sqlite"}
+
+
+@pytest.fixture
+def empty(tmp_path: Path) -> Iterator[Callable[[str], Database]]:
+    """Make databases without tables."""
+    made: list[Database] = []
+
+    def make(backend: str) -> Database:
+        made.append(Database(backends.blank(backend, tmp_path)))
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.close()
+        backends.drop(one.url)
+
+
+def rows(database: Database) -> dict[str, list[tuple[Any, ...]]]:
+    """Read everything that is backed up, as it is stored, but for the events of restoring."""
+    found = {}
+    with database.reading() as session:
+        for table in archive.tables():
+            raw = archive.Dumped(
+                table.name, [[c.name, archive.kind_of(c)] for c in table.columns], 0, "", None, 0
+            ).table
+            query = select(raw).order_by(*(raw.c[key.name] for key in table.primary_key))
+            found[table.name] = [tuple(row) for row in session.execute(query)]
+    found["events"] = [row for row in found["events"] if "restore" not in row]
+    return found
+
+
+def wrong(database: Database) -> list[tuple[str, str]]:
+    return [one for checked in inspect_installation(database) for one in checked.wrong]
+
+
+def etags(database: Database) -> dict[str, str]:
+    """Ask the service for every policy that it serves."""
+    service = Service(database.url)
+    with service.http as http:
+        served = http.get("/policies").json()["items"]
+        paths = [f"/policies/{one['surgeon']}/{one['suture']}" for one in served]
+        paths += [f"/policy-versions/{one['sha256']}" for one in served]
+        return {path: http.get(path).headers["etag"] for path in paths}
+
+
+def test_a_backup_under_traffic_is_one_state_and_comes_back_on_either_database(
+    database: Database, empty: Callable[[str], Database], tmp_path: Path
+):
+    acknowledged = [cases.add_demo(database).sha256]
+    cases.train(database, release=True)
+    over, errors = threading.Event(), []
+
+    def traffic() -> None:
+        shift = 0.0
+        while not over.is_set():
+            shift += 0.01
+            try:
+                acknowledged.append(cases.add_demo(database, cases.hand_off((shift, 0.0, 0.0))).sha256)
+                cases.train(database, release=True, seed=int(shift * 100))
+            except Exception as error:
+                errors.append(error)
+
+    others = [threading.Thread(target=traffic)]
+    for other in others:
+        other.start()
+    try:
+        taken = []
+        for number in range(2):
+            before = list(acknowledged)
+            manifest = back_up(database, tmp_path / f"{number}.zip")
+            taken.append((before, manifest))
+    finally:
+        over.set()
+        for other in others:
+            other.join()
+    assert errors == []
+    for number, (before, manifest) in enumerate(taken):
+        kind = database.engine.dialect.name
+        for backend in (OTHER[kind],) if number == 1 else (kind,):
+            restored = empty(backend)
+            restore(restored, tmp_path / f"{number}.zip")
+            found = rows(restored)
+            assert set(before) <= {row[1] for row in found["demonstrations"]}
+            assert {one.name: one.rows for one in manifest.tables} == {name: len(of) for name, of in found.items()}
+            assert wrong(restored) == []
+    same = rows(database)
+    back_up(database, tmp_path / "last.zip")
+    last = empty(OTHER[database.engine.dialect.name])
+    restore(last, tmp_path / "last.zip")
+    assert rows(last) == same
+    assert etags(last) == etags(database) != {}
+
+
+def test_row_numbers_go_on_and_what_is_append_only_still_is(
+    database: Database, empty: Callable[[str], Database], tmp_path: Path
+):
+    cases.add_demo(database)
+    with database.writing() as session:
+        session.add(Job(id="one", kind="training", identity="1" * 64, request={}, state="failed"))
+    with database.writing() as session:
+        session.add(Executor(id="a worker of that installation"))
+        session.execute(text("DELETE FROM jobs"))
+    back_up(database, tmp_path / "b.zip")
+    for backend in backends.BACKENDS:
+        restored = empty(backend)
+        restore(restored, tmp_path / "b.zip")
+        with restored.writing() as session:
+            assert session.scalars(select(Executor)).all() == []
+            session.add(job := Job(id="two", kind="training", identity="2" * 64, request={}))
+            session.flush()
+            assert job.row == 2
+        with pytest.raises(Exception, match="demonstrations is append-only"), restored.writing() as session:
+            session.execute(text("UPDATE demonstrations SET arm = 'other'"))
+
+
+def test_jobs_that_had_not_ended_are_told_again_and_done(
+    database: Database, empty: Callable[[str], Database], tmp_path: Path
+):
+    cases.add_demo(database)
+    waiting, begun = cases.ask_training(database), cases.ask_training(database, seed=1)
+    with database.writing() as session:
+        session.execute(text("UPDATE jobs SET told_at = created_at"))
+        session.execute(text("UPDATE jobs SET state = 'running' WHERE row = :row"), {"row": begun.row})
+    back_up(database, tmp_path / "b.zip")
+    restored = empty(OTHER[database.engine.dialect.name])
+    restore(restored, tmp_path / "b.zip")
+    for job in (waiting, begun):
+        with restored.reading() as session:
+            assert session.get_one(Job, job.row).told_at is None
+        assert cases.work(restored, job).state == "succeeded"
+
+
+def test_a_worker_of_the_restored_installation_carries_on(tmp_path: Path):
+    """Of a database whose engine knew the jobs, with an engine that has never heard of them."""
+    before = House(backends.fresh("sqlite", tmp_path), tmp_path)
+    row, begun = before.ask(), before.ask(state="running")
+    with before.database.writing() as session:
+        session.execute(text("UPDATE jobs SET told_at = created_at"))
+    back_up(before.database, tmp_path / "b.zip")
+    before.close()
+    url = backends.blank("sqlite", tmp_path)
+    restored = Database(url)
+    restore(restored, tmp_path / "b.zip")
+    restored.close()
+    after = House(url, tmp_path)
+    with after.workers(1):
+        assert {after.ended(row).state, after.ended(begun).state} == {"succeeded"}
+    after.close()
+
+
+def test_it_never_overwrites_and_leaves_nothing_behind_when_it_fails(database: Database, tmp_path: Path):
+    back_up(database, tmp_path / "one.zip")
+    assert (tmp_path / "one.zip").stat().st_mode & 0o777 == 0o600
+    before = (tmp_path / "one.zip").read_bytes()
+    with pytest.raises(Conflict, match="never overwrites"):
+        back_up(database, tmp_path / "one.zip")
+    assert (tmp_path / "one.zip").read_bytes() == before
+
+    def fail(name: str) -> None:
+        raise OSError(28, "No space left on device")
+
+    with pytest.raises(OSError, match="No space"):
+        back_up(database, tmp_path / "two.zip", fail)
+    assert [file.name for file in tmp_path.iterdir() if "zip" in file.name] == ["one.zip"]
+
+
+@pytest.mark.parametrize("backend", backends.BACKENDS)
+def test_a_backup_of_an_older_schema_is_migrated(
+    backend: str, empty: Callable[[str], Database], tmp_path: Path, monkeypatch
+):
+    from alembic import command
+
+    old, revision = empty(backend), "0001"
+    old.migrate()
+    cases.add_surgeon(old)
+    cases.add_demo(old)
+    cases.train(old, release=True)
+    as_new = rows(old)
+    with old.engine.execution_options(writes=True).connect() as connection:
+        config = alembic_config()
+        config.attributes["connection"] = connection
+        command.downgrade(config, revision)
+        connection.commit()
+    with pytest.raises(Conflict, match="of another version"):
+        back_up(old, tmp_path / "refused.zip")
+    # What the first version's code would have written: its tables, read from the database itself.
+    first = [t for t in archive.tables() if t.name in inspect(old.engine).get_table_names()]
+    monkeypatch.setattr(archive, "tables", lambda: [as_it_is(old, t) for t in first])
+    monkeypatch.setattr(archive, "revisions", lambda: (revision,))
+    back_up(old, tmp_path / "old.zip")
+    monkeypatch.undo()
+    restored = empty(OTHER[backend])
+    manifest = restore(restored, tmp_path / "old.zip").manifest
+    assert (manifest.schema, revisions()[0] != revision) == (revision, True)
+    assert rows(restored) == as_new
+    assert wrong(restored) == []
+
+
+def as_it_is(database: Database, table: Any) -> Any:
+    """A table with only those of its columns that the database has."""
+    there = {column["name"] for column in inspect(database.engine).get_columns(table.name)}
+    copy = table.to_metadata(Base.metadata.__class__())
+    for column in list(copy.columns):
+        if column.name not in there:
+            copy._columns.remove(column)
+    return copy
+
+
+# ---- erasures ------------------------------------------------------------------------------------------------------
+
+
+def test_who_was_erased_after_the_backup_does_not_come_back(
+    database: Database, empty: Callable[[str], Database], tmp_path: Path
+):
+    canary = "canary-7f3a91"
+    cases.add_surgeon(database, canary)
+    table = cases.hand_off((1.25, 0.0, 0.0))
+    kept = cases.add_demo(database).sha256
+    gone = cases.add_demo(database, cases.hand_off((2.5, 0.0, 0.0))).sha256
+    cases.add_demo(database, table, canary)
+    cases.train(database, canary, release=True)
+    back_up(database, tmp_path / "b.zip")
+    with database.writing() as session:
+        put_surgeon(session, "after-the-backup", {}, "test")
+        for slug in (canary, "after-the-backup"):
+            erase_surgeon(session, slug, "test")
+        withdraw_demo(session, gone, "test")
+        erase_demo(session, gone, "test")
+    listed = keep_erasures(database, tmp_path / "erasures.json")
+    assert (len(listed.surgeons), {digest for digest, _ in listed.demos}) == (2, {gone})
+    assert canary not in (tmp_path / "erasures.json").read_text()
+    for source, backend in ((str(tmp_path / "erasures.json"), "sqlite"), (database.url, "postgresql")):
+        restored = empty(backend)
+        done = restore(restored, tmp_path / "b.zip", read_erasures(source))
+        assert (done.surgeons_erased, done.demos_erased) == (1, 1)
+        with restored.writing() as session:
+            assert [d.sha256 for d in session.scalars(select(Demonstration))] == [kept]
+            assert [s.slug for s in session.scalars(select(Surgeon))] == ["kestrel"]
+            for slug in (canary, "after-the-backup"):
+                with pytest.raises(Erased):
+                    put_surgeon(session, slug, {}, "test")
+        assert wrong(restored) == []
+        assert {digest for digest, _ in erasures_of(restored).demos} == {gone}
+        if backend == "sqlite":
+            file = Path(restored.url.removeprefix("sqlite:///"))
+            left = b"".join(one.read_bytes() for one in file.parent.glob(f"{file.name}*"))
+            assert canary.encode() not in left
+            assert table[1000:1064] not in left
+    without = empty("sqlite")
+    restore(without, tmp_path / "b.zip")
+    with without.reading() as session:
+        assert policy_of(session, canary, cases.SUTURE).policy.releasable
+
+
+def test_what_was_erased_and_added_anew_before_the_backup_is_not_erased_again(
+    database: Database, empty: Callable[[str], Database], tmp_path: Path
+):
+    demo = cases.add_demo(database).sha256
+    with database.writing() as session:
+        erase_demo(session, demo, "test")
+    assert cases.add_demo(database).sha256 == demo
+    back_up(database, tmp_path / "b.zip")
+    keep_erasures(database, tmp_path / "list.json")
+    listed = read_erasures(str(tmp_path / "list.json"))
+    restored = empty(OTHER[database.engine.dialect.name])
+    assert restore(restored, tmp_path / "b.zip", listed).demos_erased == 0
+    with database.writing() as session:
+        erase_demo(session, demo, "test")
+    keep_erasures(database, tmp_path / "list.json")
+    again = empty("sqlite")
+    assert restore(again, tmp_path / "b.zip", read_erasures(str(tmp_path / "list.json"))).demos_erased == 1
+
+
+def test_a_list_of_erasures_never_gets_shorter_and_is_refused_when_it_was_changed(database: Database, tmp_path: Path):
+    kept = tmp_path / "erasures.json"
+    earlier = Erasures(
+        frozenset({("00", "11" * 32, "2026-01-01T00:00:00Z")}), frozenset({("ab" * 32, "2026-01-01T00:00:00Z")})
+    )
+    assert keep_erasures(database, kept) == Erasures()
+    with database.writing() as session:
+        erase_surgeon(session, "kestrel", "test")
+    now_listed = keep_erasures(database, kept)
+    other = Database(backends.fresh("sqlite", tmp_path))
+    assert keep_erasures(other, kept) == now_listed == read_erasures(str(kept))
+    other.close()
+    assert len((now_listed | earlier).surgeons) == 2
+    for damaged in (kept.read_bytes()[:-20], kept.read_bytes().replace(b"surgeons", b"surgeans"), b"[]", b"\xff"):
+        (tmp_path / "damaged.json").write_bytes(damaged)
+        with pytest.raises(Corrupt, match="no list of erasures"):
+            read_erasures(str(tmp_path / "damaged.json"))
+
+
+def test_a_copied_list_may_be_given_to_an_installation_that_knows_it(database: Database, tmp_path: Path):
+    with database.writing() as session:
+        session.add(Erasure(salt="0" * 64, digest="1" * 64))
+    back_up(database, tmp_path / "b.zip")
+    restored = Database(f"sqlite:///{tmp_path / 'r.sqlite'}")
+    assert restore(restored, tmp_path / "b.zip", erasures_of(database)).surgeons_erased == 0
+    with restored.reading() as session:
+        assert len(session.scalars(select(Erasure)).all()) == 1
+    restored.close()
+
+
+def test_every_column_of_every_table_is_known_to_the_backup():
+    assert {t.name for t in archive.tables()} | archive.LEFT_OUT == set(Base.metadata.tables)
+    assert all(archive.kind_of(column) in archive.KINDS for table in archive.tables() for column in table.columns)

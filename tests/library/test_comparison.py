@@ -1,0 +1,62 @@
+"""A recorded replay beside its plan."""
+
+import numpy as np
+import pytest
+
+from skills.db.models import Demonstration, Plan
+from skills.db.session import Database
+from skills.errors import BadPlan, NotFound
+from skills.library.comparison import compare_with_plan
+from skills.library.demos import Cut, upload_demo
+from skills.library.plans import find_plan, trajectory_of
+from tests.library import cases
+
+
+def stored(database: Database, bag: bytes, surgeon: str) -> Demonstration:
+    return upload_demo(database, cases.upload(bag, "application/vnd.mcap"), Cut(surgeon, cases.SUTURE), "test")[0]
+
+
+@pytest.fixture
+def plan(database: Database) -> Plan:
+    cases.add_surgeon(database, "robot")
+    stored(database, cases.bag("PSM2"), "kestrel")
+    cases.train(database, release=True)
+    return cases.add_plan(database)
+
+
+def recorded(database: Database, plan: Plan, *, off_mm: tuple[float, float, float], arm: str = "PSM2") -> Demonstration:
+    """Record a replay in which the tip was off by as much, at a rate of its own."""
+    with database.reading() as session:
+        tip_mm = trajectory_of(find_plan(session, plan.sha256).plan).tip_mm
+    return stored(database, cases.bag(arm, tip=tip_mm[::3] + off_mm), "robot")
+
+
+def test_a_replay_that_was_off_by_a_millimetre_is_said_to_be(database: Database, plan: Plan):
+    demo = recorded(database, plan, off_mm=(0.0, 0.0, 1.0))
+    with database.reading() as session:
+        found = compare_with_plan(session, plan.sha256, demo.sha256)
+    assert found["start_mm"] == pytest.approx(1.0, abs=1e-9)
+    assert found["end_mm"] == pytest.approx(1.0, abs=0.1)  # mm; the last sample was not recorded
+    assert 0.4 <= found["mean_mm"] <= 1.0  # along z the paths can be slid together
+    assert found["max_mm"] <= 1.2
+    assert found["recorded_s"] > found["planned_s"] > 1
+
+
+def test_a_replay_that_went_as_planned_is_nowhere_off(database: Database, plan: Plan):
+    demo = recorded(database, plan, off_mm=(0.0, 0.0, 0.0))
+    with database.reading() as session:
+        found = compare_with_plan(session, plan.sha256, demo.sha256)
+    assert found["mean_mm"] < 0.1
+    assert np.max(found["rmse_mm"]) < 0.2
+    assert found["max_mm"] < 0.5
+
+
+def test_a_recording_of_another_arm_or_of_nothing_is_refused(database: Database, plan: Plan):
+    demo = recorded(database, plan, off_mm=(0.0, 0.0, 0.0), arm="PSM1")
+    with database.reading() as session:
+        with pytest.raises(BadPlan, match="recording of PSM1 in 'PSM1_base'"):
+            compare_with_plan(session, plan.sha256, demo.sha256)
+        with pytest.raises(BadPlan, match="0 to 0"):
+            compare_with_plan(session, plan.sha256, find_plan(session, plan.sha256).policy.demonstration.sha256, 1)
+        with pytest.raises(NotFound):
+            compare_with_plan(session, plan.sha256, "0" * 64)

@@ -1,0 +1,139 @@
+"""The pictures of a playback: asked for with the verdict, drawn after it, erased with what they show."""
+
+from typing import Any
+
+import pytest
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from skills.db.models import Job, Plan, StoredPictures, StoredPlayback
+from skills.db.session import Database
+from skills.errors import NotDrawnYet, SimulationFailed
+from skills.library import pictures
+from skills.library.erasure import erase_demo, erase_surgeon
+from skills.library.jobs import cancel
+from skills.library.plans import trajectory_of
+from skills.library.verified import planned
+from skills.settings import Settings
+from skills.sim import film
+from skills.style.pictures import Pictures
+from skills.style.playback import Playback
+from tests.library import cases
+from tests.style.motions import ideal_playback, small_trajectory
+
+REPORT = {
+    "failure": None,
+    "failure_in_words": None,
+    "settings": {"clearance_pad_mm": 1.0, "clearance_psm_m_mm": 0.5},
+}
+
+
+def store_playback(session: Session, plan: Plan, sha256: str, measured: Playback) -> StoredPlayback:
+    """Store a playback and ask for its pictures, as a worker does with the verdict."""
+    row = StoredPlayback(
+        sha256=sha256, plan=session.get_one(Plan, plan.row), feasible=True, report=REPORT, measured=measured
+    )
+    session.add(row)
+    session.flush()
+    pictures.request(session, row, "test")
+    return row
+
+
+@pytest.fixture
+def playback(database: Database) -> StoredPlayback:
+    """A playback whose pictures are still to be drawn."""
+    cases.add_demo(database)
+    cases.train(database, release=True)
+    plan = cases.add_plan(database)
+    with database.writing() as session:
+        measured = ideal_playback(trajectory_of(planned(session.get_one(Plan, plan.row))))
+        return store_playback(session, plan, "a" * 64, measured)
+
+
+def asked(database: Database) -> list[Job]:
+    with database.reading() as session:
+        return list(session.scalars(select(Job).where(Job.kind == "pictures").order_by(Job.row)))
+
+
+def drawn(database: Database) -> list[StoredPictures]:
+    with database.reading() as session:
+        return list(session.scalars(select(StoredPictures)))
+
+
+def refusal(database: Database, playback: StoredPlayback) -> str:
+    with database.reading() as session, pytest.raises(NotDrawnYet) as caught:
+        pictures.find_pictures(session, playback)
+    return str(caught.value)
+
+
+def test_pictures_are_drawn_and_stored_once_however_often_that_is_tried(
+    database: Database, playback: StoredPlayback, monkeypatch: pytest.MonkeyPatch
+):
+    pytest.importorskip("pybullet", reason="PYBULLET IS NOT INSTALLED: no film is made here")
+    monkeypatch.setattr(film, "FRAMES", 2)
+    monkeypatch.setattr(film, "FRAMES_PER_PASS", 2)
+    [job] = asked(database)
+    assert job.id in refusal(database, playback)
+    store = pictures.draw_pictures(database, job.request, Settings(database_url=database.url))
+    for _ in range(2):  # the second time by a worker who did not hear of the first
+        with database.writing() as session:
+            assert store(session, "test") == {"playback": playback.sha256}
+    assert len(drawn(database)) == 1
+    with database.reading() as session:
+        found = pictures.find_pictures(session, playback)
+    assert found.animation_mp4[4:8] == b"ftyp"
+    assert found.animation_gif.startswith(b"GIF89a")
+    assert all(png.startswith(b"\x89PNG") for png in (found.joints_png, found.clearance_png))
+
+
+def test_asking_again_gives_the_same_job_until_it_has_failed(database: Database, playback: StoredPlayback):
+    [job] = asked(database)
+    with database.writing() as session:
+        assert pictures.request(session, playback, "test")[0].row == job.row
+        cancel(session, job.id, "test")
+    assert f"POST /playbacks/{playback.sha256}/pictures" in refusal(database, playback)
+    with database.writing() as session:
+        again, new = pictures.request(session, playback, "test")
+    assert new and again.row != job.row
+    assert again.id in refusal(database, playback)
+
+
+def test_nobody_asked_for_pictures_of_older_playbacks(database: Database, playback: StoredPlayback):
+    with database.writing() as session:
+        session.delete(session.get_one(Job, asked(database)[0].row))
+    assert "Nobody has asked" in refusal(database, playback)
+
+
+def test_a_film_that_fails_fails_the_job_and_nothing_is_stored(
+    database: Database, playback: StoredPlayback, monkeypatch: pytest.MonkeyPatch
+):
+    def shoot(*_: Any, **__: Any) -> None:
+        raise SimulationFailed("The simulator hung; play fewer passes.", cause="hung")
+
+    monkeypatch.setattr(film, "shoot", shoot)
+    [job] = asked(database)
+    ended = cases.work(database, job)
+    assert (ended.state, ended.error) == ("failed", "The simulator hung; play fewer passes.")
+    assert drawn(database) == []
+    assert job.id in refusal(database, playback)
+
+
+def test_a_playback_of_other_samples_is_refused_in_words(database: Database, playback: StoredPlayback):
+    with database.writing() as session:
+        store_playback(session, playback.plan, "b" * 64, ideal_playback(small_trajectory()))
+    ended = cases.work(database, asked(database)[-1])
+    assert ended.state == "failed"
+    assert "plan it and play it again" in ended.error
+
+
+@pytest.mark.parametrize("what", ["surgeon", "demonstration"])
+def test_they_are_erased_with_what_they_show(database: Database, playback: StoredPlayback, what: str):
+    with database.writing() as session:
+        session.add(StoredPictures(playback_row=playback.row, drawn=Pictures(b"mp4", b"gif", b"png", b"png")))
+    with database.writing() as session:
+        if what == "surgeon":
+            dropped = erase_surgeon(session, "kestrel", "test")
+        else:
+            dropped = erase_demo(session, playback.plan.policy.manifest["demos"][0], "test")
+    assert "pictures" in [job.kind for job in dropped]
+    assert drawn(database) == asked(database) == []

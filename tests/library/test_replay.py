@@ -1,0 +1,235 @@
+"""The gate before the bag, and what is in it: on both back ends."""
+
+import io
+import json
+import math
+import zipfile
+from typing import Any
+
+import numpy as np
+import pytest
+
+from skills.db.models import Plan, StoredPlayback
+from skills.db.session import Database
+from skills.errors import BadPlan, Conflict, Corrupt, NotFound
+from skills.library import releases
+from skills.library.catalogue import find_surgeon, put_surgeon
+from skills.library.demos import withdraw_demo
+from skills.library.plans import Beside, PlanRequest, find_plan, plan_sutures, trajectory_of
+from skills.library.playbacks import trajectory_digest
+from skills.library.policies import find_version
+from skills.library.replay import check_doubt, cleared, replay_bag
+from skills.packing import canonical, sha256
+from skills.recordings.replay import arms_of
+from skills.recordings.replay_check import check_bag
+from skills.style.plan import SuturePoint
+from skills.style.playback import Playback, link_pairs
+from tests.library import cases
+
+ASKED: dict[str, Any] = {"tip_error_mm": 0.65, "lower_bound": 0.9}
+
+
+def measured() -> Playback:
+    """What a simulator would have measured on nothing: the gate reads the report alone."""
+    one = np.zeros((1, 3))
+    return Playback(
+        tip_mm=one,
+        rotation_xyzw=np.zeros((1, 4)),
+        joints=np.zeros((1, 6)),
+        tracking_mm=np.zeros(1),
+        efforts=np.zeros((1, 6)),
+        contact_n=np.zeros(1),
+        looked_at=np.zeros(1, np.int64),
+        clearances_mm=np.zeros((1, len(link_pairs(False)))),
+        shaft_off_mm=np.zeros(1),
+        psm_m_tip_mm=None,
+        pad_mm=one[0],
+        picture_png=b"",
+        engine="none",
+        files={},
+        seconds_per_step=0.0,
+    )
+
+
+def judged(database: Database, plan: Plan, *, feasible: bool = True, digest: str | None = None, **more: Any) -> str:
+    """Store a verdict on a plan as a playback does."""
+    words = None if feasible else "Pass 0, A1, sample 3 (0.015 s): clearance to the pad is -2 mm, the limit is 1."
+    with database.reading() as session:
+        digest_of_it = trajectory_digest(trajectory_of(find_plan(session, plan.sha256).plan))
+    told = {"feasible": feasible, "failure_in_words": words, "trajectory": digest_of_it}
+    report = told | doubt(0.97) | more
+    identity = digest or sha256(canonical([plan.sha256, report]))
+    with database.writing() as session:
+        row = find_plan(session, plan.sha256)
+        session.add(StoredPlayback(sha256=identity, plan=row, feasible=feasible, report=report, measured=measured()))
+    return identity
+
+
+def doubt(*lower: float | None, tip_error_mm: float = 0.65) -> dict[str, Any]:
+    passes = [{"succeeds": {"count": 990, "of": 1000, "lower": bound}} for bound in lower]
+    return {"doubt": {"under": [{"tip_error_mm": tip_error_mm, "passes": passes}]}}
+
+
+def gate(database: Database, plan: Plan, **asked: Any) -> str:
+    with database.reading() as session:
+        return cleared(session, find_plan(session, plan.sha256), **(ASKED | asked)).sha256
+
+
+@pytest.fixture
+def plan(database: Database) -> Plan:
+    """A plan that follows what is released, not played yet."""
+    cases.add_demo(database)
+    cases.train(database, release=True)
+    return cases.add_plan(database)
+
+
+# ---- the gate
+
+
+def test_a_plan_is_cleared_by_the_newest_feasible_playback_of_exactly_this_plan(database: Database, plan: Plan):
+    with pytest.raises(Conflict, match="not played in the simulator yet; POST /playbacks"):
+        gate(database, plan)
+    other = cases.add_plan(database, speed_mm_s=10.0)
+    judged(database, other)
+    with pytest.raises(Conflict, match="not played"):
+        gate(database, plan)
+    first = judged(database, plan)
+    assert gate(database, plan) == first
+    newer = judged(database, plan, samples=7)
+    assert gate(database, plan) == newer
+    judged(database, plan, **doubt(0.5))
+    with pytest.raises(Conflict, match=r"only 0.500, and 0.9 is asked for"):
+        gate(database, plan)
+    gate(database, plan, lower_bound=0.5)
+    judged(database, plan, feasible=False)
+    with pytest.raises(Conflict, match="infeasible: Pass 0, A1, sample 3"):
+        gate(database, plan)
+    judged(database, plan, digest="1" * 64)
+    with pytest.raises(Corrupt, match="verdict"):
+        gate(database, plan)
+
+
+def test_only_a_plan_that_follows_the_released_policy_is_replayed(database: Database, plan: Plan):
+    judged(database, plan)
+    with database.writing() as session:
+        releases.withdraw(session, find_surgeon(session, "kestrel"), cases.SUTURE, "test")
+    with pytest.raises(Conflict, match="follows version 1 of the policy, and none is released"):
+        gate(database, plan)
+    with database.writing() as session:
+        releases.release(session, find_version(session, "kestrel", cases.SUTURE, 1), "test")
+    gate(database, plan)
+    cases.train(database, seed=1, release=True)
+    with pytest.raises(Conflict, match="follows version 1 of the policy, and version 2 is released"):
+        gate(database, plan)
+    newer = cases.add_plan(database)
+    judged(database, newer)
+    gate(database, newer)
+
+
+def test_consent_and_the_demonstration_have_to_stand(database: Database, plan: Plan):
+    judged(database, plan)
+    for consent, words in (
+        ({"uses": ["training"]}, "does not cover export"),
+        ({"uses": ["export"], "until": "2001-01-01"}, "ran out on 2001-01-01"),
+    ):
+        with database.writing() as session:
+            put_surgeon(session, "kestrel", {"consent": consent}, "test")
+        with pytest.raises(Conflict, match=words):
+            gate(database, plan)
+    with database.writing() as session:
+        put_surgeon(session, "kestrel", {"consent": {"uses": ["export"]}}, "test")
+    gate(database, plan)
+    with database.writing() as session:
+        withdraw_demo(session, find_plan(session, plan.sha256).policy.demonstration.sha256, "test")
+    with pytest.raises(Conflict, match="demonstration that this plan rests on was withdrawn"):
+        gate(database, plan)
+
+
+@pytest.mark.parametrize(
+    ("report", "asked", "words"),
+    [
+        (doubt(0.95), {}, None),
+        (doubt(0.9), {}, None),
+        (doubt(0.95, 0.91), {}, None),
+        (doubt(0.95, 0.89), {}, "only 0.890, and 0.9 is asked for"),
+        (doubt(0.0), {"lower_bound": 0.0}, None),
+        (doubt(0.95, None), {}, "only nan"),
+        (doubt(math.nan), {}, "only nan"),
+        (doubt(0.95), {"lower_bound": math.nan}, "nan is asked for"),
+        (doubt(0.95), {"tip_error_mm": 3.0}, "With a tip error of 3 mm this plan was not judged"),
+        (doubt(0.95), {"tip_error_mm": math.nan}, "was not judged"),
+        (doubt(), {}, "was not judged"),
+        ({"doubt": None}, {}, "was not judged"),
+        ({}, {}, "was not judged"),
+    ],
+)
+def test_the_least_certain_pass_has_to_reach_the_lower_bound(report, asked, words):
+    if words is None:
+        check_doubt(report, **(ASKED | asked))
+    else:
+        with pytest.raises(Conflict, match=words):
+            check_doubt(report, **(ASKED | asked))
+
+
+# ---- the bag
+
+
+def test_the_bag_is_whole_the_same_every_time_and_holds_the_plans_own_samples(database: Database, plan: Plan):
+    playback = judged(database, plan)
+    with pytest.raises(NotFound):
+        replay_bag(database, "0" * 64, **ASKED)
+    data = replay_bag(database, plan.sha256, **ASKED)
+    assert data == replay_bag(database, plan.sha256, **ASKED)
+    lines = check_bag(io.BytesIO(data))
+    assert playback[:12] in lines[1]
+    with database.reading() as session:
+        trajectory = trajectory_of(find_plan(session, plan.sha256).plan)
+    [arm] = arms_of(trajectory, arm="PSM", frame="PSM_base")
+    assert f"PSM1 (PSM_A, 400006): {len(trajectory)} samples" in lines[2]
+    assert np.array_equal(arm.joints[:, [0, 1, 3, 4, 5]], trajectory.joints[:, [0, 1, 3, 4, 5]])
+    papers_say_whose_it_is_and_how_far_it_goes(data, plan)
+    judged(database, plan, trajectory="1" * 64)
+    with pytest.raises(Conflict, match="otherwise than when the plan was played"):
+        replay_bag(database, plan.sha256, **ASKED)
+
+
+def papers_say_whose_it_is_and_how_far_it_goes(data: bytes, plan: Plan) -> None:
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        papers = {name: json.loads(archive.read(name)) for name in archive.namelist() if name.endswith(".json")}
+        readme = archive.read("README.txt").decode()
+    assert all("Research use only" in paper["use"] for paper in papers.values())
+    assert papers["plan.json"]["passes"] == plan.about["passes"]
+    assert papers["policy.json"]["surgeon"] == papers["plan.json"]["surgeon"] == "kestrel"
+    assert {"metrics", "coverage", "grid_certificate", "limits", "demos"} <= set(papers["policy.json"])
+    assert "actions" not in papers["policy.json"]
+    for words in (
+        "skills verify",
+        "ASSUMED to point straight down",
+        "calls its arm 'PSM'",
+        "-a PSM1 -b PSM1 -m servo_jp",
+    ):
+        assert words in readme
+
+
+def samples(database: Database, plan: Plan, pass_index: int | None = None) -> list[tuple[str, int]]:
+    """Check a bag, and count each arm's samples."""
+    lines = check_bag(io.BytesIO(replay_bag(database, plan.sha256, pass_index=pass_index, **ASKED)))
+    return [(line.split()[0], int(line.split()[3])) for line in lines[2:]]
+
+
+def test_both_arms_have_a_bag_and_a_pass_alone_is_a_part_of_the_whole(database: Database):
+    cases.add_demo(database)
+    cases.train(database, release=True)
+    half = math.radians(35) / 2
+    beside = Beside((-0.94, 0.10, -0.33), (160.0, 20.0, 20.0), (0.0, math.sin(half), 0.0, math.cos(half)))
+    points = [SuturePoint((5.0, 55.0, -125.0)), SuturePoint((8.0, 55.0, -125.0))]
+    plan, _ = plan_sutures(
+        database, PlanRequest("kestrel", cases.SUTURE, points, psm_m=beside, speed_mm_s=60.0, rate_hz=100.0), "test"
+    )
+    judged(database, plan)
+    (psm1, whole), (psm2, beside_it) = samples(database, plan)
+    assert (psm1, psm2) == ("PSM1", "PSM2")
+    assert whole == beside_it == plan.about["trajectory"]["samples"]
+    assert whole == sum(samples(database, plan, number)[0][1] for number in (0, 1))
+    with pytest.raises(BadPlan, match="0 to 1"):
+        replay_bag(database, plan.sha256, pass_index=2, **ASKED)

@@ -1,0 +1,419 @@
+"""Batches: each style for itself, nothing twice, and released only what is asked for and not worse."""
+
+import math
+
+import pytest
+from sqlalchemy import func, select
+
+from skills.db.models import Event, Job, PolicyVersion, Release, StyleToRetrain
+from skills.db.session import Database
+from skills.errors import Conflict, NotFound
+from skills.jobs.workflows import Work, fail, start
+from skills.library import batch_work, batches, jobs, perform_job, retraining
+from skills.library.batch_work import compare
+from skills.library.batches import BATCH
+from skills.library.catalogue import put_surgeon
+from skills.library.demos import withdraw_demo
+from skills.library.erasure import erase_demo, erase_surgeon
+from skills.library.training import learn_style
+from skills.settings import Settings
+from skills.style.learning.q_learning import CellQLearning
+from skills.style.learning.value_iteration import ValueIteration
+from tests.library import cases
+from tests.library.styles import (
+    add_styles,
+    ask_retraining,
+    damage,
+    look,
+    parts_of,
+    retrain,
+    states_of,
+    styles_of,
+)
+
+NO_CONSENT = {"consent": {"uses": ["atlas"], "until": None}}
+
+
+def versions(database: Database) -> int:
+    return counted(database, PolicyVersion)
+
+
+def counted(database: Database, table: type) -> int:
+    with database.reading() as session:
+        return session.scalar(select(func.count()).select_from(table))
+
+
+# ---- what is trained
+
+
+def test_all_styles_of_a_surgeon_or_of_a_suture_type_are_trained_once_each(database: Database):
+    styles = add_styles(database, 13)  # eleven of one surgeon, two of the next
+    first, second = styles[0][0], styles[-1][0]
+    batch = retrain(database, surgeon=second)
+    assert (batch.state, batch.progress, batch.result["done"], batch.error) == ("succeeded", 1.0, 2, None)
+    assert batch.started_at <= batch.ended_at
+    retrain(database, suture=styles[0][1])  # one of each surgeon, of which one is known by now
+    assert versions(database) == 3
+    whole = retrain(database)
+    assert states_of(database, whole) == ["done"] * 13
+    assert versions(database) == 13
+    with database.reading() as session:
+        trained = session.execute(select(Event.object_id).where(Event.action == "train")).all()
+        assert len(trained) == len(set(trained)) == 13
+        ended = select(func.count()).where(Event.action == "finish", Event.object_kind == f"job-{BATCH}")
+        assert session.scalar(ended) == 3
+    assert counted(database, Release) == 0
+    with pytest.raises(NotFound, match="no surgeon 'nobody'"):
+        ask_retraining(database, surgeon="nobody")
+    with pytest.raises(Conflict, match="no active demonstration"):
+        ask_retraining(database, surgeon="kestrel")
+    assert first != second
+
+
+def test_a_style_in_a_batch_is_trained_as_by_a_training_of_its_own(database: Database):
+    cases.add_demo(database)
+    alone = cases.train(database)
+    (style,) = styles_of(database, retrain(database))
+    assert (style.policy_row, versions(database)) == (alone.row, 1)
+    other = ValueIteration()
+    (style,) = styles_of(database, retrain(database, learner=other))
+    assert style.policy.version == 2
+    assert cases.train(database, learner=other).row == style.policy_row
+
+
+def test_equal_requests_for_the_same_styles_are_one_job_until_one_fails(database: Database):
+    add_styles(database, 3)
+    job = ask_retraining(database)
+    assert ask_retraining(database).row == job.row
+    assert ask_retraining(database, release=True).row != job.row
+    assert ask_retraining(database, learner=CellQLearning()).row != job.row
+    for part in parts_of(database, job):
+        cases.work(database, part)
+    assert ask_retraining(database).row == job.row
+    cases.add_demo(database)
+    more = ask_retraining(database)
+    assert (more.row != job.row, more.request["styles"]) == (True, 4)
+    with database.writing() as session:
+        put_surgeon(session, "kestrel", NO_CONSENT, "test")
+    for part in parts_of(database, more):
+        cases.work(database, part)
+    assert look(database, more).state == "failed"
+    again = ask_retraining(database)
+    assert (again.row != more.row, again.state) == (True, "queued")
+
+
+def test_only_stale_styles_are_trained_and_each_says_why(database: Database, monkeypatch: pytest.MonkeyPatch):
+    def reasons(**asked: object) -> list[list[str]]:
+        return [style.stale for style in styles_of(database, retrain(database, only_stale=True, **asked))]
+
+    add_styles(database, 2)
+    assert reasons() == [["never trained"]] * 2
+    nothing = ask_retraining(database, only_stale=True)
+    assert (nothing.state, nothing.progress, nothing.request["styles"]) == ("succeeded", 1.0, 0)
+    assert ask_retraining(database, only_stale=True).row == nothing.row
+    cases.add_demo(database)
+    older = cases.train(database)
+    cases.add_demo(database, cases.hand_off((5.0, 0.0, 0.0)))
+    assert reasons() == [["a newer demonstration"]]
+    assert reasons(learner=ValueIteration(), surgeon="kestrel") == [["other settings"]]
+    monkeypatch.setattr(retraining, "LEARNER_VERSION", retraining.LEARNER_VERSION + 1)
+    assert sorted(reasons()) == [["a newer learner"]] * 2 + [["other settings", "a newer learner"]]
+    with database.writing() as session:  # what the newest version rests on is gone: the one before it counts again
+        newest = session.scalars(select(PolicyVersion).order_by(PolicyVersion.row.desc())).first()
+        withdraw_demo(session, newest.demonstration.sha256, "test")
+    (style,) = styles_of(database, ask_retraining(database, only_stale=True, surgeon="kestrel"))
+    assert (style.stale, style.demonstration_row) == (["a newer demonstration"], older.demonstration_row)
+
+
+# ---- one bad style
+
+
+def test_of_eight_styles_with_one_poisoned_seven_are_done_and_one_failed_with_its_reason(database: Database):
+    add_styles(database, 8)
+    job = ask_retraining(database)
+    damage(database, styles_of(database, job)[3].demonstration_row)
+    for part in parts_of(database, job):
+        assert cases.work(database, part).state == "succeeded"
+    assert states_of(database, job) == ["done"] * 3 + ["failed"] + ["done"] * 4
+    bad = styles_of(database, job)[3]
+    assert "not what was stored" in bad.reason
+    assert (bad.policy_row, bad.comparison, bad.ended_at is None) == (None, None, False)
+    batch = look(database, job)
+    assert (batch.state, batch.progress) == ("failed", 1.0)
+    assert batch.error.startswith("1 of 8 styles failed")
+    assert batch.result == {"queued": 0, "done": 7, "failed": 1, "cancelled": 0}
+    assert versions(database) == 7
+
+
+def test_a_style_without_consent_or_whose_demonstration_was_withdrawn_fails_and_the_others_go_on(database: Database):
+    add_styles(database, 2)
+    demo = cases.add_demo(database)
+    cases.add_surgeon(database, "heron")
+    cases.add_demo(database, surgeon="heron")
+    job = ask_retraining(database)
+    with database.writing() as session:
+        put_surgeon(session, "kestrel", NO_CONSENT, "test")
+        heron = cases.Demonstration.surgeon.has(slug="heron")
+        withdraw_demo(session, session.scalars(select(cases.Demonstration).where(heron)).one().sha256, "test")
+    for part in parts_of(database, job):
+        cases.work(database, part)
+    reasons = {style.demonstration.surgeon.slug: style.reason for style in styles_of(database, job)}
+    assert reasons["surgeon-0"] is None
+    assert "does not cover training" in reasons["kestrel"]
+    assert "was withdrawn" in reasons["heron"]
+    assert (look(database, job).result["done"], look(database, job).result["failed"]) == (2, 2)
+    assert demo.sha256 not in str(reasons)
+
+
+def test_what_fails_inside_the_service_is_tried_again_and_then_given_up_alone(
+    database: Database, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(retraining, "FEWEST_PARTS", 1)
+    add_styles(database, 5)
+    job = ask_retraining(database)
+    (part,) = parts_of(database, job)
+    bad = styles_of(database, job)[1].demonstration_row
+    learnt = []
+
+    def learn(lesson, request):
+        learnt.append(lesson.row)
+        if lesson.row == bad:
+            raise RuntimeError("/srv/secret")
+        return learn_style(lesson, request)
+
+    monkeypatch.setattr(batch_work, "learn_style", learn)
+    work = Work(database, Settings(database_url=database.url), perform_job)
+    assert not work.try_once(part.row, 1, 0)
+    assert states_of(database, job) == ["done", "queued", "done", "done", "done"]
+    assert look(database, job).state == "running"
+    assert 0.79 < look(database, job).progress < 0.81
+    assert not work.try_once(part.row, 1, 1)
+    assert learnt.count(bad) == 3  # once among the others, and then alone
+    work.give_up(part.row, 1)
+    style = styles_of(database, job)[1]
+    assert style.state == "failed"
+    assert "failed inside the service" in style.reason and "secret" not in style.reason
+    batch = look(database, job)
+    assert (batch.state, batch.result["done"], batch.result["failed"]) == ("failed", 4, 1)
+
+
+def test_a_style_at_which_its_worker_died_comes_last_the_next_time(database: Database, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(retraining, "FEWEST_PARTS", 1)
+    add_styles(database, 4)
+    job = ask_retraining(database)
+    (part,) = parts_of(database, job)
+    deadly = styles_of(database, job)[1].demonstration_row
+
+    class Death(BaseException):
+        """What no worker survives."""
+
+    def learn(lesson, request):
+        if lesson.row == deadly:
+            raise Death
+        return learn_style(lesson, request)
+
+    monkeypatch.setattr(batch_work, "learn_style", learn)
+    for done in (0, 1, 3):  # at first it took the others of its transaction along
+        assert start(database, part.row, 1)
+        with pytest.raises(Death):
+            perform_job(database, part.row, 1, Settings(database_url=database.url))
+        assert states_of(database, job).count("done") == done
+    assert [style.tries for style in styles_of(database, job)] == [2, 3, 2, 2]
+    assert fail(database, part.row, 1, "Its worker died every time while working on it.")
+    assert states_of(database, job) == ["done", "failed", "done", "done"]
+    assert look(database, job).state == "failed"
+
+
+def test_a_style_refused_at_the_last_moment_takes_none_of_its_transaction_along(
+    database: Database, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(retraining, "FEWEST_PARTS", 1)
+    add_styles(database, 3)
+    job = ask_retraining(database)
+    (part,) = parts_of(database, job)
+    withdrawn = styles_of(database, job)[1].demonstration.sha256
+
+    def learn(lesson, request):
+        if lesson.sha256 == withdrawn:
+            with database.writing() as session:
+                withdraw_demo(session, withdrawn, "test")
+        return learn_style(lesson, request)
+
+    monkeypatch.setattr(batch_work, "learn_style", learn)
+    cases.work(database, part)
+    assert states_of(database, job) == ["done", "failed", "done"]
+    assert "withdrawn while it was being learnt" in styles_of(database, job)[1].reason
+    assert versions(database) == 2
+
+
+def test_what_takes_long_is_committed_alone(database: Database, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(retraining, "FEWEST_PARTS", 1)
+    monkeypatch.setattr(batch_work, "TOGETHER_S", 0.0)
+    add_styles(database, 3)
+    job = ask_retraining(database)
+    (part,) = parts_of(database, job)
+    seen = []
+
+    def learn(lesson, request):
+        seen.append((states_of(database, job).count("done"), look(database, job).progress))
+        return learn_style(lesson, request)
+
+    monkeypatch.setattr(batch_work, "learn_style", learn)
+    cases.work(database, part)
+    assert [done for done, _ in seen] == [0, 1, 2]
+    assert [round(progress, 6) for _, progress in seen] == [0.0, round(1 / 3, 6), round(2 / 3, 6)]
+
+
+# ---- cancelling and erasing
+
+
+@pytest.mark.parametrize(("together", "begun", "kept"), [(1, 3, 2), (2, 4, 2), (5, 4, 0)])
+def test_a_cancelled_batch_stops_at_its_next_commit_and_keeps_no_late_result(
+    database: Database, monkeypatch: pytest.MonkeyPatch, together: int, begun: int, kept: int
+):
+    monkeypatch.setattr(retraining, "FEWEST_PARTS", 2)
+    monkeypatch.setattr(batch_work, "TOGETHER", together)
+    monkeypatch.setattr(batch_work, "TOGETHER_S", 60.0)
+    add_styles(database, 8)
+    job = ask_retraining(database)
+    learnt = []
+
+    def learn(lesson, request):
+        learnt.append(lesson.row)
+        if len(learnt) == 3:
+            with database.writing() as session:
+                jobs.cancel(session, job.id, "test")
+        return learn_style(lesson, request)
+
+    monkeypatch.setattr(batch_work, "learn_style", learn)
+    for part in parts_of(database, job):
+        cases.work(database, part)
+    assert (len(learnt), versions(database)) == (begun, kept)
+    assert states_of(database, job) == ["done"] * kept + ["cancelled"] * (8 - kept)
+    batch = look(database, job)
+    assert (batch.state, batch.result) == ("cancelled", None)
+    assert {part.state for part in parts_of(database, job)} == {"cancelled"}
+    assert ask_retraining(database).row != job.row
+    done = retrain(database, only_stale=True)
+    with database.writing() as session, pytest.raises(Conflict, match="ended already"):
+        jobs.cancel(session, done.id, "test")
+
+
+def test_an_erased_surgeon_leaves_batches_and_the_others_go_on(database: Database):
+    styles = add_styles(database, 13)
+    whole, own = ask_retraining(database), ask_retraining(database, surgeon=styles[-1][0])
+    first, *rest = parts_of(database, whole)
+    cases.work(database, first)
+    with database.writing() as session:
+        erased = erase_surgeon(session, styles[-1][0], "test")
+        demo = styles_of(database, whole)[5].demonstration
+        erase_demo(session, demo.sha256, "test")
+    assert {job.kind for job in erased} == {BATCH, "retraining-part"}
+    for part in rest:
+        cases.work(database, part)
+    batch = look(database, whole)
+    assert (batch.state, batch.result["done"]) == ("succeeded", 10)
+    assert len(states_of(database, whole)) == 10
+    with database.reading() as session:
+        assert session.get(Job, own.row) is None
+    with database.writing() as session:  # trained, in a batch, and erased all the same
+        erase_surgeon(session, styles[0][0], "test")
+    assert counted(database, StyleToRetrain) == 0
+    assert versions(database) == 0
+
+
+def test_a_batch_all_of_whose_styles_were_erased_ends(database: Database):
+    cases.add_demo(database)
+    job = ask_retraining(database)
+    (part,) = parts_of(database, job)
+    with database.writing() as session:
+        erase_surgeon(session, "kestrel", "test")
+    cases.work(database, part)
+    assert (look(database, job).state, look(database, job).result["done"]) == ("succeeded", 0)
+
+
+# ---- two workers at the same part
+
+
+def test_a_late_result_changes_nothing_and_its_worker_goes_on_with_what_is_left(
+    database: Database, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(retraining, "FEWEST_PARTS", 1)
+    add_styles(database, 3)
+    job = ask_retraining(database)
+    (part,) = parts_of(database, job)
+    others, ended = [], []
+
+    def learn(lesson, request):
+        if not others:  # meanwhile another worker has taken the part over, and ends it
+            others.append(lesson.row)
+            with monkeypatch.context() as meanwhile:
+                meanwhile.setattr(batch_work, "learn_style", learn_style)
+                perform_job(database, part.row, 1, Settings(database_url=database.url))
+            ended.append(look(database, job).ended_at)
+        return learn_style(lesson, request)
+
+    monkeypatch.setattr(batch_work, "learn_style", learn)
+    cases.work(database, part)
+    assert states_of(database, job) == ["done"] * 3
+    assert (versions(database), look(database, job).state) == (3, "succeeded")
+    assert [look(database, job).ended_at] == ended
+    with database.reading() as session:
+        finished = select(func.count()).where(Event.action == "finish", Event.object_id == job.id)
+        assert session.scalar(finished) == 1
+
+
+def test_parts_are_shared_out_and_nobody_sees_them(database: Database):
+    add_styles(database, 40)
+    job = ask_retraining(database)
+    assert len(parts_of(database, job)) == 14  # of three styles: enough for many workers
+    with database.reading() as session:
+        assert [one.id for one in jobs.list_jobs(session, 50, None, None)] == [job.id]
+        assert len(batches.to_tell(session, job)) == 14
+        with pytest.raises(NotFound):
+            jobs.find_job(session, parts_of(database, job)[0].id)
+
+
+# ---- releasing
+
+
+def test_a_version_is_released_only_if_that_was_asked_for_and_the_comparison_is_kept(database: Database):
+    cases.add_demo(database)
+    (style,) = styles_of(database, retrain(database))
+    assert style.comparison["released"] is None
+    assert (style.comparison["now_released"], counted(database, Release)) == (False, 0)
+    (style,) = styles_of(database, retrain(database, release=True))
+    assert (style.comparison["now_released"], counted(database, Release)) == (True, 1)
+    (style,) = styles_of(database, retrain(database, release=True, learner=ValueIteration()))
+    compared = style.comparison
+    assert (compared["released"]["version"], compared["trained"]["version"]) == (1, 2)
+    assert (compared["same_demonstration"], compared["worse_because"]) == (True, [])
+    assert (compared["now_released"], counted(database, Release)) == (True, 2)
+    cases.add_demo(database, cases.hand_off((5.0, 0.0, 0.0)))
+    (style,) = styles_of(database, retrain(database, release=True))
+    assert (style.comparison["same_demonstration"], style.comparison["now_released"]) == (False, True)
+
+
+def test_a_worse_version_is_kept_and_not_released(database: Database):
+    cases.add_demo(database)
+    cases.train(database, release=True)
+    job = retrain(database, release=True, learner=CellQLearning(episodes=3))
+    (style,) = styles_of(database, job)
+    assert (job.state, style.state, style.policy.version) == ("succeeded", "done", 2)
+    assert style.comparison["worse_because"]
+    assert style.comparison["not_released_because"].startswith("It is worse than the released version: ")
+    assert counted(database, Release) == 1
+
+
+FIGURES = {"demos": ["a"], "dtw_total_mm": 10.0, "exact_share": 0.9, "reaching_share": 0.95}
+
+
+@pytest.mark.parametrize(
+    ("name", "equal", "better", "worse"),
+    [("dtw_total_mm", 10.0, 9.0, 10.1), ("exact_share", 0.9, 1.0, 0.8), ("reaching_share", 0.95, 1.0, 0.9)],
+)
+def test_worse_is_what_is_worse_in_one_figure_or_no_number(name: str, equal: float, better: float, worse: float):
+    for value, reasons in ((equal, 0), (better, 0), (worse, 1), (math.nan, 1)):
+        assert len(compare(FIGURES, FIGURES | {name: value})["worse_because"]) == reasons
+    assert len(compare(FIGURES | {name: math.nan}, FIGURES)["worse_because"]) == 1
+    assert compare(None, FIGURES | {name: worse})["worse_because"] == []

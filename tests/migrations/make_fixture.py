@@ -1,0 +1,139 @@
+"""Make the fixture of a release: `make fixture`, by hand at each release; what it writes is kept for ever.
+
+    releases/VERSION/skills.sqlite        a populated installation in one file
+    releases/VERSION/postgresql.sql.gz    the same, as PostgreSQL's own `pg_dump --inserts` writes it
+    releases/VERSION/expected.json        ETag and SHA-256 of each policy that it serves, as JSON and as arrays;
+                                          of arrays also the digest of their numbers, for how they are compressed
+                                          depends on the zlib that Python was built with
+
+The installation is made once, through the service's own calls, on SQLite; PostgreSQL gets it by a backup that is
+restored. The dump holds the tables as that version made them, so it does not rest on our migrations still being what
+they were; written as INSERTs it can be run through psycopg, and nobody needs `psql`. `pg_dump` comes with the server
+of the tests.
+"""
+
+import gzip
+import hashlib
+import io
+import json
+import sqlite3
+import subprocess
+import tempfile
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from sqlalchemy import make_url, select
+
+from skills import __version__
+from skills.db.models import StoredPictures, StoredPlayback
+from skills.db.schema import revisions
+from skills.db.session import Database
+from skills.library.backup import back_up, restore
+from skills.packing import canonical, sha256
+from skills.seeds.recordings import sample_recordings
+from skills.style.pictures import Pictures
+from tests import backends
+from tests.api.service import CSV, MCAP, Service, serving
+from tests.library import cases
+
+RELEASES = Path(__file__).parent / "releases"
+SURGEONS = ("kestrel", "heron")
+JSON, NPZ = "application/json", "application/x-npz"
+
+
+def main() -> None:
+    """Write the fixture of this version anew."""
+    target = RELEASES / __version__
+    target.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix="skills-fixture-") as name:
+        folder = Path(name)
+        url = backends.fresh("sqlite", folder)
+        with serving(url) as service:
+            populate(service)
+            expected = {"schema": revisions()[0], "zlib": zlib.ZLIB_RUNTIME_VERSION, "policies": policies_of(service)}
+            back_up(service.database, folder / "backup.zip")
+        write_sqlite(Path(make_url(url).database or ""), target / "skills.sqlite")
+        write_postgresql(folder / "backup.zip", target / "postgresql.sql.gz")
+    (target / "expected.json").write_text(json.dumps(expected, indent=1) + "\n")
+    for file in sorted(target.iterdir()):
+        print(f"{file.relative_to(RELEASES)}: {file.stat().st_size / 1e3:.0f} kB")
+
+
+def populate(service: Service) -> None:
+    """Make at least one row of every table, through the service's own calls."""
+    client = service.client
+    client.put_surgeon("kestrel", skill_level="expert", consent={"uses": ["training", "export"], "until": None})
+    client.add_demo(cases.hand_off(), media_type=CSV, surgeon="kestrel", suture=cases.SUTURE)
+    client.put_surgeon("heron", handedness="left")
+    bag = next(sample.data for sample in sample_recordings() if sample.surgeon == "heron")
+    client.add_demo(bag, media_type=MCAP, surgeon="heron", suture=cases.SUTURE)
+    withdrawn = client.add_demo(cases.hand_off((0.0, 2.5, 0.0)), media_type=CSV, surgeon="heron", suture=cases.SUTURE)
+    client.withdraw_demo(withdrawn["sha256"])
+    client.put_surgeon("wren")
+    client.erase_surgeon("wren")
+    client.retrain(release=True)
+    client.cancel(client.train(surgeon="heron", suture=cases.SUTURE, seed=3)["id"])
+    client.train(surgeon="kestrel", suture=cases.SUTURE, learner={"kind": "value-iteration"}, release=True)
+    service.work()
+    plan = client.plan("kestrel", cases.SUTURE, [{"position_mm": [5.0, 55.0, -125.0]}])
+    client.play(plan["sha256"])
+    service.work()
+    with service.database.writing() as session:  # real ones are as large as all the rest; their job goes on waiting
+        playback = session.scalars(select(StoredPlayback.row)).one()
+        session.add(StoredPictures(playback_row=playback, drawn=Pictures(b"mp4", b"gif", b"png", b"png")))
+
+
+def policies_of(service: Service) -> dict[str, Any]:
+    """Find all that is served and every version, byte for byte as a client gets it."""
+    client = service.client
+    served = [f"/policies/{one['surgeon']}/{one['suture']}" for one in client.policies()]
+    versions = [
+        f"/policy-versions/{version['sha256']}"
+        for surgeon in SURGEONS
+        for version in client.versions(surgeon, cases.SUTURE)
+    ]
+    return {path: {kind: answer_of(service, path, kind) for kind in (JSON, NPZ)} for path in served + versions}
+
+
+def answer_of(service: Service, path: str, media_type: str) -> dict[str, str]:
+    """Get one answer: its ETag and the digest of its bytes."""
+    answer = service.http.get(path, headers={"Accept": media_type})
+    assert answer.status_code == 200, answer.text
+    said = {"etag": answer.headers["etag"], "sha256": hashlib.sha256(answer.content).hexdigest()}
+    return said | {"numbers": numbers_of(answer.content)} if media_type == NPZ else said
+
+
+def numbers_of(npz: bytes) -> str:
+    """Digest arrays, however they are compressed."""
+    with np.load(io.BytesIO(npz)) as arrays:
+        parts = [[name, str(a.dtype), list(a.shape), sha256(a.tobytes())] for name, a in sorted(arrays.items())]
+    return sha256(canonical(parts))
+
+
+def write_sqlite(source: Path, target: Path) -> None:
+    """Write a database as one file, with nothing in it but what is stored."""
+    target.unlink(missing_ok=True)
+    connection = sqlite3.connect(source)
+    connection.execute("VACUUM INTO ?", (str(target),))
+    connection.close()
+
+
+def write_postgresql(backup: Path, target: Path) -> None:
+    """Restore a backup into PostgreSQL, and dump that."""
+    url = backends.blank("postgresql", backup.parent)
+    database = Database(url)
+    restore(database, backup)
+    database.close()
+    server = (backends.server().pgdata / "postmaster.opts").read_text().split()[0]  # the wheel has several versions
+    where = make_url(url).set(drivername="postgresql").render_as_string(hide_password=False)
+    options = ["--inserts", "--rows-per-insert=50", "--no-owner", "--no-privileges", "--no-comments"]
+    dump = subprocess.run([Path(server).with_name("pg_dump"), *options, where], check=True, capture_output=True).stdout
+    lines = [line for line in dump.splitlines(keepends=True) if not line.startswith(b"\\")]  # words to psql
+    target.write_bytes(gzip.compress(b"".join(lines), mtime=0))
+    backends.drop(url)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,108 @@
+"""What docs/operating.md shows really runs."""
+
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from skills.cli import app
+from skills.settings import Settings, settings
+from tests.api.service import copy_of_trained
+
+PAGE = (Path(__file__).parent.parent / "docs" / "operating.md").read_text()
+UNITS = [block for block in re.findall(r"```ini\n(.*?)```", PAGE, re.DOTALL) if "[Service]" in block]
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """An installation with a released policy, as the commands find it."""
+    monkeypatch.setenv("SKILLS_DATABASE_URL", copy_of_trained(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    settings.cache_clear()
+    yield tmp_path
+    settings.cache_clear()
+
+
+def test_every_command_of_the_page_runs_in_the_order_of_the_page(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    commands = "".join(re.findall(r"```bash\n(.*?)```", PAGE, re.DOTALL)).splitlines()
+    ran = []
+    for command in commands:
+        words = shlex.split(command)
+        if words[0] == "export":
+            name, _, value = words[1].partition("=")
+            monkeypatch.setenv(name, value)
+            settings.cache_clear()
+            continue
+        assert words[0] == "skills", command
+        result = CliRunner().invoke(app, words[1:])
+        assert result.exit_code == 0, (command, result.output)
+        ran.append(words[1])
+    assert {"backup", "restore", "erasures", "verify"} == set(ran)
+    assert (folder / "elsewhere" / "skills.sqlite").stat().st_size > 100_000
+
+
+def test_a_restore_without_a_list_of_erasures_says_so_and_one_beside_an_engines_memory_does_not_begin(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = CliRunner().invoke
+    assert run(app, ["backup", "b.zip"]).exit_code == 0
+    again = run(app, ["backup", "b.zip"])
+    assert (again.exit_code, "never overwrites" in again.output) == (1, True)
+    monkeypatch.setenv("SKILLS_DATABASE_URL", "sqlite:///new.sqlite")
+    settings.cache_clear()
+    Path("new.jobs.sqlite").touch()
+    refused = run(app, ["restore", "b.zip"])
+    assert (refused.exit_code, "another state" in refused.output) == (1, True)
+    assert not Path("new.sqlite").exists()
+    Path("new.jobs.sqlite").unlink()
+    done = run(app, ["restore", "b.zip"])
+    assert (done.exit_code, "NO LIST OF ERASURES WAS GIVEN" in done.output) == (0, True)
+    refused = run(app, ["restore", "b.zip"])
+    assert (refused.exit_code, "into an empty one only" in refused.output) == (1, True)
+    missing = run(app, ["restore", "nowhere.zip", "--check"])
+    assert (missing.exit_code, "No such file" in missing.output) == (1, True)
+
+
+def test_verify_exits_with_1_and_names_what_is_wrong(folder: Path) -> None:
+    import sqlite3
+
+    with sqlite3.connect("skills.sqlite") as connection:
+        connection.execute("DROP TRIGGER policy_versions_append_only")
+        connection.execute("UPDATE policy_versions SET manifest = replace(manifest, '\"seed\": 0', '\"seed\": 1')")
+    result = CliRunner().invoke(app, ["verify"])
+    assert (result.exit_code, "policy_versions 1: it is not what was certified" in result.output) == (1, True)
+    assert '"wrong": 1' in CliRunner().invoke(app, ["verify", "--json"]).output
+
+
+def test_the_settings_of_the_page_are_those_there_are() -> None:
+    table = PAGE[PAGE.index("| setting | default |") :]
+    names = re.findall(r"`([A-Z_]+)`", table[: table.index("\n\n")])
+    names += [name.removeprefix("SKILLS_") for name in re.findall(r"SKILLS_[A-Z_]+", PAGE)]
+    assert len(names) > 8
+    assert {name.lower() for name in names} <= set(Settings.model_fields)
+
+
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="UNITS WERE NOT CHECKED: no systemd-analyze here")
+def test_the_units_of_the_page_are_units(tmp_path: Path) -> None:
+    assert len(UNITS) == 3
+    for name, unit in zip(
+        ("suture-skills.service", "suture-skills-worker@.service", "backup.service"), UNITS, strict=True
+    ):
+        assert "MemoryDenyWriteExecute" not in unit
+        assert "User=skills" in unit
+        file = tmp_path / name
+        file.write_text(unit.replace("/opt/suture-skills/.venv/bin/skills", sys.executable))
+        checked = subprocess.run(
+            ["systemd-analyze", "verify", "--man=no", str(file)], capture_output=True, text=True, env=dict(os.environ)
+        )
+        ours = [
+            line for line in checked.stderr.splitlines() if name.split("@")[0] in line and "EnvironmentFile" not in line
+        ]
+        assert (checked.returncode, ours) == (0, []), checked.stderr
