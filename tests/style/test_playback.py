@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from skills.style.playback_report import PlaybackReport
 
 from skills.errors import BadInput
 from skills.style.gates import JudgeSettings
 from skills.style.handoff import OtherArm
 from skills.style.kinematics import POINTING_DOWN, forward, inverse, quaternion_of
 from skills.style.playback import LINKS, Playback, link_pairs
+from skills.style.playback_report import PlaybackReport
 from skills.style.trajectory import A1, A2, TRANSFER, Trajectory
 from skills.style.verdict import judge
 from tests.style.motions import PSM_M, ideal_playback, small_trajectory
