@@ -13,7 +13,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from itertools import pairwise, product
 from pathlib import Path
 from typing import Any
@@ -50,7 +50,7 @@ def main() -> int:
     with tempfile.TemporaryDirectory(prefix="suture-skills-") as folder, running_service(Path(folder)) as client:
         styles = tell_styles(client)
         report = Table("style", "states", "DTW mm", "starts", "verdict", "train s", "plan s", "play s", box=None)
-        checked = [check_style(client, *style, report, film=style == styles[0]) for style in styles]
+        checked = [check_style(client, *style, report) for style in styles]
         out.print("\nLearnt, certified, released; stacked at five suture points; played back in PyBullet:")
         out.print(report)
         draw_samples(client, styles)
@@ -105,7 +105,7 @@ def tell_styles(client: Client) -> list[tuple[str, str]]:
     return list(styles)
 
 
-def check_style(client: Client, surgeon: str, suture: str, report: Table, *, film: bool) -> tuple[bool, str]:
+def check_style(client: Client, surgeon: str, suture: str, report: Table) -> tuple[bool, str]:
     """Train, release, roll out, plan and play a style: whether everything is as it should be, and the playback."""
     laps = [time.monotonic()]
     client.wait(client.train(surgeon, suture, release=True))
@@ -116,8 +116,6 @@ def check_style(client: Client, surgeon: str, suture: str, report: Table, *, fil
     laps.append(time.monotonic())
     playback = client.playback(client.wait(client.play(plan["id"]))["result"]["playback"])
     laps.append(time.monotonic())
-    if not film:
-        leave_out_film(client, playback["id"])
     (PICTURES / f"{surgeon}-{suture}-playback.png").write_bytes(client.picture(playback["id"]))
     coverage, total = policy["coverage"], followed["dtw_total_mm"]
     report.add_row(
@@ -170,12 +168,6 @@ def save_film(client: Client, playback: str, name: str) -> None:
     out.print(f"\nThe film of {name} and its plots over time: {files}", soft_wrap=True)
 
 
-def leave_out_film(client: Client, playback: str) -> None:
-    """Cancel what would be drawn of a playback: one film is enough here, and the demo does not stay for others."""
-    with suppress(Problem):  # it has ended already
-        client.cancel(client.draw(playback)["id"])
-
-
 def real_recording(client: Client) -> None:
     """Take a real recording through the same line, with the command that a lab would use, where one is there."""
     folder = settings().sample_recordings
@@ -206,7 +198,6 @@ def real_recording(client: Client) -> None:
         out.print(f"Not played back: {refused}", soft_wrap=True)
         return
     playback = client.playback(client.wait(client.play(plan["id"]))["result"]["playback"])
-    leave_out_film(client, playback["id"])
     (PICTURES / "real-recording-playback.png").write_bytes(client.picture(playback["id"]))
     out.print(f"Played back at its own place: {verdict(playback)}")
 
