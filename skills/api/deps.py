@@ -10,6 +10,7 @@ from typing import Annotated, Any
 from fastapi import Depends, Header, Path, Query, Request
 from starlette.requests import ClientDisconnect
 
+from skills.api.access import Asking
 from skills.db.session import Database
 from skills.errors import TooLarge, TooSlow, UnknownFormat, UnreadableRecording
 from skills.jobs.engine import Engine
@@ -42,9 +43,9 @@ def _settings(request: Request) -> Settings:
     return settings
 
 
-def _actor() -> str:
-    """Say who asks: without keys, only somebody on this machine can."""
-    return "local"
+def _actor(caller: Asking) -> str:
+    """Name who asks, for events."""
+    return caller.name
 
 
 Db = Annotated[Database, Depends(_database)]
