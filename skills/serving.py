@@ -1,4 +1,4 @@
-"""Starting the service: the application in this process, its worker in a child at lower priority."""
+"""Starting the service: the application in this process, its workers in children at lower priority."""
 
 import logging
 import signal
@@ -24,6 +24,7 @@ from skills.settings import Settings
 
 GRACE_S = 12  # a worker finishes what it has begun within ten
 RESTART_S = 1.0
+FURTHER_S = 5.0  # from one worker to the next: several that start at once are all ready later than the first alone
 
 log = logging.getLogger("skills.serving")
 
@@ -63,20 +64,22 @@ def serve(settings: Settings, *, samples: bool = False) -> None:
 
 @contextmanager
 def working(settings: Settings) -> Iterator[None]:
-    """Keep a worker at work for as long as the block; one that dies is replaced."""
+    """Keep workers at work for as long as the block; the first starts at once, and one that dies is replaced."""
     over = threading.Event()
 
     def watch() -> None:
-        worker = start_worker_child(settings)
-        while not over.wait(RESTART_S):
-            if worker.poll() is not None:
-                log.warning("The worker ended with %s; another one starts.", worker.returncode)
-                worker = start_worker_child(settings)
-        worker.terminate()
-        try:
-            worker.wait(GRACE_S)
-        except subprocess.TimeoutExpired:
-            worker.kill()
+        crew: list[subprocess.Popen[bytes]] = []
+        began_s = time.monotonic()
+        while True:
+            for place, worker in enumerate(crew):
+                if worker.poll() is not None:
+                    log.warning("A worker ended with %s; another one starts.", worker.returncode)
+                    crew[place] = start_worker_child(settings)
+            if len(crew) < settings.workers and time.monotonic() - began_s >= len(crew) * FURTHER_S:
+                crew.append(start_worker_child(settings))
+            if over.wait(RESTART_S):
+                break
+        _end(crew)
 
     watcher = threading.Thread(target=watch)
     watcher.start()
@@ -85,6 +88,18 @@ def working(settings: Settings) -> Iterator[None]:
     finally:
         over.set()
         watcher.join()
+
+
+def _end(crew: list[subprocess.Popen[bytes]]) -> None:
+    """Let workers finish what they have begun, for as long as that is allowed."""
+    for worker in crew:
+        worker.terminate()
+    deadline_s = time.monotonic() + GRACE_S
+    for worker in crew:
+        try:
+            worker.wait(max(0.0, deadline_s - time.monotonic()))
+        except subprocess.TimeoutExpired:
+            worker.kill()
 
 
 def _leave(_signal: int, _frame: FrameType | None) -> None:

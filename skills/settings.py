@@ -1,5 +1,6 @@
 """The one place that reads the environment: `SKILLS_*` variables into one frozen object."""
 
+import os
 from functools import cache
 from ipaddress import ip_address
 from pathlib import Path
@@ -15,6 +16,11 @@ MEBIBYTE = 1 << 20
 
 def _data_folder() -> Path:
     return Path.home() / ".local" / "share" / "suture-skills"
+
+
+def _cores() -> int:
+    """Count the cores that this process may use; beyond four a laptop wants to choose."""
+    return min(4, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
 
 
 class Settings(BaseSettings):
@@ -44,7 +50,7 @@ class Settings(BaseSettings):
     playback_memory_bytes: int = Field(default=1024 * MEBIBYTE, gt=0)
     replay_tip_error_mm: float = Field(default=0.65, ge=0)  # a calibrated dVRK's; under it every pass shall succeed
     replay_lower_bound: float = Field(default=0.95, ge=0, le=1)  # as surely: samples do at 0.99, at 3 mm at 0.28
-    worker_threads: int = Field(default=2, ge=1, le=64)
+    workers: int = Field(default_factory=_cores, ge=0, le=64)  # processes beside the service; 0: they run elsewhere
     lease_s: float = Field(default=2.0, gt=0)  # a worker silent for longer is taken for dead
     job_attempts: int = Field(default=3, ge=1)
     log_level: Literal["debug", "info", "warning", "error"] = "warning"  # "info" adds a line for each request and job

@@ -30,15 +30,30 @@ def revision_of(connection: Connection) -> str | None:
     return MigrationContext.configure(connection).get_current_revision()
 
 
+def refuse_other_tables(connection: Connection) -> None:
+    """Refuse tables that are not of this version.
+
+    Raises:
+        Conflict: They are older, newer, or not there.
+    """
+    current = revision_of(connection)
+    _refuse_newer(current)
+    if current != revisions()[0]:
+        raise Conflict("The database has no tables of this version yet; run `skills migrate`.")
+
+
 def upgrade(connection: Connection, to: str = "head") -> None:
     """Bring the tables to a revision, within the caller's transaction.
 
     Raises:
         Conflict: They are of a newer version of the code.
     """
-    current = revision_of(connection)
-    if current is not None and current not in revisions():
-        raise Conflict("This database was written by a newer version; update the code, nothing was changed.")
+    _refuse_newer(revision_of(connection))
     config = alembic_config()
     config.attributes["connection"] = connection
     command.upgrade(config, to)
+
+
+def _refuse_newer(current: str | None) -> None:
+    if current is not None and current not in revisions():
+        raise Conflict("This database was written by a newer version; update the code, nothing was changed.")

@@ -14,22 +14,24 @@ from typing import TYPE_CHECKING
 
 from sqlalchemy.engine import make_url
 
+from skills.library.batches import PART
 from skills.settings import Settings
 
 if TYPE_CHECKING:
     from dbos import DBOSClient, DBOSConfig
 
 APPLICATION = "suture-skills"
-QUEUE, ASIDE = "jobs", "aside"  # aside: what nobody waits for; one at a time, so that it holds up nothing else
-QUEUES = [QUEUE, ASIDE]
-DONE_ASIDE = ("pictures",)  # kinds of jobs
+JOBS, BATCHES, ASIDE = "jobs", "batches", "aside"  # a person waits for the first, somebody for the second, nobody else
+# How many of each a worker process does at once, so that none holds up another. The engine keeps these numbers in its
+# database, the same for all workers: they are no setting, and a machine is limited by how many workers it has.
+QUEUES = {JOBS: 2, BATCHES: 1, ASIDE: 1}
 WORKFLOW = "perform_job"
 STEPS = "1"  # the engine's "application version": to be changed with the sequence of steps in `workflows`, only then
 POLLING_S = 0.2
 FAREWELL_S = 2.0
 
 log = logging.getLogger(__name__)
-Errand = Callable[["DBOSClient", int, int], None]
+Errand = Callable[["DBOSClient"], None]
 
 
 def workflow_id(row: int, attempt: int) -> str:
@@ -81,10 +83,17 @@ def prepare(settings: Settings) -> None:
         connection.close()
 
 
-def tell(client: "DBOSClient", row: int, attempt: int, queue: str = QUEUE) -> None:
+def queue_of(kind: str) -> str:
+    """Name the queue that jobs of a kind wait in."""
+    return {PART: BATCHES, "pictures": ASIDE}.get(kind, JOBS)
+
+
+def tell(client: "DBOSClient", row: int, attempt: int, kind: str) -> None:
     """Tell the engine of an attempt at a job; telling it again changes nothing."""
     client.enqueue(
-        {"queue_name": queue, "workflow_name": WORKFLOW, "workflow_id": workflow_id(row, attempt)}, row, attempt
+        {"queue_name": queue_of(kind), "workflow_name": WORKFLOW, "workflow_id": workflow_id(row, attempt)},
+        row,
+        attempt,
     )
 
 
@@ -104,17 +113,17 @@ class Engine:
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
         self._client: DBOSClient | None = None
-        self._errands: SimpleQueue[tuple[Errand, int, int] | None] = SimpleQueue()
+        self._errands: SimpleQueue[Errand | None] = SimpleQueue()
         self._thread = Thread(target=self._run, name="engine", daemon=True)  # must not hold up the exit
         self._thread.start()
 
-    def tell(self, row: int, attempt: int) -> None:
+    def tell(self, row: int, attempt: int, kind: str) -> None:
         """Tell of an attempt at a job, after the commit of its row."""
-        self._errands.put((tell, row, attempt))
+        self._errands.put(lambda client: tell(client, row, attempt, kind))
 
     def cancel(self, row: int, attempt: int) -> None:
         """Drop an attempt whose job was cancelled, after the commit of that."""
-        self._errands.put((drop, row, attempt))
+        self._errands.put(lambda client: drop(client, row, attempt))
 
     def close(self) -> None:
         """Do the errands that can be done at once, and let go."""
@@ -124,14 +133,11 @@ class Engine:
     def _run(self) -> None:
         while (errand := self._errands.get()) is not None:
             try:
-                self._do(*errand)
+                self._client = self._client or connect(self._settings)
+                errand(self._client)
             except Exception:
-                log.info("The job engine missed a %s; the workers' watch makes up for it.", errand[0].__name__)
+                log.info("The job engine missed a message; the workers' watch makes up for it.")
                 log.debug("This is why:", exc_info=True)
         if self._client is not None:
             self._client.destroy()
             self._client = None
-
-    def _do(self, errand: Errand, row: int, attempt: int) -> None:
-        self._client = self._client or connect(self._settings)
-        errand(self._client, row, attempt)

@@ -6,7 +6,7 @@ each change is one conditional statement, and it does not matter who makes it, n
 """
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 from dbos import DBOSClient, WorkflowStatus
@@ -15,7 +15,7 @@ from sqlalchemy import delete, select, update
 from skills.db.base import now
 from skills.db.models import Executor, Job
 from skills.db.session import Database
-from skills.jobs.engine import ASIDE, DONE_ASIDE, QUEUE, QUEUES, STEPS, drop, tell, workflow_id
+from skills.jobs.engine import QUEUES, STEPS, drop, tell, workflow_id
 from skills.jobs.lease import Leases
 from skills.jobs.workflows import ACTIVE, fail
 from skills.library.batches import BATCH
@@ -50,11 +50,6 @@ class Live:
     def workflow(self) -> str:
         """The name of its workflow."""
         return workflow_id(self.row, self.attempt)
-
-    @property
-    def queue(self) -> str:
-        """The queue that it waits in."""
-        return ASIDE if self.kind in DONE_ASIDE else QUEUE
 
 
 class Watch:
@@ -96,7 +91,7 @@ class Watch:
         for job in live:
             workflow = known.get(job.workflow)
             if workflow is None:
-                tell(self._client, job.row, job.attempt, job.queue)
+                tell(self._client, job.row, job.attempt, job.kind)
             elif workflow.status in ENDINGS:
                 state, reason = ENDINGS[workflow.status]
                 fail(self._database, job.row, job.attempt, reason, state)
@@ -109,7 +104,7 @@ class Watch:
 
     def at_work(self, *queues: str) -> bool:
         """Tell whether this worker still holds work, of some queues or of any."""
-        return bool(self._pending(self._executor, list(queues or QUEUES)))
+        return bool(self._pending(self._executor, queues or QUEUES))
 
     def _take_over(self) -> None:
         """Give back the work of workers whose lease ran out; forget those silent for long.
@@ -132,7 +127,11 @@ class Watch:
     def _inherit(self, dead: list[str]) -> None:
         """Give back what the dead were working on; start over what only workers of another version could go on with."""
         left = self._client.list_workflows(
-            status=["PENDING", "ENQUEUED"], executor_id=dead, queue_name=QUEUES, load_input=False, load_output=False
+            status=["PENDING", "ENQUEUED"],
+            executor_id=dead,
+            queue_name=list(QUEUES),
+            load_input=False,
+            load_output=False,
         )
         for workflow in left:
             if workflow.app_version != STEPS:
@@ -160,9 +159,9 @@ class Watch:
         names = [job.workflow for job in live]
         return self._client.list_workflows(workflow_ids=names, load_input=False, load_output=False)
 
-    def _pending(self, executor: str | None = None, queues: list[str] = QUEUES) -> list[WorkflowStatus]:
+    def _pending(self, executor: str | None = None, queues: Iterable[str] = QUEUES) -> list[WorkflowStatus]:
         return self._client.list_workflows(
-            status="PENDING", queue_name=queues, executor_id=executor, load_input=False, load_output=False
+            status="PENDING", queue_name=list(queues), executor_id=executor, load_input=False, load_output=False
         )
 
     def _start_over(self, workflow: str) -> None:

@@ -13,8 +13,10 @@ from types import FrameType
 from dbos import DBOS
 
 from skills import logs
+from skills.db.schema import refuse_other_tables
 from skills.db.session import Database
-from skills.jobs.engine import ASIDE, POLLING_S, QUEUE, configuration, connect
+from skills.errors import SkillsError
+from skills.jobs.engine import BATCHES, JOBS, POLLING_S, QUEUES, configuration, connect
 from skills.jobs.lease import Leases
 from skills.jobs.logged import logged
 from skills.jobs.memory import keep_freed_memory
@@ -32,18 +34,23 @@ log = logging.getLogger(__name__)
 def run_worker(settings: Settings, *, parent: int | None = None, perform: Perform | None = None) -> None:
     """Run jobs until SIGTERM or SIGINT, or until the parent is gone; then finish what is begun, and return.
 
-    The database must have been migrated. To be called in the main thread of a process of its own, once: the engine
+    To be called in the main thread of a process of its own, once: the engine
     is one per process. The process ends here and now if its work does not end in time.
 
     Args:
         parent: The id of the process without which this one has no reason to live.
         perform: Carries a job out; `skills.library.perform_job` unless told otherwise.
+
+    Raises:
+        Conflict: The database was not migrated to this version, or to a newer one.
     """
     keep_freed_memory()
     stop = _stopped_by_signals()
     perform = logged(perform or _library())
     executor = f"{os.getpid()}-{uuid.uuid4().hex}"  # never used again: the engine would run its work twice
     database = Database(settings.database_url)
+    with database.reading() as session:
+        refuse_other_tables(session.connection())
     client = connect(settings)
     watch = Watch(database, client, executor, Leases(settings.lease_s), DBOS._recover_pending_workflows)
     try:
@@ -74,7 +81,7 @@ def _engine(work: Work, executor: str, watch: Watch) -> Iterator[None]:
     register(work)
     DBOS(config=configuration(work.settings, executor))
     DBOS.launch()
-    for queue, at_once in ((QUEUE, work.settings.worker_threads), (ASIDE, 1)):
+    for queue, at_once in QUEUES.items():
         DBOS.register_queue(queue, worker_concurrency=at_once, polling_interval_sec=POLLING_S)
     try:
         yield
@@ -89,7 +96,7 @@ def _engine(work: Work, executor: str, watch: Watch) -> Iterator[None]:
 def _patience_s(watch: Watch) -> int:
     """Choose how long to drain: what is done aside is cut at once, for it may take long and nobody waits for it."""
     try:
-        return DRAIN_S if watch.at_work(QUEUE) else 0
+        return DRAIN_S if watch.at_work(JOBS, BATCHES) else 0
     except Exception:  # a database that is away for a while
         return DRAIN_S
 
@@ -130,7 +137,11 @@ def main() -> None:
     settings = Settings()
     logs.configure(settings.log_level, as_json=settings.log_format == "json")
     os.nice(NICENESS)
-    run_worker(settings, parent=int(sys.argv[1]))
+    try:
+        run_worker(settings, parent=int(sys.argv[1]))
+    except SkillsError as refused:
+        log.error("%s", refused)
+        sys.exit(1)
     logging.shutdown()
     os._exit(0)  # nobody waits for what is still being compiled
 

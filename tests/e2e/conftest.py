@@ -30,6 +30,7 @@ class Service:
             **{k: v for k, v in os.environ.items() if not k.startswith("SKILLS_")},
             "SKILLS_DATABASE_URL": f"sqlite:///{self.database}",
             "SKILLS_PORT": str(self.port),
+            "SKILLS_WORKERS": "1",
             **{f"SKILLS_{name.upper()}": str(value) for name, value in settings.items()},
         }
         self.process: subprocess.Popen[bytes] | None = None
@@ -41,11 +42,15 @@ class Service:
 
     def child(self, word: str) -> int:
         """Find the child process that has a word on its command line: its worker, or its fork server."""
+        (child,) = self.children(word)
+        return child
+
+    def children(self, word: str) -> list[int]:
+        """Find the child processes that have a word on their command lines."""
         assert self.process is not None
         tasks = Path(f"/proc/{self.process.pid}/task")  # it may be any of its threads that started it
         children = [pid for task in tasks.iterdir() for pid in (task / "children").read_text().split()]
-        (child,) = [int(pid) for pid in children if word in Path(f"/proc/{pid}/cmdline").read_text()]
-        return child
+        return [int(pid) for pid in children if word in Path(f"/proc/{pid}/cmdline").read_text()]
 
     def kill(self) -> None:
         assert self.process is not None

@@ -56,8 +56,9 @@ def test_the_recording_comes_back_exactly_and_two_segments_are_two_demonstration
 
 
 def test_a_stopped_service_exits_with_0_and_takes_its_children_along(tmp_path: Path) -> None:
-    with running(tmp_path) as service:
-        children = [service.child(WORKER), service.child(FORK_SERVER)]
+    with running(tmp_path, workers=2) as service:
+        waited(lambda: len(service.children(WORKER)) == 2)
+        children = [*service.children(WORKER), service.child(FORK_SERVER)]
         assert service.stop() == 0
     waited(lambda: not any(map(alive, children)))
 

@@ -42,7 +42,7 @@ def database(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Databas
 def workers(database: Database, number: int) -> Iterator[list[subprocess.Popen[bytes]]]:
     """Real workers, ready; each a process that takes one part at a time."""
     command = [sys.executable, "-m", "skills", "worker"]
-    how = environment(Settings(database_url=database.url, worker_threads=1))
+    how = environment(Settings(database_url=database.url))
     started = [subprocess.Popen(command, cwd=ROOT, env=how, stderr=subprocess.DEVNULL) for _ in range(number)]
     try:
         until(lambda: counted(database, Executor) == number, PATIENCE_S)

@@ -3,7 +3,7 @@ from skills.settings import Settings
 
 
 def test_settings_reach_the_child_whatever_the_environment_says(monkeypatch):
-    given = Settings(database_url="sqlite:////somewhere/else.sqlite", lease_s=3.5, worker_threads=1)
+    given = Settings(database_url="sqlite:////somewhere/else.sqlite", lease_s=3.5, workers=1)
     monkeypatch.setenv("SKILLS_LEASE_S", "9")
     monkeypatch.setenv("SKILLS_SERVER", "http://elsewhere")
     assert "SKILLS_SERVER" not in environment(given)

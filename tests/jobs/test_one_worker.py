@@ -25,9 +25,9 @@ def test_a_row_that_nobody_told_of_runs(house: House):
 def test_telling_eight_times_runs_once_and_soon(house: House):
     row = house.ask()
     with ThreadPoolExecutor(4) as pool:
-        list(pool.map(lambda _: house.engine.tell(row, 1), range(8)))
+        list(pool.map(lambda _: house.engine.tell(row, 1, "training"), range(8)))
     took_s = until(lambda: house.job(row).state == "succeeded", 3.0)
-    house.engine.tell(row, 1)
+    house.engine.tell(row, 1, "training")
     time.sleep(0.5)
     assert len(house.noted("begins", row)) == 1
     print(f"told to succeeded: {took_s:.2f} s")
@@ -35,7 +35,7 @@ def test_telling_eight_times_runs_once_and_soon(house: House):
 
 def test_a_refusal_is_final_and_says_why(house: House):
     row = house.ask("refused")
-    house.engine.tell(row, 1)
+    house.engine.tell(row, 1, "training")
     job = house.ended(row)
     assert (job.state, job.error) == ("failed", "The goal lies outside the grid; ask for another one.")
     assert len(house.noted("begins", row)) == 1
@@ -44,7 +44,7 @@ def test_a_refusal_is_final_and_says_why(house: House):
 
 def test_a_fault_is_tried_again_and_then_told_without_its_innards(house: House):
     row = house.ask("broken")
-    house.engine.tell(row, 1)
+    house.engine.tell(row, 1, "training")
     job = house.ended(row)
     assert job.state == "failed"
     assert len(house.noted("begins", row)) == house.settings.job_attempts == 3
@@ -56,7 +56,7 @@ def test_a_cancelled_job_stays_cancelled_before_its_start_and_in_the_middle(hous
     before = house.ask(state="cancelled")
     middle = house.ask("slow", seconds=1.0)
     for row in (before, middle):
-        house.engine.tell(row, 1)
+        house.engine.tell(row, 1, "training")
     house.begun(middle)
     with house.database.writing() as session:
         session.execute(text("UPDATE jobs SET state = 'cancelled' WHERE row = :row"), {"row": middle})
@@ -141,7 +141,7 @@ def test_a_worker_silent_for_long_is_forgotten_and_known_again_when_it_speaks(ho
 
 def test_nothing_in_the_tables_of_the_engine_is_a_pickle(house: House):
     row = house.ask("broken")
-    house.engine.tell(row, 1)
+    house.engine.tell(row, 1, "training")
     house.ended(row)
     database = Database(house.settings.engine_url)
     schema = "dbos" if database.engine.dialect.name == "postgresql" else None
@@ -161,7 +161,7 @@ def test_nothing_in_the_tables_of_the_engine_is_a_pickle(house: House):
 
 def test_the_first_telling_may_find_no_engine_at_all(empty_house: House):
     row = empty_house.ask()
-    empty_house.engine.tell(row, 1)
+    empty_house.engine.tell(row, 1, "training")
     empty_house.engine.cancel(row, 1)
     empty_house.engine.close()
     assert empty_house.job(row).state == "queued"

@@ -109,6 +109,7 @@ def test_code_that_is_older_than_the_tables_says_so_everywhere(release: Released
     for words, said in (
         (["migrate"], REFUSED),
         (["serve"], REFUSED),
+        (["worker"], REFUSED),
         (["train", "kestrel", "simple-running"], REFUSED),
         (["backup", str(tmp_path / "backup.zip")], "The tables are of another version"),
         (["verify"], "schema: it is at 9999"),

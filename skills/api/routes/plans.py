@@ -38,7 +38,7 @@ def play(
     with db.writing() as session:
         job, new = playbacks.request_playback(session, body.plan, actor, settings)
     if new:
-        jobs.tell(job.row, job.attempt)
+        jobs.tell(job.row, job.attempt, job.kind)
     return accepted(job, response)
 
 

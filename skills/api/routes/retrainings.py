@@ -7,7 +7,7 @@ from fastapi import APIRouter, Response
 from skills.api.deps import Actor, Db, Jobs, Limit, RowCursor, page
 from skills.api.routes.trainings import JobId, accepted
 from skills.api.schemas import RetrainingIn, job_out, retrained_out
-from skills.library.batches import count, to_tell
+from skills.library.batches import PART, count, to_tell
 from skills.library.retraining import find_retraining, list_styles, request_retraining
 from skills.settings import MEBIBYTE
 
@@ -29,7 +29,7 @@ def retrain(body: RetrainingIn, db: Db, jobs: Jobs, actor: Actor, response: Resp
         )
         told = to_tell(session, job) if new else []
     for row, attempt in told:
-        jobs.tell(row, attempt)
+        jobs.tell(row, attempt, PART)
     return accepted(job, response)
 
 

@@ -46,7 +46,7 @@ def train(body: TrainingIn, db: Db, jobs: Jobs, actor: Actor, response: Response
             release=body.release,
         )
     if new:
-        jobs.tell(job.row, job.attempt)
+        jobs.tell(job.row, job.attempt, job.kind)
     return accepted(job, response)
 
 

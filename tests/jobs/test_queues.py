@@ -1,16 +1,28 @@
-"""What nobody waits for is done aside: one at a time, and never in the way of what people do wait for."""
+"""A person who waits comes before a batch, and what nobody waits for is done aside."""
 
 from itertools import pairwise
 
+from skills.jobs.engine import JOBS, QUEUES
+from skills.library.batches import PART
 from tests.jobs.house import House, until
 
 GRACE_S = 5.0
 
 
+def test_a_person_who_waits_comes_before_a_batch_that_was_there_first(house: House):
+    parts = [house.ask(PART, seconds=1.5) for _ in range(4)]
+    house.begun(parts[0])
+    waited_for = [house.ask() for _ in range(2 * QUEUES[JOBS])]
+    for row in waited_for:
+        assert house.ended(row, 5.0).state == "succeeded"
+    assert [house.job(row).state for row in parts[2:]] == ["queued", "queued"]
+    assert all(house.ended(row).state == "succeeded" for row in parts)
+
+
 def test_pictures_are_drawn_one_after_the_other_and_hold_up_nothing(house: House):
     pictures = [house.ask("pictures", seconds=1.5) for _ in range(3)]
     house.begun(pictures[0])
-    waited_for = [house.ask() for _ in range(house.settings.worker_threads + 1)]
+    waited_for = [house.ask() for _ in range(QUEUES[JOBS] + 1)]
     for row in waited_for:
         assert house.ended(row, 5.0).state == "succeeded"
     assert house.job(pictures[-1]).state == "queued"
