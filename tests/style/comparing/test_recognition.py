@@ -1,0 +1,85 @@
+"""Whose style it is: known cohorts, chance where there is nothing to know, and sessions that are left out."""
+
+import numpy as np
+import pytest
+
+from skills.errors import BadInput
+from skills.style.comparing.distances import distances
+from skills.style.comparing.recognition import Validated, calibrate, probabilities, validate, wilson
+from skills.style.comparing.shapes import shape_of
+from tests.style.comparing.cohort import Cohort, cohort
+
+
+def validated(drawn: Cohort, surgeons: np.ndarray | None = None) -> Validated:
+    shapes = [shape_of(demo) for demo in drawn.demos]
+    return validate(distances(shapes, shapes), drawn.surgeons if surgeons is None else surgeons, drawn.sessions)
+
+
+def test_eight_surgeons_in_five_sessions_are_recognised():
+    found = validated(cohort(1))
+    print(f"{found.right} of {len(found.tested)}, {found.interval}, log loss {found.log_loss:.2f} nat")
+    assert found.chance == 0.125
+    assert found.interval[0] > 0.6
+    assert found.log_loss < 0.5 * np.log(8)
+    np.testing.assert_allclose(found.probability.sum(axis=1), 1.0)
+
+
+def test_with_labels_shuffled_recognition_falls_to_chance():
+    drawn = cohort(1)
+    rng = np.random.default_rng(3)
+    right = of = 0
+    losses = []
+    for _ in range(20):
+        found = validated(drawn, rng.permutation(drawn.surgeons))
+        right, of = right + found.right, of + len(found.tested)
+        losses.append(found.log_loss)
+    print(f"{right} of {of}, log loss {np.mean(losses):.2f} nat")
+    assert abs(right / of - 0.125) < 4 * np.sqrt(0.125 * 0.875 / of)
+    assert np.mean(losses) > 0.95 * np.log(8)  # and it does not claim to know
+
+
+def test_what_only_the_session_tells_is_not_recognised():
+    """All surgeons alike, two demonstrations a session: nearest neighbours would be right, but are of the session."""
+    drawn = cohort(2, surgeons=4, sessions=4, own=0.0, day=5.0)
+    twice = Cohort(drawn.demos * 2, np.tile(drawn.surgeons, 2), np.tile(drawn.sessions, 2))
+    assert validated(twice).interval[0] < 0.25
+    alone = Cohort(twice.demos, twice.surgeons, np.arange(len(twice.demos)))  # as if each were a session of its own
+    assert validated(alone).accuracy > validated(twice).accuracy
+
+
+def test_probabilities_hold():
+    """Of what is said with a certainty of about p, about p is right."""
+    drawn = [validated(cohort(seed, own=2.0, day=1.5)) for seed in range(6)]
+    truth = np.tile(np.repeat(np.arange(8), 5), 6)
+    said = np.concatenate([one.probability for one in drawn])
+    sure, right = said.max(axis=1), said.argmax(axis=1) == truth
+    low, high = sure < np.median(sure), sure >= np.median(sure)
+    for part in (low, high):
+        print(f"said {sure[part].mean():.2f}, was {right[part].mean():.2f}")
+        assert abs(sure[part].mean() - right[part].mean()) < 0.15
+
+
+def test_the_fitted_scale_is_the_likeliest():
+    rng = np.random.default_rng(4)
+    away, truth = rng.uniform(1.0, 9.0, (200, 3)), rng.integers(0, 3, 200)
+    away[np.arange(200), truth] -= 0.8
+    scale = calibrate(away, truth)
+
+    def loss(of: float) -> float:
+        return -np.log(probabilities(away, of)[np.arange(200), truth]).mean()
+
+    assert all(loss(scale) <= loss(scale * factor) for factor in (0.5, 0.9, 0.99, 1.01, 1.1, 2.0))
+
+
+def test_one_session_each_or_one_surgeon_is_refused():
+    with pytest.raises(BadInput, match="two sessions"):
+        validated(cohort(1, sessions=1))
+    with pytest.raises(BadInput, match="two sessions"):
+        validated(cohort(1, surgeons=1))
+
+
+def test_intervals_by_the_book():
+    low, high = wilson(8, 10)  # a textbook's example
+    assert (round(low, 3), round(high, 3)) == (0.490, 0.943)
+    assert wilson(0, 5)[0] == 0.0
+    assert wilson(5, 5)[1] == 1.0
