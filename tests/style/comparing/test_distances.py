@@ -1,7 +1,7 @@
 """Distances between all shapes: against another library, by hand, and by laws."""
 
 import numpy as np
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from tslearn.metrics import dtw_path_from_metric
 
@@ -36,6 +36,7 @@ def test_three_points_by_hand():
     assert distances([step], [still])[0, 0] == 4.0  # 0 + 1 + 3, whichever way it is warped
 
 
+@settings(deadline=None)  # the first call compiles
 @given(st.integers(0, 1000))
 def test_they_are_symmetric_and_nothing_only_from_itself(seed):
     shapes = np.random.default_rng(seed).normal(0, 10, (4, 9, 3))

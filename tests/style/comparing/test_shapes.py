@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skills.errors import BadPath
@@ -22,6 +22,7 @@ def test_a_quarter_circle_worked_by_hand():
     assert half == pytest.approx(10 - long / 2)
 
 
+@settings(deadline=None)  # the first call compiles
 @given(st.floats(-np.pi, np.pi), st.tuples(*[st.floats(-50, 50)] * 3), st.floats(1.5, 6.0), st.floats(0.3, 3.0))
 def test_place_turn_tempo_and_size_say_nothing(turn_rad, place_mm, duration_s, size):
     plain = demo_of(HUMPS_MM, 0.0, np.zeros(3), 3.0)
