@@ -14,7 +14,8 @@ def connect(settings: Settings, *, works: bool = False) -> Iterator[Client]:
     In-process, jobs need a worker: `works` starts one for as long as the connection is open.
     """
     if settings.server:
-        with Client(settings.server) as client:
+        shown = "" if settings.api_key is None else settings.api_key.get_secret_value()
+        with Client(settings.server, api_key=shown) as client:
             yield client
         return
     from starlette.testclient import TestClient
@@ -22,6 +23,8 @@ def connect(settings: Settings, *, works: bool = False) -> Iterator[Client]:
     from skills.api.app import create_app
     from skills.serving import working
 
-    in_process = TestClient(create_app(settings), base_url="http://skills.local")
+    app = create_app(settings)
+    key = {"X-API-Key": app.state.access.own_key}  # whoever runs this has the database in their hands anyway
+    in_process = TestClient(app, base_url="http://localhost", headers=key)
     with in_process as http, working(settings) if works else nullcontext():
         yield Client(http)

@@ -14,10 +14,11 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import IO
 
-from skills.client import Client, Json, Problem
+from skills.api.schemas.given import Recording
+from skills.client import Client, Problem
 from skills.errors import BadInput, SkillsError
 from skills.recordings.archive import pack
-from skills.recordings.jigsaws import Trial, meta_line, trials
+from skills.recordings.jigsaws import Skill, Trial, meta_line, trials
 
 NOT_FOUND = "not-found"
 
@@ -39,7 +40,7 @@ class Sent:
 
     trial: str
     surgeon: str
-    skill_level: str | None
+    skill_level: Skill | None
     score: int | None
     recording: str | None = None
     proposed: int = 0
@@ -94,14 +95,14 @@ def send_trials(
                 known.add(sent.surgeon)
             with _packed(trial) as file:
                 stored = client.add_recording(file)
-            sent.recording = stored["sha256"]
+            sent.recording = stored.sha256
             _cut(client, stored, sent, suture, arm)
         except SkillsError as error:
             sent.problems.append(str(error))
         yield sent
 
 
-def _make_known(client: Client, surgeon: str, skill_level: str | None) -> None:
+def _make_known(client: Client, surgeon: str, skill_level: Skill | None) -> None:
     """Write a surgeon who is not there yet; one who is stays as they are."""
     try:
         client.surgeon(surgeon)
@@ -111,17 +112,24 @@ def _make_known(client: Client, surgeon: str, skill_level: str | None) -> None:
         client.put_surgeon(surgeon, skill_level=skill_level)
 
 
-def _cut(client: Client, stored: Json, sent: Sent, suture: str | None, arm: str | None) -> None:
-    proposed = [part for part in stored["segments"] if arm in (None, part["arm"])]
+def _cut(client: Client, stored: Recording, sent: Sent, suture: str | None, arm: str | None) -> None:
+    proposed = [part for part in stored.segments if arm in (None, part.arm)]
     sent.proposed = len(proposed)
     for part in proposed if suture else ():
-        where = {name: part[name] for name in ("arm", "start_s", "end_s")}
         session = re.sub(r"[^a-z0-9_-]", "-", sent.trial.lower())
         try:
-            demo = client.cut_demo(stored["sha256"], surgeon=sent.surgeon, suture=str(suture), session=session, **where)
-            sent.demos.append(demo["id"])
+            demo = client.cut_demo(
+                stored.sha256,
+                surgeon=sent.surgeon,
+                suture=str(suture),
+                arm=part.arm,
+                start_s=part.start_s,
+                end_s=part.end_s,
+                session=session,
+            )
+            sent.demos.append(demo.id)
         except SkillsError as error:
-            sent.problems.append(f"{part['arm']} {part['start_s']:.1f} to {part['end_s']:.1f} s: {error}")
+            sent.problems.append(f"{part.arm} {part.start_s:.1f} to {part.end_s:.1f} s: {error}")
 
 
 @contextmanager

@@ -16,18 +16,17 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import pairwise, product
 from pathlib import Path
-from typing import Any
 
 import httpx2 as httpx
 from rich.console import Console
 from rich.table import Table
 
+from skills.api.schemas.given import Playback, Policy
 from skills.client import Client, JobFailed, Problem
 from skills.drawing import draw_styles
 from skills.samples import load_samples
 from skills.settings import settings
 
-Json = dict[str, Any]
 PICTURES = Path("build/demo")
 START_S = 60.0
 SPACING_MM = (6.0, 0.0, 0.0)  # between suture points, along the wound
@@ -83,10 +82,11 @@ def wait_until_ready(client: Client, server: subprocess.Popen[bytes]) -> None:
     deadline = time.monotonic() + START_S
     while time.monotonic() < deadline and server.poll() is None:
         try:
-            client.send("GET", "/readyz")
-            return
-        except (httpx.TransportError, Problem):
-            time.sleep(0.1)
+            if client.http.get("/readyz").is_success:
+                return
+        except httpx.TransportError:
+            pass
+        time.sleep(0.1)
     raise SystemExit("The service did not start.")
 
 
@@ -95,11 +95,11 @@ def tell_styles(client: Client) -> list[tuple[str, str]]:
     stored = Table("surgeon", "suture type", "demonstration", "from - to s", "states", "crossings", "clutch", box=None)
     styles: dict[tuple[str, str], None] = {}
     for demo in load_samples(client):
-        report = demo["report"]
-        span = f"{demo['start_s']:.1f} - {demo['end_s']:.1f}"
-        figures = (str(report[name]) for name in ("path_states", "revisits", "clutch_presses"))
-        stored.add_row(demo["surgeon"], demo["suture"], demo["id"][:12], span, *figures)
-        styles[demo["surgeon"], demo["suture"]] = None
+        report = demo.report
+        span = f"{demo.start_s:.1f} - {demo.end_s:.1f}"
+        figures = (str(figure) for figure in (report.path_states, report.revisits, report.clutch_presses))
+        stored.add_row(demo.surgeon, demo.suture, demo.id[:12], span, *figures)
+        styles[demo.surgeon, demo.suture] = None
     out.print("Stored, each hand-off as the service proposed it:")
     out.print(stored)
     return list(styles)
@@ -111,30 +111,37 @@ def check_style(client: Client, surgeon: str, suture: str, report: Table) -> tup
     client.wait(client.train(surgeon, suture, release=True))
     policy = client.policy(surgeon, suture)
     laps.append(time.monotonic())
-    followed = client.rollout(surgeon, suture, policy["start_mm"])
+    followed = client.rollout(surgeon, suture, policy.start_mm)
     plan = client.plan(surgeon, suture, suture_points(policy), psm_m=SAMPLE_PSM_M)
     laps.append(time.monotonic())
-    playback = client.playback(client.wait(client.play(plan["id"]))["result"]["playback"])
+    playback = played(client, plan.id)
     laps.append(time.monotonic())
-    (PICTURES / f"{surgeon}-{suture}-playback.png").write_bytes(client.picture(playback["id"]))
-    coverage, total = policy["coverage"], followed["dtw_total_mm"]
+    (PICTURES / f"{surgeon}-{suture}-playback.png").write_bytes(client.picture(playback.id))
+    coverage, total = policy.coverage, followed.dtw_total_mm
     report.add_row(
         f"{surgeon} {suture}",
-        f"{policy['metrics']['exact_states']}/{policy['metrics']['path_states']}",
+        f"{policy.metrics.exact_states}/{policy.metrics.path_states}",
         f"{total:g}",
-        f"{coverage['starts_reaching_goal']}/{coverage['n_states']}",
+        f"{coverage.starts_reaching_goal}/{coverage.n_states}",
         verdict(playback),
         *(f"{after - before:.2f}" for before, after in pairwise(laps)),
     )
-    reach_all = coverage["starts_reaching_goal"] == coverage["n_states"]
-    return bool(followed["finished"] and total == 0 and reach_all and playback["feasible"]), playback["id"]
+    reach_all = coverage.starts_reaching_goal == coverage.n_states
+    return followed.finished and total == 0 and reach_all and playback.feasible, playback.id
 
 
-def suture_points(policy: Json) -> list[Json]:
+def played(client: Client, plan: str) -> Playback:
+    """Play a plan in the simulator, and give its verdict."""
+    done = client.wait(client.play(plan))
+    assert done.result is not None, done
+    return client.playback(done.result["playback"])
+
+
+def suture_points(policy: Policy) -> list[dict[str, list[float]]]:
     """Lay five suture points in a line about the policy's goal."""
     middle = (N_POINTS - 1) / 2
     return [
-        {"position_mm": [g + (i - middle) * d for g, d in zip(policy["goal_mm"], SPACING_MM, strict=True)]}
+        {"position_mm": [g + (i - middle) * d for g, d in zip(policy.goal_mm, SPACING_MM, strict=True)]}
         for i in range(N_POINTS)
     ]
 
@@ -144,12 +151,12 @@ def draw_samples(client: Client, styles: list[tuple[str, str]]) -> None:
     drawn = []
     for surgeon, suture in styles:
         policy = client.policy(surgeon, suture)
-        grid = policy["grid"]
-        low, cell = grid["origin_mm"], grid["cell_mm"]
-        ends = [(o, o + cell * (n - 1)) for o, n in zip(low, grid["shape"], strict=True)]
+        grid = policy.grid
+        low, cell = grid.origin_mm, grid.cell_mm
+        ends = [(o, o + cell * (n - 1)) for o, n in zip(low, grid.shape, strict=True)]
         corners = [c for c in product(*ends) if sum(a == b[0] for a, b in zip(c, ends, strict=True)) % 2]
         rollouts = [client.rollout(surgeon, suture, corner) for corner in corners]
-        drawn.append((client.demo_path(policy["demos"][0]), policy, rollouts))
+        drawn.append((client.demo_path(policy.demos[0]), policy, rollouts))
     draw_styles(drawn, PICTURES / "styles.png")
 
 
@@ -181,30 +188,30 @@ def real_recording(client: Client) -> None:
     out.print(f"\nA real recording: skills {' '.join([*command[:2], bag.name, *command[3:]])}", soft_wrap=True)
     subprocess.run([sys.executable, "-m", "skills", *command], check=True)  # noqa: S603 - our own command
     try:
-        result = client.wait(client.train(surgeon, suture, release=True))["result"]
+        result = client.wait(client.train(surgeon, suture, release=True)).result or {}
     except JobFailed as failed:
         out.print(f"It was not learnt: {failed}")
         return
     policy = client.policy(surgeon, suture, result["policy_version"])
-    metrics, coverage = policy["metrics"], policy["coverage"]
+    metrics, coverage = policy.metrics, policy.coverage
     out.print(
-        f"{metrics['exact_states']} of {metrics['path_states']} states, DTW {metrics['dtw_total_mm']:g} mm, "
-        f"{coverage['starts_reaching_goal']} of {coverage['n_states']} starts reach the goal; "
+        f"{metrics.exact_states} of {metrics.path_states} states, DTW {metrics.dtw_total_mm:g} mm, "
+        f"{coverage.starts_reaching_goal} of {coverage.n_states} starts reach the goal; "
         + ("released." if result["released"] else f"not released: {result['not_released_because']}")
     )
     try:
-        plan = client.plan(surgeon, suture, [{"position_mm": policy["goal_mm"]}], version=policy["version"])
+        plan = client.plan(surgeon, suture, [{"position_mm": policy.goal_mm}], version=policy.version)
     except Problem as refused:
         out.print(f"Not played back: {refused}", soft_wrap=True)
         return
-    playback = client.playback(client.wait(client.play(plan["id"]))["result"]["playback"])
-    (PICTURES / "real-recording-playback.png").write_bytes(client.picture(playback["id"]))
+    playback = played(client, plan.id)
+    (PICTURES / "real-recording-playback.png").write_bytes(client.picture(playback.id))
     out.print(f"Played back at its own place: {verdict(playback)}")
 
 
-def verdict(playback: Json) -> str:
+def verdict(playback: Playback) -> str:
     """Say a playback's verdict."""
-    return "feasible" if playback["feasible"] else str(playback["report"]["failure_in_words"])
+    return "feasible" if playback.feasible else str(playback.report.failure_in_words)
 
 
 if __name__ == "__main__":

@@ -3,13 +3,15 @@
 from collections.abc import Sequence
 from math import ceil
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-Json = dict[str, Any]
+if TYPE_CHECKING:
+    from skills.api.schemas.given import DemoPath, Policy, Rollout
+
 RECORDED, CELLS, ROLLOUT, GOAL = (
     "#8a8f98",
     "#0072b2",
@@ -21,7 +23,7 @@ RECORDED, CELLS, ROLLOUT, GOAL = (
 COLUMNS = 3
 
 
-def draw_styles(styles: Sequence[tuple[Json, Json, Sequence[Json]]], to: Path) -> None:
+def draw_styles(styles: Sequence[tuple["DemoPath", "Policy", Sequence["Rollout"]]], to: Path) -> None:
     """Draw styles beside each other: a demonstration's path, its policy, and rollouts from several starts, each."""
     rows = ceil(len(styles) / COLUMNS)
     figure = Figure(figsize=(4.4 * min(COLUMNS, len(styles)), 4.3 * rows + 0.3), layout="constrained")
@@ -34,18 +36,16 @@ def draw_styles(styles: Sequence[tuple[Json, Json, Sequence[Json]]], to: Path) -
     figure.savefig(to, dpi=90)
 
 
-def _draw_style(axes: Any, path: Json, policy: Json, rollouts: Sequence[Json]) -> None:
-    recorded, cells = np.array(path["recorded_mm"]), np.array(path["path_mm"])
+def _draw_style(axes: Any, path: "DemoPath", policy: "Policy", rollouts: "Sequence[Rollout]") -> None:
+    recorded, cells = np.array(path.recorded_mm), np.array(path.path_mm)
     axes.plot(*recorded.T, color=RECORDED, linewidth=1.2, label="recorded")
     for number, one in enumerate(rollouts):
         label = "learnt, from other starts" if number == 0 else None
-        axes.plot(*np.array(one["path_mm"]).T, color=ROLLOUT, linewidth=1.0, alpha=0.75, label=label)
-        axes.scatter(*one["path_mm"][0], color=ROLLOUT, s=14)
+        axes.plot(*np.array(one.path_mm).T, color=ROLLOUT, linewidth=1.0, alpha=0.75, label=label)
+        axes.scatter(*one.path_mm[0], color=ROLLOUT, s=14)
     axes.plot(*cells.T, color=CELLS, linewidth=1.8, marker="o", markersize=3, label="demonstration in the grid")
-    axes.scatter(*policy["goal_mm"], color=GOAL, s=60, marker="*", label="goal: hand-off", zorder=5)
-    axes.set_title(
-        f"{policy['surgeon']}: {policy['suture']}\n{len(cells)} states, DTW {policy['metrics']['dtw_total_mm']:g} mm"
-    )
+    axes.scatter(*policy.goal_mm, color=GOAL, s=60, marker="*", label="goal: hand-off", zorder=5)
+    axes.set_title(f"{policy.surgeon}: {policy.suture}\n{len(cells)} states, DTW {policy.metrics.dtw_total_mm:g} mm")
     axes.set_xlabel("x (mm)")
     axes.set_ylabel("y (mm)")
     axes.set_zlabel("z (mm)")

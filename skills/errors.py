@@ -7,6 +7,10 @@
     │   ├── BadSettings         a learner, grid or request that cannot be meant
     │   ├── BadPlan             a plan or trajectory that the arm cannot follow
     │   └── BadBag              a bag for replay that is not what its plan and its verdict say
+    ├── WrongHost               the request was meant for another name than those of this service
+    ├── NotSignedIn             who asks showed no key, or none that counts
+    ├── NotAllowed              who asks may not do this
+    ├── TooMany                 over a rate or an allowance of the key
     ├── NotFound                no such thing here (and what there is instead)
     │   └── NotDrawnYet         a picture that is being drawn, or that nobody asked for
     ├── Erased                  it was here and was erased for good
@@ -36,6 +40,26 @@ class SkillsError(Exception):
 
 class BadInput(SkillsError):
     """What was given is wrong; nothing was kept."""
+
+
+class WrongHost(SkillsError):
+    """The request was meant for another name than those of this service."""
+
+
+class NotSignedIn(SkillsError):
+    """Who asks showed no key, or none that counts."""
+
+
+class NotAllowed(SkillsError):
+    """Who asks may not do this."""
+
+
+class TooMany(SkillsError):
+    """Over a rate or an allowance of the key; it may go on after `wait_s`."""
+
+    def __init__(self, message: str, wait_s: float) -> None:
+        super().__init__(message, wait_s=round(wait_s, 1))
+        self.wait_s = wait_s
 
 
 class NotFound(SkillsError):

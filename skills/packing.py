@@ -9,16 +9,19 @@ constructors check every number again.
 import hashlib
 import json
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import Field, fields, is_dataclass
 from typing import IO, Any
 
 import numpy as np
 
+from skills.style.palette import Palette, painted, palette_of
+
 Arrays = list[np.ndarray[Any, Any]]
 Known = Mapping[str, type]
 
 _ADDED: set[tuple[type, str]] = set()
+_FEW: set[tuple[type, str]] = set()
 
 
 def known(*classes: type) -> dict[str, type]:
@@ -35,6 +38,11 @@ def added_later(value: type, field: str) -> None:
     _ADDED.add((value, field))
 
 
+def few_numbers(value: type, field: str) -> None:
+    """Name a field whose array has few different numbers: it is written as their palette, if that can name them all."""
+    _FEW.add((value, field))
+
+
 def sha256(data: bytes) -> str:
     """Compute the SHA-256 of bytes, in hex."""
     return hashlib.sha256(data).hexdigest()
@@ -45,11 +53,16 @@ def canonical(data: Any) -> bytes:
     return json.dumps(data, sort_keys=True, separators=(",", ":"), allow_nan=False, ensure_ascii=True).encode()
 
 
-def write(file: IO[bytes], value: Any, classes: Known, save: Callable[..., None] = np.savez) -> None:
-    """Lay a value out in a file: quickly with `np.savez`, in little space with `np.savez_compressed`."""
+def write(file: IO[bytes], value: Any, classes: Known) -> None:
+    """Lay a value out in a file, quickly."""
     arrays: Arrays = []
-    tree = np.frombuffer(canonical(flatten(value, arrays, classes)), np.uint8)
-    save(file, tree=tree, **{f"a{i}": a for i, a in enumerate(arrays)})
+    tree = flatten(value, arrays, classes)
+    np.savez(file, **named(tree, arrays))  # type: ignore[arg-type]
+
+
+def named(tree: Any, arrays: Arrays) -> dict[str, np.ndarray[Any, Any]]:
+    """Name the parts of a flattened value as an archive has them."""
+    return {"tree": np.frombuffer(canonical(tree), np.uint8), **{f"a{i}": a for i, a in enumerate(arrays)}}
 
 
 def read(file: IO[bytes], classes: Known) -> Any:
@@ -81,12 +94,15 @@ def flatten(value: Any, arrays: Arrays, classes: Known) -> Any:
     if isinstance(value, np.ndarray):
         arrays.append(np.ascontiguousarray(value))
         return {"array": len(arrays) - 1}
+    if isinstance(value, Palette):
+        arrays.extend(value)
+        return {"palette": len(arrays) - 2}
     if isinstance(value, bytes):
         arrays.append(np.frombuffer(value, np.uint8))
         return {"bytes": len(arrays) - 1}
     if is_dataclass(value) and not isinstance(value, type):
         assert classes.get(type(value).__name__) is type(value), f"{type(value).__name__} is not declared"
-        written = {f.name: getattr(value, f.name) for f in fields(value) if _is_written(value, f)}
+        written = {f.name: _part(value, f.name) for f in fields(value) if _is_written(value, f)}
         return {
             "value": type(value).__name__,
             "of": {name: flatten(part, arrays, classes) for name, part in written.items()},
@@ -106,6 +122,8 @@ def build(tree: Any, arrays: Arrays, classes: Known) -> Any:
         return tree
     if "array" in tree:
         return arrays[tree["array"]]
+    if "palette" in tree:
+        return painted(Palette(arrays[tree["palette"]], arrays[tree["palette"] + 1]))
     if "bytes" in tree:
         return arrays[tree["bytes"]].tobytes()
     if "dict" in tree:
@@ -113,6 +131,11 @@ def build(tree: Any, arrays: Arrays, classes: Known) -> Any:
     if "tuple" in tree:
         return tuple(build(v, arrays, classes) for v in tree["tuple"])
     return classes[tree["value"]](**{name: build(part, arrays, classes) for name, part in tree["of"].items()})
+
+
+def _part(value: Any, name: str) -> Any:
+    part = getattr(value, name)
+    return part if (type(value), name) not in _FEW else palette_of(part) or part
 
 
 def _is_written(value: Any, field: Field[Any]) -> bool:

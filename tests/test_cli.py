@@ -1,12 +1,19 @@
 """The command line, on the application in its own process: what a lab types, in order."""
 
 import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
+from typer.main import get_command
 from typer.testing import CliRunner
 
 from skills.cli import app
+from skills.cli.completing import surgeons, sutures
 from skills.db.session import Database
 from skills.library.catalogue import put_surgeon
 from skills.recordings import write_mcap
@@ -128,8 +135,8 @@ def test_a_demonstration_with_hysteresis_tells_its_states_crossings_and_loss(ski
     assert (code, "0 crossings; samples are 1.58, 1.60, 1.56 mm off" in said) == (0, True), said
     _, said = skills(*add, "--hysteresis", "0.25", "--json")
     stored = json.loads(said)
-    assert (stored["hysteresis"], stored["path_states"]) == (0.25, 18)
-    code, said = skills("demo", "report", stored["id"])
+    assert (stored["hysteresis"], stored["report"]["path_states"]) == (0.25, 18)
+    code, said = skills("demo", "report", stored["id"], "--json")
     assert (code, json.loads(said)["report"]["path_states"]) == (0, 18), said
     assert skills("demo", "report", stored["id"], "--html", str(tmp_path / "report.html"))[0] == 0
     page = (tmp_path / "report.html").read_text()
@@ -206,3 +213,126 @@ def test_a_trial_that_is_refused_does_not_stop_the_others(skills, tmp_path: Path
     assert (code, "no trials of JIGSAWS in Knot_Tying" in said) == (1, True)
     _, said = skills("jigsaws", "add", str(root))
     assert "Suturing_B001: " in said and "jigsaws-c" in said
+
+
+def test_a_refusal_is_a_problem_on_stderr_for_programs_and_a_sentence_for_people(skills, tmp_path: Path) -> None:
+    def run(*words: str) -> tuple[int, str, str]:
+        result = CliRunner().invoke(app, list(words))
+        return result.exit_code, result.stdout, result.stderr
+
+    code, out, err = run("surgeon", "show", "nobody", "--json")
+    assert (code, out) == (1, "")
+    problem = json.loads(err)
+    assert (problem["type"], problem["status"]) == ("urn:suture-skills:not-found", 404)
+    code, out, err = run("plan", *STYLE, "--point", "here", "--json")
+    assert (code, out, json.loads(err)["type"]) == (1, "", "urn:suture-skills:bad-input")
+    assert "3 numbers" in json.loads(err)["detail"]
+    code, out, err = run("surgeon", "show", "nobody")
+    assert (code, out, err.startswith("Problem: There is no surgeon 'nobody'")) == (1, "", True)
+
+
+def test_what_is_printed_for_programs_is_one_document_and_nothing_else(skills, tmp_path: Path) -> None:
+    bag = tmp_path / "wren.mcap"
+    bag.write_bytes(next(s for s in sample_recordings() if s.surgeon == "wren").data)
+    for words in (
+        ("migrate",),
+        ("surgeon", "put", "wren", "--consent", "training", "--until", "2999-12-31"),
+        ("surgeon", "list"),
+        ("suture", "list"),
+        ("recording", "add", str(bag)),
+        ("demo", "add", str(bag), "--surgeon", "wren", "--suture", "simple-running", "--proposal", "1"),
+        ("demo", "list"),
+        ("job", "list"),
+        ("policy", "list"),
+        ("backup", str(tmp_path / "backup.zip")),
+        ("restore", str(tmp_path / "backup.zip"), "--check"),
+        ("erasures", str(tmp_path / "erasures.json")),
+        ("verify",),
+        ("erase", "wren", "--yes"),
+    ):
+        result = CliRunner().invoke(app, [*words, "--json"])
+        assert result.exit_code == 0, (words, result.output)
+        assert json.loads(result.stdout) is not None, words
+
+
+def groups(group: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    for name, command in group.commands.items():
+        if hasattr(command, "commands"):
+            yield from groups(command, (*path, name))
+        else:
+            yield (*path, name), command
+
+
+def test_every_command_of_the_interface_is_there_and_speaks_to_programs() -> None:
+    every = dict(groups(get_command(app)))
+    named = "serve worker migrate seed backup restore verify train retrain rollout plan play export erase report"
+    assert {(name,) for name in named.split()} <= set(every)
+    for group, names in {
+        "recording": "add show",
+        "demo": "add list show report save withdraw",
+        "policy": "list versions show card release withdraw export",
+        "keys": "create list revoke",
+        "job": "list show wait cancel",
+        "surgeon": "put list show",
+    }.items():
+        assert {(group, name) for name in names.split()} <= set(every)
+    silent = {path for path, command in every.items() if not any("--json" in one.opts for one in command.params)}
+    assert silent == {("serve",), ("worker",)}, "they answer nothing"
+
+
+HEAVY = {  # pydantic is not among them: typer itself takes it to read what a command is given
+    *("numpy", "numba", "scipy", "matplotlib", "sqlalchemy", "alembic", "fastapi", "starlette", "uvicorn"),
+    *("pydantic_settings", "httpx2", "orjson", "mcap", "rosbags", "dbos", "pybullet", "jinja2", "psycopg"),
+}
+
+
+@pytest.mark.parametrize("words", [["--help"], ["train", "--help"], ["policy", "--help"]])
+def test_help_is_quick_because_nothing_heavy_is_imported_for_it(words: list[str]) -> None:
+    script = (
+        "import sys; from skills.cli import app\n"
+        "try: app(sys.argv[1:])\n"
+        "finally: print(*{name.partition('.')[0] for name in sys.modules}, file=sys.stderr)"
+    )
+    ended = subprocess.run([sys.executable, "-c", script, *words], capture_output=True, text=True)
+    assert ended.returncode == 0 and "Usage" in ended.stdout
+    loaded = set(ended.stderr.split())
+    assert {"typer", "skills"} <= loaded
+    assert loaded & HEAVY == set()
+    assert "pydantic" not in loaded or words != ["--help"]
+
+
+def completed(line: str, **settings: str) -> tuple[list[str], str]:
+    """Press Tab at the end of a line, in bash: what is proposed, and what was said otherwise."""
+    words = line.split(" ")
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("SKILLS_")} | settings
+    asked = {"_SKILLS_COMPLETE": "complete_bash", "COMP_WORDS": line, "COMP_CWORD": str(len(words) - 1)}
+    script = "import sys; sys.argv = ['skills']; from skills.cli import app; app(prog_name='skills')"
+    ended = subprocess.run(
+        [sys.executable, "-c", script], env=environment | asked, capture_output=True, text=True, check=False
+    )
+    return ended.stdout.split(), ended.stderr
+
+
+def test_tab_proposes_the_surgeons_and_sutures_that_there_are(skills, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr("skills.cli.completing.LIMIT_S", 60.0)
+    assert surgeons("") == [], "there is no database yet"
+    assert not (tmp_path / "skills.sqlite").exists()
+    for name in ("kestrel", "kite", "wren"):
+        assert skills("surgeon", "put", name)[0] == 0
+    assert (surgeons(""), surgeons("k")) == (["kestrel", "kite", "wren"], ["kestrel", "kite"])
+    assert sutures("simple-") == ["simple-buried", "simple-interrupted", "simple-running"]
+    monkeypatch.setenv("SKILLS_SERVER", "http://127.0.0.1:9")
+    settings.cache_clear()
+    assert surgeons("") == [], "where a service is set, it alone is asked"
+
+
+def test_tab_in_a_shell_is_silent_whatever_is_wrong(tmp_path: Path) -> None:
+    assert completed("skills poli") == (["policy"], "")
+    (tmp_path / "no.sqlite").write_bytes(b"this is no database" * 100)
+    for nonsense in (
+        {"SKILLS_SERVER": "http://127.0.0.1:9"},
+        {"SKILLS_DATABASE_URL": f"sqlite:///{tmp_path / 'no.sqlite'}"},
+        {"SKILLS_DATABASE_URL": "no url at all"},
+        {"SKILLS_PORT": "no port"},
+    ):
+        assert completed("skills policy show k", **nonsense) == ([], "")

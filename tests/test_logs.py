@@ -212,7 +212,7 @@ def test_the_real_service_and_its_worker_tell_of_a_job_that_fails_and_of_nobody(
     assert CANARY not in text
     told = [json.loads(line) for line in text.splitlines()]
     (failed,) = [line for line in told if line["message"] == "job"]
-    assert (failed["job_id"], failed["kind"]) == (job["id"], "training")
+    assert (failed["job_id"], failed["kind"]) == (job.id, "training")
     assert failed["outcome"] in [line["error"] for line in told if "error" in line]
     routes = {line["route"] for line in told if line["logger"] == "skills.api.request"}
     assert {"/surgeons/{surgeon}", "/demos", "/trainings", "/jobs/{job}", "/readyz"} <= routes

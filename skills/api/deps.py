@@ -5,15 +5,17 @@ import hashlib
 import tempfile
 import time
 from collections.abc import AsyncIterator
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import Depends, Header, Path, Query, Request
 from starlette.requests import ClientDisconnect
 
 from skills.api.access import Asking
+from skills.api.limits import Limits
 from skills.db.session import Database
 from skills.errors import TooLarge, TooSlow, UnknownFormat, UnreadableRecording
 from skills.jobs.engine import Engine
+from skills.library.jobs import refuse_too_many
 from skills.library.recordings import Reader, Upload, check_digest
 from skills.recordings import MEDIA_TYPES
 from skills.settings import Settings
@@ -23,27 +25,31 @@ DIGEST = r"^[0-9a-f]{64}$"
 SPOOL_BYTES = 8 << 20
 
 
-def _database(request: Request) -> Database:
+# All of these are `async`, for FastAPI sends what is not to a thread.
+
+
+async def _database(request: Request, caller: Asking) -> Database:
+    """Give the database, as far as the caller may see it."""
     database: Database = request.app.state.database
-    return database
+    return database.seen_by(caller.only)
 
 
-def _engine(request: Request) -> Engine:
+async def _engine(request: Request) -> Engine:
     engine: Engine = request.app.state.engine
     return engine
 
 
-def _reader(request: Request) -> Reader:
+async def _reader(request: Request) -> Reader:
     reader: Reader = request.app.state.reader
     return reader
 
 
-def _settings(request: Request) -> Settings:
+async def _settings(request: Request) -> Settings:
     settings: Settings = request.app.state.settings
     return settings
 
 
-def _actor(caller: Asking) -> str:
+async def _actor(caller: Asking) -> str:
     """Name who asks, for events."""
     return caller.name
 
@@ -60,14 +66,24 @@ RowCursor = Annotated[int | None, Query(alias="cursor", ge=1, le=2**62)]
 SlugCursor = Annotated[str | None, Query(alias="cursor", pattern=SLUG)]
 
 
-def page(items: list[Any], limit: int, cursor: Any) -> dict[str, Any]:
-    """Write one page of a list, and where the next one starts, if there may be one."""
-    return {"items": items, "next": cursor if len(items) == limit else None}
+def _refuse_too_many_jobs(request: Request, caller: Asking, settings: Configured) -> None:
+    """Refuse to take on more work for somebody than the settings allow; whoever is on this machine may ask for any.
+
+    Requests that come at the same moment are counted before either has asked: each may be let in.
+    """
+    if caller.key is not None:
+        database: Database = request.app.state.database
+        with database.reading() as session:
+            refuse_too_many(session, caller.name, settings.key_jobs)
+
+
+room_for_a_job = Depends(_refuse_too_many_jobs)
 
 
 async def receive(
     request: Request,
     settings: Configured,
+    caller: Asking,
     content_type: Annotated[str, Header()] = "",
     content_digest: Annotated[str | None, Header(max_length=500)] = None,
     content_encoding: Annotated[str | None, Header(max_length=100)] = None,
@@ -81,7 +97,9 @@ async def receive(
         TooLarge: The body is over the limit.
         TooSlow: It did not come in time.
         UnreadableRecording: It ended early, or is not what its Content-Digest says.
+        TooMany: The key has sent as much today as it may.
     """
+    limits: Limits = request.app.state.access.limits
     media_type = content_type.partition(";")[0].strip().lower()
     if media_type not in MEDIA_TYPES:
         known = ", ".join(f"{kind} ({name})" for kind, name in MEDIA_TYPES.items())
@@ -92,6 +110,8 @@ async def receive(
     with tempfile.SpooledTemporaryFile(max_size=SPOOL_BYTES) as file:
         async for data in _in_time(request, settings):
             size += len(data)
+            if caller.key is not None:
+                limits.upload(caller.key, len(data))
             if size > settings.max_upload_bytes:
                 raise TooLarge(f"A recording has at most {settings.max_upload_bytes} bytes; cut it.")
             seen.update(data)

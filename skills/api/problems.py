@@ -5,6 +5,7 @@ the caller sent.
 """
 
 import logging
+import math
 import re
 import secrets
 from typing import Any
@@ -19,6 +20,10 @@ from skills import errors
 log = logging.getLogger("skills.api")
 
 STATUS: tuple[tuple[type[errors.SkillsError], int, str], ...] = (
+    (errors.WrongHost, 400, "Not a name of this service"),
+    (errors.NotSignedIn, 401, "Who are you?"),
+    (errors.NotAllowed, 403, "Not allowed"),
+    (errors.TooMany, 429, "Too many"),
     (errors.UnknownFormat, 415, "This format is not read here"),
     (errors.TooLarge, 413, "Too large"),
     (errors.TooSlow, 408, "Too slow"),
@@ -31,7 +36,11 @@ STATUS: tuple[tuple[type[errors.SkillsError], int, str], ...] = (
     (errors.SimulationFailed, 503, "The simulator failed"),
     (errors.BadInput, 422, "What was sent cannot be used"),
 )
-HEADERS = {errors.Busy: {"Retry-After": "1"}, errors.TooSlow: {"Connection": "close"}}
+HEADERS = {
+    errors.Busy: {"Retry-After": "1"},
+    errors.TooSlow: {"Connection": "close"},
+    errors.NotSignedIn: {"WWW-Authenticate": 'Bearer realm="suture-skills"'},
+}
 DETAILS = {
     400: "The body cannot be read as JSON; mend it.",
     404: "See /openapi.json for the calls there are.",
@@ -72,7 +81,21 @@ def _why(one: dict[str, Any]) -> str:
     """Say why a field is refused, without what was sent."""
     if one["type"] == "union_tag_invalid":
         return f"The kind must be one of {one['ctx']['expected_tags']}."
+    if one["type"] == "json_invalid":
+        return f"{one['ctx']['error']}."
     return str(one["msg"])
+
+
+def answer_to(error: errors.SkillsError) -> Response:
+    """Write what a refusal is answered with."""
+    for family, status, title in STATUS:
+        if isinstance(error, family):
+            headers = HEADERS.get(family)
+            if isinstance(error, errors.TooMany):
+                headers = {"Retry-After": str(max(1, math.ceil(error.wait_s)))}
+            numbers = {"numbers": error.numbers} if error.numbers else {}
+            return problem(status, kind_of(error), title, str(error), headers=headers, **numbers)
+    raise error
 
 
 def answer_refusals(app: FastAPI) -> None:
@@ -80,12 +103,7 @@ def answer_refusals(app: FastAPI) -> None:
 
     @app.exception_handler(errors.SkillsError)
     def refused(_request: Request, error: errors.SkillsError) -> Response:
-        for family, status, title in STATUS:
-            if isinstance(error, family):
-                headers = HEADERS.get(family)
-                numbers = {"numbers": error.numbers} if error.numbers else {}
-                return problem(status, kind_of(error), title, str(error), headers=headers, **numbers)
-        raise error
+        return answer_to(error)
 
     @app.exception_handler(RequestValidationError)
     def invalid(_request: Request, error: RequestValidationError) -> Response:

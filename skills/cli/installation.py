@@ -1,14 +1,13 @@
 """The commands that act on this installation."""
 
-import json
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from skills.cli.shell import AsJson, err, out, refusing, service
+from skills.cli.shell import AsJson, err, out, print_json, refusing, service, show
 from skills.errors import SkillsError
 
 commands = typer.Typer()
@@ -42,29 +41,28 @@ def worker() -> None:
 
 @commands.command()
 @refusing
-def migrate() -> None:
+def migrate(as_json: AsJson = False) -> None:
     """Bring the database to this version; an empty one gets its tables and the catalogue."""
     from skills.serving import prepare
     from skills.settings import settings
 
     prepare(settings())
-    out.print("The database is up to date.")
+    _say("The database is up to date.", as_json, up_to_date=True)
 
 
 @commands.command()
 @refusing
-def seed() -> None:
+def seed(as_json: AsJson = False) -> None:
     """Load the synthetic sample surgeons and their recordings."""
     from skills.samples import load_samples
 
-    with service() as client:
-        for demo in load_samples(client):
-            out.print(f"{demo['surgeon']} {demo['suture']}: {demo['report']['path_states']} states")
+    with service() as client, err.status("loading"):
+        show(list(load_samples(client)), as_json, ("surgeon", "suture", "id", "report.path_states"))
 
 
 @commands.command()
 @refusing
-def backup(to: Annotated[Path, typer.Argument(help="A new file.", dir_okay=False)]) -> None:
+def backup(to: Annotated[Path, typer.Argument(help="A new file.", dir_okay=False)], as_json: AsJson = False) -> None:
     """Write all that is stored into one file, while the service goes on working."""
     from skills.db.session import Database
     from skills.library.backup import back_up
@@ -72,8 +70,9 @@ def backup(to: Annotated[Path, typer.Argument(help="A new file.", dir_okay=False
 
     with closing(Database(settings().database_url)) as database, _telling("backing up") as told, _files():
         manifest = back_up(database, to, told)
-    rows = sum(table.rows for table in manifest.tables)
-    out.print(f"{to}: {rows} rows, {to.stat().st_size / 1e6:.1f} MB, the state of {manifest.created_at}.")
+    rows, size, taken = sum(table.rows for table in manifest.tables), to.stat().st_size, manifest.created_at
+    sentence = f"{to}: {rows} rows, {size / 1e6:.1f} MB, the state of {taken}."
+    _say(sentence, as_json, file=to, size_bytes=size, rows=rows, created_at=taken)
 
 
 @commands.command()
@@ -85,6 +84,7 @@ def restore(
         typer.Option(help="A list that `skills erasures` wrote, or the URL of the database that is replaced."),
     ] = None,
     check: Annotated[bool, typer.Option("--check", help="Only check the backup; nothing is written.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Fill an empty database from a backup, and erase again who was erased since."""
     from skills.db.session import Database
@@ -95,7 +95,8 @@ def restore(
     with _files():
         if check:
             manifest = library.check_backup(source)
-            out.print(f"{source} is whole: {sum(t.rows for t in manifest.tables)} rows of {manifest.created_at}.")
+            rows, taken = sum(table.rows for table in manifest.tables), manifest.created_at
+            _say(f"{source} is whole: {rows} rows of {taken}.", as_json, whole=True, rows=rows, created_at=taken)
             return
         refuse_left_over(settings())
         listed = library.NOTHING
@@ -104,10 +105,12 @@ def restore(
         with closing(Database(settings().database_url)) as database, _telling("restoring") as told:
             done = library.restore(database, source, listed, told)
     rows, taken = sum(table.rows for table in done.manifest.tables), done.manifest.created_at
-    out.print(f"Restored {rows} rows, the state of {taken}; what was withdrawn since then stands again.")
+    sentence = f"Restored {rows} rows, the state of {taken}; what was withdrawn since then stands again."
     if erasures:
-        out.print(f"Erased again: {done.surgeons_erased} surgeons, {done.demos_erased} demonstrations.")
-    else:
+        sentence += f"\nErased again: {done.surgeons_erased} surgeons, {done.demos_erased} demonstrations."
+    erased = {"surgeons_erased": done.surgeons_erased, "demos_erased": done.demos_erased}
+    _say(sentence, as_json, rows=rows, created_at=taken, **erased)
+    if not erasures:
         err.print(
             f"NO LIST OF ERASURES WAS GIVEN: whoever was erased after {taken} IS BACK. Erase them again before this "
             "database is used, or restore into an empty one with --erasures.",
@@ -119,6 +122,7 @@ def restore(
 @refusing
 def erasures(
     to: Annotated[Path, typer.Argument(help="The list; it grows, and is kept apart from the backups.")],
+    as_json: AsJson = False,
 ) -> None:
     """Write the list of who and what was erased, as digests, for `skills restore --erasures`."""
     from skills.db.session import Database
@@ -127,7 +131,8 @@ def erasures(
 
     with closing(Database(settings().database_url)) as database, _files():
         listed = keep_erasures(database, to)
-    out.print(f"{to}: {len(listed.surgeons)} surgeons, {len(listed.demos)} demonstrations.")
+    surgeons, demos = len(listed.surgeons), len(listed.demos)
+    _say(f"{to}: {surgeons} surgeons, {demos} demonstrations.", as_json, file=to, surgeons=surgeons, demos=demos)
 
 
 @commands.command()
@@ -140,8 +145,8 @@ def verify(
     if bag is not None:
         from skills.recordings.replay_check import verify_bag
 
-        for line in verify_bag(bag):
-            out.print(line, markup=False, soft_wrap=True)
+        lines = list(verify_bag(bag))
+        _say("\n".join(lines), as_json, whole=True, checked=lines)
         return
     from skills.db.session import Database
     from skills.library.inspection import Checked, inspect_installation
@@ -155,7 +160,7 @@ def verify(
     wrong = [one for part in found.values() for one in part.wrong]
     if as_json:
         counts = {part.what: {"checked": part.count, "wrong": len(part.wrong)} for part in found.values()}
-        out.print_json(json.dumps({"checked": counts, "wrong": [{"what": what, "why": why} for what, why in wrong]}))
+        print_json({"checked": counts, "wrong": [{"what": what, "why": why} for what, why in wrong]})
     else:
         for part in found.values():
             out.print(f"{part.what:20} {part.count:>10} {f'{len(part.wrong)} WRONG' if part.wrong else 'whole'}")
@@ -163,6 +168,14 @@ def verify(
             err.print(f"{what}: {why}", style="red", markup=False, soft_wrap=True)
     if wrong:
         raise typer.Exit(1)
+
+
+def _say(sentence: str, as_json: bool, **facts: Any) -> None:
+    """Say what was done, to people or to programs."""
+    if as_json:
+        print_json(facts)
+    else:
+        out.print(sentence, markup=False, soft_wrap=True)
 
 
 @contextmanager

@@ -1,12 +1,25 @@
 """Plans, their playback in the simulator, and the bag that a robot replays."""
 
-import json
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from skills.cli.shell import AsJson, Surgeon, Suture, finished, numbers, out, refusing, service, show, triple
+from skills.cli.shell import (
+    AsJson,
+    Surgeon,
+    Suture,
+    bar,
+    finished,
+    numbers,
+    out,
+    print_json,
+    refusing,
+    result_of,
+    service,
+    show,
+    triple,
+)
 from skills.errors import BadInput
 
 commands = typer.Typer()
@@ -43,18 +56,20 @@ def plan(
         x, y, z, *turned = numbers(base, 7)
         psm_m["base"] = {"position_mm": (x, y, z), "rotation_xyzw": turned}
     with service() as client:
-        points = [{"position_mm": triple(one)} for one in point or ()]
+        points: list[dict[str, Any]] = [{"position_mm": triple(one)} for one in point or ()]
         if scene is not None:
-            marks = client.suture_points(scene)["points"]
-            points = [
-                {"position_mm": one["position_mm"], "rotation_xyzw": one["turn_xyzw"]}
-                for one in marks
-                if one["is_goal"]
-            ]
-        asked = {"speed_mm_s": speed_mm_s, "rate_hz": rate_hz, "tip_offset_mm": tip_offset_mm, "psm_m": psm_m or None}
-        answer = client.plan(surgeon, suture, points, **asked)
-    answer["duration_s"] = answer["trajectory"]["duration_s"]
-    show(answer, as_json, ("id", "arm", "frame", "orientation", "duration_s"))
+            goals = [mark for mark in client.suture_points(scene).points if mark.is_goal]
+            points = [{"position_mm": goal.position_mm, "rotation_xyzw": goal.turn_xyzw} for goal in goals]
+        made = client.plan(
+            surgeon,
+            suture,
+            points,
+            speed_mm_s=speed_mm_s,
+            rate_hz=rate_hz,
+            tip_offset_mm=tip_offset_mm,
+            psm_m=psm_m or None,
+        )
+    show(made, as_json, ("id", "arm", "frame", "orientation", "trajectory.duration_s"))
 
 
 @commands.command()
@@ -69,26 +84,26 @@ def play(
 ) -> None:
     """Play a plan in the simulator, and print its verdict; exit code 1 where it is not feasible."""
     with service(works=True) as client:
-        playback = client.playback(finished(client, client.play(plan_id))["result"]["playback"])
+        playback = client.playback(result_of(finished(client, client.play(plan_id)))["playback"])
         if picture is not None:
-            picture.write_bytes(client.picture(playback["id"]))
+            picture.write_bytes(client.picture(playback.id))
         if pictures is not None:
             pictures.mkdir(parents=True, exist_ok=True)
-            finished(client, client.draw(playback["id"]))
-            (pictures / "playback.png").write_bytes(client.picture(playback["id"]))
-            (pictures / "playback.mp4").write_bytes(client.animation(playback["id"]))
-            (pictures / "playback.gif").write_bytes(client.animation(playback["id"], "gif"))
-            (pictures / "joints.png").write_bytes(client.plot(playback["id"], "joints"))
-            (pictures / "clearance.png").write_bytes(client.plot(playback["id"], "clearance"))
+            finished(client, client.draw(playback.id))
+            (pictures / "playback.png").write_bytes(client.picture(playback.id))
+            (pictures / "playback.mp4").write_bytes(client.animation(playback.id))
+            (pictures / "playback.gif").write_bytes(client.animation(playback.id, "gif"))
+            (pictures / "joints.png").write_bytes(client.plot(playback.id, "joints"))
+            (pictures / "clearance.png").write_bytes(client.plot(playback.id, "clearance"))
     if as_json:
-        out.print_json(json.dumps(playback))
+        print_json(playback)
     else:
-        out.print("feasible" if playback["feasible"] else playback["report"]["failure_in_words"])
-        for under in playback["report"]["doubt"]["under"]:
-            least = min(one["succeeds"]["lower"] for one in under["passes"])
-            error = f"tips {under['tip_error_mm']:g} mm off"
+        out.print("feasible" if playback.feasible else playback.report.failure_in_words)
+        for under in playback.report.doubt.under:
+            least = min(one.succeeds.lower for one in under.passes)
+            error = f"tips {under.tip_error_mm:g} mm off"
             out.print(f"{error}: every pass succeeds with a probability of at least {least:.3f} (95 %)")
-    if not playback["feasible"]:
+    if not playback.feasible:
         raise typer.Exit(1)
 
 
@@ -98,9 +113,13 @@ def export(
     plan_id: PlanId,
     to: Annotated[Path, typer.Argument(help="The zip to write.", dir_okay=False)],
     pass_index: Annotated[int | None, typer.Option("--pass", help="One pass alone, counted from 0.")] = None,
+    as_json: AsJson = False,
 ) -> None:
     """Write the bag of a plan that a robot or a simulator replays; first read docs/replay.md."""
-    with service() as client:
-        bag = client.replay_bag(plan_id, pass_index)
-    to.write_bytes(bag)
-    out.print(f"{to}: {len(bag) / 1e6:.1f} MB. Check it with `skills verify {to}` where it is used. Research use only.")
+    with service() as client, bar("fetching") as progress:
+        client.save_replay_bag(plan_id, to, pass_index, progress)
+    size = to.stat().st_size
+    if as_json:
+        print_json({"file": to, "size_bytes": size})
+    else:
+        out.print(f"{to}: {size / 1e6:.1f} MB. Check it with `skills verify {to}` where it is used. Research use only.")

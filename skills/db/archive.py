@@ -38,7 +38,7 @@ from sqlalchemy import (
 from sqlalchemy.types import NullType, TypeEngine
 
 from skills.db.base import Base, Moment, now, rfc3339
-from skills.db.models import Executor
+from skills.db.models import Executor, SignIn
 from skills.db.packed import Packed
 from skills.db.schema import revision_of, revisions, upgrade
 from skills.errors import Conflict, Corrupt, UnknownFormat
@@ -48,7 +48,7 @@ MANIFEST = "manifest.json"
 SEAL_BYTES = 64
 CUT_OFF = "its end is missing or damaged, as of a file that was cut off"
 PIECE_BYTES = 1 << 20
-LEFT_OUT = {Executor.__tablename__}  # workers that live, which elsewhere are none
+LEFT_OUT = {Executor.__tablename__, SignIn.__tablename__}  # workers that live and people who are in: elsewhere none
 ROWS_AT_ONCE = 500
 ROWS_WITH_BYTES_AT_ONCE = 8  # a recording's chunk has a mebibyte
 

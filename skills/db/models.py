@@ -2,7 +2,7 @@
 
 Append-only (triggers of the migrations refuse changes): recordings and their chunks, demonstrations, reward maps,
 policy versions, releases, plans, playbacks and their pictures, events; a demonstration and a release can be withdrawn,
-once. Deleting is left to erasure alone.
+once. Deleting is left to erasure alone. Keys are revoked and stay; a sign-in goes when it is over.
 """
 
 from datetime import datetime
@@ -23,7 +23,7 @@ from sqlalchemy.orm import Mapped, mapped_column, relationship
 
 from skills.db.base import Base, now
 from skills.db.packed import Packed, stored
-from skills.packing import added_later
+from skills.packing import added_later, few_numbers
 from skills.style.certificate import Coverage
 from skills.style.demo import Demo, Partner, Pause
 from skills.style.grid import GridPath, GridWorld
@@ -46,6 +46,7 @@ added_later(Partner, "base_xyzw")
 added_later(Partner, "instrument")
 added_later(PhaseQLearning, "slip")
 added_later(ValueIteration, "slip")
+few_numbers(Policy, "q")
 
 RowId = Annotated[
     int, mapped_column(BigInteger().with_variant(Integer, "sqlite"), primary_key=True, autoincrement=True)
@@ -106,6 +107,15 @@ class StoredRecording(Base):
     reading: Mapped[dict[str, Any]]  # how it was read: rate_hz and frame where the file does not say them
     about: Mapped[dict[str, Any]]  # topics, quality, proposed hand-offs
     created_at: Mapped[datetime] = mapped_column(default=now)
+
+
+class RecordingUpload(Base):
+    """Somebody sent a recording's bytes, and may see them for that."""
+
+    __tablename__ = "recording_uploads"
+
+    recording_row: Mapped[int] = mapped_column(ForeignKey("recordings.row", ondelete="CASCADE"), primary_key=True)
+    actor: Mapped[str] = mapped_column(primary_key=True)
 
 
 class RecordingChunk(Base):
@@ -324,6 +334,51 @@ class Executor(Base):
 
     id: Mapped[str] = mapped_column(String(64), primary_key=True)
     beat_at: Mapped[datetime] = mapped_column(default=now)
+
+
+class Key(Base):
+    """What lets a person or a program in: the digest of a secret that is stored nowhere, and what it may do.
+
+    `id` is the part of the key that is no secret. `restricted` keeps a key to its surgeons even when all are erased.
+    """
+
+    __tablename__ = "keys"
+
+    row: Mapped[RowId]
+    id: Mapped[str] = mapped_column(String(16), unique=True)
+    digest: Mapped[str] = mapped_column(Sha256)
+    owner: Mapped[str] = mapped_column(String(64))
+    role: Mapped[str] = mapped_column(String(10))
+    restricted: Mapped[bool]
+    created_at: Mapped[datetime] = mapped_column(default=now)
+    created_by: Mapped[str]
+    expires_at: Mapped[datetime | None]
+    revoked_at: Mapped[datetime | None]
+
+    surgeons: Mapped[list[Surgeon]] = relationship(secondary="key_surgeons", lazy="selectin", order_by=Surgeon.slug)
+    __table_args__ = (CheckConstraint("role IN ('reader', 'uploader', 'trainer', 'releaser', 'admin')", name="role"),)
+
+
+class KeySurgeon(Base):
+    """A key is restricted to this surgeon, among others; it goes with the surgeon."""
+
+    __tablename__ = "key_surgeons"
+
+    key_row: Mapped[int] = mapped_column(ForeignKey("keys.row"), primary_key=True)
+    surgeon_row: Mapped[int] = mapped_column(ForeignKey("surgeons.row", ondelete="CASCADE"), primary_key=True)
+
+
+class SignIn(Base):
+    """Somebody signed in to the page with a key: the digest of the cookie, and when it was last used."""
+
+    __tablename__ = "sign_ins"
+
+    digest: Mapped[str] = mapped_column(Sha256, primary_key=True)
+    key_row: Mapped[int] = mapped_column(ForeignKey("keys.row"))
+    created_at: Mapped[datetime] = mapped_column(default=now)
+    used_at: Mapped[datetime] = mapped_column(default=now)
+
+    key: Mapped[Key] = relationship(lazy="joined", innerjoin=True)
 
 
 class Event(Base):

@@ -8,7 +8,7 @@ compressed.
 import hashlib
 import io
 from dataclasses import is_dataclass
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 from sqlalchemy import Dialect, LargeBinary
 from sqlalchemy.types import TypeDecorator
@@ -31,18 +31,42 @@ def stored(*values: type) -> None:
         _VALUES[value.__name__] = value
 
 
+class Sealed(NamedTuple):
+    """A value as it is stored, and the digest that it is known by."""
+
+    packed: bytes
+    digest: str
+
+
+def seal(value: Any) -> Sealed:
+    """Lay a value out as bytes, and compute its digest: for less than both cost alone."""
+    flat = _flat(value)
+    return Sealed(_packed(*flat), _digest(*flat))
+
+
 def digest(value: Any) -> str:
     """Compute the SHA-256 of a value, in hex: over its numbers and names, however they are stored."""
-    arrays: Arrays = []
-    tree = packing.flatten(value, arrays, _VALUES)
-    shape = [[str(a.dtype), list(a.shape), sha256(a.tobytes())] for a in arrays]
-    return sha256(canonical([tree, shape]))
+    return _digest(*_flat(value))
 
 
 def pack(value: Any) -> bytes:
     """Lay a value out as bytes."""
+    return _packed(*_flat(value))
+
+
+def _flat(value: Any) -> tuple[Any, Arrays]:
+    arrays: Arrays = []
+    return packing.flatten(value, arrays, _VALUES), arrays
+
+
+def _digest(tree: Any, arrays: Arrays) -> str:
+    shape = [[str(a.dtype), list(a.shape), hashlib.sha256(a.data).hexdigest()] for a in arrays]
+    return sha256(canonical([tree, shape]))
+
+
+def _packed(tree: Any, arrays: Arrays) -> bytes:
     out = io.BytesIO()
-    packing.write(out, value, _VALUES, npz.save)
+    npz.save(out, **packing.named(tree, arrays))
     body = out.getvalue()
     return FORMAT + hashlib.sha256(body).digest() + body
 

@@ -24,7 +24,8 @@ APPLICATION = "suture-skills"
 JOBS, BATCHES, ASIDE = "jobs", "batches", "aside"  # a person waits for the first, somebody for the second, nobody else
 # How many of each a worker process does at once, so that none holds up another. The engine keeps these numbers in its
 # database, the same for all workers: they are no setting, and a machine is limited by how many workers it has.
-QUEUES = {JOBS: 2, BATCHES: 1, ASIDE: 1}
+# Two parts of batches: one learns while the other commits, or the engine looks for the next (`library.batch_work`).
+QUEUES = {JOBS: 2, BATCHES: 2, ASIDE: 1}
 WORKFLOW = "perform_job"
 STEPS = "1"  # the engine's "application version": to be changed with the sequence of steps in `workflows`, only then
 POLLING_S = 0.2

@@ -12,6 +12,7 @@ from skills.style.evaluation import dtw, measure
 from skills.style.grid import GridPath, GridWorld
 from skills.style.learning._kernels import warp_compiled
 from skills.style.learning.q_learning import PhaseQLearning
+from skills.style.palette import palette_of
 from skills.style.policy import learn_policy, rollout_from
 from skills.style.reward import sparse_reward
 
@@ -39,9 +40,11 @@ def learn_once() -> None:
     """Learn the shortest path there is, as a job would."""
     policy = learn_policy(sparse_reward(TWO_CELLS), PhaseQLearning())
     certify(policy)
+    palette_of(policy.q)
     measure(rollout_from(policy, TWO_CELLS.start))
 
 
 def align_once() -> None:
-    """Align the shortest path there is, as a request would."""
+    """Align the shortest path there is, and look for a palette, as a request would."""
     dtw(TWO_CELLS.tip_mm, TWO_CELLS.tip_mm)
+    palette_of(TWO_CELLS.tip_mm)

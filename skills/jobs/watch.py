@@ -6,7 +6,7 @@ each change is one conditional statement, and it does not matter who makes it, n
 """
 
 import logging
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 
 from dbos import DBOSClient, WorkflowStatus
@@ -15,7 +15,7 @@ from sqlalchemy import delete, select, update
 from skills.db.base import now
 from skills.db.models import Executor, Job
 from skills.db.session import Database
-from skills.jobs.engine import QUEUES, STEPS, drop, tell, workflow_id
+from skills.jobs.engine import JOBS, QUEUES, STEPS, drop, tell, workflow_id
 from skills.jobs.lease import Leases
 from skills.jobs.workflows import ACTIVE, fail
 from skills.library.batches import BATCH
@@ -62,18 +62,22 @@ class Watch:
         executor: str,
         leases: Leases,
         recover: Callable[[list[str]], object],
+        doing: Collection[str] = frozenset(),
     ) -> None:
         """Watch for one executor.
 
         Args:
             recover: Hands the pending workflows of dead executors back to their queue, on the condition that they
                 are still pending and still theirs.
+            doing: The workflows that this worker is working on, as they are at any time.
         """
         self._database = database
         self._client = client
         self._executor = executor
         self._leases = leases
         self._recover = recover
+        self._doing = doing
+        self._unheard = Leases(leases.lease_s, leases.clock)
 
     def beat(self) -> None:
         """Show that this worker lives."""
@@ -112,7 +116,9 @@ class Watch:
         The engine's own `resume_workflow` would run cancelled work, would take work that a third worker has just
         taken over, and would forget how often the work has killed its worker.
         """
-        holders = {workflow.executor_id for workflow in self._pending() if workflow.executor_id}
+        pending = self._pending()
+        self._give_back({workflow.workflow_id for workflow in pending if workflow.executor_id == self._executor})
+        holders = {workflow.executor_id for workflow in pending if workflow.executor_id}
         with self._database.reading() as session:
             beats = {row.id: row.beat_at for row in session.execute(select(Executor.id, Executor.beat_at))}
         others = {**dict.fromkeys(holders), **beats}
@@ -123,6 +129,16 @@ class Watch:
         for executor in others.keys() - holders:
             if silent_s[executor] > FORGOTTEN_AFTER_LEASES * self._leases.lease_s:
                 self._forget(executor, beats[executor])
+
+    def _give_back(self, mine: set[str]) -> None:
+        """Give back what is this worker's and has not been begun for a lease: it was not heard that it had been taken.
+
+        That is so where the connection breaks between a commit and its answer.
+        """
+        self._unheard.look(dict.fromkeys(mine.difference(self._doing)))
+        for workflow in self._unheard.dead():
+            log.warning("Job %s was taken and never begun; it is given back.", workflow)
+            self._client._sys_db.reenqueue_for_recovery(workflow, [self._executor], JOBS)
 
     def _inherit(self, dead: list[str]) -> None:
         """Give back what the dead were working on; start over what only workers of another version could go on with."""

@@ -25,6 +25,7 @@ from skills.jobs.workflows import Perform, Work, register
 from skills.settings import Settings
 
 ROUND_S = 0.5
+MISSED_ROUNDS = 20  # in a row; where the database is away the engine waits for up to 90 s before it tries again
 DRAIN_S = 8  # what works then is cut and done again elsewhere; containers are killed after ten
 NICENESS = 10
 
@@ -52,18 +53,33 @@ def run_worker(settings: Settings, *, parent: int | None = None, perform: Perfor
     with database.reading() as session:
         refuse_other_tables(session.connection())
     client = connect(settings)
-    watch = Watch(database, client, executor, Leases(settings.lease_s), DBOS._recover_pending_workflows)
+    work = Work(database, settings, perform)
+    watch = Watch(database, client, executor, Leases(settings.lease_s), DBOS._recover_pending_workflows, work.doing)
     try:
         watch.beat()  # before it can hold any work
-        with _engine(Work(database, settings, perform), executor, watch):
-            while not (stop.is_set() or _orphaned(parent)):
-                _survive(watch.round)
-                stop.wait(ROUND_S)
+        with _engine(work, executor, watch):
+            _go_round(watch, lambda: stop.wait(ROUND_S) or _orphaned(parent))
         _go_if_cut_short(watch)
         _survive(watch.leave)
     finally:
         client.destroy()
         database.close()
+
+
+def _go_round(watch: Watch, over: Callable[[], bool]) -> None:
+    """Make rounds until it is over, or until the database is back after so long that a new process does better."""
+    missed = 0
+    while True:
+        if not _survive(watch.round):
+            missed += 1
+        elif missed < MISSED_ROUNDS:
+            missed = 0
+        else:
+            log.error("The database was away for long, and the engine's pauses have grown; this worker starts anew.")
+            logging.shutdown()
+            os._exit(1)
+        if over():
+            return
 
 
 def _library() -> Perform:
@@ -95,18 +111,25 @@ def _engine(work: Work, executor: str, watch: Watch) -> Iterator[None]:
 
 def _patience_s(watch: Watch) -> int:
     """Choose how long to drain: what is done aside is cut at once, for it may take long and nobody waits for it."""
+    return DRAIN_S if _at_work(watch, JOBS, BATCHES) else 0
+
+
+def _at_work(watch: Watch, *queues: str) -> bool:
+    """Tell whether this worker holds work; where the database is away it may, and its threads wait for that."""
     try:
-        return DRAIN_S if watch.at_work(JOBS, BATCHES) else 0
-    except Exception:  # a database that is away for a while
-        return DRAIN_S
+        return watch.at_work(*queues)
+    except Exception:
+        return True
 
 
-def _survive(step: Callable[[], None]) -> None:
-    """Take a step of the watch; a database that is locked or away for a while must not end the worker."""
+def _survive(step: Callable[[], None]) -> bool:
+    """Take a step of the watch, or miss it: a database that is locked or away for a while must not end the worker."""
     try:
         step()
+        return True
     except Exception:
         log.warning("The watch missed a round; the next one makes up for it.", exc_info=True)
+        return False
 
 
 def _stopped_by_signals() -> Event:
@@ -126,7 +149,7 @@ def _orphaned(parent: int | None) -> bool:
 
 def _go_if_cut_short(watch: Watch) -> None:
     """End the process if a job still runs: its thread cannot be stopped, and would hold up the exit for as long."""
-    if watch.at_work():
+    if _at_work(watch):
         log.warning("Stopped in the middle of a job; it is done again elsewhere, or after the next start.")
         logging.shutdown()
         os._exit(0)

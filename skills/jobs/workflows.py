@@ -7,8 +7,9 @@ names the attempt and the states it may come from.
 
 import logging
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 
 from dbos import DBOS
 from sqlalchemy import func, update
@@ -17,7 +18,7 @@ from skills.db.base import now
 from skills.db.models import Job
 from skills.db.session import Database
 from skills.errors import Busy, SkillsError
-from skills.jobs.engine import WORKFLOW
+from skills.jobs.engine import WORKFLOW, workflow_id
 from skills.library.batches import PART, end_part
 from skills.settings import Settings
 
@@ -36,6 +37,16 @@ class Work:
     database: Database
     settings: Settings
     perform: Perform
+    doing: set[str] = field(default_factory=set)  # workflows that have been begun and have not ended
+
+    @contextmanager
+    def begun(self, workflow: str) -> Iterator[None]:
+        """Keep a workflow among those that are being done for as long as the block."""
+        self.doing.add(workflow)
+        try:
+            yield
+        finally:
+            self.doing.discard(workflow)
 
     def try_once(self, row: int, attempt: int, tries: int) -> bool:
         """Try to carry a job out; tell whether that settled it, for good or bad.
@@ -112,5 +123,6 @@ def register(work: Work) -> None:
     # A job that kills its worker is handed on as often as one that raises is tried.
     @DBOS.workflow(name=WORKFLOW, max_recovery_attempts=attempts - 1)
     def perform_job(row: int, attempt: int) -> None:
-        if not any(try_job(row, attempt, tries) for tries in range(attempts)):
-            give_up(row, attempt)
+        with work.begun(workflow_id(row, attempt)):
+            if not any(try_job(row, attempt, tries) for tries in range(attempts)):
+                give_up(row, attempt)

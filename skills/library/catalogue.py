@@ -8,7 +8,7 @@ from datetime import date
 from importlib import resources
 from typing import Any
 
-from sqlalchemy import func, select
+from sqlalchemy import func, or_, select
 from sqlalchemy.orm import Session
 
 from skills.db.base import now
@@ -23,7 +23,7 @@ def put_surgeon(session: Session, slug: str, about: dict[str, Any], actor: str) 
     Raises:
         Erased: A surgeon of this pseudonym was erased.
     """
-    surgeon = session.scalar(select(Surgeon).where(Surgeon.slug == slug))
+    surgeon = known_surgeon(session, slug)
     if surgeon is None:
         _refuse_erased(session, slug)
         surgeon = Surgeon(slug=slug, subject=secrets.token_hex(16), **about)
@@ -37,6 +37,11 @@ def put_surgeon(session: Session, slug: str, about: dict[str, Any], actor: str) 
     return surgeon, False
 
 
+def known_surgeon(session: Session, slug: str) -> Surgeon | None:
+    """Look for a surgeon; None where there is none of this pseudonym."""
+    return session.scalar(select(Surgeon).where(Surgeon.slug == slug))
+
+
 def find_surgeon(session: Session, slug: str) -> Surgeon:
     """Find a surgeon.
 
@@ -44,18 +49,23 @@ def find_surgeon(session: Session, slug: str) -> Surgeon:
         NotFound: There is none of this pseudonym.
         Erased: There was one.
     """
-    surgeon = session.scalar(select(Surgeon).where(Surgeon.slug == slug))
+    surgeon = known_surgeon(session, slug)
     if surgeon is None:
         _refuse_erased(session, slug)
         raise NotFound(f"There is no surgeon '{slug}'; add one with PUT /surgeons/{slug}.")
     return surgeon
 
 
-def list_surgeons(session: Session, limit: int, after: str | None) -> Sequence[Surgeon]:
-    """List surgeons in the order of their pseudonyms."""
-    return session.scalars(
-        select(Surgeon).where(Surgeon.slug > (after or "")).order_by(Surgeon.slug).limit(limit)
-    ).all()
+def list_surgeons(
+    session: Session, limit: int, after: str | None, search: str | None = None, skill_level: str | None = None
+) -> Sequence[Surgeon]:
+    """List surgeons in the order of their pseudonyms: those in whose pseudonym `search` is, in any case."""
+    query = select(Surgeon).where(Surgeon.slug > (after or ""))
+    if search is not None:
+        query = query.where(Surgeon.slug.icontains(search, autoescape=True))
+    if skill_level is not None:
+        query = query.where(Surgeon.skill_level == skill_level)
+    return session.scalars(query.order_by(Surgeon.slug).limit(limit)).all()
 
 
 def check_consent(surgeon: Surgeon, use: str, today: date | None = None) -> None:
@@ -76,7 +86,7 @@ def check_consent(surgeon: Surgeon, use: str, today: date | None = None) -> None
 
 def put_suture_type(session: Session, slug: str, about: dict[str, Any], actor: str) -> tuple[SutureType, bool]:
     """Write a suture type whole: (the row, whether it is new)."""
-    suture = session.get(SutureType, slug)
+    suture = known_suture_type(session, slug)
     created = suture is None
     if suture is None:
         suture = SutureType(slug=slug, **about)
@@ -88,22 +98,32 @@ def put_suture_type(session: Session, slug: str, about: dict[str, Any], actor: s
     return suture, created
 
 
+def known_suture_type(session: Session, slug: str) -> SutureType | None:
+    """Look for a suture type; None where the catalogue has none of this name."""
+    return session.get(SutureType, slug)
+
+
 def find_suture_type(session: Session, slug: str) -> SutureType:
     """Find a suture type.
 
     Raises:
         NotFound: The catalogue has none of this name.
     """
-    suture = session.get(SutureType, slug)
+    suture = known_suture_type(session, slug)
     if suture is None:
         raise NotFound(f"There is no suture type '{slug}'; GET /suture-types lists them, PUT adds one.")
     return suture
 
 
-def list_suture_types(session: Session, limit: int, after: str | None) -> Sequence[SutureType]:
-    """List suture types in the order of their names."""
-    query = select(SutureType).where(SutureType.slug > (after or "")).order_by(SutureType.slug).limit(limit)
-    return session.scalars(query).all()
+def list_suture_types(
+    session: Session, limit: int, after: str | None, search: str | None = None
+) -> Sequence[SutureType]:
+    """List suture types in the order of their slugs: those in whose slug, name or family `search` is, in any case."""
+    query = select(SutureType).where(SutureType.slug > (after or ""))
+    if search is not None:
+        told = (SutureType.slug, SutureType.name, SutureType.family)
+        query = query.where(or_(*(column.icontains(search, autoescape=True) for column in told)))
+    return session.scalars(query.order_by(SutureType.slug).limit(limit)).all()
 
 
 def seed_catalogue(session: Session) -> int:

@@ -10,11 +10,12 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from skills.db.base import now
-from skills.db.models import Demonstration, Release, StoredRecording, StoredRewardMap
+from skills.db.models import Demonstration, Release, StoredRecording, StoredRewardMap, Surgeon
 from skills.db.packed import digest
+from skills.db.seen import EVERYBODYS
 from skills.db.session import Database
 from skills.errors import Conflict, NotFound
-from skills.library.catalogue import find_surgeon, find_suture_type
+from skills.library.catalogue import check_consent, find_surgeon, find_suture_type
 from skills.library.events import record
 from skills.library.recordings import Reader, Upload, find_recording, keep, read_upload, recording_bytes
 from skills.library.releases import withdraw_resting_on
@@ -167,6 +168,25 @@ def find_demo(session: Session, demo_sha256: str) -> Demonstration:
     return demonstration
 
 
+def exported_recording(session: Session, demo_sha256: str) -> StoredRecording:
+    """Find the recording of a demonstration, for whoever takes its bytes away.
+
+    Raises:
+        Conflict: The consent of a surgeon of whom it holds a demonstration does not cover an export.
+    """
+    demo = find_demo(session, demo_sha256)
+    check_consent(demo.surgeon, "export")
+    also = select(Demonstration.surgeon_row).where(Demonstration.recording_row == demo.recording_row)
+    others = select(Surgeon).where(Surgeon.row.in_(also), Surgeon.row != demo.surgeon_row)
+    for other in session.scalars(others, execution_options=EVERYBODYS):
+        try:
+            check_consent(other, "export")
+        except Conflict:  # whose it is, whoever asks may not be allowed to know
+            why = "Another surgeon's hand-off is in this recording, and their consent does not cover export."
+            raise Conflict(why) from None
+    return demo.recording
+
+
 def newest_demo(session: Session, surgeon_row: int, suture: str) -> Demonstration | None:
     """Find the newest active demonstration of a style."""
     return session.scalar(
@@ -179,9 +199,15 @@ def newest_demo(session: Session, surgeon_row: int, suture: str) -> Demonstratio
 
 
 def list_demos(
-    session: Session, limit: int, before: int | None, surgeon: str | None, suture: str | None
+    session: Session,
+    limit: int,
+    before: int | None,
+    surgeon: str | None,
+    suture: str | None,
+    recording: str | None = None,
+    active: bool | None = None,
 ) -> Sequence[Demonstration]:
-    """List demonstrations, the newest first."""
+    """List demonstrations, the newest first: all, or those of a surgeon, a suture type, a recording; active or not."""
     query = select(Demonstration).order_by(Demonstration.row.desc()).limit(limit)
     if before is not None:
         query = query.where(Demonstration.row < before)
@@ -189,6 +215,10 @@ def list_demos(
         query = query.where(Demonstration.surgeon_row == find_surgeon(session, surgeon).row)
     if suture is not None:
         query = query.where(Demonstration.suture == find_suture_type(session, suture).slug)
+    if recording is not None:
+        query = query.where(Demonstration.recording_row == find_recording(session, recording).row)
+    if active is not None:
+        query = query.where(Demonstration.withdrawn_at.is_(None) if active else Demonstration.withdrawn_at.is_not(None))
     return session.scalars(query).all()
 
 

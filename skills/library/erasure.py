@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from sqlalchemy import delete, select
 from sqlalchemy.orm import Session
 
+from skills.db.changes import announce
 from skills.db.models import (
     Demonstration,
     Erasure,
@@ -75,6 +76,7 @@ def _drop_jobs(session: Session, jobs: Sequence[Job], demos: Sequence[Demonstrat
 
 
 def _erase(session: Session, demos: Sequence[Demonstration]) -> None:
+    announce(session)
     rows = [demo.row for demo in demos]
     recordings = {demo.recording_row for demo in demos}
     policies = select(PolicyVersion.row).where(PolicyVersion.demonstration_row.in_(rows))

@@ -4,18 +4,20 @@ import secrets
 from collections.abc import Sequence
 from typing import Any
 
-from sqlalchemy import select, update
+from sqlalchemy import func, select, update
 from sqlalchemy.orm import Session
 
 from skills.db.base import now
 from skills.db.models import Job, Surgeon
-from skills.errors import Conflict, NotFound
+from skills.db.seen import EVERYBODYS
+from skills.errors import Conflict, NotFound, TooMany
 from skills.library.batches import BATCH, PART, cancel_parts
 from skills.library.events import record
 from skills.packing import canonical, sha256
 
 LIVE = ("queued", "running", "succeeded")
 ACTIVE = ("queued", "running")
+JOBS_WAIT_S = 10.0  # some trainings later
 
 
 def ask(session: Session, kind: str, request: dict[str, Any], surgeon: Surgeon | None, actor: str) -> tuple[Job, bool]:
@@ -24,7 +26,8 @@ def ask(session: Session, kind: str, request: dict[str, Any], surgeon: Surgeon |
     An equal request that is waiting, running or done gives the same job; a failed or cancelled one gives a new one.
     """
     identity = identity_of(kind, request)
-    known = session.scalar(select(Job).where(Job.identity == identity, Job.state.in_(LIVE)))
+    alike = select(Job).where(Job.identity == identity, Job.state.in_(LIVE))
+    known = session.scalar(alike.execution_options(**EVERYBODYS))
     if known is not None:
         return known, False
     job = Job(
@@ -39,6 +42,20 @@ def ask(session: Session, kind: str, request: dict[str, Any], surgeon: Surgeon |
     session.flush()
     record(session, actor, "ask", f"job-{kind}", job.id, surgeon)
     return job, True
+
+
+def refuse_too_many(session: Session, actor: str, most: int) -> None:
+    """Refuse more work for somebody who has so much waiting or running already; a batch counts as one.
+
+    Raises:
+        TooMany: They have.
+    """
+    mine = select(func.count()).where(Job.asked_by == actor, Job.state.in_(ACTIVE), Job.kind != PART)
+    waiting = session.scalar(mine.select_from(Job)) or 0
+    if waiting >= most:
+        raise TooMany(
+            f"You have {waiting} jobs waiting or running; wait for some of them, or cancel them.", JOBS_WAIT_S
+        )
 
 
 def identity_of(kind: str, request: dict[str, Any]) -> str:
@@ -60,13 +77,17 @@ def find_job(session: Session, job_id: str) -> Job:
     return job
 
 
-def list_jobs(session: Session, limit: int, before: int | None, state: str | None) -> Sequence[Job]:
-    """List jobs, the newest first."""
+def list_jobs(
+    session: Session, limit: int, before: int | None, state: str | None, kind: str | None = None
+) -> Sequence[Job]:
+    """List jobs, the newest first: all, or those in a state, or of a kind."""
     query = select(Job).where(Job.kind != PART).order_by(Job.row.desc()).limit(limit)
     if before is not None:
         query = query.where(Job.row < before)
     if state is not None:
         query = query.where(Job.state == state)
+    if kind is not None:
+        query = query.where(Job.kind == kind)
     return session.scalars(query).all()
 
 

@@ -1,7 +1,7 @@
 """Policies of a style: which is served, its history, what it does from a place, and its numbers for a client."""
 
 import io
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -64,8 +64,10 @@ def list_versions(
     return session.scalars(query.order_by(PolicyVersion.version.desc()).limit(limit)).all()
 
 
-def list_served(session: Session, limit: int, after: int | None) -> Sequence[Release]:
-    """List what is served, one release per style, in the order of release."""
+def list_served(
+    session: Session, limit: int, after: int | None, surgeon: str | None = None, suture: str | None = None
+) -> Sequence[Release]:
+    """List what is served, one release per style, in the order of release: all, or of a surgeon, or a suture type."""
     later = aliased(Release)
     superseded = exists().where(
         later.surgeon_row == Release.surgeon_row,
@@ -74,6 +76,10 @@ def list_served(session: Session, limit: int, after: int | None) -> Sequence[Rel
         later.withdrawn_at.is_(None),
     )
     query = select(Release).where(Release.row > (after or 0), Release.withdrawn_at.is_(None), ~superseded)
+    if surgeon is not None:
+        query = query.where(Release.surgeon_row == find_surgeon(session, surgeon).row)
+    if suture is not None:
+        query = query.where(Release.suture == find_suture_type(session, suture).slug)
     return session.scalars(query.order_by(Release.row).limit(limit)).all()
 
 
@@ -98,6 +104,12 @@ def find_by_digest(session: Session, policy_sha256: str) -> PolicyVersion:
     if policy is None:
         raise NotFound("There is no policy version of this digest.")
     return policy
+
+
+def missing(session: Session, policies: Collection[str]) -> set[str]:
+    """Tell which of some policy versions, by digest, are not there (any more)."""
+    found = session.scalars(select(PolicyVersion.sha256).where(PolicyVersion.sha256.in_(policies)))
+    return set(policies) - set(found)
 
 
 def choose(session: Session, surgeon: str, suture: str, version: int | None) -> PolicyVersion:

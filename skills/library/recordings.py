@@ -9,7 +9,8 @@ from typing import Any, BinaryIO
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from skills.db.models import RecordingChunk, StoredRecording
+from skills.db.models import RecordingChunk, RecordingUpload, StoredRecording
+from skills.db.seen import EVERYBODYS
 from skills.db.session import Database
 from skills.errors import BadInput, Conflict, Corrupt, NotFound, UnknownFormat, UnreadableRecording
 from skills.library.about import about_recording
@@ -88,16 +89,19 @@ def store_recording(
 
 
 def keep(session: Session, upload: Upload, recording: Recording, actor: str) -> tuple[StoredRecording, bool]:
-    """Write a recording and its bytes into the caller's transaction, once: (the row, whether it is new).
+    """Write a recording and its bytes into the caller's transaction, once: (the row, whether it is new to who sent it).
+
+    Bytes that somebody else has sent are told as new, so that nobody learns from a digest what others have.
 
     Raises:
         Conflict: The bytes are stored already, read in another way.
     """
-    stored = session.scalar(select(StoredRecording).where(StoredRecording.sha256 == upload.sha256))
+    same = select(StoredRecording).where(StoredRecording.sha256 == upload.sha256)
+    stored = session.scalar(same.execution_options(**EVERYBODYS))
     if stored is not None:
         if stored.reading != upload.reading:
             raise Conflict(f"These bytes are stored already, read with {stored.reading}; send the same.")
-        return stored, False
+        return stored, _brought_by(session, stored, actor)
     stored = StoredRecording(
         sha256=upload.sha256,
         size_bytes=upload.size_bytes,
@@ -115,8 +119,17 @@ def keep(session: Session, upload: Upload, recording: Recording, actor: str) -> 
         session.add(RecordingChunk(recording=stored.row, number=number, data=data))
         session.flush()
         number += 1
-    record(session, actor, "add", "recording", upload.sha256)
-    return stored, True
+    return stored, _brought_by(session, stored, actor)
+
+
+def _brought_by(session: Session, stored: StoredRecording, actor: str) -> bool:
+    """Write down that somebody brought a recording; whether that is new."""
+    if session.get(RecordingUpload, (stored.row, actor)) is not None:
+        return False
+    session.add(RecordingUpload(recording_row=stored.row, actor=actor))
+    record(session, actor, "add", "recording", stored.sha256)
+    session.flush()
+    return True
 
 
 def find_recording(session: Session, recording_sha256: str) -> StoredRecording:

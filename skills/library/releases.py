@@ -6,15 +6,26 @@ itself: what the newest one superseded is withdrawn with it, so that nothing is 
 
 from collections.abc import Sequence
 
-from sqlalchemy import select
+from sqlalchemy import String, bindparam, select, type_coerce
 from sqlalchemy.orm import Session
 
 from skills.db.base import now
+from skills.db.changes import announce
 from skills.db.models import Demonstration, PolicyVersion, Release, Surgeon
 from skills.errors import Conflict, NotFound
 from skills.library.events import record
 from skills.library.verified import learnt
 
+# Which release a style serves, in terms that no other ever has: the number of a row that was erased is used again.
+SERVED = (
+    select(Release.row, type_coerce(Release.released_at, String).label("released_at"), PolicyVersion.sha256)
+    .join(Surgeon, Surgeon.row == Release.surgeon_row)
+    .join(PolicyVersion, PolicyVersion.row == Release.policy_row)
+    .where(Surgeon.slug == bindparam("surgeon"), Release.suture == bindparam("suture"))
+    .where(Release.withdrawn_at.is_(None))
+    .order_by(Release.row.desc())
+    .limit(1)
+)
 DTW_SLACK_MM = 0.0  # ours: another learner may be released if its total DTW is no larger than the released one's
 
 
@@ -52,6 +63,7 @@ def release(session: Session, policy: PolicyVersion, actor: str) -> Release:
     session.add(released)
     record(session, actor, "release", "policy-version", policy.sha256, policy.surgeon)
     session.flush()
+    announce(session)
     return released
 
 
@@ -78,3 +90,4 @@ def _withdraw(session: Session, releases: Sequence[Release], actor: str) -> None
         one.withdrawn_at = now()
         record(session, actor, "withdraw", "policy-version", one.policy.sha256, one.policy.surgeon)
     session.flush()
+    announce(session)

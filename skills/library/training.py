@@ -1,44 +1,50 @@
 """Training a style: from its demonstration to a certified policy version, and to its release if that was asked."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from typing import Any, NamedTuple, cast
 
 from sqlalchemy import LargeBinary, Table, bindparam, func, insert, select, type_coerce
 from sqlalchemy.orm import Session
 
 from skills.db.models import Demonstration, Job, PolicyVersion, StoredRewardMap, Surgeon
-from skills.db.packed import digest, pack, unpack_as
+from skills.db.packed import seal, unpack_as
 from skills.db.session import Database
 from skills.errors import BadInput, BadSettings, Conflict, NotFound
 from skills.library import jobs, releases
 from skills.library.catalogue import check_consent, find_surgeon, find_suture_type
 from skills.library.demos import find_demo, newest_demo
 from skills.library.events import record
-from skills.library.verified import policy_identity
+from skills.library.verified import policy_identity_of
 from skills.packing import canonical, sha256
 from skills.settings import Settings
-from skills.style.certificate import Certificate, Coverage, certify
+from skills.style.certificate import Certificate, certify
 from skills.style.demo import Demo
-from skills.style.evaluation import discretisation_rmse, measure
+from skills.style.evaluation import Metrics, discretisation_rmse, measure
 from skills.style.kinematics import POINTING_DOWN, reachable
 from skills.style.learning.learners import LEARNER_VERSION, LEARNERS, Learner, refuse_too_large
-from skills.style.learning.q_learning import PhaseQLearning
+from skills.style.learning.q_learning import PhaseQLearning, Training
 from skills.style.plan import rotation_of
-from skills.style.policy import Policy, learn_policy, rollout_from
-from skills.style.reward import RewardMap
+from skills.style.policy import Policy, learn_policy
+from skills.style.reward import RewardLevels, RewardMap
 
 Store = Callable[[Session, str], dict[str, Any]]
 
 # Statements that every style goes through, built once: to build one takes as long as to run it.
 _VERSIONS, _DEMOS = (cast(Table, one.__table__) for one in (PolicyVersion, Demonstration))
-KNOWN = select(_VERSIONS.c.row, _VERSIONS.c.version).where(_VERSIONS.c.sha256 == bindparam("sha256"))
-STANDING = select(
-    _DEMOS.c.withdrawn_at,
-    select(func.max(_VERSIONS.c.version))
-    .where(_VERSIONS.c.surgeon_row == _DEMOS.c.surgeon_row, _VERSIONS.c.suture == _DEMOS.c.suture)
-    .scalar_subquery(),
-).where(_DEMOS.c.row == bindparam("demonstration"))
+_OF_STYLE = _VERSIONS.alias("of_style")
+STANDING = (
+    select(
+        _DEMOS.c.withdrawn_at,
+        select(func.max(_OF_STYLE.c.version))
+        .where(_OF_STYLE.c.surgeon_row == _DEMOS.c.surgeon_row, _OF_STYLE.c.suture == _DEMOS.c.suture)
+        .scalar_subquery(),
+        _VERSIONS.c.row,
+        _VERSIONS.c.version,
+    )
+    .select_from(_DEMOS.outerjoin(_VERSIONS, _VERSIONS.c.sha256 == bindparam("sha256")))
+    .where(_DEMOS.c.row == bindparam("demonstration"))
+)
 ADD = insert(_VERSIONS).returning(_VERSIONS.c.row, _VERSIONS.c.version)
 CERTIFICATE_NOTE = (
     "Checked on the grid: every greedy action against exact dynamic programming, and every start by following it; "
@@ -187,14 +193,16 @@ def learn_style(lesson: Lesson, request: dict[str, Any]) -> Learnt:
     demo, reward = unpack_as(Demo, lesson.demo), unpack_as(RewardMap, lesson.reward)
     policy = learn_policy(reward, learner_of(request["learner"]), request["seed"])
     certificate, covered = certify(policy)
-    manifest = describe_policy(policy, certificate, covered, demo, request, refusals(policy, certificate, demo))
+    numbers, coverage = seal(policy), seal(covered)
+    refused_because = refusals(policy, certificate, demo)
+    manifest = describe_policy(policy, certificate, coverage.digest, demo, request, refused_because)
     return Learnt(
         lesson=lesson,
         training=sha256(canonical(request)),
-        sha256=policy_identity(manifest, policy),
+        sha256=policy_identity_of(manifest, numbers.digest),
         manifest=manifest,
-        policy=pack(policy),
-        coverage=pack(covered),
+        policy=numbers.packed,
+        coverage=coverage.packed,
     )
 
 
@@ -206,13 +214,12 @@ def store_style(session: Session, learnt: Learnt) -> Stored:
         Conflict: It was withdrawn meanwhile.
     """
     lesson = learnt.lesson
-    known = session.execute(KNOWN, {"sha256": learnt.sha256}).first()
-    if known is not None:
-        return Stored(*known)
-    found = session.execute(STANDING, {"demonstration": lesson.row}).first()
+    found = session.execute(STANDING, {"demonstration": lesson.row, "sha256": learnt.sha256}).first()
     if found is None:
         raise NotFound("The demonstration was erased while it was being learnt.")
-    withdrawn_at, last = found
+    withdrawn_at, last, *known = found
+    if known[0] is not None:
+        return Stored(*known)
     if withdrawn_at is not None:
         raise Conflict("The demonstration was withdrawn while it was being learnt.")
     values = {
@@ -246,8 +253,7 @@ def refusals(policy: Policy, certificate: Certificate, demo: Demo) -> list[str]:
         reasons.append(f"the frame '{demo.frame}' is not the arm's base, so its joint limits cannot be checked")
     else:
         rotation = rotation_of(demo.rotation_xyzw)
-        rotations = [POINTING_DOWN if rotation is None else rotation] * len(policy.path.states)
-        within = reachable(policy.path.tip_mm, rotations, demo.instrument)
+        within = reachable(policy.path.tip_mm, POINTING_DOWN if rotation is None else rotation, demo.instrument)
         if not within.all():
             out = int((~within).sum())
             reasons.append(f"{out} of {len(within)} places of the demonstrated pass are outside the joint limits")
@@ -257,7 +263,7 @@ def refusals(policy: Policy, certificate: Certificate, demo: Demo) -> list[str]:
 def describe_policy(
     policy: Policy,
     certificate: Certificate,
-    covered: Coverage,
+    coverage_sha256: str,
     demo: Demo,
     request: dict[str, Any],
     refused_because: list[str],
@@ -265,7 +271,7 @@ def describe_policy(
     """Write what a client is told of a policy (interface.md), but for its version, digest, release and arrays."""
     path, grid = policy.path, policy.path.grid
     lost_mm = discretisation_rmse(demo.tip_mm, grid, path.hysteresis)
-    metrics = asdict(measure(rollout_from(policy, path.start), lost_mm))
+    metrics = measure(policy.replay, lost_mm)
     return {
         "surgeon": request["surgeon"],
         "suture": request["suture"],
@@ -279,17 +285,17 @@ def describe_policy(
         "phases": policy.domain.phases,
         "learner": policy.learner.kind,
         "learner_version": request["learner_version"],
-        "settings": asdict(policy.learner),
-        "reward_levels": asdict(policy.levels),
+        "settings": _said(policy.learner),
+        "reward_levels": _said(policy.levels),
         "seed": policy.seed,
         "demos": request["demos"],
-        "training": asdict(policy.training),
-        "metrics": _lists(metrics),
+        "training": _said(policy.training),
+        "metrics": _said(metrics),
         "coverage": {
             "starts_reaching_goal": certificate.starts_reaching,
             "starts_joining_nearest": certificate.starts_joining_nearest,
             "n_states": certificate.starts,
-            "sha256": digest(covered),
+            "sha256": coverage_sha256,
         },
         "grid_certificate": {
             "states_checked": certificate.checked,
@@ -308,6 +314,7 @@ def describe_grid(policy: Policy) -> dict[str, Any]:
     return {"origin_mm": list(grid.origin_mm), "cell_mm": grid.cell_mm, "shape": list(grid.shape)}
 
 
-def _lists(of: dict[str, Any]) -> dict[str, Any]:
-    """Write tuples as lists, as they come back from the database."""
-    return {name: list(value) if isinstance(value, tuple) else value for name, value in of.items()}
+def _said(of: Learner | RewardLevels | Training | Metrics) -> dict[str, Any]:
+    """Write numbers by their names, tuples as lists, as they come back from the database."""
+    named = ((field.name, getattr(of, field.name)) for field in fields(of))
+    return {name: list(value) if isinstance(value, tuple) else value for name, value in named}

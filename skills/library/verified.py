@@ -4,6 +4,7 @@ A column is guarded by its own checksum (`skills.db.packed`); this guards what b
 said of it, a plan and the policy that it follows. What does not agree is refused; nothing takes its place.
 """
 
+from collections.abc import Iterable
 from dataclasses import asdict
 from typing import Any
 
@@ -36,6 +37,16 @@ def learnt(version: PolicyVersion) -> Policy:
     return policy
 
 
+def remembered() -> list[str]:
+    """List the policies that are still in memory, by digest."""
+    return [policy for policy, _ in _policies.items()]
+
+
+def forget(policies: Iterable[str]) -> None:
+    """Keep nothing of these policies in memory: they were erased."""
+    _policies.forget(policies)
+
+
 def covered(version: PolicyVersion) -> Coverage:
     """Read the coverage of a policy that was verified.
 
@@ -61,6 +72,11 @@ def planned(plan: Plan) -> SuturePlan:
 
 def demo_identity(recording_sha256: str, surgeon: str, suture: str, demo: Demo, path: GridPath) -> str:
     """Compute a demonstration's digest: over its recording, its style, the part of it and the grid."""
+    return sha256(canonical(what_identifies(recording_sha256, surgeon, suture, demo, path)))
+
+
+def what_identifies(recording_sha256: str, surgeon: str, suture: str, demo: Demo, path: GridPath) -> dict[str, Any]:
+    """Write what a demonstration's digest is taken of."""
     identity: dict[str, Any] = {
         "recording": recording_sha256,
         "surgeon": surgeon,
@@ -74,12 +90,17 @@ def demo_identity(recording_sha256: str, surgeon: str, suture: str, demo: Demo, 
         identity["left_out"] = [asdict(pause) for pause in demo.pauses]
     if path.hysteresis:  # else left out, so that a demonstration is still known by the digest it always had
         identity["hysteresis"] = path.hysteresis
-    return sha256(canonical(identity))
+    return identity
 
 
 def policy_identity(manifest: dict[str, Any], policy: Policy) -> str:
     """Compute a policy version's digest: over its identity, its numbers and all that a client is told of it."""
-    return sha256(canonical([manifest, digest(policy)]))
+    return policy_identity_of(manifest, digest(policy))
+
+
+def policy_identity_of(manifest: dict[str, Any], numbers: str) -> str:
+    """Compute a policy version's digest from that of its numbers, see `policy_identity`."""
+    return sha256(canonical([manifest, numbers]))
 
 
 def plan_identity(policy_sha256: str, plan: SuturePlan) -> str:

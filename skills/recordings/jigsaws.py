@@ -18,7 +18,7 @@ import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, Literal
 
 import numpy as np
 
@@ -31,7 +31,8 @@ RATE_HZ = 30.0
 FRAME = "jigsaws"
 ROWS = 1_000_000  # nine hours; the longest trial has 9,000
 ORTHONORMAL = 5e-3  # ours: the masters' matrices were measured to be off by 1e-3, which is how they were recorded
-SKILLS = {"N": "novice", "I": "intermediate", "E": "expert"}
+Skill = Literal["novice", "intermediate", "expert"]
+SKILLS: dict[str, Skill] = {"N": "novice", "I": "intermediate", "E": "expert"}
 SCORES = (
     "respect for tissue",
     "suture and needle handling",
@@ -58,7 +59,7 @@ class Rated:
     """
 
     trial: str
-    skill: str
+    skill: Skill
     score: int
     parts: tuple[int, ...]
 

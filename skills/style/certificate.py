@@ -13,7 +13,7 @@ from skills.style._arrays import Floats, frozen
 from skills.style.domain import FINISHED
 from skills.style.exact import Mdp, action_values, exact_q, exact_values
 from skills.style.learning import _kernels
-from skills.style.policy import Policy, rollout_from
+from skills.style.policy import Policy
 from skills.style.reward import sparse_reward
 
 TIE = 1e-9  # relative; two actions closer than this are equally good (a Q value carries about 1e-15 of rounding)
@@ -70,7 +70,7 @@ def certify(policy: Policy) -> tuple[Certificate, Coverage]:
         starts=len(covered.reaches),
         starts_reaching=int(covered.reaches.sum()),
         starts_joining_nearest=int(covered.joins_nearest.sum()),
-        demonstration_reproduced=np.array_equal(rollout_from(policy, policy.path.start).states, policy.path.states),
+        demonstration_reproduced=np.array_equal(policy.replay.states, policy.path.states),
     )
     return certificate, covered
 

@@ -61,6 +61,11 @@ class Policy:
         """Where the greedy action of each row leads, (rows,); of no meaning where there is none."""
         return self.domain.move(np.arange(self.domain.n_rows), self.greedy.astype(np.int64).clip(0))
 
+    @cached_property
+    def replay(self) -> "Rollout":
+        """The rollout from the demonstrated start: the demonstration, if it was learnt."""
+        return rollout_from(self, self.path.start)
+
     def table(self) -> Bytes:
         """Spread the greedy actions over all phases and states, (phases, n_states), for a client."""
         domain = self.domain

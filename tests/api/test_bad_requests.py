@@ -39,12 +39,15 @@ SOUND: dict[tuple[str, str], Any] = {
         },
     },
     ("POST", "/playbacks"): {"plan": "0" * 64},
+    ("POST", "/keys"): {
+        "owner": "somebody", "role": "reader", "expires_at": "2999-01-01T00:00:00Z", "surgeons": ["kestrel"],
+    },
 }  # fmt: skip
 TOKENS = (
     "NaN", "Infinity", "-Infinity", "1e400", "9" * 400, "-" + "9" * 400, '"\\ud800"', '"\\u0000"', '"a\\u0000b"', "{}",
     '{"a": 1}', '[["b"]]', f'"{CANARY}"', '"' + "x" * 5000 + '"', "1.5e308", '"; DROP TABLE jobs; --"',
 )  # fmt: skip
-FREE_TEXT = {"name", "family", "description", "also_called", "protocol", "source"}
+FREE_TEXT = {"owner", "name", "family", "description", "also_called", "protocol", "source"}
 NUMBERS_ONLY = ("true", '"1"')  # where a number belongs
 WHOLE_ONLY = ("1.5", "true", '"1"', "1e400", "-1")
 BODIES = (
@@ -160,6 +163,107 @@ def test_no_path_is_ours_to_blame(still: Service, untouched: None, segment: str)
             fine = (200, 404) if method == "GET" and segment == "%2f" else ()  # a list, by its path with a slash
             assert answer.status_code in (*fine, 404, 405, 414, 415, 422), (method, path, answer.status_code)
             assert answer.headers["x-request-id"]
+
+
+LIMITS = ("-1", "0", "201", "1e2", "1.5", "NaN", "", " ", "0x10", "9" * 400, "1;2", "null", "\u0661\u0660", "%00")
+CURSORS = (
+    "-1",
+    "0",
+    "9" * 30,
+    "NaN",
+    "",
+    "..",
+    "a" * 65,
+    "KESTREL",
+    "' OR 1=1 --",
+    "\x00",
+    "\r\nX: 1",
+    "\ud83d",
+    "null",
+)
+HEADERS = (
+    {"Accept": ""}, {"Accept": ","}, {"Accept": "q=1;;;"}, {"Accept": "*/*;q=NaN"}, {"Accept": "x" * 5000},
+    {"If-None-Match": ""}, {"If-None-Match": ","}, {"If-None-Match": '"' + "x" * 5000}, {"If-None-Match": 'W/"'},
+    {"If-Match": '"'}, {"If-Match": "x" * 5000}, {"Range": "bytes=-1"}, {"Range": "bytes=5-1,7-"},
+    {"Expect": "nothing"}, {"Accept-Encoding": "zstd;q=9"}, {"Accept-Language": "x" * 5000},
+    {"X-Request-ID": "x" * 5000}, {"Content-Digest": "sha-256=:====:"}, {"Content-Encoding": "gzip"},
+    {"Cookie": "a=" + "b" * 5000},
+    {"X-Forwarded-For": "' OR 1=1"}, {"X-HTTP-Method-Override": "DELETE"}, {"Origin": "null"},
+)  # fmt: skip
+NOT_JSON = (
+    "text/plain", "application/xml", "multipart/form-data", "multipart/form-data; boundary=x", "text/csv", "",
+    "application/x-www-form-urlencoded", "application/json; charset=nothing", "application/jsonx", "json", "x" * 5000,
+)  # fmt: skip
+
+
+def lists(service: Service) -> list[str]:
+    """Name the lists, by what their document says of them."""
+    found = (path for method, path, call in routes(service) if method == "GET" and "Link" in str(call["responses"]))
+    return [filled(path) for path in found]
+
+
+def test_no_limit_and_no_cursor_is_ours_to_blame(still: Service, untouched: None):
+    assert len(lists(still)) == 8
+    for path in lists(still):
+        for name, values in (("limit", LIMITS), ("cursor", CURSORS)):
+            for value in values:
+                answer = still.http.get(path, params={name: value.encode("utf-8", "surrogatepass")})
+                taken = answer.status_code == 200 and (name == "cursor" or value == "\u0661\u0660")  # int() reads it
+                if not taken:
+                    assert_problem(answer, range(400, 500))
+                assert "OR 1=1" not in answer.text
+
+
+def test_the_cursor_of_one_list_is_refused_by_another_or_is_a_place_in_it(still: Service):
+    given = {str(still.http.get(path, params={"limit": 1}).json().get("next")) for path in lists(still)} - {"None"}
+    assert len(given) > 1
+    for path in lists(still):
+        for cursor in given:
+            answer = still.http.get(path, params={"cursor": cursor})
+            if answer.status_code != 200:
+                assert_problem(answer, range(400, 500))
+
+
+def test_a_parameter_that_there_is_not_or_that_comes_twice_harms_nobody(still: Service, untouched: None):
+    for method, path, _ in routes(still):
+        for query in (
+            "?limit=1&limit=200&limit=-1",
+            "?" + "a=b&" * 1000,
+            "?=&&;=",
+            "?%00=%00",
+            "?limit[]=1",
+            "?" + "x" * 50_000,
+        ):
+            if method == "GET":
+                answer = still.http.get(filled(path) + query)
+                assert answer.status_code < 500 or path == "/readyz", (path, query[:20], answer.text)
+                if answer.status_code >= 400:
+                    assert_problem(answer, range(400, 504))
+
+
+@pytest.mark.parametrize("header", HEADERS, ids=lambda header: str(header)[:30])
+def test_no_header_is_ours_to_blame(still: Service, untouched: None, header: dict[str, str]):
+    for method, path, _ in routes(still):
+        if method == "DELETE":
+            continue  # a header that means nothing keeps nobody from it
+        answer = still.http.request(method, filled(path), headers=header, json=None if method == "GET" else [])
+        assert answer.status_code < 500 or path == "/readyz", (method, path, answer.text)
+        if answer.status_code >= 400:
+            assert_problem(answer, range(400, 504))
+
+
+@pytest.mark.parametrize("route", SOUND, ids=" ".join)
+def test_json_under_another_name_or_with_a_name_twice_is_refused(
+    still: Service, untouched: None, route: tuple[str, str]
+):
+    for kind in NOT_JSON:
+        body = json.dumps(SOUND[route] | {CANARY: 1}).encode()
+        answer = still.http.request(route[0], filled(route[1]), content=body, headers={"Content-Type": kind})
+        assert_problem(answer, range(400, 500))
+        assert CANARY not in answer.text
+    twice = body[:-1] + b', "' + CANARY.encode() + b'": 2}'
+    problem = assert_problem(still.http.request(route[0], filled(route[1]), content=twice, headers=JSON), 422)
+    assert problem["errors"][0]["why"] == "A name comes twice in an object."
 
 
 def test_every_answer_has_a_request_id_of_its_own_and_forbids_guessing(still: Service):

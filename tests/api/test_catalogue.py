@@ -87,7 +87,7 @@ def test_an_erased_surgeon_is_gone_for_good(service: Service):
     ):
         assert_problem(answer, 410, "erased")
     assert service.counts()["recordings"] == 0
-    assert "kestrel" not in str(service.client._all("/surgeons"))
+    assert "kestrel" not in str(service.client.surgeons())
     assert service.http.put("/surgeons/kestrel-2", json={}).status_code == 201
 
 

@@ -66,8 +66,8 @@ def beat(settings: Settings, **late: float) -> None:
 
 def test_with_a_database_a_queue_and_a_worker_it_is_ready(house: House):
     assert refuse_unready(house.settings) == 1
-    service = Service(house.settings.database_url)
-    assert service.http.get("/readyz").json() == {"status": "ready", "workers": 1}
+    with serving(house.settings.database_url) as service:
+        assert service.http.get("/readyz").json() == {"status": "ready", "workers": 1}
     with pytest.raises(NotReady, match="another state of this database"):
         refuse_left_over(house.settings)
 

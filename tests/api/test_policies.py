@@ -281,7 +281,7 @@ def test_a_place_outside_the_grid_is_refused(still: Service):
 def test_the_service_serves_on_postgresql_too(tmp_path):
     url = backends.fresh("postgresql", tmp_path)
     with serving(url) as service:
-        service.client.put_surgeon("kestrel", consent={"uses": ["training"]})
+        service.client.put_surgeon("kestrel", consent={"uses": ["training", "export"]})
         demo = service.client.add_demo(cases.hand_off(), media_type=CSV, **KESTREL)
         assert service.train(release=True)["result"]["released"]
         assert service.client.rollout(**KESTREL, start_mm=STARTS_MM[0])["dtw_total_mm"] == 0

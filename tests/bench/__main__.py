@@ -12,6 +12,7 @@ from tests.bench.learning import learning
 from tests.bench.playing import playing
 from tests.bench.reading import reading
 from tests.bench.scaling import scaling
+from tests.bench.serving import serving
 
 PARTS = {
     "reading": reading,
@@ -21,6 +22,7 @@ PARTS = {
     "doubt": doubting,
     "batches": batches,
     "scaling": scaling,
+    "serving": serving,
 }
 
 

@@ -1,4 +1,8 @@
-"""How fast a batch is trained, beside the same learning in a bare process pool, in turn, on the same cores."""
+"""How fast a batch is trained, beside the same learning in a bare process pool, in turn, on the same cores.
+
+Besides the time that passes, what the processes that learn take of the processor: on a machine that others use too,
+only that can be compared.
+"""
 
 import os
 import shutil
@@ -6,13 +10,14 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from itertools import count, islice
-from multiprocessing import get_context
+from multiprocessing import active_children, get_context
 from pathlib import Path
 from statistics import median
+from typing import NamedTuple
 
 import numpy as np
 from rich.table import Table
@@ -41,6 +46,13 @@ FIRST = "warm-up"  # a surgeon whose style is trained before any clock runs
 MOST_S = 600.0
 
 
+class Took(NamedTuple):
+    """What some work took, in s: by the clock, and of the processor by those that learn."""
+
+    clock_s: float
+    processor_s: float
+
+
 def batches(table: Table, styles: int = STYLES, rounds: int = ROUNDS) -> None:
     """Train all styles of many synthetic surgeons with 1, 2 and 4 workers, beside a bare pool of as many processes."""
     with tempfile.TemporaryDirectory(prefix="skills-batches-") as folder:
@@ -48,20 +60,38 @@ def batches(table: Table, styles: int = STYLES, rounds: int = ROUNDS) -> None:
         rewards = fill(full, styles)
         for workers in WORKERS:
             took = [
-                (pool_s(rewards, workers, kernel), pool_s(rewards, workers, returned), ours_s(full, workers, styles))
+                (pool(rewards, workers, kernel), pool(rewards, workers, returned), ours(full, workers, styles))
                 for _ in range(rounds)
             ]
-            bare_s, _, all_s = (median(times) for times in zip(*took, strict=True))
+            dropping, handing, whole = zip(*took, strict=True)
             name = f"{styles} styles, {workers} worker{'s' if workers > 1 else ''}"
-            table.add_row(name, f"{all_s:.1f} s", f"{styles / all_s:.0f} styles/s")
-            for index, what in enumerate(("a bare pool that drops its results", "  that hands them to its parent")):
-                shares = ", ".join(f"{times[index] / times[2]:.2f}" for times in took)
-                table.add_row(f"  {what}", f"{median(t[index] for t in took):.1f} s", f"ours has {shares} of its rate")
-            cores = min(workers, os.cpu_count() or 1)
-            above_ms = (all_s - bare_s) * cores / styles * 1e3
-            table.add_row("  a style, above its learning", f"{above_ms:.1f} ms", "of a core")
-        empty_s = ours_s(full, 2, styles, consent=False)
-        table.add_row("  the engine and our books alone", f"{empty_s / styles * 1e3:.1f} ms", "a style, two workers")
+            table.add_row(name, *said(whole, styles))
+            for what, pooled in (("drops its results", dropping), ("hands them to its parent", handing)):
+                table.add_row(f"  a bare pool that {what}", *said(pooled, styles))
+                for by, index in (("the clock", 0), ("the processor", 1)):
+                    part = (
+                        f"{bare[index] / all_of_it[index]:.2f}" for bare, all_of_it in zip(pooled, whole, strict=True)
+                    )
+                    table.add_row("", f"by {by}", f"ours has {', '.join(part)} of its rate")
+        table.add_row("  the engine and our books alone", *said([ours(full, 2, styles, consent=False)], styles))
+
+
+def said(took: Sequence[Took], styles: int) -> tuple[str, str]:
+    """Say how long some rounds took, and what a style did."""
+    clock_s, processor_s = (median(times) for times in zip(*took, strict=True))
+    each_ms = f"{processor_s / styles * 1e3:.1f} ms of the processor each"
+    return f"{clock_s:.1f} s", f"{styles / clock_s:.0f} styles/s, {each_ms}"
+
+
+def used_s(processes: Iterable[int]) -> float:
+    """Sum what living processes have taken of the processor so far, all their threads and for all they asked of the
+    system.
+    """
+    ticks = 0
+    for process in processes:
+        fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+        ticks += int(fields[11]) + int(fields[12])  # utime and stime, see proc(5)
+    return ticks / os.sysconf("SC_CLK_TCK")
 
 
 def fill(file: Path, styles: int) -> list[RewardMap]:
@@ -106,14 +136,15 @@ def fits(tip_mm: np.ndarray) -> bool:
 # ---- a bare pool
 
 
-def pool_s(rewards: list[RewardMap], workers: int, work: Callable[[RewardMap], object]) -> float:
+def pool(rewards: list[RewardMap], workers: int, work: Callable[[RewardMap], object]) -> Took:
     """Time the learning and the certificate of every style and nothing else, in so many processes that are warm."""
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
         list(pool.map(kernel, rewards[:1] * workers * 4))
-        began_s = time.monotonic()
+        processes = [child.pid for child in active_children()]
+        began_s, before_s = time.monotonic(), used_s(processes)
         for _ in pool.map(work, rewards, chunksize=5):
             pass
-        return time.monotonic() - began_s
+        return Took(time.monotonic() - began_s, used_s(processes) - before_s)
 
 
 def kernel(reward: RewardMap) -> None:
@@ -128,23 +159,25 @@ def returned(reward: RewardMap) -> tuple[np.ndarray, Certificate, Coverage]:
 # ---- ours
 
 
-def ours_s(full: Path, workers: int, styles: int, *, consent: bool = True) -> float:
+def ours(full: Path, workers: int, styles: int, *, consent: bool = True) -> Took:
     """Time a batch in a fresh copy of the database, from its request to its end; without consent nothing is learnt."""
     with tempfile.TemporaryDirectory(prefix="skills-batch-", dir=full.parent) as folder:
         file = Path(folder) / "skills.sqlite"
         shutil.copy(full, file)
         settings = Settings(database_url=f"sqlite:///{file}")
         database = Database(settings.database_url)
-        with working(settings, workers, database):
+        with working(settings, workers, database) as processes:
             for number in range(2 * workers):  # everybody has learnt something
                 ended(database, asked(database, surgeon=FIRST, learner=PhaseQLearning(gamma=0.1 - number / 1000)))
             if not consent:
                 with database.writing() as session:
                     session.execute(update(Surgeon).values(consent={"uses": [], "until": None}))
+            before_s = used_s(processes)
             job = ended(database, asked(database))
+            took = Took((job.ended_at - job.created_at).total_seconds(), used_s(processes) - before_s)
         database.close()
         assert job.result["done" if consent else "failed"] == styles + 1, (job.state, job.error)
-        return (job.ended_at - job.created_at).total_seconds()
+        return took
 
 
 def asked(database: Database, **what: object) -> int:
@@ -164,7 +197,7 @@ def ended(database: Database, row: int) -> Job:
 
 
 @contextmanager
-def working(settings: Settings, workers: int, database: Database) -> Iterator[None]:
+def working(settings: Settings, workers: int, database: Database) -> Iterator[list[int]]:
     command = [sys.executable, "-m", "skills", "worker"]
     how = environment(settings)
     started = [subprocess.Popen(command, env=how, stderr=subprocess.DEVNULL) for _ in range(workers)]
@@ -173,8 +206,9 @@ def working(settings: Settings, workers: int, database: Database) -> Iterator[No
             with database.reading() as session:
                 if session.scalar(select(func.count()).select_from(Executor)) == workers:
                     break
+            assert all(worker.poll() is None for worker in started), "a worker has ended"
             time.sleep(0.05)
-        yield
+        yield [worker.pid for worker in started]
     finally:
         for worker in started:
             worker.terminate()

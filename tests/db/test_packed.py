@@ -5,6 +5,7 @@ import io
 import json
 from collections.abc import Iterator
 from dataclasses import fields, is_dataclass, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as some
 
 from skills.db import npz, packed  # the tables declare what may be stored
-from skills.db.packed import FORMAT, Packed, digest, pack, unpack
+from skills.db.packed import FORMAT, Packed, digest, pack, seal, unpack
 from skills.errors import Corrupt
 from skills.recordings import read_recording
 from skills.style.certificate import certify
@@ -35,6 +36,8 @@ PATH = discretize(DEMO.tip_mm, PAPER_GRID)
 REWARD = sparse_reward(PATH)
 POLICY = learn_policy(REWARD, CellQLearning(episodes=10), seed=3)
 PHASED = learn_policy(REWARD, PhaseQLearning(), seed=0)
+SIGNED = replace(PHASED, q=np.where(PHASED.q == 0, -0.0, PHASED.q))
+VARIED = replace(PHASED, q=np.random.default_rng(0).random(PHASED.q.shape))  # more numbers than a palette has room for
 PLAN = stack(
     PHASED,
     [SuturePoint((5.0, 55.0, -125.0)), SuturePoint((8.0, 55.0, -125.0), (0.0, 0.0, 0.1, 0.99498743710662))],
@@ -71,6 +74,8 @@ VALUES = [
     REWARD,
     POLICY,
     PHASED,
+    SIGNED,
+    VARIED,
     ValueIteration(),
     MaxEntIRL(),
     replace(PLAN, psm_m=None),
@@ -145,6 +150,65 @@ def test_arrays_come_back_read_only():
 @given(ARRAYS)
 def test_every_array_comes_back_as_it_was(array: np.ndarray):
     assert_same(unpack(pack((array,))), (array,))
+
+
+@pytest.mark.parametrize("value", VALUES, ids=lambda value: type(value).__name__)
+def test_a_sealed_value_is_the_packed_one_with_its_digest(value: object):
+    assert seal(value) == (pack(value), digest(value))
+
+
+def parts_of(value: object) -> tuple[Any, dict[str, np.ndarray]]:
+    """Take a packed value apart: its tree and its arrays."""
+    arrays = npz.load(pack(value)[40:])
+    return json.loads(arrays.pop("tree").tobytes()), arrays
+
+
+def test_the_q_values_of_a_policy_are_stored_as_their_palette_where_it_has_room():
+    tree, arrays = parts_of(PHASED)
+    at = tree["of"]["q"]["palette"]
+    assert (arrays[f"a{at + 1}"].dtype, arrays[f"a{at + 1}"].shape) == (np.uint8, PHASED.q.shape)
+    assert len(arrays[f"a{at}"]) == len(np.unique(PHASED.q)) < 256
+    assert "array" in parts_of(VARIED)[0]["of"]["q"]
+    assert digest(SIGNED) != digest(PHASED)
+
+
+def test_a_policy_is_the_same_whether_its_q_values_came_as_a_palette_or_in_full():
+    tree, arrays = parts_of(PHASED)
+    at = tree["of"]["q"]["palette"]
+    tree["of"]["q"] = {"array": at}
+    full = unpack(forged(tree, **{**arrays, f"a{at}": PHASED.q}))
+    assert_same(full, PHASED)
+    assert digest(full) == digest(PHASED)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        lambda colours, places: (colours[:-1], places),
+        lambda colours, places: (colours, places.astype(np.int16) - 300),
+        lambda colours, places: (colours, places[:-1]),
+        lambda colours, places: (colours, places.ravel()),
+        lambda colours, places: (colours.astype(np.float32), places),
+        lambda colours, places: (np.append(colours[:-1], np.nan), places),
+        lambda colours, places: (colours[:, None], places),
+        lambda colours, places: (places, colours),
+    ],
+    ids=["a number short", "other bytes", "a row short", "flat", "single", "NaN", "column", "turned round"],
+)
+def test_a_palette_that_is_none_is_refused_though_its_checksum_agrees(wrong):
+    tree, arrays = parts_of(PHASED)
+    at = tree["of"]["q"]["palette"]
+    arrays[f"a{at}"], arrays[f"a{at + 1}"] = wrong(arrays[f"a{at}"], arrays[f"a{at + 1}"])
+    with pytest.raises(Corrupt):
+        unpack(forged(tree, **arrays))
+
+
+@pytest.mark.parametrize("at", [99, -1, "0", None])
+def test_a_palette_that_is_not_there_is_refused(at: object):
+    tree, arrays = parts_of(PHASED)
+    tree["of"]["q"] = {"palette": at}
+    with pytest.raises(Corrupt):
+        unpack(forged(tree, **arrays))
 
 
 @given(ARRAYS)

@@ -10,6 +10,7 @@ from sqlalchemy import event, text
 from sqlalchemy.orm import Session
 
 from skills.db.session import Database
+from skills.jobs.lease import Leases
 from skills.jobs.watch import Watch
 from skills.library import batches, catalogue, demos, jobs, policies, retraining, training
 from skills.library.condition import condition_of
@@ -83,7 +84,7 @@ def test_what_is_asked_often_is_answered_by_an_index(filled: Database, what: str
 
 def test_what_a_watch_looks_at_is_found_by_its_state(filled: Database):
     with noted(filled) as asked:
-        assert len(Watch(filled, None, "test", None, None)._live()) == hospital.WAITING
+        assert len(Watch(filled, None, "test", Leases(2.0), None)._live()) == hospital.WAITING
     with filled.reading() as session:
         for statement, values in asked:
             assert wasteful(session, statement, values, sorts=True) == []

@@ -4,6 +4,7 @@ import sqlite3
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -156,3 +157,17 @@ def test_the_folder_of_a_new_database_is_made(tmp_path: Path):
     database.migrate()
     database.close()
     assert (tmp_path / "a" / "b" / "skills.sqlite").is_file()
+
+
+def test_more_at_once_than_there_are_connections_wait_and_are_told_that_it_is_busy(database: Database):
+    crowded = Database(database.url, patience_ms=200)
+    try:
+        with ExitStack() as at_once:
+            for _ in range(sessions.AT_ONCE):
+                at_once.enter_context(crowded.reading()).execute(text("SELECT 1"))
+            with pytest.raises(Busy, match="too much to do"), crowded.reading() as session:
+                session.execute(text("SELECT 1"))
+        with crowded.reading() as session:
+            assert session.scalar(text("SELECT 1")) == 1
+    finally:
+        crowded.close()

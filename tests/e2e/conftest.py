@@ -35,8 +35,11 @@ class Service:
         }
         self.process: subprocess.Popen[bytes] | None = None
 
-    def start(self) -> None:
+    def launch(self) -> None:
         self.process = subprocess.Popen([sys.executable, "-m", "skills", "serve"], env=self.environment)
+
+    def start(self) -> None:
+        self.launch()
         with Client(self.url) as client:
             wait_until_ready(client, self.process)
 
@@ -66,8 +69,8 @@ class Service:
 @contextmanager
 def running(folder: Path, **settings: object) -> Iterator[Service]:
     service = Service(folder, **settings)
-    service.start()
     try:
+        service.start()  # in here, so that one that does not get ready in time is stopped too
         yield service
     finally:
         if service.process is not None and service.process.poll() is None:

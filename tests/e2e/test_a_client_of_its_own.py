@@ -46,12 +46,12 @@ def test_a_client_that_knows_only_the_interface_goes_where_the_library_goes_from
     client.put_surgeon(sample.surgeon)
     client.add_demo(sample.data, surgeon=sample.surgeon, suture=sample.suture)
     client.wait(client.train(sample.surgeon, sample.suture, release=True))
-    policy = client.policy(sample.surgeon, sample.suture)
+    policy = client.get_json(f"/policies/{sample.surgeon}/{sample.suture}")
     origin, cell = np.array(policy["grid"]["origin_mm"]), policy["grid"]["cell_mm"]
     assert len(policy["waypoints"]) > len(set(policy["waypoints"]))
     for state, ijk in enumerate(product(*map(range, policy["grid"]["shape"]))):
         states, finished = rolled_out(policy, state)
         answer = client.rollout(sample.surgeon, sample.suture, (origin + cell * np.array(ijk)).tolist())
-        assert (answer["states"], answer["finished"]) == (states, finished), state
+        assert (answer.states, answer.finished) == (states, finished), state
         assert finished
     assert rolled_out(policy, policy["waypoints"][0]) == (policy["waypoints"], True)

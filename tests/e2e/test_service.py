@@ -25,34 +25,32 @@ def test_what_was_acknowledged_survives_a_kill_and_the_training_goes_on(tmp_path
         demo = client.add_demo(sample.data, surgeon=sample.surgeon, suture=sample.suture)
         job = client.train(*style, learner=SLOW_LEARNER)
         deadline = time.monotonic() + 30
-        while client.job(job["id"])["state"] == "queued" and time.monotonic() < deadline:
+        while client.job(job.id).state == "queued" and time.monotonic() < deadline:
             time.sleep(0.02)
-        assert client.job(job["id"])["state"] == "running"
+        assert client.job(job.id).state == "running"
         service.kill()
         service.start()
-        assert client.demo(demo["id"])["state"] == "active"
-        assert client.demo_recording(demo["id"]) == sample.data
-        done = client.wait(client.job(job["id"]), timeout_s=60)
-        assert done["state"] == "succeeded"
-        assert [v["version"] for v in client.versions(*style)] == [1]
-        assert client.train(*style, learner=SLOW_LEARNER)["id"] == job["id"]
+        assert client.demo(demo.id).state == "active"
+        assert client.demo_recording(demo.id) == sample.data
+        done = client.wait(client.job(job.id), timeout_s=60)
+        assert done.state == "succeeded"
+        assert [v.version for v in client.versions(*style)] == [1]
+        assert client.train(*style, learner=SLOW_LEARNER).id == job.id
 
 
 def test_the_recording_comes_back_exactly_and_two_segments_are_two_demonstrations(client: Client) -> None:
     sample = next(s for s in sample_recordings() if len(s.segments) > 1)
     client.put_surgeon(sample.surgeon)
     first, again = client.add_recording(sample.data), client.add_recording(sample.data)
-    assert first["id"] == again["id"]
-    parts = first["segments"][:2]
+    assert first.id == again.id
+    parts = first.segments[:2]
     demos = [
-        client.cut_demo(
-            first["id"], surgeon=sample.surgeon, suture=sample.suture, start_s=p["start_s"], end_s=p["end_s"]
-        )
+        client.cut_demo(first.id, surgeon=sample.surgeon, suture=sample.suture, start_s=p.start_s, end_s=p.end_s)
         for p in parts
     ]
-    assert len({d["id"] for d in demos}) == 2
-    assert {d["recording"] for d in demos} == {first["id"]}
-    assert all(client.demo_recording(d["id"]) == sample.data for d in demos)
+    assert len({d.id for d in demos}) == 2
+    assert {d.recording for d in demos} == {first.id}
+    assert all(client.demo_recording(d.id) == sample.data for d in demos)
 
 
 def test_a_stopped_service_exits_with_0_and_takes_its_children_along(tmp_path: Path) -> None:
@@ -70,7 +68,7 @@ def test_a_worker_that_dies_is_replaced_and_its_job_done(tmp_path: Path) -> None
         client.add_demo(sample.data, surgeon=sample.surgeon, suture=sample.suture)
         os.kill(service.child(WORKER), signal.SIGKILL)
         done = client.wait(client.train(sample.surgeon, sample.suture, release=True), timeout_s=60)
-        assert done["result"]["released"]
+        assert done.result["released"]
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.0.2.7", "example.org"])

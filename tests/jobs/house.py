@@ -1,4 +1,4 @@
-"""A database, the service's side of the engine, and workers as processes of their own."""
+"""A database, the service's side of the engine, and workers as processes of their own; and the whole service."""
 
 import subprocess
 import sys
@@ -8,15 +8,21 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from sqlalchemy import select
+import httpx2 as httpx
+from sqlalchemy import ColumnElement, func, select, text
 
 from skills.db.models import Executor, Job
 from skills.db.session import Database
 from skills.jobs.child import environment
 from skills.jobs.engine import Engine
+from skills.library.inspection import inspect_installation
 from skills.settings import Settings
+from tests.backends import blank, drop
+from tests.e2e.conftest import Service, running
+from tests.library import cases
 
 ROOT = Path(__file__).parents[2]
+START_S = 180.0  # on a crowded machine; it takes three on one of its own
 Worker = subprocess.Popen[bytes]
 
 
@@ -71,8 +77,8 @@ class House:
             for _ in range(number)
         ]
         try:
-            until(lambda: len(self.executors()) == number, 30.0)
-            self.ended(self.ask(), 15.0)
+            until(lambda: len(self.executors()) == number, START_S)
+            self.ended(self.ask(), START_S)
             yield {worker.pid: worker for worker in started}
         finally:
             for worker in started:
@@ -91,3 +97,81 @@ def until(what: Callable[[], object], within_s: float) -> float:
         assert time.monotonic() - began < within_s, f"it did not happen within {within_s} s"
         time.sleep(0.02)
     return time.monotonic() - began
+
+
+class Records:
+    """What the tables of an installation say, and those of its engine."""
+
+    def __init__(self, url: str) -> None:
+        self.database = Database(url)
+        self.engine = Database(Settings(database_url=url).engine_url)
+        self._workflows = "workflow_status" if url.startswith("sqlite") else "dbos.workflow_status"
+
+    def close(self) -> None:
+        self.database.close()
+        self.engine.close()
+
+    def held(self) -> dict[str, int]:
+        """Tell which process holds which job, by the names of its workflows."""
+        return self._holders("status = 'PENDING'")
+
+    def begun_since(self, moment: float) -> set[int]:
+        """Tell which processes have begun a job since then, in seconds of the clock."""
+        return set(self._holders(f"started_at_epoch_ms > {moment * 1000:.0f}").values())
+
+    def count(self, table: type, *where: ColumnElement[bool]) -> int:
+        with self.database.reading() as session:
+            return session.scalar(select(func.count()).select_from(table).where(*where)) or 0
+
+    def jobs(self, state: str) -> int:
+        return self.count(Job, Job.state == state)
+
+    def state(self, row: int) -> str:
+        with self.database.reading() as session:
+            return session.get_one(Job, row).state
+
+    def wrong(self) -> list[tuple[str, str]]:
+        """Look at everything that is stored, as `skills verify` does: what is wrong."""
+        parts = {part.what: part for part in inspect_installation(self.database)}
+        return [wrong for part in parts.values() for wrong in part.wrong]
+
+    def _holders(self, which: str) -> dict[str, int]:
+        query = text(f"SELECT workflow_uuid, executor_id FROM {self._workflows} WHERE {which}")
+        with self.engine.reading() as session:
+            return {row.workflow_uuid: int(row.executor_id.partition("-")[0]) for row in session.execute(query)}
+
+
+def add_demonstration(url: str) -> None:
+    """Add a surgeon and a small hand-off of his to a service."""
+    with httpx.Client(base_url=url, timeout=60.0) as http:
+        http.put("/surgeons/kestrel", json={}).raise_for_status()
+        query, as_table = {"surgeon": "kestrel", "suture": cases.SUTURE}, {"Content-Type": "text/csv"}
+        http.post("/demos", params=query, content=cases.hand_off(), headers=as_table).raise_for_status()
+
+
+class Site(Records):
+    """The real service with its workers, and its records."""
+
+    def __init__(self, service: Service, url: str) -> None:
+        super().__init__(url)
+        self.service = service
+
+
+@contextmanager
+def site(backend: str, folder: Path, **settings: object) -> Iterator[Site]:
+    """Start the service on an empty database of a back end."""
+    url = blank(backend, folder)
+    with site_at(url, folder, **settings) as place:
+        yield place
+    drop(url)
+
+
+@contextmanager
+def site_at(url: str, folder: Path, **settings: object) -> Iterator[Site]:
+    """Start the service on a database; it is ready, and it is gone in the end."""
+    with running(folder, database_url=url, **settings) as service:
+        place = Site(service, url)
+        try:
+            yield place
+        finally:
+            place.close()

@@ -16,6 +16,7 @@ from tests.style.test_kernel_cache import start, told
 WARM = """
 from threading import enumerate as threads
 from skills.jobs.warm import align_once, learn_once, warm_up
+from skills.style.palette import palette_of
 def finish():
     [thread.join() for thread in threads() if thread.name == "warm-up"]
 def touched():
@@ -31,22 +32,22 @@ def test_a_worker_warms_up_when_it_starts_and_its_first_job_loads_and_compiles_n
 
 
 def test_a_server_warms_up_what_a_rollout_calls():
-    code = "warm_up(align_once).join()\nwarm = touched()\ndtw(path.tip_mm, path.tip_mm)\n"
+    code = "warm_up(align_once).join()\nwarm = touched()\ndtw(path.tip_mm, path.tip_mm)\npalette_of(path.tip_mm)\n"
     each = told(start(WARM + code + "tell(warm=warm, after=touched())"))
     assert each["warm"] == each["after"]
-    assert sum(each["after"].values()) == 1
+    assert sum(each["after"].values()) == 2
 
 
 def test_what_a_power_cut_left_half_written_is_made_anew(tmp_path):
     tmp_path.chmod(0o700)
     code = WARM + "warm_up(align_once).join()\ntell(aligned=dtw(path.tip_mm, path.tip_mm[::-1]).total_mm)"
     whole = told(start(code, NUMBA_CACHE_DIR=str(tmp_path)))
-    (kept,) = tmp_path.rglob("*.nbc")
+    (kept,) = tmp_path.rglob("*warp*.nbc")
     os.truncate(kept, 100)
     mended, after = (told(start(code, NUMBA_CACHE_DIR=str(tmp_path))) for _ in range(2))
     assert whole["aligned"] == mended["aligned"] == after["aligned"] > 0
     assert "cannot be loaded; they are made anew" in mended["logged"]
-    assert (mended["compiled"], after["compiled"], after["loaded"], after["logged"]) == (1, 0, 1, "")
+    assert (mended["compiled"], after["compiled"], after["loaded"], after["logged"]) == (2, 0, 2, "")
 
 
 # ---- where others can write

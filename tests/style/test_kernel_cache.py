@@ -21,6 +21,7 @@ from skills.style.evaluation import dtw
 from skills.style.grid import GridPath, GridWorld
 from skills.style.learning import _kernels
 from skills.style.learning.q_learning import CellQLearning, PhaseQLearning
+from skills.style.palette import palette_of
 from skills.style.policy import learn_policy
 from skills.style.reward import RewardLevels, sparse_reward
 loops = {name: loop for name, loop in vars(_kernels).items() if name.endswith("_compiled")}
@@ -28,6 +29,7 @@ path = GridPath(GridWorld((0.0, 0.0, 0.0), 5.0, (3, 3, 3)), np.array([0, 1, 4, 3
 def learn(levels=RewardLevels(), **settings):
     policy = learn_policy(sparse_reward(path, levels), PhaseQLearning(**settings), 3)
     certify(policy)
+    palette_of(policy.q)
     return hashlib.sha256(policy.q.tobytes()).hexdigest()
 def tell(**more):
     stats = [loop.stats for loop in loops.values()]
@@ -101,6 +103,8 @@ cells = CellQLearning(episodes=5), CellQLearning(episodes=5, alpha=1, epsilon_st
 for levels, cell in [(whole, cell) for cell in cells] + [(costly, CellQLearning(gamma=1))]:
     certify(learn_policy(sparse_reward(path, levels), cell))
 dtw(path.tip_mm, path.tip_mm), dtw(path.tip_mm[::-1], path.tip_mm.astype(int).tolist()[1:])
+unaligned = np.frombuffer(bytes(17), np.float64, offset=1)
+palette_of(np.zeros((2, 3))), palette_of(np.zeros((2, 3)).T), palette_of(unaligned), palette_of(np.zeros(0))
 tell(signatures={name: len(loop.signatures) for name, loop in loops.items()})"""
     signatures = told(start(code))["signatures"]
     assert signatures == dict.fromkeys(signatures, 1)

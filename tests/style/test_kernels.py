@@ -66,6 +66,20 @@ def test_the_compiled_warp_and_the_plain_one_agree_to_the_last_bit(distance):
     assert costs[0] == costs[1]
 
 
+@settings(deadline=None)
+@given(arrays(float, st.integers(0, 300), elements=st.sampled_from([0.0, -0.0, 1.0, 0.1, np.nan, np.inf, 5e-324])))
+def test_the_compiled_palette_and_the_plain_one_agree(values):
+    bits, found = values.view(np.uint64), []
+    for tell_apart in (_kernels.tell_apart, _kernels.tell_apart_compiled):
+        read_only = bits.copy()
+        read_only.flags.writeable = False
+        colours, places, slots = np.zeros(4, np.uint64), np.zeros(len(bits), np.uint8), np.full(8, -1, np.int16)
+        with np.errstate(over="ignore"):  # the product's upper bits are meant to be lost
+            count = tell_apart(read_only, colours, places, slots, np.uint64(61))
+        found.append((count, colours.tobytes(), places.tobytes(), slots.tobytes()))
+    assert found[0] == found[1]
+
+
 def episodes(starts, *, first, alpha=0.5, gamma=0.5, max_steps=1, epsilon=0.0):
     """Run episodes in the paper's state on two cells, of which the second is the goal; `first` is best at first."""
     q, value, best = np.zeros(2 * 27), np.zeros(2), np.zeros(2, np.int8)

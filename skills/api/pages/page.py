@@ -1,9 +1,35 @@
-"""What every page has: its frame, its style, and a policy by which a browser runs and fetches nothing."""
+"""What every page has. There are two kinds.
+
+`render` makes a page of the site from a template: a browser loads its scripts, style and numbers from this server, and
+nothing from anywhere else. `page` makes a document that stands alone, to be kept or sent on: a browser runs and fetches
+nothing for it.
+"""
 
 from base64 import b64encode
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from functools import cache
 from hashlib import sha256
 from html import escape
+from typing import Any, get_args
+
+from fastapi import Request, Response
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from skills.api.access import Caller, Role
+from skills.api.pages import words
+from skills.api.pages.assets import PLOTLY_MAP_STYLE, build
+
+# No script or style but our files, none inline. Of pictures, plotly asks with `data:` what a browser can show, and
+# saves a view by way of a `blob:`.
+SITE_POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; media-src 'self'; "
+    "connect-src 'self'; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
+)
+SITE_HEADERS = {
+    "Content-Security-Policy": SITE_POLICY,
+    "Referrer-Policy": "same-origin",
+    "Cache-Control": "no-store",  # surgeons, and the token of the session
+}
 
 STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; color: #1b1f24; background: #fff; max-width: 66rem; margin: 2rem auto;
@@ -29,6 +55,42 @@ svg text { font: 11px system-ui, sans-serif; fill: #57606a; } .axis { stroke: #d
 # By its digest, so that no other style is taken; no script, picture or address at all.
 POLICY = f"default-src 'none'; style-src 'sha256-{b64encode(sha256(STYLE.encode()).digest()).decode()}'"
 HEADERS = {"Content-Security-Policy": f"{POLICY}; frame-ancestors 'none'", "Vary": "Accept"}
+
+
+@cache
+def templates() -> Environment:
+    """Read templates in which all is escaped, and a name that is not there is an error."""
+    made = Environment(
+        loader=PackageLoader("skills.api.pages"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    made.filters |= words.FILTERS
+    made.globals |= {"plotly_map_style": PLOTLY_MAP_STYLE}
+    return made
+
+
+def render(request: Request, template: str, caller: Caller | None, *, status: int = 200, **context: Any) -> Response:
+    """Make a page of the site; `caller` is None where nobody knows yet who asks.
+
+    In the template `url` puts our prefix before a path, `static` names a file of `static/`, and `may` tells whether the
+    caller has a role, or one above it.
+    """
+    root = str(request.scope.get("root_path", "")).rstrip("/")
+    ladder = get_args(Role)
+    reached = -1 if caller is None else ladder.index(caller.role)
+    about: Mapping[str, Any] = {
+        "caller": caller,
+        "root": root,
+        "path": request.url.path.removeprefix(root),
+        "url": lambda path: root + path,
+        "static": lambda name: f"{root}/static/{build()}/{name}",
+        "may": lambda role: reached >= ladder.index(role),
+    }
+    html = templates().get_template(template).render(**about, **context)
+    return Response(html, status, headers=SITE_HEADERS, media_type="text/html")
 
 
 def page(title: str, body: str) -> str:

@@ -1,16 +1,20 @@
 """The motion of a plan: JSON, a table, or the bag that a robot replays; and what came of replaying it."""
 
 import csv
-import hashlib
 import io
 from typing import Annotated, Any
 
 import orjson
 from fastapi import APIRouter, Query, Response
 
-from skills.api.answers import JSON, Body, answer
+from skills.api.access import needs
+from skills.api.answers import JSON
 from skills.api.deps import DIGEST, Configured, Db, Digest
-from skills.api.routes.policies import Accept, Match
+from skills.api.documented import gives
+from skills.api.replies import Giving
+from skills.api.routes.policies import Accept
+from skills.api.schemas.given import Comparison
+from skills.api.schemas.given import Trajectory as GivenTrajectory
 from skills.db.session import Database
 from skills.errors import UnknownFormat
 from skills.library.comparison import compare_with_plan
@@ -34,14 +38,18 @@ PassIndex = Annotated[int | None, _PASS]
 OnePass = Annotated[int, _PASS]
 
 
-@router.get("/plans/{plan}/trajectory")
+@router.get(
+    "/plans/{plan}/trajectory",
+    dependencies=[needs("reader")],
+    **gives(GivenTrajectory, 404, 409, 415, as_well=(TABLE, BAG)),
+)
 def get_trajectory(
     plan: Digest,
     db: Db,
     settings: Configured,
+    give: Giving,
     pass_index: PassIndex = None,
     accept: Accept = "*/*",
-    if_none_match: Match = None,
 ) -> Response:
     """Give the motion of a plan, sampled: JSON, `Accept: text/csv` a table, `Accept: application/zip` the replay bag.
 
@@ -50,20 +58,20 @@ def get_trajectory(
     """
     media_type = _media_type(accept)
     content = _contents(db, plan, pass_index, media_type, settings)
-    given = answer(Body(content, media_type, f'"{hashlib.sha256(content).hexdigest()}"'), if_none_match)
+    given = give.bytes(content, media_type)
     if media_type == BAG:
         which = "" if pass_index is None else f"-pass-{pass_index}"
         given.headers["Content-Disposition"] = f'attachment; filename="replay-{plan[:12]}{which}.zip"'
     return given
 
 
-@router.get("/plans/{plan}/comparison")
+@router.get("/plans/{plan}/comparison", dependencies=[needs("reader")], **gives(Comparison, 404))
 def compare(
-    plan: Digest, demo: Annotated[str, Query(pattern=DIGEST)], db: Db, pass_index: OnePass = 0
-) -> dict[str, Any]:
+    plan: Digest, demo: Annotated[str, Query(pattern=DIGEST)], db: Db, give: Giving, pass_index: OnePass = 0
+) -> Response:
     """Compare a pass of a plan with a demonstration that is the recording of its replay."""
     with db.reading() as session:
-        return compare_with_plan(session, plan, demo, pass_index)
+        return give(compare_with_plan(session, plan, demo, pass_index))
 
 
 def _media_type(accept: str) -> str:

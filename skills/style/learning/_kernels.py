@@ -16,6 +16,7 @@ from skills.compiled import compiled, inner
 UNKNOWN, OFF_GRID = -2, -1  # in a model: never tried; would leave the grid, and stays
 # Whole numbers without a sign; one of these and a number of Python's would give a float.
 NONE, ONE, THREE, SEVEN, NINE, THIRTEEN, SEVENTEEN = (np.uint64(n) for n in (0, 1, 3, 7, 9, 13, 17))
+SCATTER = np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio (Knuth 6.4): spreads bits that are alike
 ACTIONS, HALF, LOW_HALF = np.uint64(27), np.uint64(32), np.uint64(0xFFFFFFFF)
 
 
@@ -269,9 +270,42 @@ def warp(distance: Any, cost: Any) -> None:
             cost[i + 1, j + 1] = distance[i, j] + min(cost[i, j], cost[i, j + 1], cost[i + 1, j])
 
 
+def tell_apart(
+    bits: Any,  # (N,) uint64: numbers as the bits they are
+    found: Any,  # (F,) uint64: room for those that differ, filled in the order in which they come first
+    places: Any,  # (N,) uint8: which of them each one is, filled
+    slots: Any,  # (2^k,) int16, more than F and all -1: which number is looked up where, the next free one if two meet
+    shift: Any,  # uint64: 64 - k
+) -> Any:
+    """Count the numbers that differ, bit by bit, and name each by its order; -1: they are more than there is room."""
+    last_slot = np.uint64(len(slots) - 1)
+    count = 0
+    which = np.int64(-1)
+    before = NONE
+    for i in range(len(bits)):
+        number = bits[i]
+        if number != before or which < 0:  # most stand several in a row
+            before = number
+            slot = (number * SCATTER) >> shift
+            which = np.int64(slots[slot])
+            while which >= 0 and found[which] != number:
+                slot = (slot + ONE) & last_slot
+                which = np.int64(slots[slot])
+            if which < 0:
+                if count == len(found):
+                    return -1
+                which = np.int64(count)
+                slots[slot] = which
+                found[which] = number
+                count += 1
+        places[i] = which
+    return count
+
+
 run_episodes_compiled = compiled(run_episodes)
 explore_compiled = compiled(explore)
 sweep_compiled = compiled(sweep)
 settle_compiled = compiled(settle)
 spread_distances_compiled = compiled(spread_distances)
 warp_compiled = compiled(warp)
+tell_apart_compiled = compiled(tell_apart)

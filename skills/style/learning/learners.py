@@ -13,7 +13,7 @@ from skills.style.reward import RewardLevels, RewardMap
 
 Learner = PhaseQLearning | CellQLearning | ValueIteration | MaxEntIRL
 LEARNERS: dict[str, type[Learner]] = {learner.kind: learner for learner in get_args(Learner)}
-LEARNER_VERSION = 3  # part of a training's identity: raise it when the same settings would learn something else
+LEARNER_VERSION = 4  # part of a training's identity: raise it when the same settings would learn something else
 MAX_SEED = 2**63 - 1
 MAX_BYTES = 4 << 30  # ours: a laptop has 8 GiB, and others learn beside it
 BYTES_A_ROW = 600  # of the domain, measured with 51 and 101 cells a side: Q values twice, and what the rest works out

@@ -1,16 +1,16 @@
-"""What crosses HTTP. Lengths are mm, angles rad; unknown fields, NaN and infinity are refused."""
+"""What comes in. Lengths are mm, angles rad; unknown fields, NaN and infinity are refused."""
 
 from dataclasses import fields
 from datetime import date
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, StrictBool, StrictInt, create_model
+from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, StrictBool, StrictInt, create_model
 
 from skills.api.deps import DIGEST, SLUG
-from skills.db import models as rows
-from skills.db.base import rfc3339 as at
+from skills.library.keys import OWNER
 from skills.library.plans import Beside, PlanRequest
 from skills.library.training import learner_of
+from skills.settings import Role
 from skills.style.grid import MAX_HYSTERESIS, GridMode
 from skills.style.handoff import Enters
 from skills.style.kinematics import INSTRUMENTS, JAW_TIP_MM
@@ -47,24 +47,53 @@ Hysteresis = Annotated[
 Component = Annotated[Number, Field(ge=-1e6, le=1e6)]
 
 
-class Consent(Schema):
+def shown(*examples: dict[str, Any]) -> ConfigDict:
+    """Show examples in the OpenAPI document; a test sends each of them."""
+    return ConfigDict(json_schema_extra={"examples": [*examples]})
+
+
+class ConsentIn(Schema):
     """What a surgeon agreed to, and until when."""
 
     uses: list[Literal["training", "export", "atlas"]]
     until: date | None = None
 
 
+class KeyIn(Schema):
+    """A key to be made."""
+
+    model_config = shown({"owner": "a.laboratory", "role": "reader", "surgeons": ["kestrel"]})
+
+    owner: Annotated[str, Field(pattern=OWNER, description="Whose it is; events and releases bear this name.")]
+    role: Role
+    expires_at: AwareDatetime | None = None
+    surgeons: Annotated[list[SlugField], Field(min_length=1, max_length=1000)] | None = None
+
+
 class SurgeonIn(Schema):
     """A surgeon, by pseudonym; never a name."""
+
+    model_config = shown(
+        {
+            "skill_level": "expert",
+            "handedness": "right",
+            "consent": {"uses": ["training", "export"], "until": "2099-12-31"},
+        },
+        {},
+    )
 
     skill_level: Literal["novice", "intermediate", "expert"] | None = None
     handedness: Literal["right", "left", "ambidextrous"] | None = None
     protocol: Name | None = None
-    consent: Consent | None = None
+    consent: ConsentIn | None = None
 
 
 class SutureTypeIn(Schema):
     """A suture type of the catalogue."""
+
+    model_config = shown(
+        {"name": "Simple running", "also_called": ["continuous"], "family": "running", "description": "One thread."}
+    )
 
     name: Name
     also_called: list[Name] = Field(default_factory=list, max_length=20)
@@ -74,6 +103,11 @@ class SutureTypeIn(Schema):
 
 class DemoIn(Schema):
     """Which part of a recording is a demonstration, whose, and in which grid."""
+
+    model_config = shown(
+        {"surgeon": "kestrel", "suture": "simple-running"},
+        {"surgeon": "kestrel", "suture": "simple-running", "end_s": 1.1, "grid": "fit", "cell_mm": 4.0},
+    )
 
     surgeon: SlugField
     suture: SlugField
@@ -103,6 +137,11 @@ LearnerIn: Any = Annotated[
 class TrainingIn(Schema):
     """What is to be learnt. Left out: the newest active demonstration, the phase learner, seed 0, no release."""
 
+    model_config = shown(
+        {"surgeon": "kestrel", "suture": "simple-running", "release": True},
+        {"surgeon": "kestrel", "suture": "simple-running", "learner": {"kind": "value-iteration", "gamma": 0.1}},
+    )
+
     surgeon: SlugField
     suture: SlugField
     demos: list[DigestField] | None = None
@@ -118,6 +157,8 @@ class TrainingIn(Schema):
 
 class RetrainingIn(Schema):
     """Which styles are to be learnt again. Left out: all of them, with the phase learner, without a release."""
+
+    model_config = shown({}, {"surgeon": "kestrel", "only_stale": True, "release": True})
 
     surgeon: SlugField | None = None
     suture: SlugField | None = None
@@ -140,12 +181,16 @@ class RetrainingIn(Schema):
 class RolloutIn(Schema):
     """Where a rollout starts, in mm of the policy's frame; left out, `version` is the released one."""
 
+    model_config = shown({"start_mm": [0.0, 50.0, -120.0]})
+
     start_mm: Point
     version: Annotated[StrictInt, Field(ge=1, le=2**31)] | None = None
 
 
 class NextIn(Schema):
     """A position in mm of the policy's frame, and the phase it was reached in; none: it is the start of a pass."""
+
+    model_config = shown({"position_mm": [-10.0, 55.0, -135.0]}, {"position_mm": [-15.0, 55.0, -130.0], "phase": 1})
 
     position_mm: Point
     phase: Annotated[StrictInt, Field(ge=0, le=10**6)] | None = None
@@ -182,6 +227,10 @@ class PsmMIn(Schema):
 
 class PlanIn(Schema):
     """Grid worlds to stack."""
+
+    model_config = shown(
+        {"surgeon": "kestrel", "suture": "simple-running", "suture_points": [{"position_mm": [5.0, 55.0, -125.0]}]}
+    )
 
     surgeon: SlugField
     suture: SlugField
@@ -235,145 +284,6 @@ def _beside(asked: PsmMIn) -> Beside:
 class PlaybackIn(Schema):
     """Which plan to play."""
 
+    model_config = shown({"plan": "0123456789abcdef" * 4})
+
     plan: DigestField
-
-
-def surgeon_out(row: rows.Surgeon) -> dict[str, Any]:
-    """Write a surgeon."""
-    return {
-        "surgeon": row.slug,
-        "skill_level": row.skill_level,
-        "handedness": row.handedness,
-        "protocol": row.protocol,
-        "consent": row.consent,
-        "created_at": at(row.created_at),
-    }
-
-
-def suture_out(row: rows.SutureType) -> dict[str, Any]:
-    """Write a suture type."""
-    return {
-        "suture": row.slug,
-        "name": row.name,
-        "also_called": row.also_called,
-        "family": row.family,
-        "description": row.description,
-    }
-
-
-def recording_out(row: rows.StoredRecording) -> dict[str, Any]:
-    """Write a recording."""
-    return {
-        "id": row.sha256,
-        "sha256": row.sha256,
-        "size_bytes": row.size_bytes,
-        "media_type": row.media_type,
-        "format": row.format,
-        "integrity": row.integrity,
-        **row.about,
-        "created_at": at(row.created_at),
-    }
-
-
-def demo_out(row: rows.Demonstration) -> dict[str, Any]:
-    """Write a demonstration."""
-    return {
-        "id": row.sha256,
-        "sha256": row.sha256,
-        "recording": row.recording.sha256,
-        "surgeon": row.surgeon.slug,
-        "suture": row.suture,
-        "arm": row.arm,
-        "topic": row.topic,
-        "frame": row.frame,
-        "instrument": row.instrument,
-        "start_s": row.start_s,
-        "end_s": row.end_s,
-        "session": row.session,
-        "hysteresis": row.hysteresis,
-        "state": "active" if row.withdrawn_at is None else "withdrawn",
-        "report": row.report,
-        "created_at": at(row.created_at),
-        "withdrawn_at": at(row.withdrawn_at),
-    }
-
-
-def job_out(row: rows.Job) -> dict[str, Any]:
-    """Write a job."""
-    return {
-        "id": row.id,
-        "kind": row.kind,
-        "state": row.state,
-        "progress": row.progress,
-        "request": row.request,
-        "result": row.result,
-        "error": row.error,
-        "created_at": at(row.created_at),
-        "started_at": at(row.started_at),
-        "ended_at": at(row.ended_at),
-    }
-
-
-def retrained_out(row: rows.StyleToRetrain) -> dict[str, Any]:
-    """Write what became of one style of a batch."""
-    return {
-        "surgeon": row.demonstration.surgeon.slug,
-        "suture": row.demonstration.suture,
-        "demo": row.demonstration.sha256,
-        "stale_because": row.stale,
-        "state": row.state,
-        "reason": row.reason,
-        "policy_version": row.policy and row.policy.version,
-        "sha256": row.policy and row.policy.sha256,
-        "comparison": row.comparison,
-        "ended_at": at(row.ended_at),
-    }
-
-
-def plan_out(row: rows.Plan) -> dict[str, Any]:
-    """Write a plan."""
-    return {
-        "id": row.sha256,
-        "sha256": row.sha256,
-        "surgeon": row.policy.surgeon.slug,
-        "suture": row.policy.suture,
-        "policy": {"version": row.policy.version, "sha256": row.policy.sha256},
-        **row.about,
-        "created_at": at(row.created_at),
-    }
-
-
-def playback_out(row: rows.StoredPlayback) -> dict[str, Any]:
-    """Write a playback; all of its pictures but the first are drawn after the verdict."""
-    here = f"/playbacks/{row.sha256}"
-    return {
-        "id": row.sha256,
-        "sha256": row.sha256,
-        "plan": row.plan.sha256,
-        "feasible": row.feasible,
-        "report": row.report,
-        "picture": f"{here}/picture.png",
-        "pictures": {
-            "picture": f"{here}/picture.png",
-            "animation_mp4": f"{here}/animation.mp4",
-            "animation_gif": f"{here}/animation.gif",
-            "joints": f"{here}/joints.png",
-            "clearance": f"{here}/clearance.png",
-        },
-        "created_at": at(row.created_at),
-    }
-
-
-def version_out(row: rows.PolicyVersion) -> dict[str, Any]:
-    """Write a line of a style's history."""
-    return {
-        "version": row.version,
-        "sha256": row.sha256,
-        "learner": row.manifest["learner"],
-        "demos": row.manifest["demos"],
-        "seed": row.manifest["seed"],
-        "metrics": row.manifest["metrics"],
-        "coverage": row.manifest["coverage"],
-        "releasable": row.releasable,
-        "created_at": at(row.created_at),
-    }

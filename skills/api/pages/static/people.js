@@ -1,0 +1,53 @@
+// Surgeons and suture types: written whole, under their pseudonym or slug.
+import { call } from "./api.js";
+import { say } from "./site.js";
+
+const forms = { surgeon: document.getElementById("surgeon"), suture: document.getElementById("suture") };
+const uses = document.getElementById("uses");
+const consented = forms.surgeon.elements.consented;
+const showUses = () => (uses.hidden = !consented.checked);
+consented.addEventListener("change", showUses);
+
+const bodies = {
+  surgeon(form) {
+    const { skill_level: skill, handedness, protocol, until } = form.elements;
+    const named = [...form.querySelectorAll('[name="uses"]:checked')].map((one) => one.value);
+    const consent = consented.checked ? { uses: named, until: until.value || null } : null;
+    return { skill_level: skill.value || null, handedness: handedness.value || null, protocol: protocol.value || null, consent };
+  },
+  suture(form) {
+    const { name, also_called: also, family, description } = form.elements;
+    const names = also.value.split(",").map((one) => one.trim()).filter(Boolean);
+    return { name: name.value, also_called: names, family: family.value, description: description.value };
+  },
+};
+
+for (const [kind, form] of Object.entries(forms)) {
+  form.addEventListener("submit", async (event) => {
+    event.preventDefault();
+    const button = form.querySelector("button");
+    say(button, "");
+    try {
+      await call("PUT", form.dataset.path + form.elements.slug.value, bodies[kind](form));
+      location.reload();
+    } catch (problem) {
+      say(button, problem.message);
+    }
+  });
+}
+
+document.addEventListener("click", (event) => {
+  const { fill, values } = event.target.closest(".edit")?.dataset ?? {};
+  if (!fill) return;
+  const form = forms[fill];
+  const { consent, ...fields } = JSON.parse(values);
+  for (const [name, value] of Object.entries(fields)) form.elements[name].value = value ?? "";
+  if (fill === "surgeon") {
+    consented.checked = consent !== null;
+    form.querySelectorAll('[name="uses"]').forEach((one) => (one.checked = consent?.uses.includes(one.value) ?? false));
+    form.elements.until.value = consent?.until ?? "";
+    showUses();
+  }
+  document.getElementById(`${fill}-form`).open = true;
+  form.elements.slug.focus();
+});

@@ -1,0 +1,130 @@
+// What every page does: light and dark, buttons that make a call, confirmations, times, parts that renew themselves.
+import { call, save, watch, root } from "./api.js";
+
+const page = document.documentElement;
+const themes = { "": "◐ auto", light: "☀ light", dark: "☾ dark" };
+
+function showTheme() {
+  document.getElementById("theme").textContent = themes[page.dataset.theme ?? ""];
+}
+
+document.getElementById("theme").addEventListener("click", () => {
+  const order = Object.keys(themes);
+  const next = order[(order.indexOf(page.dataset.theme ?? "") + 1) % order.length];
+  if (next) page.dataset.theme = next;
+  else delete page.dataset.theme;
+  localStorage.setItem("theme", next);
+  showTheme();
+  document.dispatchEvent(new Event("theme"));
+});
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => document.dispatchEvent(new Event("theme")));
+showTheme();
+
+// Say something where it arose: in the place that `near` names, or right after it.
+export function say(near, text, kind = "wrong") {
+  let place = near.dataset.said ? document.getElementById(near.dataset.said) : near.parentElement.querySelector(":scope > .said");
+  if (!place) {
+    place = document.createElement("p");
+    place.setAttribute("role", "alert");
+    near.after(place);
+  }
+  place.className = `said ${text ? kind : ""}`;
+  place.textContent = text;
+  if (text) place.scrollIntoView({ block: "nearest" });
+}
+
+// Ask before something that cannot be taken back lightly; with a word, it must be typed.
+export function confirmed({ what, means, yes, word }) {
+  const dialog = document.getElementById("ask");
+  const [label, button] = [document.getElementById("ask-word"), document.getElementById("ask-yes")];
+  const input = label.querySelector("input");
+  document.getElementById("ask-what").textContent = what;
+  document.getElementById("ask-means").textContent = means;
+  button.textContent = yes;
+  label.hidden = !word;
+  label.querySelector("span").textContent = word ? `Type ${word} to go on` : "";
+  input.value = "";
+  const check = () => (button.disabled = Boolean(word) && input.value !== word);
+  input.oninput = check;
+  check();
+  dialog.returnValue = "";
+  dialog.showModal();
+  return new Promise((resolve) =>
+    dialog.addEventListener("close", () => resolve(dialog.returnValue === "yes"), { once: true }),
+  );
+}
+
+// Show a job while it runs, beside what asked for it.
+export function jobLine(near) {
+  const line = document.createElement("p");
+  line.className = "said running";
+  const bar = document.createElement("progress");
+  const words = document.createElement("span");
+  line.append(bar, words);
+  near.after(line);
+  return (job) => {
+    if (job.state === "running" && job.progress > 0) bar.value = job.progress;
+    if (!["queued", "running"].includes(job.state)) bar.value = 1;
+    words.textContent = job.error ? `${job.state}: ${job.error}` : job.state;
+    line.classList.toggle("wrong", job.state === "failed");
+  };
+}
+
+async function act(button) {
+  const { call: what, json, ask: question, means, yes, word, then } = button.dataset;
+  if (question && !(await confirmed({ what: question, means, yes: yes ?? button.textContent.trim(), word }))) return;
+  const [method, path] = what.split(" ");
+  button.disabled = true;
+  say(button, "");
+  try {
+    const answer = await call(method, path, json && JSON.parse(json));
+    if (then === "job") {
+      const job = await watch(answer.id, jobLine(button));
+      if (job.state !== "succeeded") return;
+    } else if (then === "jobs") {
+      location.assign(`${root}/pages/jobs/${answer.id}`);
+      return;
+    }
+    if (then?.startsWith("/")) location.assign(root + then);
+    else location.reload();
+  } catch (problem) {
+    say(button, problem.message);
+  } finally {
+    button.disabled = false;
+  }
+}
+
+async function saveFile(button) {
+  const { file: path, accept, name } = button.dataset;
+  say(button, "");
+  button.disabled = true;
+  try {
+    await save(path, accept, name);
+  } catch (problem) {
+    say(button, problem.message);
+  } finally {
+    button.disabled = false;
+  }
+}
+
+document.addEventListener("click", (event) => {
+  const button = event.target.closest?.("button[data-call], button[data-file]");
+  if (button?.dataset.call) act(button);
+  else if (button) saveFile(button);
+});
+
+// A part of a page that changes by itself is asked for again, as the server draws it, until it says that it rests.
+async function renew(part) {
+  while (part.dataset.renew) {
+    await new Promise((wake) => setTimeout(wake, Number(part.dataset.renew)));
+    if (document.hidden) continue;
+    const answer = await fetch(location.href, { headers: { Accept: "text/html" } }).catch(() => null);
+    if (!answer?.ok) continue;
+    const now = new DOMParser().parseFromString(await answer.text(), "text/html").getElementById(part.id);
+    if (!now) return;
+    if (now.innerHTML !== part.innerHTML && !part.contains(document.activeElement)) part.replaceChildren(...now.childNodes);
+    if (now.dataset.renew) part.dataset.renew = now.dataset.renew;
+    else delete part.dataset.renew;
+  }
+}
+document.querySelectorAll("[data-renew]").forEach(renew);

@@ -1,0 +1,83 @@
+// Sending a recording: the raw bytes, with their digest, and how far it is.
+import { changing, problemOf, root } from "./api.js";
+
+const get = (id) => document.getElementById(id);
+const form = get("upload");
+const KINDS = { mcap: "application/vnd.mcap", zip: "application/zip", csv: "text/csv", txt: "text/plain", bag: "application/x-rosbag", db3: "application/vnd.sqlite3" };
+const TABLE = "text/csv";
+const DIGESTED_BYTES = 512 * 2 ** 20; // the digest needs the whole file in memory; a larger one is sent without
+const mebibytes = (bytes) => `${(bytes / 2 ** 20).toFixed(1)} MiB`;
+
+function chosen() {
+  const [file] = get("file").files;
+  if (!file) return;
+  const kind = KINDS[file.name.split(".").pop().toLowerCase()];
+  if (kind) get("kind").value = kind;
+  get("chosen").textContent = `${file.name}, ${mebibytes(file.size)}`;
+  ofTable();
+}
+const ofTable = () => document.querySelectorAll(".of-table").forEach((one) => (one.hidden = get("kind").value !== TABLE));
+get("file").addEventListener("change", chosen);
+get("kind").addEventListener("change", ofTable);
+
+const drop = get("drop");
+for (const name of ["dragover", "dragleave", "drop"]) {
+  drop.addEventListener(name, (event) => {
+    event.preventDefault();
+    drop.classList.toggle("over", name === "dragover");
+    if (name !== "drop" || !event.dataTransfer.files.length) return;
+    get("file").files = event.dataTransfer.files;
+    chosen();
+  });
+}
+
+async function digestOf(file) {
+  if (file.size > DIGESTED_BYTES || !crypto.subtle) return {};
+  const digest = await crypto.subtle.digest("SHA-256", await file.arrayBuffer());
+  return { "Content-Digest": `sha-256=:${btoa(String.fromCharCode(...new Uint8Array(digest)))}:` };
+}
+
+function send(file, headers, query) {
+  const request = new XMLHttpRequest();
+  const done = new Promise((resolve, reject) => {
+    request.upload.onprogress = ({ loaded, total }) => {
+      get("progress").value = loaded / total;
+      get("sent").textContent = loaded < total ? `${mebibytes(loaded)} of ${mebibytes(total)}` : "Sent; it is being read and checked.";
+    };
+    request.onload = async () =>
+      request.status < 300 ? resolve(JSON.parse(request.responseText)) : reject(await problemOf(request.status, request.responseText));
+    request.onerror = () => reject(new Error("The line broke; send it again. Nothing was kept."));
+    request.onabort = () => reject(new Error("Stopped; nothing was kept."));
+  });
+  request.open("POST", `${root}/recordings?${query}`);
+  for (const [name, value] of Object.entries({ ...headers, ...changing() })) request.setRequestHeader(name, value);
+  get("stop").onclick = () => request.abort();
+  request.send(file);
+  return done;
+}
+
+form.addEventListener("submit", async (event) => {
+  event.preventDefault();
+  const [file] = get("file").files;
+  const kind = get("kind").value;
+  const query = new URLSearchParams();
+  if (kind === TABLE && get("rate").value) query.set("rate_hz", get("rate").value);
+  if (kind === TABLE && get("frame").value) query.set("frame", get("frame").value);
+  const button = form.querySelector("button:not([type])");
+  button.disabled = true;
+  get("progress").hidden = get("stop").hidden = false;
+  get("upload-said").textContent = "";
+  get("upload-said").className = "said";
+  try {
+    const stored = await send(file, { "Content-Type": kind, ...(await digestOf(file)) }, query);
+    const more = new URLSearchParams(Object.entries({ surgeon: form.dataset.surgeon, suture: form.dataset.suture }).filter(([, value]) => value));
+    location.assign(`${root}/pages/recordings/${stored.id}${more.size ? `?${more}` : ""}`);
+  } catch (problem) {
+    get("upload-said").textContent = problem.message;
+    get("upload-said").className = "said wrong";
+    get("sent").textContent = "";
+  } finally {
+    button.disabled = false;
+    get("progress").hidden = get("stop").hidden = true;
+  }
+});

@@ -1,0 +1,284 @@
+"""The pages of the site, and what they load. They only look; whatever changes something is one of the calls."""
+
+from collections.abc import Callable, Coroutine
+from typing import Annotated, Any, Literal, get_args
+
+import orjson
+from fastapi import APIRouter, Query, Request, Response
+from fastapi.exceptions import RequestValidationError
+from fastapi.routing import APIRoute
+from sqlalchemy.orm import Session
+
+from skills import errors
+from skills.api.access import Asking, needs, open_to_all
+from skills.api.answers import JSON
+from skills.api.deps import Db, Digest, Limit, Read, RowCursor, Slug, SlugCursor
+from skills.api.pages.assets import assets, build
+from skills.api.pages.page import render
+from skills.api.routes.policies import Version
+from skills.api.routes.trainings import JobId
+from skills.library import batches, jobs, overview, policies, retraining, views
+from skills.library.demos import find_demo
+from skills.library.plans import find_plan
+from skills.library.recordings import find_recording
+from skills.recordings import MEDIA_TYPES
+from skills.settings import MEBIBYTE
+from skills.style.handoff import Enters
+from skills.style.kinematics import INSTRUMENTS
+
+LOST = (errors.NotFound, errors.Erased, RequestValidationError)
+FOR_GOOD = "public, max-age=31536000, immutable"
+
+Words = Annotated[str, Query(max_length=200)]
+Picked = Annotated[str | None, Query(max_length=64)]
+
+
+class PageRoute(APIRoute):
+    """A route for a person: what is not there is told on a page."""
+
+    def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
+        """Answer as the route does, or say on a page what is not there."""
+        answer = super().get_route_handler()
+
+        async def answer_or_tell(request: Request) -> Response:
+            try:
+                return await answer(request)
+            except LOST as lost:
+                status = 410 if isinstance(lost, errors.Erased) else 404
+                said = str(lost) if isinstance(lost, errors.SkillsError) else "There is no page of this address."
+                return render(request, "lost.html", request.scope.get("caller"), status=status, said=said)
+
+        return answer_or_tell
+
+
+router = APIRouter(route_class=PageRoute, include_in_schema=False, max_body_size=MEBIBYTE)
+
+
+@router.get("/static/{version}/{name}", dependencies=[open_to_all()])
+def get_static(version: str, name: str, request: Request) -> Response:
+    """Give what a page loads; under the address of this build a browser may keep it for good."""
+    asset = assets().get(name)
+    if asset is None:
+        raise errors.NotFound("There is no such file.")
+    headers = {"Cache-Control": FOR_GOOD if version == build() else "no-cache", "Vary": "Accept-Encoding"}
+    if "gzip" in request.headers.get("accept-encoding", ""):
+        headers["Content-Encoding"] = "gzip"
+        return Response(asset.packed, headers=headers, media_type=asset.media_type)
+    return Response(asset.content, headers=headers, media_type=asset.media_type)
+
+
+@router.get("/", dependencies=[needs("reader")])
+def show_catalogue(
+    request: Request,
+    caller: Asking,
+    db: Db,
+    q: Words = "",
+    state: Literal["", "released", "trained", "stored", "empty"] = "",
+    skill: Literal["", "novice", "intermediate", "expert"] = "",
+    cursor: SlugCursor = None,
+) -> Response:
+    """Show the styles: surgeons and suture types, what is stored, trained and released."""
+    with db.reading() as session:
+        found = overview.matrix(session, q, state or None, skill or None, cursor)
+        asked = {"q": q, "state": state, "skill": skill}
+        return render(request, "catalogue.html", caller, found=found, asked=asked)
+
+
+@router.get("/pages/styles/{surgeon}/{suture}", dependencies=[needs("reader")])
+def show_style(
+    surgeon: Slug,
+    suture: Slug,
+    request: Request,
+    caller: Asking,
+    db: Db,
+    version: Annotated[int | None, Query(ge=1)] = None,
+    beside: Annotated[int | None, Query(ge=1)] = None,
+) -> Response:
+    """Show a style: in 3-D, its numbers, versions and demonstrations; `beside` is a version to compare."""
+    with db.reading() as session:
+        whole = overview.whole_style(session, surgeon, suture)
+        shown = _chosen(session, whole, version)
+        other = None if beside is None else policies.find_version(session, surgeon, suture, beside)
+        return render(request, "style.html", caller, whole=whole, shown=shown, other=other)
+
+
+def _chosen(session: Session, whole: overview.WholeStyle, version: int | None) -> Any:
+    """Choose what to show: the version asked for, else the served one, else the newest."""
+    if version is not None:
+        return policies.find_version(session, whole.surgeon.slug, whole.suture.slug, version)
+    if whole.served is not None:
+        return whole.served.policy
+    return whole.versions[0] if whole.versions else None
+
+
+@router.get("/pages/styles/{surgeon}/{suture}/versions/{version}/view", dependencies=[needs("reader")])
+def view_version(surgeon: Slug, suture: Slug, version: Version, caller: Asking, db: Db) -> Response:
+    """Give what the 3-D view of a version is drawn from."""
+    with db.reading() as session:
+        return _json(views.view_of_version(session, policies.find_version(session, surgeon, suture, version)))
+
+
+@router.get("/pages/demos/{demo}/view", dependencies=[needs("reader")])
+def view_demo(demo: Digest, caller: Asking, db: Db) -> Response:
+    """Give what the 3-D view of a demonstration is drawn from."""
+    with db.reading() as session:
+        return _json(views.view_of_demo(session, find_demo(session, demo)))
+
+
+@router.get("/pages/recordings", dependencies=[needs("reader")])
+def show_recordings(request: Request, caller: Asking, db: Db, cursor: RowCursor = None) -> Response:
+    """Show the newest recordings."""
+    with db.reading() as session:
+        found = overview.newest_recordings(session, cursor)
+        return render(request, "recordings.html", caller, found=found, most=overview.MOST)
+
+
+@router.get("/pages/recordings/new", dependencies=[needs("reader")])
+def show_upload(request: Request, caller: Asking, surgeon: Picked = None, suture: Picked = None) -> Response:
+    """Show where a recording is sent from."""
+
+    return render(request, "upload.html", caller, kinds=MEDIA_TYPES, surgeon=surgeon, suture=suture)
+
+
+@router.get("/pages/recordings/{recording}", dependencies=[needs("reader")])
+def show_recording(
+    recording: Digest, request: Request, caller: Asking, db: Db, surgeon: Picked = None, suture: Picked = None
+) -> Response:
+    """Show a recording: its quality, its proposed hand-offs, and what was cut out of it."""
+    with db.reading() as session:
+        found = find_recording(session, recording)
+        demos = overview.demos_of_recording(session, found)
+        return render(
+            request,
+            "recording.html",
+            caller,
+            found=found,
+            demos=demos,
+            taken=[[demo.start_s, demo.end_s] for demo in demos if demo.withdrawn_at is None],
+            surgeons=overview.all_surgeons(session),
+            sutures=overview.all_suture_types(session),
+            surgeon=surgeon,
+            suture=suture,
+        )
+
+
+@router.get("/pages/recordings/{recording}/traces", dependencies=[needs("reader")])
+def trace_recording(recording: Digest, caller: Asking, db: Db, read: Read) -> Response:
+    """Give what the time line of a recording is drawn from."""
+    return _json(views.traces_of(db, recording, read))
+
+
+@router.get("/pages/plans", dependencies=[needs("reader")])
+def show_plans(request: Request, caller: Asking, db: Db, cursor: RowCursor = None) -> Response:
+    """Show the newest plans with their verdicts."""
+    with db.reading() as session:
+        found = overview.newest_plans(session, cursor)
+        return render(request, "plans.html", caller, found=found, most=overview.MOST)
+
+
+@router.get("/pages/plans/new", dependencies=[needs("reader")])
+def show_plan_editor(
+    request: Request,
+    caller: Asking,
+    db: Db,
+    surgeon: Picked = None,
+    suture: Picked = None,
+    version: Annotated[int | None, Query(ge=1)] = None,
+    like: Annotated[str | None, Query(pattern=r"^[0-9a-f]{64}$")] = None,
+) -> Response:
+    """Show the plan editor, filled from a style or from a plan that exists."""
+    with db.reading() as session:
+        before = None if like is None else find_plan(session, like)
+        if before is not None:
+            surgeon, suture = before.policy.surgeon.slug, before.policy.suture
+            version = before.policy.version
+        released = overview.released_styles(session)
+        policy = None
+        if surgeon is not None and suture is not None:
+            policy = policies.choose(session, surgeon, suture, version)
+        elif released:
+            policy = released[0].policy
+        return render(
+            request,
+            "plan_editor.html",
+            caller,
+            released=released,
+            policy=policy,
+            partner=None if policy is None else policy.demonstration.demo.partner,
+            before=before,
+            instruments=sorted(INSTRUMENTS),
+            enters=get_args(Enters),
+        )
+
+
+@router.get("/pages/plans/{plan}", dependencies=[needs("reader")])
+def show_plan(plan: Digest, request: Request, caller: Asking, db: Db) -> Response:
+    """Show a plan with its playbacks."""
+    with db.reading() as session:
+        found = find_plan(session, plan)
+        return render(
+            request,
+            "plan.html",
+            caller,
+            plan=found,
+            played=overview.playbacks_of(session, found),
+            job=overview.newest_job(session, "playback", plan=found.sha256),
+        )
+
+
+@router.get("/pages/jobs", dependencies=[needs("reader")])
+def show_jobs(
+    request: Request,
+    caller: Asking,
+    db: Db,
+    state: Literal["", "queued", "running", "succeeded", "failed", "cancelled"] = "",
+    cursor: RowCursor = None,
+) -> Response:
+    """Show jobs, the newest first, and where a batch is started."""
+    with db.reading() as session:
+        return render(
+            request,
+            "jobs.html",
+            caller,
+            found=jobs.list_jobs(session, overview.MOST, cursor, state or None),
+            state=state,
+            most=overview.MOST,
+            surgeons=overview.all_surgeons(session),
+            sutures=overview.all_suture_types(session),
+        )
+
+
+@router.get("/pages/jobs/{job}", dependencies=[needs("reader")])
+def show_job(
+    job: JobId, request: Request, caller: Asking, db: Db, limit: Limit = overview.MOST, cursor: RowCursor = None
+) -> Response:
+    """Show a job as it runs; of a batch its styles too."""
+    with db.reading() as session:
+        found = jobs.find_job(session, job)
+        batch = found.kind == batches.BATCH
+        return render(
+            request,
+            "job.html",
+            caller,
+            job=found,
+            counts=batches.count(session, found.row) if batch else None,
+            styles=retraining.list_styles(session, found, limit, cursor, None) if batch else [],
+            limit=limit,
+        )
+
+
+@router.get("/pages/catalogue", dependencies=[needs("reader")])
+def show_people(request: Request, caller: Asking, db: Db) -> Response:
+    """Show surgeons and suture types, to add and change."""
+    with db.reading() as session:
+        return render(
+            request,
+            "people.html",
+            caller,
+            surgeons=overview.all_surgeons(session),
+            sutures=overview.all_suture_types(session),
+        )
+
+
+def _json(content: dict[str, Any]) -> Response:
+    return Response(orjson.dumps(content), headers={"Cache-Control": "no-store"}, media_type=JSON)

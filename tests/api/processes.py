@@ -1,0 +1,65 @@
+"""Several servers as processes of their own on one database, without workers."""
+
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import httpx2 as httpx
+
+from skills.jobs.child import environment
+from skills.settings import Settings
+from tests.api.service import CSV, KESTREL, serving
+from tests.library import cases
+
+PATIENCE_S = 180.0  # where the machine is busy, a server starts slowly
+
+
+@contextmanager
+def servers(url: str, number: int) -> Iterator[list[httpx.Client]]:
+    """Start servers as `skills serve` does, and give a client of each once it answers."""
+    settings = [Settings(database_url=url, port=free_port(), workers=0) for _ in range(number)]
+    command = [sys.executable, "-m", "skills", "serve"]
+    started = [subprocess.Popen(command, env=environment(one)) for one in settings]
+    clients = [httpx.Client(base_url=f"http://127.0.0.1:{one.port}", timeout=PATIENCE_S) for one in settings]
+    try:
+        for one, process in zip(settings, started, strict=True):
+            wait_until_it_answers(one.port, process)
+        yield clients
+    finally:
+        for client in clients:
+            client.close()
+        for process in started:
+            process.terminate()
+        for process in started:
+            process.wait(PATIENCE_S)
+
+
+def learn_two_versions(url: str) -> None:
+    """Learn kestrel's style twice, and release the first version."""
+    with serving(url) as service:
+        service.client.put_surgeon("kestrel")
+        service.client.add_demo(cases.hand_off(), media_type=CSV, **KESTREL)
+        service.train(release=True)
+        service.train(seed=2)
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port: int = taken.getsockname()[1]
+        return port
+
+
+def wait_until_it_answers(port: int, process: subprocess.Popen[bytes]) -> None:
+    deadline = time.monotonic() + PATIENCE_S
+    while True:
+        assert process.poll() is None, "the server ended"
+        assert time.monotonic() < deadline, "the server does not answer"
+        try:
+            httpx.get(f"http://127.0.0.1:{port}/healthz")
+        except httpx.TransportError:
+            time.sleep(0.05)
+        else:
+            return

@@ -1,0 +1,278 @@
+"""The pages without a browser: what they say, what they never let through, and what their views are drawn from."""
+
+import re
+import shutil
+from collections.abc import Iterator
+from functools import cache
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from sqlalchemy import select
+from starlette.testclient import TestClient
+
+from skills.api.pages.assets import PLOTLY, PLOTLY_MAP_STYLE, assets, build
+from skills.api.pages.words import number, share, size
+from skills.db.models import Demonstration, Job, Plan, PolicyVersion, StoredRecording
+from skills.library.overview import matrix
+from skills.library.policies import find_version
+from skills.library.verified import covered, learnt
+from skills.library.views import moves_to_goal
+from skills.style.policy import rollout_from
+from tests.api.keyed import As, copy_of_told, key
+from tests.api.service import CSV, KESTREL, Service, assert_problem, serving
+from tests.library import cases
+from tests.migrations.make_fixture import RELEASES
+
+STYLE = f"/pages/styles/kestrel/{cases.SUTURE}"
+NASTY = """<script>alert(1)</script>'"><img src=x onerror=alert(2)>{{ 7 * 7 }}"""
+USE = "not a medical device"
+
+
+class Html(HTMLParser):
+    """A page's tags with their attributes, and its text."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.text = ""
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+    def addresses(self) -> Iterator[str]:
+        for _, about in self.tags:
+            yield from (value or "" for name, value in about.items() if name in ("href", "src", "action"))
+
+
+@pytest.fixture(scope="module")
+def told(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
+    """Kestrel has everything up to a playback and its pictures, heron a demonstration."""
+    with serving(copy_of_told(tmp_path_factory.mktemp("told"))) as service:
+        yield service
+
+
+def every_page(service: Service) -> list[str]:
+    """List an address of every kind of page there is, and of each thing that there is one of."""
+    with service.database.reading() as session:
+        recordings = session.scalars(select(StoredRecording.sha256)).all()
+        plans = session.scalars(select(Plan.sha256)).all()
+        jobs = session.scalars(select(Job.id).where(Job.kind != "retraining-part")).all()
+        styles = {(demo.surgeon.slug, demo.suture) for demo in session.scalars(select(Demonstration))}
+    return [
+        *("/", "/pages/recordings", "/pages/recordings/new", "/pages/plans", "/pages/plans/new", "/pages/jobs"),
+        *("/pages/catalogue", "/?q=kestrel&state=released&skill=expert"),
+        *(f"/pages/styles/{surgeon}/{suture}" for surgeon, suture in sorted(styles)),
+        *(f"/pages/recordings/{one}" for one in recordings),
+        *(f"/pages/plans/{one}" for one in plans),
+        *(f"/pages/plans/new?like={one}" for one in plans),
+        *(f"/pages/jobs/{one}" for one in jobs),
+    ]
+
+
+def page_of(service: Service, path: str) -> Html:
+    answer = service.http.get(path, headers={"Accept": "text/html"})
+    assert answer.status_code == 200, (path, answer.text[:400])
+    assert answer.headers["content-type"] == "text/html; charset=utf-8"
+    return Html(answer.text)
+
+
+def test_every_page_runs_our_files_alone_and_says_what_it_is_not(told: Service) -> None:
+    for path in every_page(told):
+        page = page_of(told, path)
+        assert page.text.count(USE) >= 2, path
+        for tag, about in page.tags:
+            assert tag != "style" and "style" not in about and not any(name.startswith("on") for name in about), path
+            assert tag != "script" or (about.get("src") or "").startswith("/static/"), path
+        assert all(address.startswith(("/", "#")) and not address.startswith("//") for address in page.addresses()), (
+            path
+        )
+        assert all(f"/static/{build()}/" in address for address in page.addresses() if address.startswith("/static/"))
+
+
+def test_the_policy_lets_nothing_in_that_is_not_ours(told: Service) -> None:
+    policy = told.http.get("/").headers["content-security-policy"]
+    parts = dict(part.strip().split(" ", 1) for part in policy.split(";"))
+    assert parts["default-src"] == "'none'"
+    assert parts["script-src"] == parts["style-src"] == parts["connect-src"] == "'self'"
+    assert parts["frame-ancestors"] == parts["base-uri"] == "'none'"
+    assert "unsafe" not in policy and "http" not in policy
+
+
+def test_names_are_shown_as_they_are_and_never_run(tmp_path: Path) -> None:
+    about = {"name": NASTY, "also_called": [NASTY], "family": NASTY, "description": NASTY}
+    shown = 0
+    with serving(copy_of_told(tmp_path)) as service:
+        assert service.http.put(f"/suture-types/{cases.SUTURE}", json=about).status_code == 200
+        assert service.http.put("/surgeons/plover", json={"protocol": NASTY[:200]}).status_code == 201
+        for path in every_page(service):
+            page = page_of(service, path)
+            shown += NASTY in page.text
+            assert not any(about.get("src") == "x" for _, about in page.tags), path
+            assert all(about.get("src") for tag, about in page.tags if tag == "script"), path
+    assert shown >= 5
+
+
+def test_behind_a_prefix_every_address_has_it(tmp_path: Path) -> None:
+    with serving(copy_of_told(tmp_path)) as service:
+        service.http = TestClient(service.app, str(service.http.base_url), root_path="/lab/skills")
+        for path in every_page(service):
+            page = page_of(service, path)
+            assert all(address.startswith(("/lab/skills/", "#")) for address in page.addresses()), path
+            assert ("meta", {"name": "root", "content": "/lab/skills"}) in page.tags
+
+
+def test_an_installation_of_an_older_version_has_all_its_pages(tmp_path: Path) -> None:
+    for release in sorted(RELEASES.iterdir()):
+        shutil.copy(release / "skills.sqlite", tmp_path / f"{release.name}.sqlite")
+        with serving(f"sqlite:///{tmp_path / release.name}.sqlite") as service:
+            for path in every_page(service):
+                page_of(service, path)
+
+
+def test_an_empty_service_says_how_to_begin(service: Service) -> None:
+    assert "Nothing is here yet" in page_of(service, "/").text
+    for path in every_page(service):
+        page_of(service, path)
+
+
+def test_what_is_not_there_is_said_on_a_page(told: Service) -> None:
+    for path in (
+        "/pages/styles/nobody/simple-running",
+        f"/pages/plans/{'0' * 64}",
+        "/pages/jobs/no",
+        f"{STYLE}?version=99",
+    ):
+        answer = told.http.get(path)
+        assert answer.status_code == 404
+        assert "That is not here" in Html(answer.text).text
+
+
+def test_an_erased_surgeon_is_gone_from_every_page(tmp_path: Path) -> None:
+    with serving(copy_of_told(tmp_path)) as service:
+        before = every_page(service)
+        assert service.http.delete("/surgeons/kestrel").status_code == 204
+        assert service.http.get(STYLE).status_code == 410
+        assert "kestrel" not in "".join(service.http.get(path).text for path in before if "kestrel" not in path)
+
+
+@pytest.mark.parametrize(
+    ("role", "allowed"),
+    [("reader", set()), ("trainer", {"Train"}), ("releaser", {"Train", "Release", "Withdraw the release", "Withdraw"})],
+)
+def test_a_button_works_only_for_those_who_may(tmp_path: Path, role: str, allowed: set[str]) -> None:
+    with serving(copy_of_told(tmp_path)) as service:
+        key(service, "somebody", "admin")
+        text = As(service, key(service, "mine", role))("GET", STYLE).text
+    buttons = re.findall(r"<button([^>]*data-call[^>]*)>([^<]+)</button>", text)
+    assert {name for about, name in buttons if " disabled" not in about} == allowed
+    assert {name for _, name in buttons} == {"Train", "Release", "Withdraw the release", "Withdraw"}
+
+
+def test_a_search_finds_surgeons_sutures_and_other_names(told: Service) -> None:
+    with told.database.reading() as session:
+
+        def found(words: str, **how: str) -> list[tuple[str, list[str]]]:
+            shown = matrix(session, words, **how)  # type: ignore[arg-type]
+            return [(who.slug, [one.suture for one in styles if one.state != "empty"]) for who, styles in shown.rows]
+
+        style = ("kestrel", [cases.SUTURE])
+        assert found("kest") == [style]
+        assert found("CONTINUOUS kestrel") == [style]
+        assert found("over-and-over", state="released") == [style]
+        assert found("%") == found("nobody") == []
+        assert found("", skill="novice") == []
+        assert ("heron", [cases.SUTURE]) in found("", state="stored")
+
+
+def test_a_part_of_the_styles_follows_another(told: Service) -> None:
+    with told.database.reading() as session:
+        first = matrix(session, limit=1)
+        second = matrix(session, limit=1, after=first.next)
+    assert [who.slug for who, _ in (*first.rows, *second.rows)] == ["heron", "kestrel"]
+
+
+def test_the_moves_to_the_goal_are_those_of_the_rollouts(told: Service) -> None:
+    with told.database.reading() as session:
+        for version in session.scalars(select(PolicyVersion)):
+            policy, reaches = learnt(version), covered(version).reaches
+            moves = moves_to_goal(policy, reaches)
+            for state in (*policy.path.states.tolist(), *range(0, policy.path.grid.n_states, 7)):
+                followed = rollout_from(policy, state)
+                assert moves[state] == (len(followed.states) - 1 if reaches[state] else -1)
+
+
+def test_the_view_shows_what_the_calls_give(told: Service) -> None:
+    view = told.http.get(f"{STYLE}/versions/1/view").json()
+    demo = told.client.policy(**KESTREL)["demos"][0]
+    path = told.http.get(f"/demos/{demo}/path").json()
+    rewards = told.http.get(f"/demos/{demo}/reward-map").json()
+    assert view["path_mm"] == path["path_mm"]
+    assert np.allclose(view["recorded_mm"], path["recorded_mm"], atol=1e-3)
+    assert view["rewards"]["of"] == rewards["rewards"]
+    with told.database.reading() as session:
+        coverage = covered(find_version(session, "kestrel", cases.SUTURE, 1))
+        assert view["starts"]["reaches"] == coverage.reaches.tolist()
+        assert view["starts"]["nearest"] == coverage.joins_nearest.tolist()
+    assert view["starts"]["at_mm"][1] == [-30.0, 25.0, -135.0]  # the states in their order, z fastest
+
+
+def test_the_time_line_has_every_arms_speed_and_the_presses(told: Service) -> None:
+    with told.database.reading() as session:
+        recording = session.scalars(select(StoredRecording).where(StoredRecording.format == "mcap")).one()
+        sha256, duration_s = recording.sha256, recording.about["duration_s"]
+    traces = told.http.get(f"/pages/recordings/{sha256}/traces").json()
+    (arm,) = traces["arms"]
+    assert traces["duration_s"] == duration_s
+    assert arm["speed"]["t_s"][-1] == pytest.approx(duration_s, abs=0.1)
+    assert max(arm["speed"]["mm_s"]) > 10
+    assert all(down < up <= duration_s for down, up in arm["clutch_s"])
+
+
+@cache
+def own() -> dict[str, bytes]:
+    return {name: asset.content for name, asset in assets().items() if name != PLOTLY}
+
+
+def test_a_file_is_kept_for_good_under_the_address_of_its_build(told: Service) -> None:
+    for name, asset in assets().items():
+        answer = told.http.get(f"/static/{build()}/{name}", headers={"Accept-Encoding": "gzip"})
+        assert answer.content == asset.content
+        assert answer.headers["content-encoding"] == "gzip"
+        assert "immutable" in answer.headers["cache-control"]
+        plain = told.http.get(f"/static/older/{name}", headers={"Accept-Encoding": "identity"})
+        assert plain.content == asset.content
+        assert plain.headers["cache-control"] == "no-cache"
+
+
+@pytest.mark.parametrize("name", ["page.py", "..%2fpage.py", "%2e%2e/page.py", "site.css%00", "", ".js"])
+def test_no_other_file_is_given(told: Service, name: str) -> None:
+    assert told.http.get(f"/static/{build()}/{name}").status_code == 404
+
+
+def test_our_files_know_no_outside_address() -> None:
+    for name, content in own().items():
+        addresses = set(re.findall(rb"https?://[^\"'\s)]+", content))
+        assert addresses <= {b"http://www.w3.org/2000/svg"}, name
+
+
+def test_the_script_of_plotly_still_leaves_its_maps_style_out_where_asked() -> None:
+    script = assets()[PLOTLY].content
+    assert f'getElementById("{PLOTLY_MAP_STYLE}")'.encode() in script
+    assert b".no-inline-styles" in script
+
+
+def test_numbers_are_written_with_their_units_and_never_rounded_up_to_all() -> None:
+    assert [number(0.0, "mm"), number(1331), number(12.5, "s"), number(None)] == ["0 mm", "1,331", "12.5 s", "–"]
+    assert [share(1.0), share(0.9998), share(0.5), share(None)] == ["100.0 %", "> 99.9 %", "50.0 %", "–"]
+    assert [size(12), size(2048), size(3 << 20)] == ["12 bytes", "2.0 KiB", "3.0 MiB"]
+
+
+def test_a_problem_of_a_call_is_no_page(told: Service) -> None:
+    assert_problem(told.http.get("/policies/nobody/simple-running"), 404)
+    assert told.http.post("/recordings", content=b"", headers={"Content-Type": CSV}).status_code == 422

@@ -1,0 +1,149 @@
+"""Every route and every role: exactly the allowed answers; a route that declares nothing is found."""
+
+from collections.abc import Iterator
+from datetime import timedelta
+from pathlib import Path
+
+import pytest
+from fastapi import APIRouter
+
+from skills.api.access import Needs
+from skills.api.gate import is_open
+from skills.db.base import now
+from skills.library.keys import LADDER, revoke_key
+from tests import backends
+from tests.api.keyed import As, key, routes
+from tests.api.service import Service, serving
+
+EVERYBODY, READER, UPLOADER, TRAINER, RELEASER, ADMIN = None, *LADDER
+NEEDED = {
+    "GET /healthz": EVERYBODY,
+    "GET /openapi.json": EVERYBODY,
+    "GET /docs": EVERYBODY,
+    "GET /sign-in": EVERYBODY,
+    "POST /sign-in": EVERYBODY,
+    "POST /sign-out": READER,
+    "GET /static/{version}/{name}": EVERYBODY,
+    "GET /readyz": READER,
+    "GET /metrics": READER,
+    "PUT /surgeons/{surgeon}": ADMIN,
+    "DELETE /surgeons/{surgeon}": ADMIN,
+    "PUT /suture-types/{suture}": ADMIN,
+    "POST /recordings": UPLOADER,
+    "POST /demos": UPLOADER,
+    "POST /recordings/{recording}/demos": UPLOADER,
+    "POST /suture-points": UPLOADER,
+    "DELETE /demos/{demo}": RELEASER,
+    "POST /trainings": TRAINER,
+    "POST /retrainings": TRAINER,
+    "DELETE /jobs/{job}": TRAINER,
+    "POST /plans": TRAINER,
+    "POST /playbacks": TRAINER,
+    "POST /playbacks/{playback}/pictures": TRAINER,
+    "POST /policies/{surgeon}/{suture}/versions/{version}/release": RELEASER,
+    "DELETE /policies/{surgeon}/{suture}/release": RELEASER,
+    "POST /policies/{surgeon}/{suture}/rollouts": READER,
+    "POST /policies/{surgeon}/{suture}/next": READER,
+    "GET /keys": ADMIN,
+    "POST /keys": ADMIN,
+    "DELETE /keys/{key}": ADMIN,
+}  # every other GET: a reader's
+SHAPES = {
+    "surgeon": "nobody",
+    "suture": "simple-running",
+    "job": "0" * 16,
+    "key": "0" * 8,
+    "version": "1",
+    "name": "site.css",
+}
+
+
+def path_of(path: str) -> str:
+    """Fill a path with what there is not."""
+    for name in [part[1:-1] for part in path.split("/") if part.startswith("{")]:
+        path = path.replace(f"{{{name}}}", SHAPES.get(name, "0" * 64))
+    return path
+
+
+@pytest.fixture
+def service(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Service]:
+    monkeypatch.setattr("skills.api.limits.BAD_AT_ONCE", 10**6)
+    with serving(backends.fresh("sqlite", tmp_path), key_requests_per_s=1e6) as service:
+        yield service
+
+
+def test_every_route_answers_every_role_as_the_table_says(service: Service):
+    credentials = {role: key(service, f"a {role}", role) for role in LADDER}
+    revoked, ends = key(service, "gone", "admin"), now() + timedelta(milliseconds=50)
+    expired = key(service, "late", "admin", expires_at=ends)
+    with service.database.writing() as session:
+        revoke_key(session, revoked.split("_")[1], "local")
+    while now() < ends:
+        pass
+    other = credentials["admin"][:-43] + "A" * 43
+    strangers = {"nothing": "", "not a key": "letmein", "a wrong key": other, "revoked": revoked, "expired": expired}
+    declared = set()
+    for method, path, _ in routes(service):
+        named = f"{method} {path}"
+        needed = NEEDED.get(named, READER) if method == "GET" else NEEDED[named]
+        declared.add(named)
+        for who, text in (strangers | credentials).items():
+            ask = As(service, text) if text else service.http.request
+            status = ask(method, path_of(path), follow_redirects=False).status_code
+            if needed is None:
+                assert status not in (401, 403) or (named, status) == ("POST /sign-in", 401), (named, who, status)
+            elif who in strangers:
+                assert status == 401, (named, who, status)
+            elif LADDER.index(who) < LADDER.index(needed):
+                assert status == 403, (named, who, status)
+            else:
+                assert status not in (401, 403), (named, who, status)
+    assert set(NEEDED) <= declared
+
+
+def undeclared(service: Service) -> list[str]:
+    """Find the routes that do not say what they need, or say another thing than the gate knows."""
+    found = []
+    for method, path, dependencies in routes(service):
+        needs = [one.dependency for one in dependencies if isinstance(one.dependency, Needs)]
+        if path == "/openapi.json":
+            continue  # FastAPI's own
+        if len(needs) != 1 or (needs[0].role is None) != is_open(path):
+            found.append(f"{method} {path}")
+    return found
+
+
+def test_every_route_declares_what_it_needs_and_one_that_does_not_is_found_and_let_nobody_in(service: Service):
+    assert undeclared(service) == []
+    forgotten = APIRouter()
+    forgotten.get("/forgotten")(lambda: "everything")
+    service.app.include_router(forgotten)
+    assert undeclared(service) == ["GET /forgotten"]
+    key(service, "anna", "reader")
+    assert service.http.get("/forgotten").status_code == 401
+
+
+def test_releasing_with_a_training_is_for_releasers_and_erasing_a_demonstration_for_admins(service: Service):
+    asked = {"surgeon": "nobody", "suture": "simple-running"}
+    trainer, releaser, admin = (As(service, key(service, role, role)) for role in ("trainer", "releaser", "admin"))
+    for path, body in (("/trainings", asked), ("/retrainings", asked)):
+        assert trainer("POST", path, json=body).status_code == 404
+        assert trainer("POST", path, json=body | {"release": True}).status_code == 403
+        assert releaser("POST", path, json=body | {"release": True}).status_code == 404
+    for who, erase, status in (
+        (releaser, "false", 404),
+        (releaser, "true", 403),
+        (releaser, "1", 403),
+        (admin, "1", 404),
+    ):
+        assert who("DELETE", f"/demos/{'0' * 64}?erase={erase}").status_code == status
+
+
+def test_who_did_what_is_known_by_the_owner_of_the_key(service: Service):
+    admin = As(service, key(service, "anna", "admin"))
+    assert admin("PUT", "/surgeons/kestrel", json={}).status_code == 201
+    from sqlalchemy import text
+
+    with service.database.reading() as session:
+        said = session.execute(text("SELECT actor, action, object_kind FROM events ORDER BY row")).all()
+    assert [tuple(one) for one in said[-2:]] == [("local", "create", "key"), ("anna", "add", "surgeon")]

@@ -1,0 +1,103 @@
+"""Requests made up from the OpenAPI document, fit and unfit ones: never our mistake, and always what the document says.
+
+schemathesis makes them up and judges the answers; `conformance`, which judges the answers of all tests, does too.
+"""
+
+from collections.abc import Iterator
+from functools import cache
+from typing import Any
+
+import pytest
+import schemathesis
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import strategies as st
+from schemathesis.checks import CHECKS
+from schemathesis.config import GenerationConfig, ProjectConfig, ProjectsConfig, SchemathesisConfig
+from schemathesis.generation import GenerationMode
+
+from tests.api.conformance import conformance
+from tests.api.service import GOAL_MM, KESTREL, Service, copy_of_trained, serving
+
+BASE = "http://localhost"
+JUDGED_BY = (
+    "not_a_server_error",
+    "status_code_conformance",
+    "content_type_conformance",
+    "response_headers_conformance",
+    "response_schema_conformance",
+)
+A_FEW, MANY = 6, 200  # requests for each operation
+
+
+@cache
+def operations() -> dict[str, Any]:
+    generation = GenerationConfig(deterministic=True)
+    projects = ProjectsConfig(default=ProjectConfig(generation=generation))
+    schema = schemathesis.openapi.from_dict(conformance().document, config=SchemathesisConfig(projects=projects))
+    found = (result.ok() for result in schema.get_all_operations())
+    return {one.label: one for one in found}
+
+
+@pytest.fixture(scope="module")
+def lasting(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
+    with serving(copy_of_trained(tmp_path_factory.mktemp("made-up"))) as service:
+        yield service
+
+
+@pytest.fixture
+def service(request: pytest.FixtureRequest, label: str) -> Service:
+    """The service that all share, but for what takes things away."""
+    shared = not label.startswith("DELETE")
+    found: Service = request.getfixturevalue("lasting" if shared else "trained")
+    return found
+
+
+def known(service: Service) -> dict[str, Any]:
+    """Name one of everything that can be had without the simulator."""
+    demo = service.client.demos()[0]
+    plan = service.client.plan(**KESTREL, suture_points=[{"position_mm": GOAL_MM}])
+    job = service.http.get("/jobs").json()["items"][0]
+    policy = service.client.policy(**KESTREL)
+    names = {"demo": demo["id"], "recording": demo["recording"], "plan": plan["id"], "job": job["id"]}
+    return {**KESTREL, **names, "policy": policy["sha256"], "version": 1}
+
+
+def sweep(service: Service, label: str, examples: int) -> int:
+    """Send what is made up for one operation, half of it to things that there are; how many were sent."""
+    operation, sent = operations()[label], 0
+    judged_by = JUDGED_BY[1:] if label == "GET /readyz" else JUDGED_BY  # no worker is here, so 503 is its answer
+    names = {name: value for name, value in known(service).items() if f"{{{name}}}" in label}
+    modes = (GenerationMode.POSITIVE, GenerationMode.NEGATIVE)
+    parts = [{}, {"path_parameters": names}] if names else [{}]
+    made_up = st.one_of(*(operation.as_strategy(generation_mode=mode, **part) for mode in modes for part in parts))
+
+    @settings(
+        max_examples=examples,
+        phases=[Phase.generate],  # what fails is told as it is: to make it smaller takes longer than to find it
+        derandomize=True,
+        database=None,
+        deadline=None,
+        suppress_health_check=[*HealthCheck],
+    )
+    @given(made_up)
+    def run(case: Any) -> None:
+        nonlocal sent
+        asked = case.as_transport_kwargs(base_url=BASE)
+        body, _ = asked.pop("data", None), asked.pop("cookies", None)
+        answer = service.http.request(**asked, **({} if body is None else {"content": body}))
+        sent += 1
+        case.validate_response(answer, checks=CHECKS.get_by_names(judged_by))
+
+    run()
+    return sent
+
+
+@pytest.mark.parametrize("label", operations())
+def test_no_made_up_request_is_our_mistake_or_answered_otherwise_than_documented(service: Service, label: str):
+    assert sweep(service, label, A_FEW) > 0
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("label", operations())
+def test_two_hundred_made_up_requests_for_each_operation(service: Service, label: str):
+    assert sweep(service, label, MANY) > 0

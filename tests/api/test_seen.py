@@ -1,0 +1,191 @@
+"""A key that is restricted to heron: whatever is kestrel's is answered as if it were not there, in every call."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from sqlalchemy import select
+
+from skills.api.gate import is_open
+from skills.db.base import Base
+from skills.db.models import Job
+from skills.db.seen import OF_NOBODY, Only
+from skills.library.batches import to_tell
+from skills.library.keys import held, list_keys
+from tests.api.keyed import HERON, As, copy_of_told, key, routes
+from tests.api.service import CSV, GOAL_MM, KESTREL, Service, serving
+from tests.library import cases
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
+    with serving(copy_of_told(tmp_path_factory.mktemp("told")), key_requests_per_s=1e6) as service:
+        yield service
+
+
+@pytest.fixture
+def admin(service: Service) -> As:
+    return As(service, key(service, "anna", "admin"))
+
+
+@pytest.fixture
+def heron(service: Service) -> As:
+    """The highest key that can be restricted."""
+    return As(service, key(service, "of heron", "releaser", surgeons=["heron"]))
+
+
+def ids(admin: As, surgeon: str) -> dict[str, str]:
+    """Find what is a surgeon's, by the name that it has in paths."""
+    demo = admin("GET", f"/demos?surgeon={surgeon}").json()["items"][0]
+    found = {"surgeon": surgeon, "suture": cases.SUTURE, "demo": demo["id"], "recording": demo["recording"]}
+    jobs = admin("GET", "/jobs").json()["items"]
+    if surgeon == "kestrel":
+        played = next(job["result"] for job in jobs if job["kind"] == "playback")
+        served = admin("GET", f"/policies/kestrel/{cases.SUTURE}").json()
+        found |= {"job": next(job["id"] for job in jobs if job["kind"] == "retraining"), "version": "2"}
+        found |= {"policy": served["sha256"], "playback": played["playback"]}
+        found["plan"] = admin("GET", f"/playbacks/{played['playback']}").json()["plan"]
+    return found
+
+
+def filled(path: str, about: dict[str, str]) -> str | None:
+    """Fill a path with ids; None: it names nothing of a surgeon's."""
+    names = [part[1:-1] for part in path.split("/") if part.startswith("{")]
+    if not set(names) & set(about) - {"suture", "version"}:
+        return None
+    for name in names:
+        path = path.replace(f"{{{name}}}", about[name])
+    return path
+
+
+def test_every_path_that_names_something_of_kestrels_is_404_and_all_of_it_is_there(
+    service: Service, admin: As, heron: As
+):
+    kestrels, seen = ids(admin, "kestrel"), 0
+    query = {"/plans/{plan}/comparison": f"?demo={kestrels['demo']}"}
+    for method, path, _ in routes(service):
+        if (where := filled(path, kestrels)) is None:
+            continue
+        where += query.get(path, "")
+        answer = heron(method, where)
+        bodiless = (
+            method == "POST" and "{surgeon}" not in path
+        )  # refused for want of a body, before anything is looked for
+        refused = {403} if path == "/surgeons/{surgeon}" and method != "GET" else {404, 422} if bodiless else {404}
+        assert answer.status_code in refused, (method, path, answer.status_code)
+        assert "kestrel" not in answer.text, (method, path)
+        if method == "GET" and not path.endswith("/events"):
+            there = admin("GET", where).status_code
+            assert there == 200 or path.endswith((".png", ".gif", ".mp4", "comparison")), (path, there)
+            seen += there == 200
+    assert seen > 20
+
+
+def test_what_is_herons_own_is_there(service: Service, admin: As, heron: As):
+    own, seen = ids(admin, "heron"), 0
+    for method, path, _ in routes(service):
+        names = {part[1:-1] for part in path.split("/") if part.startswith("{")}
+        if method == "GET" and names and names <= set(own) and names & {"surgeon", "demo", "recording"}:
+            status = heron("GET", filled(path, own) or "").status_code
+            assert status == admin("GET", filled(path, own) or "").status_code, path
+            seen += status == 200
+    assert seen >= 8
+
+
+def test_no_list_and_no_page_has_anything_of_kestrels(service: Service, admin: As, heron: As):
+    full = 0
+    for method, path, _ in routes(service):
+        if method != "GET" or "{" in path or is_open(path):
+            continue
+        answer = heron("GET", path)
+        assert answer.status_code == (403 if path in ("/readyz", "/metrics", "/keys") else 200), path
+        assert "kestrel" not in answer.text, path
+        full += "kestrel" in admin("GET", path).text
+    assert full >= 5
+    assert [one["surgeon"] for one in heron("GET", "/surgeons").json()["items"]] == ["heron"]
+    assert len(heron("GET", "/demos").json()["items"]) == 1
+    assert heron("GET", "/policies").json()["items"] == []
+    assert heron("GET", "/jobs").json()["items"] == []
+
+
+def test_no_body_or_query_reaches_anything_of_kestrels(service: Service, admin: As, heron: As):
+    kestrels, own = ids(admin, "kestrel"), ids(admin, "heron")
+    asked: list[tuple[str, str, dict[str, Any]]] = [
+        ("POST", "/trainings", {"json": KESTREL}),
+        ("POST", "/trainings", {"json": HERON | {"demos": [kestrels["demo"]]}}),
+        ("POST", "/retrainings", {"json": {"surgeon": "kestrel"}}),
+        ("POST", "/plans", {"json": KESTREL | {"suture_points": [{"position_mm": GOAL_MM}]}}),
+        ("POST", "/playbacks", {"json": {"plan": kestrels["plan"]}}),
+        ("POST", f"/recordings/{own['recording']}/demos", {"json": KESTREL}),
+        ("POST", f"/recordings/{kestrels['recording']}/demos", {"json": HERON}),
+        ("POST", "/demos", {"params": KESTREL, "content": cases.hand_off(), "headers": {"Content-Type": CSV}}),
+        ("GET", "/demos?surgeon=kestrel", {}),
+        ("GET", f"/policies?surgeon=kestrel&suture={cases.SUTURE}", {}),
+    ]
+    for method, path, how in asked:
+        answer = heron(method, path, **how)
+        assert answer.status_code in (404, 409), (path, answer.text)
+        assert answer.status_code == 404 or "demos" in how["json"], path
+
+
+def test_a_batch_for_all_is_one_for_the_surgeons_of_the_key(service: Service, admin: As, heron: As):
+    asked = heron("POST", "/retrainings", json={})
+    assert asked.status_code == 202
+    job = asked.json()["id"]
+    about = heron("GET", f"/retrainings/{job}").json()
+    assert [one["surgeon"] for one in about["items"]] == ["heron"]
+    assert job in [one["id"] for one in heron("GET", "/jobs").json()["items"]]
+    alike = As(service, key(service, "another of heron", "trainer", surgeons=["heron"]))
+    assert alike("POST", "/retrainings", json={}).json()["id"] == job
+    assert job in [one["id"] for one in alike("GET", "/jobs").json()["items"]]
+    everybodys = admin("POST", "/retrainings", json={}).json()["id"]
+    for where in (f"/jobs/{everybodys}", f"/retrainings/{everybodys}"):
+        assert (heron("GET", where).status_code, admin("GET", where).status_code) == (404, 200)
+    with service.database.seen_by(held_by(service, "of heron")).reading() as session:
+        found = session.scalar(select(Job).where(Job.id == job))
+        assert found is not None
+        assert len(to_tell(session, found)) == 1  # its parts are seen too, or no engine would be told
+    assert heron("DELETE", f"/jobs/{job}").json()["state"] == "cancelled"
+    assert admin("DELETE", f"/jobs/{everybodys}").json()["state"] == "cancelled"
+
+
+def held_by(service: Service, owner: str) -> Only | None:
+    with service.database.reading() as session:
+        return next(held(one).only for one in list_keys(session) if one.owner == owner)
+
+
+def test_who_brings_bytes_that_are_here_already_learns_nothing_from_it_and_sees_them_from_then_on(
+    service: Service, admin: As, heron: As
+):
+    recording = ids(admin, "kestrel")["recording"]
+    assert heron("GET", f"/recordings/{recording}").status_code == 404
+    sent = [heron("POST", "/recordings", content=cases.hand_off(), headers={"Content-Type": CSV}) for _ in range(2)]
+    assert [one.status_code for one in sent] == [201, 200]
+    assert heron("GET", f"/recordings/{recording}").status_code == 200
+    assert "kestrel" not in heron("GET", f"/recordings/{recording}").text
+    other = As(service, key(service, "beside heron", "releaser", surgeons=["heron"]))
+    assert other("GET", f"/recordings/{recording}").status_code == 404
+    cut = heron("POST", f"/recordings/{recording}/demos", json=HERON)
+    assert cut.status_code == 201
+    assert other("GET", f"/recordings/{recording}").status_code == 200
+
+
+def test_an_erased_surgeon_leaves_the_key_with_nobody_and_not_with_everybody(tmp_path: Path):
+    with serving(copy_of_told(tmp_path)) as service:
+        admin, heron = (
+            As(service, key(service, "anna", "admin")),
+            As(service, key(service, "h", "reader", surgeons=["heron"])),
+        )
+        assert heron("GET", "/surgeons/heron").status_code == 200
+        assert admin("DELETE", "/surgeons/heron").status_code == 204
+        service.app.state.access.forget()
+        assert heron("GET", "/surgeons").json()["items"] == []
+        assert heron("GET", "/surgeons/kestrel").status_code == 404
+        assert admin("GET", "/keys").json()["items"][1]["surgeons"] == []
+
+
+def test_every_table_has_a_rule_or_is_said_to_need_none():
+    ruled = {table.__tablename__ for table in Only("somebody", frozenset({1})).rules}
+    assert ruled | set(OF_NOBODY) == set(Base.metadata.tables)
+    assert not ruled & set(OF_NOBODY)

@@ -1,0 +1,67 @@
+"""`skills serve` as it is, and beside the application constant answers, of the same server and outside of it.
+
+`python -m tests.bench.beside BYTES ...` answers `/constant/BYTES`, in no more steps than the protocol has, and
+`/fastapi/BYTES`, by a route of FastAPI's that does nothing else. With 0 it is an empty 304.
+"""
+
+import sys
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+from fastapi import FastAPI, Response
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from skills import serving
+from skills.settings import settings
+
+create_app = serving.create_app
+
+
+def constants(sizes: list[int]) -> dict[str, tuple[dict[str, Any], dict[str, Any]]]:
+    """Write the messages of the plain ones."""
+    kept = {}
+    for size in sizes:
+        headers = [(b"content-length", str(size).encode()), (b"content-type", b"application/json")] if size else []
+        start = {"type": "http.response.start", "status": 200 if size else 304, "headers": headers}
+        kept[f"/constant/{size}"] = start, {"type": "http.response.body", "body": b"x" * size}
+    return kept
+
+
+def routes(sizes: list[int]) -> FastAPI:
+    """Make an application of constant routes."""
+    app = FastAPI(openapi_url=None)
+    for size in sizes:
+        app.get(f"/fastapi/{size}")(route(size))
+    return app
+
+
+def route(size: int) -> Callable[[], Awaitable[Response]]:
+    content = b"x" * size
+
+    async def constant() -> Response:
+        return Response(content, 200 if content else 304, media_type="application/json")
+
+    return constant
+
+
+class Beside:
+    """The application, and the constant answers before it."""
+
+    def __init__(self, app: Any, sizes: list[int]) -> None:
+        self.app, self.state = app, app.state
+        self.kept, self.routes = constants(sizes), routes(sizes)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        path = scope.get("path", "")
+        if path in self.kept:
+            for message in self.kept[path]:
+                await send(message)
+            return
+        app: ASGIApp = self.routes if path.startswith("/fastapi/") else self.app
+        await app(scope, receive, send)
+
+
+if __name__ == "__main__":
+    sizes = [int(one) for one in sys.argv[1:]]
+    serving.create_app = lambda given: Beside(create_app(given), sizes)  # type: ignore[assignment,return-value]
+    serving.serve(settings())

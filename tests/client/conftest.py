@@ -1,0 +1,3 @@
+from tests.api.conftest import still, trained
+
+__all__ = ["still", "trained"]

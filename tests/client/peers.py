@@ -1,0 +1,101 @@
+"""What a client may meet: a service that does what a script says, and a clock that goes when somebody sleeps."""
+
+import asyncio
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import httpx2 as httpx
+
+from skills.client import AsyncClient, Client, Retrying
+
+ADDRESS = "http://127.0.0.1:9"
+SURGEON = {
+    **{"surgeon": "kestrel", "skill_level": "expert", "handedness": None, "protocol": None, "consent": None},
+    "created_at": "2026-01-02T03:04:05Z",
+}
+Outcome = httpx.Response | Exception
+
+
+class Script(httpx.BaseTransport, httpx.AsyncBaseTransport):
+    """A service whose answers are known beforehand, the last one for ever; it remembers what it was asked."""
+
+    def __init__(self, *outcomes: Outcome) -> None:
+        self.outcomes = list(outcomes)
+        self.asked: list[httpx.Request] = []
+        self.bodies: list[bytes] = []
+
+    def handle_request(self, request: httpx.Request) -> httpx.Response:
+        self.bodies.append(request.read())
+        return self._next(request)
+
+    async def handle_async_request(self, request: httpx.Request) -> httpx.Response:
+        self.bodies.append(await request.aread())
+        return self._next(request)
+
+    def _next(self, request: httpx.Request) -> httpx.Response:
+        self.asked.append(request)
+        outcome = self.outcomes.pop(0) if len(self.outcomes) > 1 else self.outcomes[0]
+        if isinstance(outcome, Exception):
+            raise outcome
+        return httpx.Response(outcome.status_code, headers=outcome.headers, content=outcome.content)
+
+
+class Time:
+    """Seconds that pass only while somebody sleeps, or is asked."""
+
+    def __init__(self) -> None:
+        self.now_s = 0.0
+        self.slept: list[float] = []
+
+    def clock(self) -> float:
+        return self.now_s
+
+    def sleep(self, seconds: float) -> None:
+        self.slept.append(seconds)
+        self.now_s += seconds
+
+    async def sleep_later(self, seconds: float) -> None:
+        self.sleep(seconds)
+
+
+Asked = Callable[..., Any]
+
+
+def at_once(script: Script, time: Time, **how: Any) -> Asked:
+    """Call a `Client` of a script: the name of a call and what it takes."""
+
+    def ask(name: str, /, *args: Any, **kwargs: Any) -> Any:
+        with Client(httpx.Client(base_url=ADDRESS, transport=script), clock=time.clock, sleep=time.sleep, **how) as one:
+            return getattr(one, name)(*args, **kwargs)
+
+    return ask
+
+
+def awaited(script: Script, time: Time, **how: Any) -> Asked:
+    """Call an `AsyncClient` in the same way."""
+
+    async def ask(name: str, /, *args: Any, **kwargs: Any) -> Any:
+        http = httpx.AsyncClient(base_url=ADDRESS, transport=script)
+        async with AsyncClient(http, clock=time.clock, sleep=time.sleep_later, **how) as one:
+            return await getattr(one, name)(*args, **kwargs)
+
+    return lambda *args, **kwargs: asyncio.run(ask(*args, **kwargs))
+
+
+BOTH = [at_once, awaited]
+
+
+def answer(body: Any = SURGEON, status: int = 200, **headers: str) -> httpx.Response:
+    return httpx.Response(status, json=body, headers=headers)
+
+
+def refusal(status: int, **headers: str) -> httpx.Response:
+    body = {"type": "urn:suture-skills:busy", "title": "Busy", "status": status, "detail": "Try again in a moment."}
+    return httpx.Response(status, json=body, headers={"content-type": "application/problem+json"} | headers)
+
+
+def asked(script: Script) -> Sequence[str]:
+    return [f"{one.method} {one.url.raw_path.decode()}" for one in script.asked]
+
+
+PATIENT = Retrying()

@@ -1,0 +1,180 @@
+"""Whether something has changed, told without reading a table: at once, and rather not at all than wrongly."""
+
+import asyncio
+import os
+import signal
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from time import monotonic
+
+import pytest
+from sqlalchemy import text
+
+from skills.db.base import now
+from skills.db.changes import APPLICATION, BOUND_S, Changes, Unasked, announce, changes_of
+from skills.db.models import Executor
+from skills.db.session import Database
+from skills.library.events import record
+from skills.library.releases import SERVED
+from tests import backends
+
+Story = Callable[[Changes, Database], Awaitable[None]]
+NOBODY = {"surgeon": "nobody", "suture": "simple-running"}
+PATIENCE_S = 20.0
+
+
+def told(backend: str, folder: Path, story: Story) -> None:
+    """Tell a story on the event loop of a service, while another process, as it were, uses the same database."""
+    url = backends.fresh(backend, folder)
+    mine, another = Database(url), Database(url)
+
+    async def run() -> None:
+        changes = changes_of(mine)
+        assert changes.version() is None
+        await changes.open()
+        try:
+            await until(lambda: changes.version() is not None)
+            await story(changes, another)
+        finally:
+            await changes.close()
+        assert changes.version() is None
+
+    asyncio.run(run())
+    mine.close()
+    another.close()
+    backends.drop(url)
+
+
+async def until(what: Callable[[], object]) -> float:
+    began = monotonic()
+    while not what():
+        assert monotonic() - began < PATIENCE_S
+        await asyncio.sleep(0.001)
+    return monotonic() - began
+
+
+def change(database: Database) -> None:
+    with database.writing() as session:
+        record(session, "test", "change", "surgeon", "nobody")
+        announce(session)
+
+
+def beat(database: Database) -> None:
+    with database.writing() as session:
+        session.merge(Executor(id="a worker", beat_at=now()))
+
+
+def listeners(database: Database) -> list[int]:
+    with database.reading() as session:
+        named = text("SELECT pid FROM pg_stat_activity WHERE application_name = :name AND datname = current_database()")
+        return list(session.scalars(named, {"name": APPLICATION}))
+
+
+@contextmanager
+def stopped(pid: int) -> Iterator[None]:
+    os.kill(pid, signal.SIGSTOP)
+    try:
+        yield
+    finally:
+        os.kill(pid, signal.SIGCONT)
+
+
+@pytest.mark.parametrize("backend", backends.BACKENDS)
+def test_the_version_stays_until_another_process_has_changed_something(backend: str, tmp_path: Path):
+    async def story(changes: Changes, another: Database) -> None:
+        versions = [changes.version()]
+        for _ in range(5):
+            await asyncio.sleep(0.15)
+            assert changes.version() == versions[-1]
+            await asyncio.to_thread(change, another)
+            await until(lambda: changes.version() != versions[-1])
+            versions.append(changes.version())
+        assert len(set(versions)) == 6
+
+    told(backend, tmp_path, story)
+
+
+def test_on_sqlite_a_commit_is_seen_as_soon_as_it_is_made_and_a_heartbeat_too(tmp_path: Path):
+    async def story(changes: Changes, another: Database) -> None:
+        for work in (change, beat) * 20:
+            before = changes.version()
+            assert changes.first(SERVED, NOBODY) is None
+            assert changes.version() == before
+            work(another)
+            assert changes.version() != before
+
+    told("sqlite", tmp_path, story)
+
+
+def test_a_commit_that_is_not_finished_is_not_seen(tmp_path: Path):
+    async def story(changes: Changes, another: Database) -> None:
+        before = changes.version()
+        with another.writing() as session:
+            record(session, "test", "change", "surgeon", "nobody")
+            assert changes.version() == before
+        assert changes.version() != before
+
+    told("sqlite", tmp_path, story)
+
+
+def test_on_postgresql_this_process_sees_its_own_commits_at_once_and_nobodys_heartbeats(tmp_path: Path):
+    async def story(changes: Changes, another: Database) -> None:
+        before = changes.version()
+        await asyncio.to_thread(beat, another)
+        await asyncio.sleep(0.3)
+        assert changes.version() == before
+        with pytest.raises(Unasked):
+            changes.first(SERVED, NOBODY)
+
+    told("postgresql", tmp_path, story)
+
+    async def run() -> None:
+        url = backends.fresh("postgresql", tmp_path)
+        database = Database(url)
+        changes = changes_of(database)
+        await changes.open()
+        await until(lambda: changes.version() is not None)
+        for _ in range(20):
+            before = changes.version()
+            change(database)
+            assert changes.version() != before
+        await changes.close()
+        database.close()
+        backends.drop(url)
+
+    asyncio.run(run())
+
+
+def test_a_line_that_is_cut_tells_nothing_until_there_is_another(tmp_path: Path):
+    async def story(changes: Changes, another: Database) -> None:
+        before = changes.version()
+        (pid,) = listeners(another)
+        with another.writing() as session:
+            session.execute(text("SELECT pg_terminate_backend(:pid)"), {"pid": pid})
+        await until(lambda: changes.version() is None)
+        await asyncio.to_thread(change, another)
+        await until(lambda: changes.version() is not None)
+        assert changes.version() != before
+        before = changes.version()
+        await asyncio.to_thread(change, another)
+        await until(lambda: changes.version() != before)
+
+    told("postgresql", tmp_path, story)
+
+
+def test_a_line_that_falls_silent_tells_nothing_after_the_bound(tmp_path: Path):
+    async def story(changes: Changes, another: Database) -> None:
+        before = changes.version()
+        (pid,) = listeners(another)
+        with stopped(pid):
+            await asyncio.to_thread(change, another)
+            began = monotonic()
+            while (version := changes.version()) is not None:
+                assert version == before
+                assert monotonic() - began < BOUND_S + 0.5, "the loop was held up itself"
+                await asyncio.sleep(0.01)
+        await until(lambda: changes.version() is not None)
+        await until(lambda: changes.version() != before)
+
+    told("postgresql", tmp_path, story)

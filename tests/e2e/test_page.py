@@ -1,0 +1,289 @@
+"""The page in a real browser: from a recording to a playback, without a word of complaint or a foreign address."""
+
+import io
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from playwright.sync_api import Browser, Locator, expect
+
+from skills.client import Client
+from skills.seeds.recordings import sample_recordings
+from tests.e2e.browsers import Watched, browsing
+from tests.e2e.conftest import Service, running
+
+SAMPLE = next(s for s in sample_recordings() if len(s.segments) > 1)
+STYLE = f"{SAMPLE.surgeon}/{SAMPLE.suture}"
+WORK_MS = 90_000  # for a training or a playback on a busy machine
+expect.set_options(timeout=30_000)
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with browsing() as started:
+        yield started
+
+
+@pytest.fixture(scope="module")
+def url(service: Service, client: Client) -> str:
+    """A service on which one style is released."""
+    client.put_surgeon(SAMPLE.surgeon, skill_level="expert")
+    start_s, end_s = SAMPLE.segments[0]
+    client.add_demo(SAMPLE.data, surgeon=SAMPLE.surgeon, suture=SAMPLE.suture, start_s=start_s, end_s=end_s)
+    client.wait(client.train(SAMPLE.surgeon, SAMPLE.suture, release=True), timeout_s=WORK_MS / 1000)
+    return service.url
+
+
+@contextmanager
+def visiting(browser: Browser, url: str, **how: bool) -> Iterator[Watched]:
+    """Open a tab of which, in the end, the browser has complained of nothing and asked nobody else."""
+    tab = Watched(browser, url, **how)
+    yield tab
+    tab.context.close()
+    assert tab.complaints == []
+    assert tab.foreign() == []
+
+
+@pytest.fixture
+def tab(browser: Browser, url: str) -> Iterator[Watched]:
+    with visiting(browser, url) as opened:
+        yield opened
+
+
+def colours(drawn: bytes) -> int:
+    """Count the colours of a picture: a canvas on which nothing was drawn has one."""
+    pixels = np.asarray(Image.open(io.BytesIO(drawn)).convert("RGB"))
+    return len(np.unique(pixels.reshape(-1, 3), axis=0))
+
+
+def camera(scene: Locator) -> list[float]:
+    eye: dict[str, float] = scene.evaluate("place => place._fullLayout.scene._scene.getCamera().eye")
+    return [eye[axis] for axis in "xyz"]
+
+
+def when_drawn(tab: Watched) -> Locator:
+    scene = tab.page.locator("#view")
+    expect(scene).to_have_attribute("data-drawn", "true")
+    return scene
+
+
+def test_from_an_empty_service_to_a_playback(browser: Browser, tmp_path: Path) -> None:
+    with running(tmp_path) as fresh, visiting(browser, fresh.url) as tab:
+        add_a_surgeon(tab)
+        send_a_recording(tab, tmp_path)
+        accept_a_hand_off(tab)
+        train_and_release(tab)
+        plan_and_play(tab)
+
+
+def add_a_surgeon(tab: Watched) -> None:
+    tab.open("/")
+    expect(tab.page.get_by_role("heading", name="Nothing is here yet")).to_be_visible()
+    tab.shoot("empty")
+    tab.page.get_by_role("link", name="Add a surgeon").click()
+    tab.page.get_by_label("Pseudonym, never a name").fill(SAMPLE.surgeon)
+    tab.page.get_by_label("Skill").select_option("expert")
+    tab.page.get_by_role("button", name="Save the surgeon").click()
+    expect(tab.page.get_by_role("row", name=re.compile(f"{SAMPLE.surgeon} expert"))).to_be_visible()
+
+
+def send_a_recording(tab: Watched, folder: Path) -> None:
+    recording = folder / "theatre.mcap"
+    recording.write_bytes(SAMPLE.data)
+    tab.open(f"/pages/recordings/new?surgeon={SAMPLE.surgeon}&suture={SAMPLE.suture}")
+    tab.page.get_by_label("Choose a file, or drop it here").set_input_files(recording)
+    tab.page.get_by_role("button", name="Send").click()
+    tab.page.wait_for_url(re.compile("/pages/recordings/[0-9a-f]{64}"))
+
+
+def accept_a_hand_off(tab: Watched) -> None:
+    """Choose a proposal with the keyboard, and correct where it begins."""
+    page = tab.page
+    expect(page.locator("#timeline svg")).to_have_attribute("data-drawn", "true")
+    page.get_by_role("button", name=re.compile("^Proposal 2,")).press("Enter")
+    begins = page.locator('[name="start_s"]')
+    corrected = round(float(begins.input_value()) + 0.05, 3)
+    begins.fill(str(corrected))
+    assert float(page.locator("#from").input_value()) == pytest.approx(corrected, abs=0.011)
+    page.get_by_role("button", name="Accept this hand-off").click()
+    expect(page.locator("#made")).to_contain_text("Path length")
+    tab.shoot("hand-off")
+
+
+def train_and_release(tab: Watched) -> None:
+    made = tab.page.locator("#made")
+    made.get_by_role("button", name="Train", exact=True).click()
+    expect(made).to_contain_text("was learnt and passes the gate", timeout=WORK_MS)
+    made.get_by_role("button", name="Release version 1").click()
+    expect(made).to_contain_text("Version 1 is released")
+    tab.open("/")
+    expect(tab.page.get_by_role("link", name=re.compile("released.*version 1 served"))).to_be_visible()
+
+
+def plan_and_play(tab: Watched) -> None:
+    page = tab.page
+    tab.open("/pages/plans/new")
+    expect(page.locator("#above")).to_have_attribute("data-drawn", "true")
+    page.get_by_label("Points", exact=True).fill("2")
+    page.get_by_role("button", name="Lay").click()
+    x = page.get_by_label("Pass 1, x in mm")
+    at = float(x.input_value())
+    page.get_by_role("slider", name="Suture point 1").press("ArrowRight")
+    assert float(x.input_value()) == pytest.approx(at + 1)
+    page.get_by_role("button", name="Make the plan").click()
+
+    page.wait_for_url(re.compile("/pages/plans/[0-9a-f]{64}"))
+    assert colours(when_drawn(tab).screenshot()) > 100
+    page.get_by_role("button", name="Play it in the simulator").click()
+    expect(page.locator(".verdict")).to_contain_text("Feasible", timeout=WORK_MS)
+    picture = page.get_by_role("img", name="The simulated scene with all passes")
+    picture.scroll_into_view_if_needed()
+    page.wait_for_function("img => img.complete && img.naturalWidth > 100", arg=picture.element_handle())
+    with page.expect_download() as bag:
+        page.get_by_role("button", name="Replay bag").click()
+    assert Path(bag.value.path()).read_bytes()[:2] == b"PK"
+    when_drawn(tab)
+    tab.shoot("plan")
+
+
+def test_the_view_can_be_turned_and_starts_chosen(tab: Watched) -> None:
+    tab.open(f"/pages/styles/{STYLE}")
+    page, scene = tab.page, when_drawn(tab)
+    followed = page.locator("#starts li")
+    expect(followed).to_have_count(1)  # the demonstrated start
+    assert colours(scene.screenshot()) > 100
+    before, box = camera(scene), scene.bounding_box()
+    assert box is not None
+    middle = (box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    page.mouse.move(*middle)
+    page.mouse.down()
+    page.mouse.move(middle[0] + 120, middle[1] + 20, steps=6)
+    page.mouse.up()
+    dragged = camera(scene)
+    assert np.abs(np.subtract(dragged, before)).max() > 0.1
+    scene.focus()
+    scene.press("ArrowRight")
+    eye = "document.getElementById('view')._fullLayout.scene._scene.getCamera().eye"
+    moved = f"before => ['x', 'y', 'z'].some((axis, at) => Math.abs(before[at] - {eye}[axis]) > 0.02)"
+    page.wait_for_function(moved, arg=dragged)
+
+    start = page.locator("#start")
+    start.get_by_label("x mm").fill("20")
+    start.get_by_label("y mm").fill("75")
+    start.get_by_role("button", name="Follow").click()
+    expect(followed).to_have_count(2)
+    expect(followed.last).to_contain_text("reaches the goal")
+    scene.evaluate("place => place.emit('plotly_click', {points: [{customdata: [[-30, 75, -140], 9]}]})")
+    expect(followed).to_have_count(3)
+    page.get_by_role("checkbox", name="Rewards").check()
+    with page.expect_download() as saved:
+        page.get_by_role("button", name="Save picture").click()
+    assert colours(Path(saved.value.path()).read_bytes()) > 100
+    tab.shoot("style")
+
+
+def test_what_is_refused_is_said_in_words_where_it_arose(browser: Browser, url: str) -> None:
+    tab = Watched(browser, url)
+    tab.open(f"/pages/styles/{STYLE}")
+    when_drawn(tab)
+    start = tab.page.locator("#start")
+    start.get_by_label("x mm").fill("9000")
+    start.get_by_role("button", name="Follow").click()
+    expect(tab.page.locator("#start-said")).to_contain_text("outside the grid")
+    tab.context.close()
+    assert [one for one in tab.complaints if "422" not in one] == []  # Chromium tells of the refusal itself
+
+
+def test_a_withdrawal_says_what_it_means_and_needs_a_yes(tab: Watched, client: Client) -> None:
+    page, dialog = tab.page, tab.page.get_by_role("dialog")
+    tab.open(f"/pages/styles/{STYLE}")
+    page.get_by_role("button", name="Withdraw the release").click()
+    expect(dialog).to_contain_text("nothing of this style is served")
+    dialog.get_by_role("button", name="Cancel").click()
+    expect(dialog).to_be_hidden()
+    assert client.policy(SAMPLE.surgeon, SAMPLE.suture)
+    page.get_by_role("button", name="Withdraw the release").click()
+    dialog.get_by_role("button", name="Withdraw").click()
+    expect(page.locator(".lead").first).to_contain_text("learnt, not released")
+    page.get_by_role("button", name="Release", exact=True).click()
+    dialog.get_by_role("button", name="Release").click()
+    expect(page.locator(".lead").first).to_contain_text("version 1 is what clients are served")
+
+
+def test_an_erasure_waits_until_the_pseudonym_is_typed(tab: Watched, client: Client) -> None:
+    page, dialog = tab.page, tab.page.get_by_role("dialog")
+    client.put_surgeon("siskin")
+    tab.open("/pages/catalogue")
+    page.get_by_role("button", name="Erase siskin").click()
+    erase = dialog.get_by_role("button", name="Erase for good")
+    expect(erase).to_be_disabled()
+    dialog.get_by_label("Type siskin to go on").fill("siski")
+    expect(erase).to_be_disabled()
+    dialog.get_by_label("Type siskin to go on").fill("siskin")
+    erase.click()
+    expect(page.get_by_role("button", name="Erase siskin")).to_have_count(0)
+    expect(page.get_by_role("button", name=f"Erase {SAMPLE.surgeon}")).to_be_visible()
+
+
+def test_a_batch_is_started_and_watched(tab: Watched) -> None:
+    page = tab.page
+    tab.open("/pages/jobs")
+    page.get_by_label("only those in need of it").uncheck()
+    page.get_by_role("button", name="Train again").click()
+    page.wait_for_url(re.compile("/pages/jobs/[0-9a-f]{16}"))
+    expect(page.locator("#job")).to_contain_text("1 of 1 styles done", timeout=WORK_MS)
+    tab.shoot("batch")
+
+
+PAGES = {
+    "style": f"/pages/styles/{STYLE}",
+    "styles": "/",
+    "recordings": "/pages/recordings",
+    "upload": "/pages/recordings/new",
+    "plans": "/pages/plans",
+    "plan-editor": "/pages/plans/new",
+    "jobs": "/pages/jobs",
+    "catalogue": "/pages/catalogue",
+}
+
+
+@pytest.mark.parametrize("name", ["desk-light", "desk-dark", "phone-light", "phone-dark"])
+def test_every_page_fits_its_window_and_says_what_it_is_for(browser: Browser, url: str, name: str) -> None:
+    with visiting(browser, url, phone="phone" in name, dark="dark" in name) as tab:
+        for which, path in PAGES.items():
+            tab.open(path)
+            if which == "style":
+                when_drawn(tab)
+            assert tab.too_wide() <= 0, which
+            expect(tab.page.get_by_text("not a medical device").first).to_be_visible()
+            tab.shoot(f"{name}-{which}")
+
+
+def test_light_or_dark_is_chosen_and_stays(tab: Watched) -> None:
+    ground = "getComputedStyle(document.body).backgroundColor"
+    tab.open("/pages/jobs")
+    light = tab.page.evaluate(ground)
+    tab.page.get_by_role("button", name="Light or dark").dblclick()  # from what the system has over light to dark
+    dark = tab.page.evaluate(ground)
+    assert dark != light
+    tab.open("/pages/plans")
+    assert tab.page.evaluate(ground) == dark
+
+
+def test_everything_is_reached_with_the_keyboard_and_the_focus_is_seen(tab: Watched) -> None:
+    page = tab.page
+    tab.open("/")
+    reached = []
+    for _ in range(14):
+        page.keyboard.press("Tab")
+        reached.append(
+            page.evaluate("(focus => (focus.ariaLabel || focus.textContent).trim())(document.activeElement)")
+        )
+        assert page.evaluate("getComputedStyle(document.activeElement).outlineStyle") != "none", reached[-1]
+    assert reached[0] == "Skip to the content"
+    assert {"Styles", "Recordings", "Plans", "Jobs", "Catalogue"} <= set(reached)
+    assert any("released" in one for one in reached)

@@ -1,0 +1,123 @@
+"""A worker stopped past its lease and continued: another has done its training, and its own result changes nothing."""
+
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+from sqlalchemy import select, text
+
+from skills.db.models import Event, Executor, Job, PolicyVersion
+from skills.jobs.child import environment
+from skills.jobs.engine import workflow_id
+from skills.settings import Settings
+from skills.style.learning.q_learning import CellQLearning
+from tests import backends
+from tests.jobs.house import ROOT, Records, Worker, until
+from tests.jobs.test_batches import can_write, stop_between_transactions
+from tests.library import cases
+
+SLOW = CellQLearning(episodes=800_000)  # about a second of learning, so that there is a middle
+PATIENCE_S = 300.0
+
+
+@pytest.fixture(params=backends.BACKENDS)
+def records(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Records]:
+    url = backends.fresh(request.param, tmp_path)
+    records = Records(url)
+    yield records
+    records.close()
+    backends.drop(url)
+
+
+@contextmanager
+def workers(records: Records, folder: Path) -> Iterator[dict[int, Worker]]:
+    """Two real workers, ready, by their processes; each tells of its every try in a log of its own."""
+    how = environment(Settings(database_url=records.database.url, log_level="info"))
+    started: dict[int, Worker] = {}
+    for number in range(2):
+        with (folder / f"{number}.log").open("wb") as log:
+            worker = subprocess.Popen([sys.executable, "-m", "skills", "worker"], cwd=ROOT, env=how, stderr=log)
+            started[worker.pid] = worker
+    try:
+        until(lambda: records.count(Executor) == 2, PATIENCE_S)
+        yield started
+    finally:
+        for worker in started.values():
+            worker.kill()
+            worker.wait()
+
+
+def stop(records: Records, worker: Worker) -> None:
+    """Stop a worker where it holds the one write lock neither of our database nor of the engine's."""
+    stop_between_transactions(records.database, worker)
+    while records.engine.engine.dialect.name == "sqlite" and not can_write(records.engine):
+        worker.send_signal(signal.SIGCONT)
+        stop_between_transactions(records.database, worker)
+
+
+def told(folder: Path, job: Job) -> int:
+    """Count the tries at a job that the workers' logs tell of."""
+    return sum(f"job_id={job.id}" in line for log in folder.glob("*.log") for line in log.read_text().splitlines())
+
+
+def everything(records: Records) -> list[tuple[Any, ...]]:
+    """Read what trainings write: every job, policy version and event."""
+    with records.database.reading() as session:
+        jobs = select(Job.row, Job.state, Job.attempt, Job.result, Job.error, Job.progress, Job.ended_at)
+        policies = select(PolicyVersion.row, PolicyVersion.sha256, PolicyVersion.version)
+        rows = [
+            session.execute(query.order_by(text("1"))) for query in (jobs, policies, select(Event.row, Event.sha256))
+        ]
+        return [tuple(row) for found in rows for row in found]
+
+
+@pytest.mark.parametrize("times", [1, pytest.param(20, marks=pytest.mark.nightly)])
+def test_the_late_result_of_a_stopped_worker_changes_nothing(records: Records, times: int, tmp_path: Path):
+    cases.add_surgeon(records.database)
+    cases.add_demo(records.database)
+    asked, late = 0, 0
+    with workers(records, tmp_path) as started:
+        while late < times:
+            job = cases.ask_training(records.database, learner=SLOW, seed=asked)
+            asked += 1
+            stopped = stopped_in_the_middle(records, started, job)
+            if stopped is None:
+                continue
+            until(partial(has_ended, records, job), PATIENCE_S)
+            before = everything(records)
+            assert told(tmp_path, job) == 1
+            stopped.send_signal(signal.SIGCONT)
+            until(partial(both_told, tmp_path, job), PATIENCE_S)
+            assert everything(records) == before
+            assert records.state(job.row) == "succeeded"
+            late += 1
+    assert records.count(PolicyVersion) == asked == records.count(Event, Event.action == "finish")
+    assert records.wrong() == []
+    print(f"late results that changed nothing: {late} of {times}")
+
+
+def stopped_in_the_middle(records: Records, started: dict[int, Worker], job: Job) -> Worker | None:
+    """Stop the worker that works on a job; None where it was too fast."""
+    until(lambda: records.state(job.row) != "queued", PATIENCE_S)
+    worker = started.get(records.held().get(workflow_id(job.row, job.attempt), 0))
+    if worker is None:
+        return None
+    stop(records, worker)
+    if has_ended(records, job):
+        worker.send_signal(signal.SIGCONT)
+        return None
+    return worker
+
+
+def both_told(folder: Path, job: Job) -> bool:
+    return told(folder, job) == 2
+
+
+def has_ended(records: Records, job: Job) -> bool:
+    return records.state(job.row) not in ("queued", "running")

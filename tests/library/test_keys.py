@@ -1,0 +1,189 @@
+"""Keys and sign-ins, on both back ends."""
+
+from datetime import timedelta
+
+import pytest
+from sqlalchemy import select, text, update
+
+from skills.db.base import Base, now
+from skills.db.models import Key, SignIn, Surgeon
+from skills.db.session import Database
+from skills.errors import BadInput, Conflict, NotFound
+from skills.library.erasure import erase_surgeon
+from skills.library.keys import (
+    about_key,
+    create_key,
+    digest_of,
+    holder_of,
+    is_keyless,
+    list_keys,
+    refuse_without_keys,
+    revoke_key,
+)
+from skills.library.sign_ins import Lasts, csrf_of, note_use, sign_in, sign_out, signed_in
+from tests.library import cases
+
+LASTS = Lasts(idle_s=3600, most_s=12 * 3600)
+
+
+def make(database: Database, owner: str = "anna", role: str = "reader", **how: object) -> str:
+    with database.writing() as session:
+        return create_key(session, owner, role, "local", **how)[1]  # type: ignore[arg-type]
+
+
+def test_a_key_is_known_by_what_is_shown_once_and_nowhere_stored(database: Database):
+    with database.reading() as session:
+        assert is_keyless(session)
+    key = make(database, role="trainer")
+    name, key_id, secret = key.split("_", 2)
+    assert (name, len(key_id), len(secret)) == ("skills", 8, 43)  # 256 bits in base64
+    with database.reading() as session:
+        holder = holder_of(session, key)
+        assert holder is not None
+        assert (holder.key, holder.owner, holder.role, holder.surgeons) == (key_id, "anna", "trainer", None)
+        assert not is_keyless(session)
+        for table in Base.metadata.tables:
+            for row in session.execute(text(f'SELECT * FROM "{table}"')):
+                assert secret not in str(tuple(row)), table
+        stored = session.scalars(select(Key)).one()
+        assert stored.digest == digest_of(key)
+        for wrong in ("", secret, key[:-1], key + "A", key[:-43] + "A" * 43, f"skills_00000000_{secret}", key.upper()):
+            assert holder_of(session, wrong) is None, wrong
+
+
+def test_no_two_keys_are_alike_and_one_owner_may_have_several(database: Database):
+    keys = [make(database) for _ in range(20)]
+    assert len({key.split("_", 2)[2] for key in keys}) == 20
+    with database.reading() as session:
+        assert {about_key(key)["owner"] for key in list_keys(session)} == {"anna"}
+        assert len({holder.key for holder in (holder_of(session, key) for key in keys) if holder}) == 20
+
+
+def test_a_revoked_key_is_nobodys_and_the_installation_is_not_keyless_for_that(database: Database):
+    key = make(database)
+    with database.writing() as session:
+        revoked = revoke_key(session, key.split("_")[1], "local").revoked_at
+    with database.writing() as session:
+        assert revoke_key(session, key.split("_")[1], "local").revoked_at == revoked
+        assert holder_of(session, key) is None
+        assert not is_keyless(session)
+        with pytest.raises(Conflict, match="skills keys create OWNER --role admin"):
+            refuse_without_keys(session)
+        with pytest.raises(NotFound, match="skills keys list"):
+            revoke_key(session, "00000000", "local")
+        said = session.execute(text("SELECT actor, action FROM events WHERE object_kind = 'key' ORDER BY row")).all()
+    assert [tuple(one) for one in said] == [("local", "create"), ("local", "revoke")]
+    make(database, role="admin")
+    with database.reading() as session:
+        refuse_without_keys(session)
+
+
+def test_a_key_that_runs_out_counts_until_that_moment(database: Database):
+    end = now() + timedelta(hours=1)
+    key = make(database, expires_at=end)
+    with database.reading() as session:
+        holder = holder_of(session, key)
+        assert holder is not None
+        assert holder.counts(end - timedelta(microseconds=1))
+        assert not holder.counts(end)
+    with database.writing() as session:
+        session.execute(update(Key).values(expires_at=now()))
+    with database.reading() as session:
+        assert [about_key(one)["state"] for one in list_keys(session)] == ["expired"]
+        with pytest.raises(Conflict):
+            refuse_without_keys(session)
+
+
+@pytest.mark.parametrize(
+    ("owner", "how"),
+    [
+        ("", {}),
+        ("local", {}),
+        ("worker", {}),
+        ("-x", {}),
+        ("a\nb", {}),
+        ("x" * 65, {}),
+        ("<b>", {}),
+        ("anna", {"expires_at": now() - timedelta(days=1)}),
+        ("anna", {"surgeons": []}),
+        ("anna", {"role": "admin", "surgeons": ["kestrel"]}),
+    ],
+)
+def test_what_cannot_be_meant_makes_no_key(database: Database, owner: str, how: dict[str, object]):
+    with pytest.raises(BadInput):
+        make(database, owner, **how)
+    with pytest.raises(NotFound, match="no surgeon 'nobody'"):
+        make(database, surgeons=["kestrel", "nobody"])
+    with database.reading() as session:
+        assert is_keyless(session)
+
+
+def test_a_restricted_key_stays_restricted_when_its_surgeons_are_erased(database: Database):
+    cases.add_surgeon(database, "heron")
+    key = make(database, surgeons=["heron", "kestrel", "heron"])
+    with database.reading() as session:
+        holder = holder_of(session, key)
+        assert holder is not None
+        assert holder.surgeons == {"heron", "kestrel"}
+    for slug, left in (("heron", {"kestrel"}), ("kestrel", set())):
+        with database.writing() as session:
+            erase_surgeon(session, slug, "local")
+        with database.reading() as session:
+            holder = holder_of(session, key)
+            assert holder is not None
+            assert holder.surgeons == left
+    assert holder.only is not None
+    with database.seen_by(holder.only).reading() as session:
+        assert session.scalars(select(Surgeon)).all() == []
+
+
+def test_a_sign_in_is_known_by_its_cookie_and_over_with_its_key(database: Database):
+    key = make(database).split("_")[1]
+    with database.writing() as session:
+        cookie, other = sign_in(session, key, LASTS), sign_in(session, key, LASTS)
+    with database.reading() as session:
+        found = signed_in(session, cookie, LASTS)
+        assert found is not None
+        assert (found[0].owner, found[1]) == ("anna", False)
+        assert signed_in(session, cookie[:-1] + "!", LASTS) is None
+        assert cookie not in str(session.execute(text("SELECT * FROM sign_ins")).all())
+    assert csrf_of(cookie) != csrf_of(other)
+    assert len(csrf_of(cookie)) == 64
+    with database.writing() as session:
+        sign_out(session, other)
+        assert signed_in(session, other, LASTS) is None
+        assert signed_in(session, cookie, LASTS) is not None
+        revoke_key(session, key, "local")
+        assert signed_in(session, cookie, LASTS) is None
+
+
+def test_a_sign_in_is_over_when_it_was_not_used_and_when_it_is_old(database: Database):
+    key = make(database).split("_")[1]
+    with database.writing() as session:
+        cookie = sign_in(session, key, LASTS)
+
+    def aged(used_s: float, made_s: float) -> tuple[bool, bool]:
+        """Tell whether it lasts, and whether its use is to be noted, when it was made and used so long ago."""
+        ago = {"used_at": now() - timedelta(seconds=used_s), "created_at": now() - timedelta(seconds=made_s)}
+        with database.writing() as session:
+            session.execute(update(SignIn).values(**ago))
+        with database.reading() as session:
+            found = signed_in(session, cookie, LASTS)
+            return found is not None, found is not None and found[1]
+
+    assert aged(5, 5) == (True, False)
+    assert aged(3590, 3590) == (True, True)
+    assert aged(3601, 3601) == (False, False)
+    assert aged(5, 12 * 3600 - 10) == (True, False)
+    assert aged(5, 12 * 3600 + 1) == (False, False)
+    assert aged(3590, 3590) == (True, True)
+    with database.writing() as session:
+        note_use(session, cookie)
+    with database.reading() as session:
+        found = signed_in(session, cookie, LASTS)
+        assert found is not None
+        assert not found[1]
+    aged(3601, 3601)
+    with database.writing() as session:
+        sign_in(session, key, LASTS)
+        assert len(session.scalars(select(SignIn)).all()) == 1  # what is over is forgotten

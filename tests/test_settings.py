@@ -1,0 +1,83 @@
+"""What an installation may be reached by: nothing beyond loopback in the clear, and nobody without a key there."""
+
+from pathlib import Path
+
+import pytest
+from pydantic import ValidationError
+
+from skills.db.session import Database
+from skills.errors import BadSettings, Conflict
+from skills.library.keys import create_key
+from skills.serving import refuse_keyless, serve
+from skills.settings import Settings
+from tests import backends
+
+SECRET = "s" * 32
+TLS = {"tls_cert": Path("cert.pem"), "tls_key": Path("key.pem")}
+
+
+@pytest.mark.parametrize(
+    "how",
+    [
+        {},
+        {"host": "localhost"},
+        {"host": "::1"},
+        {"host": "127.8.8.8"},
+        {"host": "10.1.2.3", **TLS},
+        {"host": "skills.lab", "tls_by_proxy": True},
+        {"host": "0.0.0.0", "hosts": "skills.lab", **TLS},
+        {"proxy_header": "X-Remote-User", "proxy_secret": SECRET},
+    ],
+)
+def test_these_go_together(how: dict[str, object]):
+    Settings(**how).check_address()
+
+
+@pytest.mark.parametrize(
+    ("how", "why"),
+    [
+        ({"host": "0.0.0.0"}, "must not go in the clear"),
+        ({"host": "::"}, "must not go in the clear"),
+        ({"host": "10.1.2.3"}, "SKILLS_TLS_BY_PROXY"),
+        ({"host": "skills.lab"}, "SKILLS_TLS_CERT"),
+        ({"host": "127.0.0.1.nip.io"}, "reached from outside"),
+        ({"tls_cert": Path("cert.pem")}, "belong together"),
+        ({"host": "0.0.0.0", **TLS}, "SKILLS_HOSTS"),
+        ({"host": "::", "tls_by_proxy": True}, "SKILLS_HOSTS"),
+        ({"proxy_header": "X-Remote-User"}, "anybody could send that header"),
+        ({"proxy_header": "X-Remote-User", "proxy_secret": "short"}, "at least 32"),
+    ],
+)
+def test_these_do_not(how: dict[str, object], why: str):
+    with pytest.raises(BadSettings, match=why):
+        Settings(**how).check_address()
+
+
+def test_roles_are_those_of_the_ladder_and_secrets_are_not_shown():
+    with pytest.raises(ValidationError):
+        Settings(proxy_role="god")
+    shown = repr(Settings(api_key="skills_secret", proxy_secret=SECRET))
+    assert "skills_secret" not in shown
+    assert SECRET not in shown
+
+
+def test_beyond_loopback_it_does_not_start_until_somebody_has_a_key_or_a_proxy_says_who_asks(tmp_path: Path):
+    url = backends.fresh("sqlite", tmp_path)
+    outside = Settings(database_url=url, host="skills.lab", tls_by_proxy=True)
+    with pytest.raises(Conflict, match="skills keys create OWNER --role admin"):
+        refuse_keyless(outside)
+    refuse_keyless(Settings(database_url=url))
+    refuse_keyless(outside.model_copy(update={"proxy_header": "X-Remote-User"}))
+    database = Database(url)
+    with database.writing() as session:
+        create_key(session, "anna", "admin", "local")
+    database.close()
+    refuse_keyless(outside)
+
+
+def test_the_samples_are_loaded_at_the_start_by_a_service_of_this_machine_only(tmp_path: Path):
+    url = f"sqlite:///{tmp_path / 'skills.sqlite'}"
+    for how in (TLS, {"host": "skills.lab", "tls_by_proxy": True}):
+        with pytest.raises(BadSettings, match="`skills seed` loads them anywhere"):
+            serve(Settings(database_url=url, **how), samples=True)
+    assert list(tmp_path.iterdir()) == []
