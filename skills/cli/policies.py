@@ -19,7 +19,8 @@ FIGURES = ("metrics.dtw_total_mm", "metrics.exact_states", "metrics.path_states"
 def policy_list(as_json: AsJson = False) -> None:
     """List what is served, one policy for each style."""
     with service() as client:
-        show(client.policies(), as_json, ("surgeon", "suture", "version", "released_at", "released_by", *FIGURES))
+        served = sorted(client.policies(), key=lambda one: (one.surgeon, one.suture))
+        show(served, as_json, ("surgeon", "suture", "version", "released_at", "released_by", *FIGURES))
 
 
 @policies.command("versions")
