@@ -14,10 +14,8 @@ from skills.settings import Settings
 
 BURST_S = 2.0  # a page asks for all it shows at once
 DAY_S = 86_400.0
-BAD_AT_ONCE, BAD_PER_S = (
-    20,
-    20 / 60,
-)  # wrong keys of an address; 256 bits cannot be tried, the database can be kept busy
+# Wrong keys of an address: 256 bits cannot be guessed, but the database can be kept busy.
+BAD_AT_ONCE, BAD_PER_S = 20, 20 / 60
 MOST = 4096  # keys and addresses that are counted; whoever was not seen for longest begins anew
 
 
