@@ -1,12 +1,17 @@
-"""Starting the service: the application in this process, its workers in children at lower priority."""
+"""Starting the service: the application in this process, its workers in children at lower priority.
 
+First it answers, then it gets ready for what only some requests need.
+"""
+
+import gc
 import logging
 import signal
+import socket
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from types import FrameType
 
@@ -15,8 +20,9 @@ import uvicorn
 from skills import logs
 from skills.api.app import create_app, prepare_database
 from skills.client import Client
+from skills.compiled import check_wanted
 from skills.db.session import Database
-from skills.errors import BadSettings
+from skills.errors import BadSettings, SkillsError
 from skills.jobs.child import start_worker_child
 from skills.jobs.warm import align_once, warm_up
 from skills.library.keys import refuse_without_keys
@@ -54,11 +60,19 @@ def serve(settings: Settings, *, samples: bool = False) -> None:
     if samples and (settings.beyond_loopback or settings.tls_cert is not None):
         raise BadSettings("--samples is for a look at this machine's own service; `skills seed` loads them anywhere.")
     logs.configure(settings.log_level, as_json=settings.log_format == "json")
-    warm_up(align_once)
+    check_wanted()
     prepare(settings)
     refuse_keyless(settings)
     app = create_app(settings)
-    server = uvicorn.Server(
+
+    def then() -> None:
+        gc.freeze()  # what is there by now stays, and is not looked through again
+        gc.enable()
+        if samples:
+            threading.Thread(target=_load, args=(settings, app.state.access.own_key), daemon=True).start()
+        warm_up(align_once)
+
+    server = Server(
         uvicorn.Config(
             app,
             host=settings.host,
@@ -73,14 +87,36 @@ def serve(settings: Settings, *, samples: bool = False) -> None:
             access_log=False,
             timeout_graceful_shutdown=GRACE_S,
             server_header=False,
-        )
+        ),
+        then,
     )
     signal.signal(signal.SIGTERM, _leave)  # the server lets a signal through again once it has shut down
     signal.signal(signal.SIGINT, _leave)
     with working(settings):
-        if samples:
-            threading.Thread(target=_load, args=(server, settings, app.state.access.own_key), daemon=True).start()
         server.run()
+    if server.refused is not None:
+        raise server.refused
+
+
+class Server(uvicorn.Server):
+    """A server that does something more once it answers, beside answering, and ends if that is refused."""
+
+    def __init__(self, config: uvicorn.Config, then: Callable[[], None]) -> None:
+        super().__init__(config)
+        self.refused: SkillsError | None = None
+        self._then = then
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Begin to answer."""
+        await super().startup(sockets)
+        if self.started:
+            threading.Thread(target=self._settle, daemon=True).start()
+
+    def _settle(self) -> None:
+        try:
+            self._then()
+        except SkillsError as refused:
+            self.refused, self.should_exit = refused, True
 
 
 @contextmanager
@@ -128,12 +164,8 @@ def _leave(_signal: int, _frame: FrameType | None) -> None:
     sys.exit(0)
 
 
-def _load(server: uvicorn.Server, settings: Settings, key: str) -> None:
-    """Load the samples and train them, over HTTP, once the server answers."""
-    while not server.started:
-        if server.should_exit:
-            return
-        time.sleep(0.05)
+def _load(settings: Settings, key: str) -> None:
+    """Load the samples and train them, over HTTP."""
     with Client(f"http://{settings.host}:{settings.port}", api_key=key) as client:
         for demo in load_samples(client):
             client.train(demo.surgeon, demo.suture, release=True)

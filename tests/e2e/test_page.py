@@ -146,6 +146,9 @@ def plan_and_play(tab: Watched) -> None:
     with page.expect_download() as bag:
         page.get_by_role("button", name="Replay bag").click()
     assert Path(bag.value.path()).read_bytes()[:2] == b"PK"
+    film = page.get_by_label("Film of the playback")
+    expect(film).to_be_visible(timeout=WORK_MS)  # it is drawn after the verdict, and appears by itself
+    page.wait_for_function("film => film.readyState > 0 && film.duration > 1", arg=film.element_handle())
     when_drawn(tab)
     tab.shoot("plan")
 

@@ -11,6 +11,7 @@ from skills.compiled import check_kept, kept_in
 from skills.errors import BadSettings
 from skills.recordings._kernels import follow_compiled
 from skills.style.learning._kernels import warp_compiled
+from tests.api.processes import free_port
 from tests.style.test_kernel_cache import start, told
 
 WARM = """
@@ -20,7 +21,7 @@ from skills.style.palette import palette_of
 def finish():
     [thread.join() for thread in threads() if thread.name == "warm-up"]
 def touched():
-    return {name: len(loop.signatures) for name, loop in loops.items()}
+    return {name: len(loop.machine.signatures) for name, loop in loops.items()}
 """
 
 
@@ -115,6 +116,16 @@ def test_nothing_starts_that_would_load_machine_code_from_where_others_write(tmp
     assert refused.returncode == 1
     assert refused.stderr.startswith("BadSettings: Machine code is loaded from")
     assert list(tmp_path.iterdir()) == [open_to_all]
+
+
+def test_a_server_that_answers_already_ends_where_its_loops_would_be_refused(tmp_path):
+    """As where the package is read-only and the user's own cache folder is open to all: only numba knows of that."""
+    environment = {"NUMBA_CACHE_DIR": "/dev/null/cache", "SKILLS_DATABASE_URL": f"sqlite:///{tmp_path / 'a.sqlite'}"}
+    environment |= {"SKILLS_PORT": str(free_port())}
+    run = [sys.executable, "-m", "skills", "serve"]
+    ended = subprocess.run(run, env={**os.environ, **environment}, capture_output=True, text=True, timeout=60)
+    assert ended.returncode == 1
+    assert "NUMBA_CACHE_DIR=/dev/null/cache cannot be written to" in ended.stderr.splitlines()[-1]
 
 
 def test_nowhere_to_keep_them_is_said():

@@ -14,7 +14,7 @@ from sqlalchemy import inspect, text
 from sqlalchemy.exc import DatabaseError
 
 from skills.db.base import Base
-from skills.db.schema import alembic_config
+from skills.db.schema import alembic_config, revisions
 from skills.db.session import Database
 from skills.errors import Conflict
 from skills.library.demos import find_demo, withdraw_demo
@@ -93,6 +93,11 @@ def test_every_revision_goes_down_and_up_on_tables_with_rows_in_them(database: D
         go(database, command.downgrade, script.down_revision or "base")
     assert tables(database) == {"alembic_version"}
     database.migrate()
+
+
+def test_the_names_of_the_files_say_which_revisions_there_are_and_in_which_order():
+    known = [script.revision for script in ScriptDirectory.from_config(alembic_config()).walk_revisions()]
+    assert list(revisions()) == known
 
 
 def test_what_the_first_version_stored_is_kept_whole_and_still_guarded(database: Database):

@@ -88,7 +88,7 @@ def test_numbers_that_are_no_json_come_back_as_they_would_be_shown():
 
 
 def signatures() -> list[int]:
-    return [len(loop.signatures) for loop in (_kernels.follow_compiled, _kernels.take_compiled)]
+    return [len(loop.machine.signatures) for loop in (_kernels.follow_compiled, _kernels.take_compiled)]
 
 
 def tell_signatures(given: BinaryIO, answer: BinaryIO) -> None:

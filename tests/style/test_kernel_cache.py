@@ -32,7 +32,7 @@ def learn(levels=RewardLevels(), **settings):
     palette_of(policy.q)
     return hashlib.sha256(policy.q.tobytes()).hexdigest()
 def tell(**more):
-    stats = [loop.stats for loop in loops.values()]
+    stats = [loop.machine.stats for loop in loops.values()]
     loaded, compiled = (sum(sum(getattr(s, n).values()) for s in stats) for n in ("cache_hits", "cache_misses"))
     print(json.dumps({"kept": stats[0].cache_path, "loaded": loaded, "compiled": compiled, **more}))
 """
@@ -105,6 +105,6 @@ for levels, cell in [(whole, cell) for cell in cells] + [(costly, CellQLearning(
 dtw(path.tip_mm, path.tip_mm), dtw(path.tip_mm[::-1], path.tip_mm.astype(int).tolist()[1:])
 unaligned = np.frombuffer(bytes(17), np.float64, offset=1)
 palette_of(np.zeros((2, 3))), palette_of(np.zeros((2, 3)).T), palette_of(unaligned), palette_of(np.zeros(0))
-tell(signatures={name: len(loop.signatures) for name, loop in loops.items()})"""
+tell(signatures={name: len(loop.machine.signatures) for name, loop in loops.items()})"""
     signatures = told(start(code))["signatures"]
     assert signatures == dict.fromkeys(signatures, 1)
