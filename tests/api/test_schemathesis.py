@@ -1,6 +1,8 @@
 """Requests made up from the OpenAPI document, fit and unfit ones: never our mistake, and always what the document says.
 
-schemathesis makes them up and judges the answers; `conformance`, which judges the answers of all tests, does too.
+schemathesis makes them up and judges the answers; `conformance`, which judges the answers of all tests, does too. What
+is in bodies is left to that one: it allows no field that is not described, and schemathesis rewrites `prefixItems` in
+the document while it makes requests up, and then judges by what it wrote.
 """
 
 from collections.abc import Iterator
@@ -24,7 +26,6 @@ JUDGED_BY = (
     "status_code_conformance",
     "content_type_conformance",
     "response_headers_conformance",
-    "response_schema_conformance",
 )
 A_FEW, MANY = 6, 200  # requests for each operation
 
@@ -56,7 +57,7 @@ def known(service: Service) -> dict[str, Any]:
     """Name one of everything that can be had without the simulator."""
     demo = service.client.demos()[0]
     plan = service.client.plan(**KESTREL, suture_points=[{"position_mm": GOAL_MM}])
-    job = service.http.get("/jobs").json()["items"][0]
+    job = service.http.get("/jobs?state=succeeded").json()["items"][0]  # of one that waits the events never end
     policy = service.client.policy(**KESTREL)
     names = {"demo": demo["id"], "recording": demo["recording"], "plan": plan["id"], "job": job["id"]}
     return {**KESTREL, **names, "policy": policy["sha256"], "version": 1}
@@ -84,7 +85,8 @@ def sweep(service: Service, label: str, examples: int) -> int:
         nonlocal sent
         asked = case.as_transport_kwargs(base_url=BASE)
         body, _ = asked.pop("data", None), asked.pop("cookies", None)
-        answer = service.http.request(**asked, **({} if body is None else {"content": body}))
+        headers = {name: value.encode("latin-1") for name, value in asked.pop("headers").items()}  # as sent
+        answer = service.http.request(**asked, headers=headers, **({} if body is None else {"content": body}))
         sent += 1
         case.validate_response(answer, checks=CHECKS.get_by_names(judged_by))
 
