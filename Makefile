@@ -6,7 +6,7 @@ READY := $(VENV)/.ready
 export SKILLS_SAMPLE_RECORDINGS ?= $(abspath $(wildcard ../shared/recordings))
 export SKILLS_PAPER_DATA ?= $(abspath $(wildcard ../shared/paper/data))
 
-.PHONY: demo test serve bench nightly lint lock wheelhouse fixture clean
+.PHONY: demo test serve bench nightly deep lint lock wheelhouse fixture clean
 
 # uv where it is present, venv and pip otherwise; either way the same versions, checked by their hashes. One package,
 # movement-primitives, comes as source: setuptools is there first, and without Cython it is built with no compiler.
@@ -57,9 +57,27 @@ lint: $(READY)
 	@$(BIN)/ruff format .
 	@$(BIN)/mypy
 
-# The lock holds versions and hashes, no addresses. Needs uv.
+# The learners beyond the table, into the same `.venv`. torch has builds of one version with other hashes, so it is taken by
+# its version alone, and which build it is, is the installer's setting (CONTRIBUTING.md); all else is checked by hashes.
+TORCH := $(shell sed -n 's/.*"\(torch==[^"]*\)".*/\1/p' pyproject.toml)
+deep: $(READY)
+	@if command -v uv >/dev/null 2>&1; then \
+	  VIRTUAL_ENV=$(CURDIR)/$(VENV) uv pip install -q --no-deps --require-hashes --no-build-isolation -r requirements-deep.lock && \
+	  VIRTUAL_ENV=$(CURDIR)/$(VENV) uv pip install -q $(TORCH) ; \
+	else \
+	  $(BIN)/python -m pip install -q --no-deps --require-hashes --no-build-isolation -r requirements-deep.lock && \
+	  $(BIN)/python -m pip install -q $(TORCH) ; \
+	fi
+
+# The locks hold versions and hashes, no addresses; the second one adds the extra `deep`, but for torch and what a build of
+# it for graphics cards brings along. Needs uv.
+LOCK := uv pip compile pyproject.toml --python-version 3.11 --universal --generate-hashes --no-header --no-annotate -q
+OF_TORCH := /^(torch|triton|cuda-[a-z]+|nvidia-[a-z0-9-]+)==/,/[^\\]$$/d
 lock:
-	uv pip compile pyproject.toml --group dev --python-version 3.11 --universal --generate-hashes --no-header --no-annotate -q -o requirements.lock
+	$(LOCK) --group dev -o requirements.lock
+	@mkdir -p build
+	$(LOCK) --extra deep -c requirements.lock -o build/deep.lock
+	sed -E '$(OF_TORCH)' build/deep.lock > requirements-deep.lock
 
 # What `requirements.lock` names, for this platform, into build/wheelhouse; what comes as source stays source, so that the
 # hashes of the lock hold there too. With pip, for uv downloads nothing.

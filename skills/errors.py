@@ -15,6 +15,7 @@
     │   └── NotDrawnYet         a picture that is being drawn, or that nobody asked for
     ├── Erased                  it was here and was erased for good
     ├── Conflict                it cannot be done in the present state
+    │   └── LearnerNotInstalled a learner that needs what is not installed here
     ├── PreconditionFailed      it changed since the caller last looked
     ├── UnknownFormat           the content is of no format that is read here
     ├── TooLarge                over a limit of the settings
@@ -23,6 +24,7 @@
     ├── Busy                    the database or the queue cannot take it now
     │   └── NotReady            a part of the installation cannot be used; the message says which
     ├── SimulationFailed        the simulator crashed, hung or answered nonsense
+    ├── LearningFailed          the process that learns crashed, hung or took too much
     └── Unanswered              a process of ours gave no answer; whoever asked it says so in words of its own
 
 An error is named after what is wrong, carries the offending numbers as attributes of `numbers`, and its message says
@@ -190,6 +192,14 @@ class NeverLeavesGoal(BadPath):
 
 class BadSettings(BadInput):
     """Settings that cannot be meant."""
+
+
+class LearnerNotInstalled(Conflict):
+    """A learner that needs what is not installed here; the same request can be met once it is."""
+
+
+class LearningFailed(SkillsError):
+    """The process that learns crashed, hung, or needed more than it may have: nothing was learnt."""
 
 
 # ---- plans and motion -------------------------------------------------------------------------------------------

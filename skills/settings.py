@@ -6,7 +6,7 @@ from ipaddress import ip_address
 from pathlib import Path
 from typing import Literal
 
-from pydantic import Field, SecretStr
+from pydantic import Field, SecretStr, ValidationError
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from skills.errors import BadSettings
@@ -52,6 +52,10 @@ class Settings(BaseSettings):
     reading_answer_bytes: int = Field(default=256 * MEBIBYTE, gt=0)  # 4 million poses
     playback_timeout_s: float = Field(default=120.0, gt=0)
     playback_memory_bytes: int = Field(default=1024 * MEBIBYTE, gt=0)
+    learning_timeout_s: float = Field(
+        default=3600.0, gt=0
+    )  # of a learner beyond the table: default budgets take ten minutes
+    learning_memory_bytes: int = Field(default=6144 * MEBIBYTE, gt=0)  # addresses: torch claims half, uses a tenth
     replay_tip_error_mm: float = Field(default=0.65, ge=0)  # a calibrated dVRK's; under it every pass shall succeed
     replay_lower_bound: float = Field(default=0.95, ge=0, le=1)  # as surely: samples do at 0.99, at 3 mm at 0.28
     workers: int = Field(default_factory=_cores, ge=0, le=64)  # processes beside the service; 0: they run elsewhere
@@ -121,5 +125,13 @@ class Settings(BaseSettings):
 
 @cache
 def settings() -> Settings:
-    """Read the environment, once."""
-    return Settings()
+    """Read the environment, once.
+
+    Raises:
+        BadSettings: A variable has a value that cannot be meant; it is named, its value is not: it may be secret.
+    """
+    try:
+        return Settings()
+    except ValidationError as error:
+        said = [f"SKILLS_{'_'.join(map(str, one['loc'])).upper()}: {one['msg']}" for one in error.errors()]
+        raise BadSettings(f"{'; '.join(said)}.") from None

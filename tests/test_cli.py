@@ -109,6 +109,22 @@ def test_a_plan_is_played_drawn_exported_and_its_bag_verified(skills, tmp_path: 
     assert (code, "--point" in said) == (1, True), said
 
 
+def test_a_style_is_learnt_from_several_demonstrations(skills, tmp_path: Path) -> None:
+    assert (skills("migrate")[0], skills("seed")[0]) == (0, 0)
+    style = ("kestrel", "simple-interrupted")
+    file = tmp_path / "five.mcap"
+    file.write_bytes(next(s for s in sample_recordings() if len(s.segments) > 1).data)
+    named = []
+    for proposal in ("1", "2", "3"):
+        add = ("--surgeon", style[0], "--suture", style[1], "--proposal", proposal, "--json")
+        named += ["--demo", json.loads(skills("demo", "add", str(file), *add)[1])["id"]]
+    code, said = skills("train", *style, *named, "--combine", "medoid", "--json")
+    job = json.loads(said)
+    assert (code, job["request"]["combine"], job["result"]["releasable"]) == (0, {"kind": "medoid"}, True), said
+    assert sorted(job["request"]["demos"]) == sorted(named[1::2])
+    assert skills("train", *style, *named[:2], "--combine", "medoid")[0] == 1
+
+
 def test_styles_are_trained_in_a_batch_and_a_failure_is_named_and_told_by_the_exit_code(skills) -> None:
     assert skills("seed")[0] == 0
     code, said = skills("retrain", "--only-stale", "--release", "--json")

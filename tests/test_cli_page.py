@@ -18,6 +18,7 @@ from skills.cli import app
 from skills.seeds.recordings import sample_recordings
 from skills.settings import settings
 from tests.e2e.conftest import running
+from tests.library import rated
 from tests.recordings import trials
 
 PAGE = (Path(__file__).parent.parent / "docs" / "cli.md").read_text()
@@ -35,6 +36,7 @@ def installation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[No
     sample = next(sample for sample in sample_recordings() if sample.surgeon == "wren")
     (tmp_path / "hand-off.mcap").write_bytes(sample.data)
     trials.folder(tmp_path / "jigsaws")
+    rated.folder(tmp_path / "rated")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("TZ", "UTC")
     with running(tmp_path) as service:

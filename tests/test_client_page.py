@@ -51,6 +51,7 @@ def test_every_block_of_the_page_runs_in_the_order_of_the_page(url: str, capsys:
     for said in (
         "22 states; 1331 starts reach the goal",
         "DTW 0.0 mm; 1 pass of",
+        "The way is the reference's all along: 0.0 mm from it on average. Not calibrated",
         "['succeeded', 'succeeded', 'succeeded']",
         "100%\n",
         "succeeded 100%",
@@ -58,6 +59,7 @@ def test_every_block_of_the_page_runs_in_the_order_of_the_page(url: str, capsys:
         "http://127.0.0.1:9 gave no answer",
         "over plain HTTP, where others can read it",
         "[('kestrel', 'simple-running', 1)]",
+        "['kestrel'] Recognition needs at least two surgeons",
     ):
         assert said in printed, printed
     assert names["path"].finished

@@ -9,7 +9,7 @@ from skills.db.session import Database
 from skills.errors import BadSettings, Conflict
 from skills.library.keys import create_key
 from skills.serving import refuse_keyless, serve
-from skills.settings import Settings
+from skills.settings import Settings, settings
 from tests import backends
 
 SECRET = "s" * 32
@@ -81,3 +81,11 @@ def test_the_samples_are_loaded_at_the_start_by_a_service_of_this_machine_only(t
         with pytest.raises(BadSettings, match="`skills seed` loads them anywhere"):
             serve(Settings(database_url=url, **how), samples=True)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_variable_that_cannot_be_meant_is_named_and_its_value_is_not_repeated(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("SKILLS_PORT", "70000")
+    monkeypatch.setenv("SKILLS_WORKERS", "s3cret")
+    with pytest.raises(BadSettings, match=r"SKILLS_PORT: .*65535; SKILLS_WORKERS: .*integer") as refused:
+        settings.__wrapped__()
+    assert "s3cret" not in str(refused.value)

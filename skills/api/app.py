@@ -19,6 +19,8 @@ from skills.api.metrics import Metrics
 from skills.api.observed import Observed
 from skills.api.problems import TOO_LARGE, answer_refusals
 from skills.api.routes import (
+    atlas,
+    atlas_pages,
     cards,
     catalogue,
     demos,
@@ -30,6 +32,7 @@ from skills.api.routes import (
     policies,
     reference,
     retrainings,
+    scores,
     sign_in,
     suture_points,
     trainings,
@@ -92,9 +95,12 @@ def create_app(settings: Settings) -> FastAPI:
     app.include_router(pictures.router)
     app.include_router(retrainings.router)
     app.include_router(cards.router)
+    app.include_router(atlas.router)
+    app.include_router(scores.router)
     app.include_router(operating.router)
     app.include_router(reference.router)
     app.include_router(pages.router)
+    app.include_router(atlas_pages.router)
     app.include_router(sign_in.router)
     app.include_router(keys.router)
     answer_refusals(app)

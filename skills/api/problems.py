@@ -34,6 +34,7 @@ STATUS: tuple[tuple[type[errors.SkillsError], int, str], ...] = (
     (errors.Corrupt, 503, "What is stored is damaged"),
     (errors.Busy, 503, "Busy"),
     (errors.SimulationFailed, 503, "The simulator failed"),
+    (errors.LearningFailed, 503, "What learns failed"),
     (errors.BadInput, 422, "What was sent cannot be used"),
 )
 HEADERS = {

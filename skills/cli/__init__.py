@@ -6,12 +6,12 @@ that `skills --help` is quick.
 
 import typer
 
-from skills.cli import installation, keys, learning, paper, plans, policies, recordings, surgeons
+from skills.cli import atlas, installation, keys, learning, paper, plans, policies, recordings, scoring, surgeons
 
 app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     help="Suture styles: learn, certify, serve and check. Research use only.",
 )
-for part in (installation, keys, recordings, learning, policies, plans, paper, surgeons):
+for part in (installation, keys, recordings, learning, policies, plans, atlas, scoring, paper, surgeons):
     app.add_typer(part.commands)

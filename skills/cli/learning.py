@@ -1,7 +1,8 @@
 """Training, and jobs of every kind."""
 
+import json
 import time
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -20,6 +21,7 @@ from skills.cli.shell import (
     service,
     show,
 )
+from skills.errors import BadInput
 
 if TYPE_CHECKING:
     from skills.api.schemas.given import Retraining
@@ -33,6 +35,8 @@ jobs = typer.Typer(no_args_is_help=True, help="Trainings, playbacks and other lo
 commands.add_typer(jobs, name="job")
 
 JobId = Annotated[str, typer.Argument(help="The job's id.")]
+Kind = Annotated[str | None, typer.Option("--learner", help="Of this kind, such as value-iteration or dqn.")]
+Chosen = Annotated[list[str] | None, typer.Option("--setting", help="Of that learner, as steps=100000; repeatable.")]
 
 
 @commands.command()
@@ -40,13 +44,24 @@ JobId = Annotated[str, typer.Argument(help="The job's id.")]
 def train(
     surgeon: Surgeon,
     suture: Suture,
+    demo: Annotated[list[str] | None, typer.Option(help="Learn from this demonstration; may be given again.")] = None,
+    combine: Annotated[
+        Literal["medoid", "barycentre", "corridor"] | None,
+        typer.Option(help="How several become one way to follow; as a corridor, if left out."),
+    ] = None,
     release: Annotated[bool, typer.Option(help="Release the version if it passes the gate.")] = False,
     seed: int = 0,
+    learner: Kind = None,
+    setting: Chosen = None,
     as_json: AsJson = False,
 ) -> None:
-    """Learn a style from its newest demonstration, and wait for it."""
+    """Learn a style from its newest demonstration, or from those that are named, and wait for it."""
+    chosen = _learner(learner, setting or [])
     with service(works=True) as client:
-        job = finished(client, client.train(surgeon, suture, seed=seed, release=release))
+        asked = client.train(
+            surgeon, suture, demos=demo or None, combine=combine, learner=chosen, seed=seed, release=release
+        )
+        job = finished(client, asked)
     show(job if as_json else result_of(job), as_json, ("policy_version", "sha256", "releasable", "released"))
 
 
@@ -57,11 +72,14 @@ def retrain(
     suture: OfSuture = None,
     only_stale: Annotated[bool, typer.Option("--only-stale", help="Only what has newer input or settings.")] = False,
     release: Annotated[bool, typer.Option(help="Release what passes the gate and is not worse.")] = False,
+    learner: Kind = None,
+    setting: Chosen = None,
     as_json: AsJson = False,
 ) -> None:
     """Learn many styles again, and wait for them; exit code 1 where one of them failed."""
+    chosen = _learner(learner, setting or [])
     with service(works=True) as client:
-        job = client.retrain(surgeon=surgeon, suture=suture, only_stale=only_stale, release=release)
+        job = client.retrain(surgeon=surgeon, suture=suture, only_stale=only_stale, learner=chosen, release=release)
         ended = _watched(client, job.id)
         styles = client.retrained(job.id)
     if as_json:
@@ -72,6 +90,22 @@ def retrain(
             show(wanting, False, ("surgeon", "suture", "state", "reason"))
     if ended.state != "succeeded":
         raise typer.Exit(1)
+
+
+def _learner(kind: str | None, settings: list[str]) -> dict[str, Any] | None:
+    """Write the learner that was asked for as the service takes it; None: its default one."""
+    if kind is None:
+        if settings:
+            raise BadInput("Name the learner that the settings are of: --learner dqn --setting steps=100000.")
+        return None
+    learner: dict[str, Any] = {"kind": kind}
+    for setting in settings:
+        name, _, value = setting.partition("=")
+        try:
+            learner[name] = json.loads(value)
+        except ValueError:
+            raise BadInput(f"Write a setting as name=number, not {setting!r}.") from None
+    return learner
 
 
 def _watched(client: "Client", job: str) -> "Retraining":

@@ -14,6 +14,7 @@ from skills.client.problems import JobFailed, JobTakesLonger, NotReached, NotUnd
 
 State = Literal["queued", "running", "succeeded", "failed", "cancelled"]
 Kind = Literal["training", "retraining", "playback", "pictures"]
+Combining = Literal["medoid", "barycentre", "corridor"]
 Watcher = Callable[[Job], None]
 
 ENDED = ("succeeded", "failed", "cancelled")
@@ -31,6 +32,7 @@ class Jobs(Connection):
         suture: str,
         *,
         demos: Sequence[str] | None = None,
+        combine: Combining | None = None,
         learner: Mapping[str, Any] | None = None,
         seed: int = 0,
         release: bool = False,
@@ -41,12 +43,15 @@ class Jobs(Connection):
             surgeon: The surgeon's pseudonym.
             suture: The suture type.
             demos: What is learnt from; left out, the newest active demonstration.
+            combine: How several become one way to follow; left out, as a corridor.
             learner: Its `kind` and settings; left out, Q-learning in the phase state.
             seed: Of the exploration.
             release: Release the version if it passes the gate.
         """
         asked = {"surgeon": surgeon, "suture": suture, "seed": seed, "release": release}
-        return await self._ask(Job, "POST", at("trainings"), asked | given({"demos": demos, "learner": learner}))
+        how = None if combine is None else {"kind": combine}
+        asked |= given({"demos": demos, "combine": how, "learner": learner})
+        return await self._ask(Job, "POST", at("trainings"), asked)
 
     @call
     async def retrain(

@@ -8,6 +8,7 @@ from typing import Any, Self
 
 import httpx2 as httpx
 
+from skills.client.atlas import Atlases
 from skills.client.calls import Later, Now, call
 from skills.client.catalogue import Catalogue
 from skills.client.connection import given
@@ -18,6 +19,7 @@ from skills.client.policies import Policies
 from skills.client.problems import UnprotectedKey
 from skills.client.recordings import Recordings
 from skills.client.retrying import Retrying
+from skills.client.scores import Scores
 from skills.client.transport import Awaited, Blocking, Transport
 from skills.errors import BadSettings
 
@@ -25,7 +27,7 @@ TIMEOUT_S = 60.0  # ours: reading a large recording takes the service 30 s at mo
 AGAIN = Retrying()
 
 
-class Calls(Catalogue, Recordings, Jobs, Policies, Plans, Keys):
+class Calls(Atlases, Catalogue, Recordings, Jobs, Policies, Plans, Keys, Scores):
     """All calls, and what they are made with."""
 
     def _connect(

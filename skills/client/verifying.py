@@ -16,6 +16,7 @@ from skills.library.verified import policy_identity
 from skills.style.domain import Domain
 from skills.style.grid import GridPath, GridWorld
 from skills.style.learning.q_learning import Training
+from skills.style.network import Network
 from skills.style.policy import Policy
 from skills.style.reward import RewardLevels
 
@@ -43,12 +44,14 @@ def rebuilt(about: dict[str, Any], arrays: bytes, demo: dict[str, Any]) -> Polic
 
 def _policy(about: dict[str, Any], arrays: bytes, demo: dict[str, Any]) -> Policy:
     grid = GridWorld(**{name: about["grid"][name] for name in ("origin_mm", "cell_mm", "shape")})
-    bridged = demo["report"].get("bridged_cells") or 0
-    path = GridPath(grid, np.array(about["waypoints"]), bridged=bridged, hysteresis=demo["hysteresis"])
+    shown = about.get("combined") or demo["report"] | {"hysteresis": demo["hysteresis"]}
+    bridged, hysteresis = shown.get("bridged_cells") or 0, shown["hysteresis"]
+    path = GridPath(grid, np.array(about["waypoints"]), bridged=bridged, hysteresis=hysteresis)
     learner = learner_of({"kind": about["learner"], **about["settings"]})
     domain = Domain(path, learner.phased)
     q = np.zeros((domain.n_rows, 27))
     with np.load(io.BytesIO(arrays), allow_pickle=False) as sent:
         q[domain.certified] = sent["q"]
+        network = Network(sent["network"].tobytes()) if "network" in sent else None
     levels, training = RewardLevels(**about["reward_levels"]), Training(**about["training"])
-    return Policy(path, levels, learner, about["seed"], training, q)
+    return Policy(path, levels, learner, about["seed"], training, q, network)

@@ -5,21 +5,29 @@ import os
 import subprocess
 import sys
 import tempfile
+import time
+from collections.abc import Callable
 from math import isfinite
 
 from skills.confined.limits import Limits, check_end, confine, environment, overdue, perform
 from skills.errors import BadInput
 
+_LOOKED_AT_S = 1.0
+_LATELY_BYTES = 1000
 _ENTRY = "import sys; from skills.confined.fresh import main; main(*sys.argv[1:])"
 
 
-def run(target: str, request: bytes, limits: Limits) -> bytes:
+Watch = Callable[[bytes], None]
+
+
+def run(target: str, request: bytes, limits: Limits, watch: Watch | None = None) -> bytes:
     """Give bytes to a function in a process of its own and wait for its answer.
 
     Args:
         target: The function, as `module:function`.
         request: What it is given.
         limits: What its process may use.
+        watch: Is given about every second the end of what the process has printed; what it raises ends the process.
 
     Raises:
         Unanswered: It hung, crashed, ran out of memory, wrote too much, or failed; the end of what it printed is a
@@ -42,7 +50,7 @@ def run(target: str, request: bytes, limits: Limits) -> bytes:
             env=environment(),
         )
         try:
-            code = process.wait(limits.wall_s)
+            code = _watched(process, said.fileno(), limits.wall_s, watch) if watch else process.wait(limits.wall_s)
         except subprocess.TimeoutExpired:
             raise overdue(said, limits) from None
         finally:
@@ -51,6 +59,24 @@ def run(target: str, request: bytes, limits: Limits) -> bytes:
         check_end(code, said, limits)
         answer.seek(0)
         return answer.read()
+
+
+def _watched(process: subprocess.Popen[bytes], said: int, wall_s: float, watch: Watch) -> int:
+    """Wait for a process, with a look at what it prints now and then: its exit code.
+
+    Raises:
+        subprocess.TimeoutExpired: It did not end in time.
+    """
+    until = time.monotonic() + wall_s
+    while True:
+        left_s = until - time.monotonic()
+        try:
+            return process.wait(min(_LOOKED_AT_S, left_s))
+        except subprocess.TimeoutExpired:
+            if left_s <= _LOOKED_AT_S:
+                raise
+        # The process writes where this file stands, so it is read without going there.
+        watch(os.pread(said, _LATELY_BYTES, max(0, os.fstat(said).st_size - _LATELY_BYTES)))
 
 
 def main(target: str, memory_bytes: str, cpu_s: str, file_bytes: str, parent: str) -> None:

@@ -1,8 +1,9 @@
 """The tables. A row is a label on a value: who, when, from what, and the value whole in one column.
 
 Append-only (triggers of the migrations refuse changes): recordings and their chunks, demonstrations, reward maps,
-policy versions, releases, plans, playbacks and their pictures, events; a demonstration and a release can be withdrawn,
-once. Deleting is left to erasure alone. Keys are revoked and stay; a sign-in goes when it is over.
+policy versions and what they rest on, releases, plans, playbacks and their pictures, calibrations, events; a
+demonstration and a release can be withdrawn, once. Deleting is left to erasure alone. Keys are revoked and stay; a
+sign-in goes when it is over.
 """
 
 from datetime import datetime
@@ -25,20 +26,24 @@ from skills.db.base import Base, now
 from skills.db.packed import Packed, stored
 from skills.packing import added_later, few_numbers
 from skills.style.certificate import Coverage
+from skills.style.comparing.measured import Measured
 from skills.style.demo import Demo, Partner, Pause
 from skills.style.grid import GridPath, GridWorld
 from skills.style.handoff import PsmM
 from skills.style.learning.learners import LEARNERS
 from skills.style.learning.q_learning import PhaseQLearning, Training
 from skills.style.learning.value_iteration import ValueIteration
+from skills.style.network import Network
 from skills.style.pictures import Pictures
 from skills.style.plan import Pass, SuturePlan, SuturePoint
 from skills.style.playback import Playback
 from skills.style.policy import Policy
 from skills.style.reward import RewardLevels, RewardMap
 
-stored(GridWorld, GridPath, RewardLevels, *LEARNERS.values(), Training, SuturePoint, Pass, Pause, Partner, PsmM)
+stored(GridWorld, GridPath, RewardLevels, *LEARNERS.values(), Training, Network)
+stored(SuturePoint, Pass, Pause, Partner, PsmM)
 added_later(GridPath, "hysteresis")
+added_later(Policy, "network")
 added_later(Demo, "pauses")
 added_later(Demo, "partner")
 added_later(Partner, "base_mm")
@@ -161,6 +166,19 @@ class Demonstration(Base):
     )
 
 
+class MeasuredShape(Base):
+    """What the atlas has measured of a demonstration: it may be dropped at any time, and is then measured again.
+
+    `version` is that of `skills.style.comparing.measured`; what another one measured is not used.
+    """
+
+    __tablename__ = "measured_shapes"
+
+    demonstration_row: Mapped[int] = mapped_column(ForeignKey("demonstrations.row"), primary_key=True)
+    version: Mapped[int]
+    measured: Mapped[Measured] = mapped_column(Packed(Measured))
+
+
 class StoredRewardMap(Base):
     """What Algorithm 1 wrote for a demonstration."""
 
@@ -192,7 +210,32 @@ class PolicyVersion(Base):
 
     surgeon: Mapped[Surgeon] = relationship(lazy="joined", innerjoin=True)
     demonstration: Mapped[Demonstration] = relationship(lazy="select")
+    others: Mapped[list[Demonstration]] = relationship(secondary="policy_demonstrations", lazy="select", viewonly=True)
     __table_args__ = (UniqueConstraint("surgeon_row", "suture", "version", name="uq_policy_versions_version"),)
+
+    @property
+    def demonstrations(self) -> list[Demonstration]:
+        """All that it was learnt from, the oldest first."""
+        return sorted([self.demonstration, *self.others], key=lambda one: one.row)
+
+    @property
+    def newest_demonstration_row(self) -> int:
+        """The row of the newest of them; of one alone nothing is loaded for it."""
+        return self.demonstrations[-1].row if "combined" in self.manifest else self.demonstration_row
+
+    @property
+    def rests_on_withdrawn(self) -> bool:
+        """Whether one of them was withdrawn."""
+        return any(one.withdrawn_at is not None for one in self.demonstrations)
+
+
+class PolicyDemonstration(Base):
+    """A policy was learnt from this demonstration too, beside the one that its row names."""
+
+    __tablename__ = "policy_demonstrations"
+
+    policy_row: Mapped[int] = mapped_column(ForeignKey("policy_versions.row"), primary_key=True)
+    demonstration_row: Mapped[int] = mapped_column(ForeignKey("demonstrations.row"), primary_key=True, index=True)
 
 
 class Release(Base):
@@ -251,6 +294,20 @@ class StoredPictures(Base):
     row: Mapped[RowId]
     playback_row: Mapped[int] = mapped_column(ForeignKey("playbacks.row"), unique=True)
     drawn: Mapped[Pictures] = mapped_column(Packed(Pictures), deferred=True)
+    created_at: Mapped[datetime] = mapped_column(default=now)
+
+
+class StoredCalibration(Base):
+    """A model of skill as plain numbers, what it was calibrated on, and how good it is; the newest is used.
+
+    It is of a laboratory's rated trials, not of the surgeons here; no trial and no pseudonym of one is in it.
+    """
+
+    __tablename__ = "calibrations"
+
+    row: Mapped[RowId]
+    sha256: Mapped[str] = mapped_column(Sha256)
+    about: Mapped[dict[str, Any]]
     created_at: Mapped[datetime] = mapped_column(default=now)
 
 

@@ -17,7 +17,9 @@ from skills.db.base import Base
 from skills.db.models import (
     Demonstration,
     Job,
+    MeasuredShape,
     Plan,
+    PolicyDemonstration,
     PolicyVersion,
     RecordingChunk,
     RecordingUpload,
@@ -32,7 +34,10 @@ from skills.db.models import (
 
 ONLY = "only"
 EVERYBODYS = {"everybodys": True}  # the execution option of a query that must see all there is
-OF_NOBODY = ("erasures", "suture_types", "executors", "events", "keys", "key_surgeons", "sign_ins", "recording_uploads")
+OF_NOBODY = (
+    *("erasures", "suture_types", "calibrations", "executors", "events", "keys", "key_surgeons", "sign_ins"),
+    "recording_uploads",
+)
 INSIDE = (Demonstration, PolicyVersion, Plan, StoredPlayback, RecordingUpload, StyleToRetrain)
 
 
@@ -61,8 +66,10 @@ class Only:
             StoredRecording: StoredRecording.row.in_(recordings),
             RecordingChunk: RecordingChunk.recording.in_(recordings),
             Demonstration: Demonstration.surgeon_row.in_(mine),
+            MeasuredShape: MeasuredShape.demonstration_row.in_(demos),
             StoredRewardMap: StoredRewardMap.demonstration_row.in_(demos),
             PolicyVersion: PolicyVersion.surgeon_row.in_(mine),
+            PolicyDemonstration: PolicyDemonstration.policy_row.in_(policies),
             Release: Release.surgeon_row.in_(mine),
             Plan: Plan.policy_row.in_(policies),
             StoredPlayback: StoredPlayback.plan_row.in_(plans),

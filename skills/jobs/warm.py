@@ -8,6 +8,7 @@ import numpy as np
 from skills.compiled import check_kept, kept_in, make_ready
 from skills.recordings._kernels import follow_compiled
 from skills.style.certificate import certify
+from skills.style.comparing._kernels import warp_pairs_compiled
 from skills.style.evaluation import dtw, measure
 from skills.style.grid import GridPath, GridWorld
 from skills.style.learning._kernels import warp_compiled
@@ -29,7 +30,7 @@ def warm_up(work: Callable[[], object]) -> Thread:
         BadSettings: Machine code would be loaded from where others can write; see `check_kept`.
     """
     folder = kept_in(warp_compiled)
-    for each in {folder, kept_in(follow_compiled)}:
+    for each in {folder, kept_in(follow_compiled), kept_in(warp_pairs_compiled)}:
         check_kept(each)
     warming = Thread(target=make_ready, args=(work, folder), name="warm-up")  # no daemon: it may not die compiling
     warming.start()

@@ -118,6 +118,7 @@ class _Batch:
     part: int
     request: dict[str, Any]
     asked_by: str
+    settings: Settings
 
     def training_of(self, lesson: Lesson) -> dict[str, Any]:
         """Ask for one style as `request_training` does: an equal training gives the same version."""
@@ -125,14 +126,14 @@ class _Batch:
         return {"surgeon": lesson.surgeon.slug, "suture": lesson.suture, "demos": [lesson.sha256], **same}
 
 
-def retrain_part(database: Database, request: dict[str, Any], _settings: Settings) -> Store:
+def retrain_part(database: Database, request: dict[str, Any], settings: Settings) -> Store:
     """Train the styles of a part that are still queued.
 
     A style that is refused has failed; one at which the service fails stays queued, for the next try at this part.
     """
     with database.reading() as session:
         job = session.get_one(Job, request["retraining"])
-        batch = _Batch(job.row, request["part"], job.request, job.asked_by)
+        batch = _Batch(job.row, request["part"], job.request, job.asked_by, settings)
     broken: dict[int, Exception] = {}
     while waiting := [style for style in _waiting(database, batch.part) if style.row not in broken]:
         groups = _groups(waiting)
@@ -191,7 +192,7 @@ def _train(database: Database, batch: _Batch, group: _Group, then: _Group) -> bo
 
 def _learn(batch: _Batch, style: _Style) -> Learnt | SkillsError:
     try:
-        return learn_style(style.lesson, batch.training_of(style.lesson))
+        return learn_style(style.lesson, batch.training_of(style.lesson), batch.settings)
     except SkillsError as refused:
         return refused
 

@@ -5,7 +5,7 @@ from datetime import datetime
 from typing import Any
 
 from skills import __version__
-from skills.db.models import Demonstration, PolicyVersion
+from skills.db.models import PolicyVersion
 from skills.style.domain import REACH
 from skills.style.doubt import CALIBRATED_MM, UNCALIBRATED_MM
 from skills.style.quality import times_in_words
@@ -61,7 +61,7 @@ METRICS = (
 DIGESTS = {
     "recording": "SHA-256 of the file's bytes, as they were uploaded (`sha256sum FILE`).",
     "demonstration": "SHA-256 of `digest_of` as canonical JSON: it names recording, style, segment and grid.",
-    "reward map": "SHA-256 of the rewards that Algorithm 1 writes for its path; they are written again to check.",
+    "reward map": "SHA-256 of the rewards that Algorithm 1 writes for the path; they are written again to check.",
     "policy": "SHA-256 of `digest_of` as canonical JSON: all that is told of the policy, the demonstration's digest in "
     "it, and the digest of its numbers.",
 }
@@ -72,6 +72,33 @@ VERIFY = [
     "Without it: take `lineage` of the JSON card. Canonical JSON has sorted keys, no spaces and ASCII alone; Python's "
     'json.dumps(digest_of, sort_keys=True, separators=(",", ":")) writes it.',
 ]
+
+
+HOW = {
+    "medoid": "It follows the one of them that is nearest to all, as it was recorded",
+    "barycentre": "It follows the way of the least total distance to all (DTW barycentre), which none of them is",
+    "corridor": "It follows the middle of those that agree, at each place on the way, which none of them is",
+}
+
+
+def of_several(count: int, how: str) -> list[str]:
+    """Say what a policy is that was learnt from several demonstrations, and how."""
+    return [IS[0].replace("one recorded demonstration", f"{count} recorded demonstrations"), how, *IS[1:]]
+
+
+def combined(said: dict[str, Any], count: int) -> str:
+    """Say how several demonstrations became one way, and how far they are from it."""
+    place = (
+        "They were shown at different places, and were turned and scaled to lie on each other. "
+        if said["moved"]
+        else ""
+    )
+    wide = said["width_mm"]
+    return (
+        f"{HOW[said['kind']]}. {place}The {count} demonstrations are {min(said['apart_mm']):.2f} to "
+        f"{max(said['apart_mm']):.2f} mm from it at a place, on average (DTW); the majority of them pass its waypoints "
+        f"within {min(wide):.2f} to {max(wide):.2f} mm. Where this card speaks of the demonstration, it means this way."
+    )
 
 
 def status(version: int, served: int | None, refused: Sequence[str], was_released: bool) -> str:
@@ -206,18 +233,21 @@ def resting(plans: int, playbacks: int, feasible_playbacks: int) -> str:
     return f"{follow} this version; in simulation, {played}."
 
 
-def citation(version: PolicyVersion, demonstration: Demonstration) -> dict[str, str]:
+def citation(version: PolicyVersion) -> dict[str, str]:
     """Write how a policy version is cited, in words and for BibTeX."""
     surgeon, suture, number, sha256 = version.surgeon.slug, version.suture, version.version, version.sha256
     title = f"Suture style of surgeon {surgeon} (a pseudonym), {suture}: policy version {number}"
-    made, source = f"suture-skills {__version__}", demonstration.recording.sha256
+    made = f"suture-skills {__version__}"
+    sources = " and ".join(
+        f"demonstration sha256:{one.sha256} of recording sha256:{one.recording.sha256}"
+        for one in version.demonstrations
+    )
     fields = {
         "title": f"{{{title}}}",
         "year": f"{version.created_at:%Y}",
         "month": f"{version.created_at.month}",
         "howpublished": f"{made}, policy version sha256:{sha256}",
-        "note": f"Learnt from demonstration sha256:{demonstration.sha256} of recording sha256:{source}. "
-        "Research use only.",
+        "note": f"Learnt from {sources}. Research use only.",
     }
     lines = [f"  {name} = {{{_for_tex(value)}}}" for name, value in fields.items()]
     return {

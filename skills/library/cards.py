@@ -30,13 +30,16 @@ from skills.errors import Corrupt
 from skills.library import card_words as words
 from skills.library import releases
 from skills.library.catalogue import find_suture_type
+from skills.library.combined import combined_of, learnt_from
 from skills.library.demos import full_report
 from skills.library.inspection import AGREES
 from skills.library.verified import covered, learnt, what_identifies
 from skills.style.certificate import Coverage
+from skills.style.combining import Combined
 from skills.style.demo import Demo
 from skills.style.doubt import CALIBRATED_MM, UNCALIBRATED_MM
 from skills.style.grid import GridPath
+from skills.style.reward import sparse_reward
 
 FORMAT = 1  # of the JSON: raise it when a field goes or means something else
 Facts = dict[str, Any]
@@ -44,12 +47,13 @@ Facts = dict[str, Any]
 
 @dataclass(frozen=True, eq=False)
 class Card:
-    """What is said of a policy version, and the demonstration, its path and the coverage that the pictures show."""
+    """What is said of a policy version, and for the pictures what it was learnt from, its path and its coverage."""
 
     facts: Facts
     demo: Demo
     path: GridPath
     coverage: Coverage
+    combined: Combined | None
 
 
 def card_of(session: Session, version: PolicyVersion) -> Card:
@@ -58,34 +62,35 @@ def card_of(session: Session, version: PolicyVersion) -> Card:
     Raises:
         Corrupt: Something on the card, or that it rests on, is not what its digest was taken of.
     """
-    demonstration = version.demonstration
-    reward = session.scalars(
-        select(StoredRewardMap).where(StoredRewardMap.demonstration_row == demonstration.row)
-    ).one()
+    demonstrations = version.demonstrations
+    of_them = StoredRewardMap.demonstration_row.in_([one.row for one in demonstrations])
+    rewards = session.scalars(select(StoredRewardMap).where(of_them)).all()
     released = session.scalars(select(Release).where(Release.policy_row == version.row).order_by(Release.row)).all()
-    _refuse_damaged([demonstration.recording, demonstration, reward, version, *released])
-    coverage, demo = covered(version), demonstration.demo
+    recordings = {one.recording.row: one.recording for one in demonstrations}.values()
+    _refuse_damaged([*recordings, *demonstrations, *rewards, version, *released])
+    coverage, demo, combined = covered(version), learnt_from(version), _combined(version)
     facts: Facts = {
         "format": FORMAT,
         "written_by": f"suture-skills {__version__}",
         "title": f"{version.surgeon.slug}, {version.suture}, version {version.version}",
         "use": words.USE,
-        "what_it_is": words.IS,
+        "what_it_is": words.IS if combined is None else words.of_several(len(demonstrations), combined["in_words"]),
         "what_it_is_not": words.IS_NOT,
         "policy": _policy(version),
         "status": _status(session, version, released),
         "surgeon": _surgeon(version.surgeon),
         "suture_type": _suture_type(find_suture_type(session, version.suture)),
-        "demonstrations": [_demonstration(demonstration)],
+        "demonstrations": [_demonstration(one) for one in demonstrations],
+        "combined": combined,
         "learner": _learner(version),
         "metrics": _metrics(version),
         "certificate": version.manifest["grid_certificate"],
         "coverage": _coverage(version, coverage),
         "limits": _limits(version, demo),
-        "lineage": _lineage(session, version, reward),
-        "citation": words.citation(version, demonstration),
+        "lineage": _lineage(session, version),
+        "citation": words.citation(version),
     }
-    return Card(facts, demo, demonstration.path, coverage)
+    return Card(facts, demo, learnt(version).path, coverage, combined_of(version))
 
 
 def _refuse_damaged(rows: Sequence[Any]) -> None:
@@ -123,7 +128,7 @@ def _status(session: Session, version: PolicyVersion, released: Sequence[Release
     standing = releases.standing(session, version.surgeon_row, version.suture)
     served = standing[0].policy if standing else None
     refused = list(version.manifest["grid_certificate"]["refused_because"])
-    if version.demonstration.withdrawn_at is not None:
+    if version.rests_on_withdrawn:
         refused.append("its demonstration was withdrawn")
     return {
         "released_now": served is not None and served.row == version.row,
@@ -197,6 +202,12 @@ def _demonstration(row: Demonstration) -> Facts:
     }
 
 
+def _combined(version: PolicyVersion) -> Facts | None:
+    """Tell how several demonstrations became one way; None of one alone."""
+    said = version.manifest.get("combined")
+    return None if said is None else said | {"in_words": words.combined(said, len(version.demonstrations))}
+
+
 def _learner(version: PolicyVersion) -> Facts:
     manifest = version.manifest
     told = ("settings", "seed", "reward_levels", "training")
@@ -261,20 +272,21 @@ def _limits(version: PolicyVersion, demo: Demo) -> Facts:
     }
 
 
-def _lineage(session: Session, version: PolicyVersion, reward: StoredRewardMap) -> Facts:
-    """Write the chain of digests from the recording to the policy, and what each was taken of.
+def _lineage(session: Session, version: PolicyVersion) -> Facts:
+    """Write the chain of digests from the recordings to the policy, and what each was taken of.
 
     Where that is JSON, `digest_of` holds it whole, so that a reader can compute the digest without this service.
     """
-    demonstration = version.demonstration
-    recording = demonstration.recording.sha256
-    taken_of = what_identifies(recording, version.surgeon.slug, version.suture, demonstration.demo, demonstration.path)
-    links = (
-        ("recording", recording, None),
-        ("demonstration", demonstration.sha256, taken_of),
-        ("reward map", reward.sha256, None),
-        ("policy", version.sha256, [version.manifest, digest(learnt(version))]),
-    )
+    links: list[tuple[str, str, Any]] = []
+    for one in version.demonstrations:
+        recording = one.recording.sha256
+        taken_of = what_identifies(recording, version.surgeon.slug, version.suture, one.demo, one.path)
+        links += [("recording", recording, None), ("demonstration", one.sha256, taken_of)]
+    policy = learnt(version)
+    links += [
+        ("reward map", digest(sparse_reward(policy.path, policy.levels)), None),
+        ("policy", version.sha256, [version.manifest, digest(policy)]),
+    ]
     return {
         "chain": [
             {"what": what, "sha256": sha256, "how": words.DIGESTS[what], "digest_of": of} for what, sha256, of in links

@@ -7,7 +7,7 @@ random subject that no longer belongs to anybody.
 import secrets
 from collections.abc import Sequence
 
-from sqlalchemy import delete, select
+from sqlalchemy import Select, delete, select
 from sqlalchemy.orm import Session
 
 from skills.db.changes import announce
@@ -15,7 +15,9 @@ from skills.db.models import (
     Demonstration,
     Erasure,
     Job,
+    MeasuredShape,
     Plan,
+    PolicyDemonstration,
     PolicyVersion,
     RecordingChunk,
     Release,
@@ -53,7 +55,7 @@ def erase_surgeon(session: Session, slug: str, actor: str) -> list[Job]:
 def erase_demo(session: Session, demo_sha256: str, actor: str) -> list[Job]:
     """Erase one demonstration and what was learnt from it; the jobs that were deleted."""
     demo = find_demo(session, demo_sha256)
-    of_demo = select(Plan.sha256).join(PolicyVersion).where(PolicyVersion.demonstration_row == demo.row)
+    of_demo = select(Plan.sha256).where(Plan.policy_row.in_(_resting_on([demo.row])))
     plans = set(session.scalars(of_demo))
     jobs = [
         job
@@ -75,19 +77,29 @@ def _drop_jobs(session: Session, jobs: Sequence[Job], demos: Sequence[Demonstrat
     session.execute(delete(Job).where(Job.row.in_([job.row for job in jobs])))
 
 
+def _resting_on(demos: Sequence[int]) -> Select[int]:
+    """Write which policies were learnt from one of these demonstrations, alone or among others."""
+    others = select(PolicyDemonstration.policy_row).where(PolicyDemonstration.demonstration_row.in_(demos))
+    return select(PolicyVersion.row).where(PolicyVersion.demonstration_row.in_(demos) | PolicyVersion.row.in_(others))
+
+
 def _erase(session: Session, demos: Sequence[Demonstration]) -> None:
     announce(session)
     rows = [demo.row for demo in demos]
     recordings = {demo.recording_row for demo in demos}
-    policies = select(PolicyVersion.row).where(PolicyVersion.demonstration_row.in_(rows))
+    policies = session.scalars(_resting_on(rows)).all()
     plans = select(Plan.row).where(Plan.policy_row.in_(policies))
     playbacks = select(StoredPlayback.row).where(StoredPlayback.plan_row.in_(plans))
+    # In each row of the suture type may be a distance from what is erased.
+    beside = select(Demonstration.row).where(Demonstration.suture.in_({demo.suture for demo in demos}))
     for statement in (
+        delete(MeasuredShape).where(MeasuredShape.demonstration_row.in_(beside)),
         delete(StoredPictures).where(StoredPictures.playback_row.in_(playbacks)),
         delete(StoredPlayback).where(StoredPlayback.plan_row.in_(plans)),
         delete(Plan).where(Plan.policy_row.in_(policies)),
         delete(Release).where(Release.policy_row.in_(policies)),
-        delete(PolicyVersion).where(PolicyVersion.demonstration_row.in_(rows)),
+        delete(PolicyDemonstration).where(PolicyDemonstration.policy_row.in_(policies)),
+        delete(PolicyVersion).where(PolicyVersion.row.in_(policies)),
         delete(StoredRewardMap).where(StoredRewardMap.demonstration_row.in_(rows)),
         delete(Demonstration).where(Demonstration.row.in_(rows)),
     ):

@@ -21,6 +21,7 @@ from skills.db.models import (
     PolicyVersion,
     RecordingChunk,
     Release,
+    StoredCalibration,
     StoredPlayback,
     StoredRecording,
     StoredRewardMap,
@@ -29,6 +30,8 @@ from skills.db.packed import Packed, digest
 from skills.db.schema import revision_of, revisions
 from skills.db.session import Database
 from skills.errors import Busy, SkillsError
+from skills.library.calibrations import read_calibration
+from skills.library.combined import path_of
 from skills.library.jobs import identity_of
 from skills.library.recordings import recording_bytes
 from skills.library.verified import covered, demo_identity, planned, policy_identity
@@ -223,7 +226,7 @@ def _reward_map(row: StoredRewardMap) -> Why:
 
 
 def _policy(row: PolicyVersion) -> Why:
-    manifest, demonstration = row.manifest, row.demonstration
+    manifest, demonstrations = row.manifest, row.demonstrations
     if policy_identity(manifest, row.learnt) != row.sha256:
         yield "it is not what was certified"
     covered(row)
@@ -231,11 +234,11 @@ def _policy(row: PolicyVersion) -> Why:
         yield "whether it may be released is not what its certificate says"
     if (manifest["surgeon"], manifest["suture"]) != (row.surgeon.slug, row.suture):
         yield "it is said to be of another style"
-    if manifest["demos"] != [demonstration.sha256]:
+    if manifest["demos"] != [one.sha256 for one in demonstrations]:
         yield "it was learnt from another demonstration"
-    if (demonstration.surgeon_row, demonstration.suture) != (row.surgeon_row, row.suture):
+    if any((one.surgeon_row, one.suture) != (row.surgeon_row, row.suture) for one in demonstrations):
         yield "its demonstration is of another style"
-    if digest(row.learnt.path) != digest(demonstration.path):
+    if digest(row.learnt.path) != digest(path_of(row)):
         yield "its path is not its demonstration's"
 
 
@@ -245,7 +248,7 @@ def _release(row: Release) -> Why:
         yield "it releases a policy of another style"
     if not policy.releasable:
         yield "its policy did not pass the gate"
-    if row.withdrawn_at is None and policy.demonstration.withdrawn_at is not None:
+    if row.withdrawn_at is None and policy.rests_on_withdrawn:
         yield "it stands, and its demonstration was withdrawn"
 
 
@@ -261,6 +264,11 @@ def _playback(row: StoredPlayback) -> Why:
         yield "whether it is feasible is not what its report says"
 
 
+def _calibration(row: StoredCalibration) -> Why:
+    read_calibration(row)
+    yield from ()
+
+
 def _job(row: Job) -> Why:
     if identity_of(row.kind, row.request) != row.identity:
         yield "it is not what was asked for"
@@ -274,5 +282,6 @@ AGREES: dict[type, Callable[[Any], Why]] = {
     Release: _release,
     Plan: _plan,
     StoredPlayback: _playback,
+    StoredCalibration: _calibration,
     Job: _job,
 }

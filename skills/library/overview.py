@@ -173,7 +173,7 @@ def _sum_up(
         versions=versions,
         released=shown.version if released else None,
         shown=shown.manifest,
-        waiting=newest_demo > shown.demonstration_row,
+        waiting=newest_demo > shown.newest_demonstration_row,
     )
 
 

@@ -11,6 +11,7 @@ from skills.db.models import Plan
 from skills.db.session import Database
 from skills.errors import BadPlan, NoApproach, NotFound
 from skills.library import policies
+from skills.library.combined import learnt_from
 from skills.library.events import record
 from skills.library.verified import learnt, plan_identity
 from skills.style.handoff import Enters, PsmM
@@ -68,7 +69,7 @@ def plan_sutures(database: Database, request: PlanRequest, actor: str) -> tuple[
     """
     with database.reading() as session:
         policy = policies.choose(session, request.surgeon, request.suture, request.version)
-        demo, followed, sha = policy.demonstration.demo, learnt(policy), policy.sha256
+        demo, followed, sha = learnt_from(policy), learnt(policy), policy.sha256
     for name in ("arm", "frame", "instrument"):
         asked, have = getattr(request, name), getattr(demo, name)
         if asked is not None and asked != have:

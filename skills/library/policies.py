@@ -140,11 +140,17 @@ def actions_of(policy: Policy) -> list[list[int]] | None:
 
 
 def arrays_of(version: PolicyVersion) -> bytes:
-    """Write a policy's arrays as an .npz, its Q values and confidence on the certified domain only."""
+    """Write a policy's arrays as an .npz, its Q values and confidence on the certified domain only.
+
+    Where a network was learnt, `network` holds the bytes of its safetensors file.
+    """
     policy, coverage = learnt(version), covered(version)
     domain = policy.domain
     kept = domain.certified
     out = io.BytesIO()
+    learnt_too: dict[str, Any] = {}
+    if policy.network is not None:
+        learnt_too["network"] = np.frombuffer(policy.network.tensors, np.uint8)
     np.savez_compressed(
         out,
         sha256=np.frombuffer(bytes.fromhex(version.sha256), np.uint8),
@@ -158,6 +164,7 @@ def arrays_of(version: PolicyVersion) -> bytes:
         joins_nearest=coverage.joins_nearest,
         finished=np.int8(FINISHED),
         outside=np.int8(OUTSIDE),
+        **learnt_too,
     )
     return out.getvalue()
 

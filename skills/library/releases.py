@@ -50,7 +50,7 @@ def release(session: Session, policy: PolicyVersion, actor: str) -> Release:
     if served and served[0].policy_row == policy.row:
         return served[0]
     reasons = list(policy.manifest["grid_certificate"]["refused_because"])
-    if policy.demonstration.withdrawn_at is not None:
+    if policy.rests_on_withdrawn:
         reasons.append("its demonstration was withdrawn")
     if policy.manifest["phases"] == 1 and served:
         before = served[0].policy.manifest["metrics"]["dtw_total_mm"]
@@ -79,7 +79,7 @@ def withdraw(session: Session, surgeon: Surgeon, suture: str, actor: str) -> lis
 def withdraw_resting_on(session: Session, demonstration: Demonstration, actor: str) -> list[Release]:
     """Withdraw the releases that rest on a demonstration, and with the served one those that it superseded."""
     releases = standing(session, demonstration.surgeon_row, demonstration.suture)
-    resting = [r for r in releases if r.policy.demonstration_row == demonstration.row]
+    resting = [r for r in releases if demonstration in r.policy.demonstrations]
     withdrawn = list(releases) if releases and releases[0] in resting else resting
     _withdraw(session, withdrawn, actor)
     return withdrawn

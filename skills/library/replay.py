@@ -17,6 +17,7 @@ from skills.db.session import Database
 from skills.errors import Conflict, Corrupt
 from skills.library import releases
 from skills.library.catalogue import check_consent
+from skills.library.combined import learnt_from
 from skills.library.plans import describe_plan, find_plan, trajectory_of
 from skills.library.playbacks import trajectory_digest
 from skills.library.verified import learnt, planned
@@ -53,7 +54,7 @@ def replay_bag(
     with database.reading() as session:
         row = find_plan(session, plan_sha256)
         verdict = cleared(session, row, tip_error_mm=tip_error_mm, lower_bound=lower_bound)
-        plan, demo, policy = planned(row), row.policy.demonstration.demo, row.policy
+        plan, demo, policy = planned(row), learnt_from(row.policy), row.policy
         learnt(policy)
         trajectory = trajectory_of(plan)
         papers = {PLAN: _plan(row, trajectory), VERDICT: _verdict(row, verdict), POLICY: _policy(policy)}
@@ -89,7 +90,7 @@ def cleared(session: Session, plan: Plan, *, tip_error_mm: float, lower_bound: f
     """
     policy = plan.policy
     check_consent(policy.surgeon, "export")
-    if policy.demonstration.withdrawn_at is not None:
+    if policy.rests_on_withdrawn:
         raise Conflict("The demonstration that this plan rests on was withdrawn; plan with another policy.")
     served = releases.standing(session, policy.surgeon_row, policy.suture)
     if not served or served[0].policy_row != policy.row:

@@ -12,6 +12,7 @@ from sqlalchemy import ColumnElement, func, insert, select
 from sqlalchemy.orm import Session
 
 from skills.db.models import Demonstration, Job, PolicyVersion, StyleToRetrain, Surgeon, SutureType
+from skills.deep.learning import require_installed
 from skills.errors import Conflict, NotFound
 from skills.library import batches, jobs
 from skills.library.batches import BATCH, PART
@@ -44,7 +45,9 @@ def request_retraining(
     Raises:
         NotFound: The surgeon or the suture type is unknown.
         Conflict: There is no active demonstration.
+        LearnerNotInstalled: The learner needs what is not installed here.
     """
+    require_installed(learner := learner or PhaseQLearning())
     who = find_surgeon(session, surgeon) if surgeon is not None else None
     what = find_suture_type(session, suture) if suture is not None else None
     demos = _newest_demos(session, who, what)
@@ -54,7 +57,7 @@ def request_retraining(
         "surgeon": surgeon,
         "suture": suture,
         "only_stale": only_stale,
-        "learner": describe_learner(learner or PhaseQLearning()),
+        "learner": describe_learner(learner),
         "learner_version": LEARNER_VERSION,
         "seed": 0,
         "release": release,
@@ -107,8 +110,8 @@ def _reasons(
     of = PolicyVersion
     last = select(func.max(of.version).label("version"), of.surgeon_row, of.suture).group_by(of.surgeon_row, of.suture)
     newest = last.where(*_styles(of, surgeon, suture)).subquery()
-    said = [of.manifest[name] for name in ("learner", "settings", "seed", "learner_version")]
-    query = select(of.surgeon_row, of.suture, of.demonstration_row, *said).join(
+    said = [of.manifest[name] for name in ("demos", "learner", "settings", "seed", "learner_version")]
+    query = select(of.surgeon_row, of.suture, *said).join(
         newest,
         (of.surgeon_row == newest.c.surgeon_row) & (of.suture == newest.c.suture) & (of.version == newest.c.version),
     )
@@ -123,7 +126,7 @@ def _reasons(
             continue
         rests_on, *how, learner_version = version
         found = {
-            "a newer demonstration": rests_on != demo.row,
+            "a newer demonstration": demo.sha256 not in rests_on,
             "other settings": tuple(how) != learnt,
             "a newer learner": learner_version != asked["learner_version"],
         }

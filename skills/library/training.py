@@ -1,32 +1,36 @@
 """Training a style: from its demonstration to a certified policy version, and to its release if that was asked."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, NamedTuple, cast
 
-from sqlalchemy import LargeBinary, Table, bindparam, func, insert, select, type_coerce
+from sqlalchemy import LargeBinary, Table, bindparam, func, insert, select, type_coerce, update
 from sqlalchemy.orm import Session
 
-from skills.db.models import Demonstration, Job, PolicyVersion, StoredRewardMap, Surgeon
+from skills.db.models import Demonstration, Job, PolicyDemonstration, PolicyVersion, StoredRewardMap, Surgeon
 from skills.db.packed import seal, unpack_as
 from skills.db.session import Database
+from skills.deep.learning import Tell, learn_policy, require_installed
 from skills.errors import BadInput, BadSettings, Conflict, NotFound
 from skills.library import jobs, releases
 from skills.library.catalogue import check_consent, find_surgeon, find_suture_type
-from skills.library.demos import find_demo, newest_demo
+from skills.library.combined import BEST, choose_demos, combining_of, describe_combined
+from skills.library.demos import find_demo
 from skills.library.events import record
 from skills.library.verified import policy_identity_of
 from skills.packing import canonical, sha256
 from skills.settings import Settings
 from skills.style.certificate import Certificate, certify
+from skills.style.combining import Combining, followed
 from skills.style.demo import Demo
 from skills.style.evaluation import Metrics, discretisation_rmse, measure
 from skills.style.kinematics import POINTING_DOWN, reachable
 from skills.style.learning.learners import LEARNER_VERSION, LEARNERS, Learner, refuse_too_large
 from skills.style.learning.q_learning import PhaseQLearning, Training
 from skills.style.plan import rotation_of
-from skills.style.policy import Policy, learn_policy
-from skills.style.reward import RewardLevels, RewardMap
+from skills.style.policy import Policy
+from skills.style.reward import RewardLevels, RewardMap, sparse_reward
+from skills.style.wandering import check_in_space
 
 Store = Callable[[Session, str], dict[str, Any]]
 
@@ -60,40 +64,40 @@ def request_training(
     actor: str,
     *,
     demos: list[str] | None = None,
+    combine: Combining | None = None,
     learner: Learner | None = None,
     seed: int = 0,
     release: bool = False,
 ) -> tuple[Job, bool]:
     """Ask for a style to be trained, all defaults resolved: the job, and whether it is a new one.
 
+    Several demonstrations are combined, in whatever order they are named.
+
     Raises:
-        NotFound: The surgeon, the suture type or the demonstration is unknown.
+        NotFound: The surgeon, the suture type or a demonstration is unknown.
         Conflict: There is no active demonstration, or the surgeon's consent does not cover training.
-        BadInput: More than one demonstration, or one of another style.
+        BadInput: A demonstration of another style, one named twice, too many, or several that cannot be combined.
         BadSettings: Learning it would need too much memory.
+        LearnerNotInstalled: The learner needs what is not installed here.
     """
+    require_installed(learner := learner or PhaseQLearning())
     who, what = find_surgeon(session, surgeon), find_suture_type(session, suture)
     check_consent(who, "training")
-    if demos is not None and len(demos) != 1:
-        raise BadInput("A policy is learnt from exactly one demonstration; name one, or none for the newest.")
-    demo = find_demo(session, demos[0]) if demos else newest_demo(session, who.row, what.slug)
-    if demo is None:
-        raise Conflict(f"'{surgeon}' has no active demonstration of '{suture}'; POST /demos adds one.")
-    if (demo.surgeon_row, demo.suture) != (who.row, what.slug):
-        raise BadInput("The demonstration belongs to another style.")
-    if demo.withdrawn_at is not None:
-        raise Conflict("The demonstration was withdrawn.")
-    learner = learner or PhaseQLearning()
-    refuse_too_large(demo.path, learner)
+    chosen = choose_demos(session, who, what.slug, demos)
+    refuse_too_large(chosen[-1].path, learner)
     request = {
         "surgeon": who.slug,
         "suture": what.slug,
-        "demos": [demo.sha256],
+        "demos": [demo.sha256 for demo in chosen],
         "learner": describe_learner(learner),
         "learner_version": LEARNER_VERSION,
         "seed": seed,
         "release": release,
     }
+    if len(chosen) > 1:  # of one alone it is left out, so that an equal training is still known as it always was
+        request["combine"] = {"kind": (combine or BEST).kind}
+    elif combine is not None:
+        raise BadInput("One demonstration is followed as it is; name several in `demos`, or leave `combine` out.")
     return jobs.ask(session, "training", request, who, actor)
 
 
@@ -113,7 +117,11 @@ def learner_of(described: dict[str, Any]) -> Learner:
 
 @dataclass(frozen=True, eq=False)
 class Lesson:
-    """A demonstration as it is learnt from, its values still packed, and whose it is."""
+    """A demonstration as it is learnt from, its values still packed, and whose it is.
+
+    Where several were combined it is the one whose place their way has; `others` are the rows of the rest, and
+    `combined` is what is told of it.
+    """
 
     row: int
     sha256: str
@@ -121,6 +129,8 @@ class Lesson:
     suture: str
     demo: bytes
     reward: bytes
+    others: tuple[int, ...] = ()
+    combined: dict[str, Any] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,11 +152,12 @@ class Stored(NamedTuple):
     version: int
 
 
-def train_style(database: Database, request: dict[str, Any], _settings: Settings) -> Store:
+def train_style(database: Database, request: dict[str, Any], settings: Settings) -> Store:
     """Learn, certify and measure what was asked for; the returned function stores it."""
     with database.reading() as session:
-        (lesson,) = lessons(session, [find_demo(session, request["demos"][0]).row])
-    learnt = learn_style(lesson, request)
+        found = lessons(session, [find_demo(session, one).row for one in request["demos"]])
+    lesson = combined_lesson(found, combining_of(request["combine"])) if "combine" in request else found[0]
+    learnt = learn_style(lesson, request, settings, _telling(database, request))
 
     def store(session: Session, actor: str) -> dict[str, Any]:
         version = session.get_one(PolicyVersion, store_style(session, learnt).row)
@@ -168,6 +179,19 @@ def train_style(database: Database, request: dict[str, Any], _settings: Settings
     return store
 
 
+def _telling(database: Database, request: dict[str, Any]) -> Tell:
+    """Write down how far a training has come; raises `Conflict` where nobody waits for it any more."""
+    mine = (Job.identity == jobs.identity_of("training", request), Job.state == "running")
+
+    def tell(share: float) -> None:
+        with database.writing() as session:
+            running = update(Job).where(*mine).values(progress=share).returning(Job.row)
+            if session.execute(running).first() is None:
+                raise Conflict("The training was cancelled while it was being learnt.")
+
+    return tell
+
+
 def lessons(session: Session, demonstrations: Sequence[int]) -> list[Lesson]:
     """Read what is learnt from, in the order of the rows."""
     of = Demonstration
@@ -181,21 +205,55 @@ def lessons(session: Session, demonstrations: Sequence[int]) -> list[Lesson]:
     return [Lesson(*row) for row in session.execute(query.order_by(of.row))]
 
 
-def learn_style(lesson: Lesson, request: dict[str, Any]) -> Learnt:
+def combined_lesson(lessons: Sequence[Lesson], how: Combining) -> Lesson:
+    """Combine lessons of one style, the oldest first, into one.
+
+    Raises:
+        Corrupt: A demonstration is not what was stored.
+        BadPath: They cannot be laid on each other, or their way has no path in the grid.
+    """
+    rewards = [unpack_as(RewardMap, lesson.reward) for lesson in lessons]
+    found = followed([unpack_as(Demo, one.demo) for one in lessons], [reward.path for reward in rewards], how)
+    at = found.combined.at
+    return replace(
+        lessons[at],
+        demo=seal(found.demo).packed,
+        reward=seal(sparse_reward(found.path, rewards[at].levels)).packed,
+        others=tuple(lesson.row for lesson in lessons if lesson is not lessons[at]),
+        combined=describe_combined(found, how, [lesson.sha256 for lesson in lessons]),
+    )
+
+
+def learn_style(lesson: Lesson, request: dict[str, Any], settings: Settings, tell: Tell | None = None) -> Learnt:
     """Learn, certify and measure a style from a demonstration, as a training asks for it; no transaction is open.
 
     Raises:
+        LearningFailed: The process of a learner beyond the table crashed, or was not done within its limits.
         Conflict: The surgeon's consent does not cover it.
         Corrupt: The demonstration is not what was stored.
         BadSettings: It cannot be learnt with these settings.
     """
     check_consent(lesson.surgeon, "training")
     demo, reward = unpack_as(Demo, lesson.demo), unpack_as(RewardMap, lesson.reward)
-    policy = learn_policy(reward, learner_of(request["learner"]), request["seed"])
+    policy = learn_policy(
+        reward,
+        learner_of(request["learner"]),
+        request["seed"],
+        tell=tell,
+        timeout_s=settings.learning_timeout_s,
+        memory_bytes=settings.learning_memory_bytes,
+    )
+    return certified(lesson, request, demo, policy)
+
+
+def certified(lesson: Lesson, request: dict[str, Any], demo: Demo, policy: Policy) -> Learnt:
+    """Certify and measure a policy that was learnt from a demonstration, and pack all of it."""
     certificate, covered = certify(policy)
     numbers, coverage = seal(policy), seal(covered)
     refused_because = refusals(policy, certificate, demo)
     manifest = describe_policy(policy, certificate, coverage.digest, demo, request, refused_because)
+    if lesson.combined is not None:  # without it a digest is what it always was
+        manifest["combined"] = lesson.combined
     return Learnt(
         lesson=lesson,
         training=sha256(canonical(request)),
@@ -210,10 +268,11 @@ def store_style(session: Session, learnt: Learnt) -> Stored:
     """Store what was learnt as the next version of its style, once.
 
     Raises:
-        NotFound: The demonstration was erased meanwhile.
-        Conflict: It was withdrawn meanwhile.
+        NotFound: A demonstration was erased meanwhile.
+        Conflict: One was withdrawn meanwhile.
     """
     lesson = learnt.lesson
+    _refuse_gone(session, lesson.others)
     found = session.execute(STANDING, {"demonstration": lesson.row, "sha256": learnt.sha256}).first()
     if found is None:
         raise NotFound("The demonstration was erased while it was being learnt.")
@@ -235,8 +294,21 @@ def store_style(session: Session, learnt: Learnt) -> Stored:
         "covered": learnt.coverage,
     }
     stored = session.execute(ADD, values).one()
+    if lesson.others:
+        rests_on = [{"policy_row": stored.row, "demonstration_row": other} for other in lesson.others]
+        session.execute(insert(PolicyDemonstration), rests_on)
     record(session, "worker", "train", "policy-version", learnt.sha256, lesson.surgeon)
     return Stored(*stored)
+
+
+def _refuse_gone(session: Session, demonstrations: Sequence[int]) -> None:
+    """Refuse to store what rests on these, too, where one of them has gone meanwhile."""
+    for row in demonstrations:
+        demo = session.get(Demonstration, row)
+        if demo is None:
+            raise NotFound("A demonstration was erased while it was being learnt from.")
+        if demo.withdrawn_at is not None:
+            raise Conflict("A demonstration was withdrawn while it was being learnt from.")
 
 
 def refusals(policy: Policy, certificate: Certificate, demo: Demo) -> list[str]:
@@ -270,6 +342,7 @@ def describe_policy(
 ) -> dict[str, Any]:
     """Write what a client is told of a policy (interface.md), but for its version, digest, release and arrays."""
     path, grid = policy.path, policy.path.grid
+    wandered = check_in_space(policy)
     lost_mm = discretisation_rmse(demo.tip_mm, grid, path.hysteresis)
     metrics = measure(policy.replay, lost_mm)
     return {
@@ -305,6 +378,7 @@ def describe_policy(
             "refused_because": refused_because,
             "note": CERTIFICATE_NOTE,
         },
+        **({} if wandered is None else {"rollouts": asdict(wandered)}),  # without it a digest is what it always was
     }
 
 

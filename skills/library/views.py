@@ -12,12 +12,15 @@ from sqlalchemy.orm import Session
 
 from skills.db.models import Demonstration, PolicyVersion, StoredRewardMap
 from skills.db.session import Database
+from skills.library.combined import learnt_from
 from skills.library.recordings import Reader, find_recording, recording_bytes
 from skills.library.verified import covered, learnt
-from skills.style.demo import Recording
+from skills.style.demo import Demo, Recording
+from skills.style.grid import GridPath
 from skills.style.movement import smoothed_speed
 from skills.style.pauses import press_times
 from skills.style.policy import Policy
+from skills.style.reward import RewardMap, sparse_reward
 
 MOST_STARTS = 20_000  # that a browser draws at ease: of a larger grid every second, third, ... cell is told
 MOST_SAMPLES = 1500  # of a line on a screen
@@ -25,14 +28,17 @@ MOST_SAMPLES = 1500  # of a line on a screen
 
 def view_of_demo(session: Session, demo: Demonstration) -> dict[str, Any]:
     """Write a demonstration as it was recorded, in its grid, and as the rewards of Algorithm 1."""
-    path, recorded, grid = demo.path, demo.demo, demo.path.grid
     stored = session.scalars(select(StoredRewardMap).where(StoredRewardMap.demonstration_row == demo.row)).one()
-    rewards, levels = stored.map.rewards, stored.map.levels
+    return _view(demo.demo, demo.path, stored.map)
+
+
+def _view(recorded: Demo, path: GridPath, reward: RewardMap) -> dict[str, Any]:
+    rewards, levels, grid = reward.rewards, reward.levels, path.grid
     special = np.flatnonzero(rewards != levels.other)
     every = max(1, len(recorded.tip_mm) // MOST_SAMPLES)
     return {
-        "frame": demo.frame,
-        "arm": demo.arm,
+        "frame": recorded.frame,
+        "arm": recorded.arm,
         "grid": {"origin_mm": list(grid.origin_mm), "cell_mm": grid.cell_mm, "shape": list(grid.shape)},
         "recorded_mm": _mm(recorded.tip_mm[::every]),
         "path_mm": _mm(path.tip_mm),
@@ -41,7 +47,7 @@ def view_of_demo(session: Session, demo: Demonstration) -> dict[str, Any]:
 
 
 def view_of_version(session: Session, version: PolicyVersion) -> dict[str, Any]:
-    """Write the demonstration of a version, and of every cell how the policy starts there."""
+    """Write what a version was learnt from, and of every cell how the policy starts there."""
     policy, coverage = learnt(version), covered(version)
     grid = policy.path.grid
     shown = np.arange(grid.n_states)
@@ -50,7 +56,7 @@ def view_of_version(session: Session, version: PolicyVersion) -> dict[str, Any]:
         every += 1
         shown = np.flatnonzero((grid.cells_of(np.arange(grid.n_states)) % every == 0).all(axis=1))
     moves = moves_to_goal(policy, coverage.reaches)
-    return view_of_demo(session, version.demonstration) | {
+    return _view(learnt_from(version), policy.path, sparse_reward(policy.path, policy.levels)) | {
         "version": version.version,
         "starts": {
             "every": every,

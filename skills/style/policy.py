@@ -15,8 +15,9 @@ from skills.style import paper
 from skills.style._arrays import Bytes, Floats, Ints, frozen
 from skills.style.domain import FINISHED, OUTSIDE, Domain, Moves
 from skills.style.grid import GridPath
-from skills.style.learning.learners import Learner, learn_values
+from skills.style.learning.learners import Learner, Tabular, learn_values
 from skills.style.learning.q_learning import Training
+from skills.style.network import Network
 from skills.style.reward import RewardLevels, RewardMap
 
 GUIDED_MM = 50.0  # ours: as far outside its grid as a plan may start; metres given for millimetres are further off
@@ -24,7 +25,10 @@ GUIDED_MM = 50.0  # ours: as far outside its grid as a plan may start; metres gi
 
 @dataclass(frozen=True, eq=False)
 class Policy:
-    """What was learnt: Q values of shape (rows, 27) on the domain of a path, and how they were learnt."""
+    """What was learnt: Q values of shape (rows, 27) on the domain of a path, and how they were learnt.
+
+    `network` is what a learner beyond the table learnt, of which the Q values are what it says at each cell's centre.
+    """
 
     path: GridPath
     levels: RewardLevels
@@ -32,6 +36,7 @@ class Policy:
     seed: int
     training: Training
     q: Floats
+    network: Network | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "q", frozen(self.q, np.float64, (self.domain.n_rows, paper.N_ACTIONS), "q"))
@@ -79,8 +84,10 @@ class Policy:
         return int(self.domain.rows_of(phase, cell)) if self.domain.holds(phase, cell) else None
 
 
-def learn_policy(reward: RewardMap, learner: Learner, seed: int = 0) -> Policy:
+def learn_policy(reward: RewardMap, learner: Tabular, seed: int = 0) -> Policy:
     """Learn to follow a demonstration from its reward map; the same arguments give the same bytes.
+
+    `skills.deep.learn_policy` does so with the learners beyond the table too.
 
     Raises:
         BadSettings: The seed or the levels cannot be meant.

@@ -10,7 +10,8 @@ motion is says the log dimensionless jerk, after Hogan and Sternad (2009) and Ba
 with D the driven time, v_peak the greatest speed and the jerk the third derivative of the position, a vector. It has no
 unit and does not depend on how far or how fast the hand went; one minimum-jerk stroke has -5.3, every hesitation takes
 something off. Half a smoothing window at the ends of each stretch is left out, where there is nothing to smooth with.
-Thresholds are ours.
+The spectral arc length (`skills.style.spectral`) says the same with less trust in the third derivative of a recording;
+it is of the smoothed speed, in which the time of pauses is closed up. Thresholds are ours.
 """
 
 from dataclasses import dataclass, replace
@@ -25,6 +26,7 @@ from skills.style.evaluation import discretisation_rmse
 from skills.style.grid import PAPER_GRID, GridPath, discretize
 from skills.style.movement import GRID_STEP_S, SMOOTHING_S, TURNING_RAD_S, Movement, movement_of
 from skills.style.segments import arrival
+from skills.style.spectral import spectral_arc_length
 
 IDLE_MM_S = 1.0
 SHORTEST_S = 0.1  # of a stretch between two pauses: a shorter one has no speed to speak of
@@ -51,6 +53,7 @@ class DemoReport:
         speed_peak_mm_s: Greatest smoothed speed.
         jerk_rms_mm_s3: Root mean square of the smoothed tip's jerk; None where it is too short.
         log_dimensionless_jerk: How smooth: the nearer to 0 the smoother; None where it is too short.
+        spectral_arc_length: The same of the speed's spectrum; None where nothing moved.
         clutch_presses: How often the clutch pedal went down.
         clutched_s: How long it was down between the first sample and the last.
         undriven_s: How long the arm was not driven, by clutch or because teleoperation did not follow; left out.
@@ -72,6 +75,7 @@ class DemoReport:
     speed_peak_mm_s: float
     jerk_rms_mm_s3: float | None
     log_dimensionless_jerk: float | None
+    spectral_arc_length: float | None
     clutch_presses: int
     clutched_s: float
     undriven_s: float
@@ -135,6 +139,7 @@ def describe(demo: Demo) -> DemoReport:
         speed_peak_mm_s=float(speed.max()),
         jerk_rms_mm_s3=jerk_rms,
         log_dimensionless_jerk=smoothness,
+        spectral_arc_length=_spectral(moved),
         clutch_presses=demo.clutch_presses,
         clutched_s=sum(pause.end_s - pause.start_s for pause in demo.pauses if pause.cause == "clutch"),
         undriven_s=sum(pause.end_s - pause.start_s for pause in demo.pauses),
@@ -198,6 +203,13 @@ def _jerk(moved: list[Movement], driven_s: float, peak_mm_s: float) -> tuple[flo
     if counted_s == 0.0 or squared == 0.0 or peak_mm_s == 0.0:
         return None, None
     return float(np.sqrt(squared / counted_s)), float(-np.log(driven_s**3 / peak_mm_s**2 * squared))
+
+
+def _spectral(moved: list[Movement]) -> float | None:
+    """Measure the spectral arc length of stretches as if each followed the one before at once."""
+    steps = sum(len(one.seconds) - 1 for one in moved)
+    lasted_s = sum(float(one.seconds[-1] - one.seconds[0]) for one in moved)
+    return spectral_arc_length(np.concatenate([one.speed_mm_s for one in moved]), lasted_s / steps)
 
 
 def _orientation_change(demo: Demo, until_s: float) -> float | None:

@@ -23,10 +23,11 @@ PAGE = {"Accept": "text/html"}
 BASE_MM, BASE_XYZW = [160.0, 20.0, 20.0], [0.0, 0.3007057995, 0.0, 0.9537169507]  # of PSM1 in PSM2's, invented
 NUMBERS = (
     "duration_s", "samples", "rate_hz", "longest_gap_s", "duplicate_stamps", "path_length_mm", "extent_mm",
-    "speed_median_mm_s", "speed_peak_mm_s", "jerk_rms_mm_s3", "log_dimensionless_jerk", "clutch_presses", "clutched_s",
-    "undriven_s", "idle_share", "a1_s", "a1_orientation_change_rad", "a1_turn_negligible", "orientation_change_rad",
-    "path_states", "revisits", "returns", "bridged_cells", "discretisation_rmse_mm", "discretisation_rmse_3d_mm",
-    "outside_paper_grid_share", "advised_hysteresis", "grid", "partner", "advice",
+    "speed_median_mm_s", "speed_peak_mm_s", "jerk_rms_mm_s3", "log_dimensionless_jerk", "spectral_arc_length",
+    "clutch_presses", "clutched_s", "undriven_s", "idle_share", "a1_s", "a1_orientation_change_rad",
+    "a1_turn_negligible", "orientation_change_rad", "path_states", "revisits", "returns", "bridged_cells",
+    "discretisation_rmse_mm", "discretisation_rmse_3d_mm", "outside_paper_grid_share", "advised_hysteresis", "grid",
+    "partner", "advice",
 )  # fmt: skip
 
 

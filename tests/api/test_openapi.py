@@ -14,13 +14,14 @@ from tests.api.service import GOAL_MM, KESTREL, Service
 
 OPERATIONS = {
     "add_demo", "add_recording", "alive", "cancel_job", "compare", "draw_pictures", "end_key", "erase_surgeon",
-    "get_animation", "get_animation_gif", "get_clearance_plot", "get_demo", "get_demo_recording", "get_job",
-    "get_joints_plot", "get_path", "get_picture", "get_plan", "get_playback", "get_policy", "get_policy_card",
-    "get_policy_version", "get_policy_version_card", "get_recording", "get_report", "get_retraining", "get_reward_map",
-    "get_surgeon", "get_suture_type", "get_trajectory", "get_version", "list_all_keys", "list_demos", "list_jobs",
-    "list_policies", "list_surgeons", "list_suture_types", "list_versions", "make_key", "make_plan", "metrics",
-    "next_action", "play", "put_surgeon", "put_suture_type", "read_suture_points", "ready", "release", "retrain",
-    "roll_out", "train", "upload_demo", "watch_job", "withdraw", "withdraw_demo",
+    "get_animation", "get_animation_gif", "get_atlas", "get_clearance_plot", "get_demo", "get_demo_recording",
+    "get_job", "get_joints_plot", "get_path", "get_picture", "get_plan", "get_playback", "get_policy",
+    "get_policy_card", "get_policy_version", "get_policy_version_card", "get_recording", "get_report",
+    "get_retraining", "get_reward_map", "get_surgeon", "get_suture_type", "get_trajectory", "get_version",
+    "list_all_keys", "list_demos", "list_jobs", "list_policies", "list_surgeons", "list_suture_types",
+    "list_versions", "make_key", "make_plan", "metrics", "next_action", "play", "put_surgeon", "put_suture_type",
+    "read_suture_points", "ready", "release", "retrain", "roll_out", "score", "train", "upload_demo", "watch_job",
+    "withdraw", "withdraw_demo",
 }  # fmt: skip
 EVERY_CALL = {"400", "500", "503"}
 PATH = {**KESTREL, "version": "1"}
@@ -104,10 +105,13 @@ def test_everything_that_takes_json_shows_how():
 
 @pytest.mark.parametrize(("method", "path", "example"), [*asked()])
 def test_every_example_of_a_request_does_what_it_shows(trained: Service, method: str, path: str, example: Any):
-    """Only the digest of a plan is put in: an example cannot know it."""
+    """Only digests are put in: an example cannot know them."""
+    there = trained.client.demos()[0]
     if "plan" in example:
         example = {"plan": trained.client.plan(**KESTREL, suture_points=[{"position_mm": GOAL_MM}])["id"]}
-    path = path.format(**PATH, recording=trained.client.demos()[0]["recording"])
+    digests = {"demo": there["id"], "recording": there["recording"]}
+    example = {name: digests.get(name, value) for name, value in example.items()}
+    path = path.format(**PATH, recording=there["recording"])
     answer = trained.http.request(method, path, json=example)
     assert answer.is_success, answer.text
 

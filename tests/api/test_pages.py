@@ -15,6 +15,7 @@ from starlette.testclient import TestClient
 from skills.api.pages.assets import PLOTLY, PLOTLY_MAP_STYLE, assets, build
 from skills.api.pages.words import number, share, size
 from skills.db.models import Demonstration, Job, Plan, PolicyVersion, StoredRecording
+from skills.library.beside import agrees
 from skills.library.overview import matrix
 from skills.library.policies import find_version
 from skills.library.verified import covered, learnt
@@ -63,11 +64,15 @@ def every_page(service: Service) -> list[str]:
         recordings = session.scalars(select(StoredRecording.sha256)).all()
         plans = session.scalars(select(Plan.sha256)).all()
         jobs = session.scalars(select(Job.id).where(Job.kind != "retraining-part")).all()
-        styles = {(demo.surgeon.slug, demo.suture) for demo in session.scalars(select(Demonstration))}
+        demos = session.scalars(select(Demonstration)).all()
+        scored = [one.sha256 for one in demos if one.withdrawn_at is None and agrees(one.surgeon)]
+        styles = {(demo.surgeon.slug, demo.suture) for demo in demos}
     return [
         *("/", "/pages/recordings", "/pages/recordings/new", "/pages/plans", "/pages/plans/new", "/pages/jobs"),
+        *("/pages/atlas", *(f"/pages/atlas/{one}?scaled=true&clusters=" for one in {suture for _, suture in styles})),
         *("/pages/catalogue", "/?q=kestrel&state=released&skill=expert"),
         *(f"/pages/styles/{surgeon}/{suture}" for surgeon, suture in sorted(styles)),
+        *(f"/pages/demos/{one}/score" for one in scored),
         *(f"/pages/recordings/{one}" for one in recordings),
         *(f"/pages/plans/{one}" for one in plans),
         *(f"/pages/plans/new?like={one}" for one in plans),

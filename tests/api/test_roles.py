@@ -44,6 +44,7 @@ NEEDED = {
     "DELETE /policies/{surgeon}/{suture}/release": RELEASER,
     "POST /policies/{surgeon}/{suture}/rollouts": READER,
     "POST /policies/{surgeon}/{suture}/next": READER,
+    "POST /scores": READER,
     "GET /keys": ADMIN,
     "POST /keys": ADMIN,
     "DELETE /keys/{key}": ADMIN,

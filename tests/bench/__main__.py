@@ -5,8 +5,12 @@ import sys
 from rich.console import Console
 from rich.table import Table
 
+from tests.bench.atlas import atlas
 from tests.bench.batches import batches
+from tests.bench.beyond import learners
+from tests.bench.combining import combining
 from tests.bench.doubt import doubting
+from tests.bench.geometry import geometry
 from tests.bench.kinematics import kinematics
 from tests.bench.learning import learning
 from tests.bench.playing import playing
@@ -17,12 +21,16 @@ from tests.bench.serving import serving
 PARTS = {
     "reading": reading,
     "learning": learning,
+    "learners": learners,
     "motion": kinematics,
     "playback": playing,
     "doubt": doubting,
     "batches": batches,
     "scaling": scaling,
     "serving": serving,
+    "atlas": atlas,
+    "combining": combining,
+    "geometry": geometry,
 }
 
 

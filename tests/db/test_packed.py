@@ -18,9 +18,12 @@ from skills.db.packed import FORMAT, Packed, digest, pack, seal, unpack
 from skills.errors import Corrupt
 from skills.recordings import read_recording
 from skills.style.certificate import certify
+from skills.style.comparing.measured import Measured
+from skills.style.comparing.shapes import STATES
 from skills.style.demo import Demo, Partner, Pause, cut_demo
 from skills.style.grid import PAPER_GRID, GridWorld, discretize
 from skills.style.handoff import PsmM
+from skills.style.learning.beyond import DDPG, DQN, TRPO
 from skills.style.learning.irl import MaxEntIRL
 from skills.style.learning.q_learning import CellQLearning, PhaseQLearning
 from skills.style.learning.value_iteration import ValueIteration
@@ -29,6 +32,7 @@ from skills.style.plan import SuturePoint, stack
 from skills.style.playback import Playback
 from skills.style.policy import learn_policy
 from skills.style.reward import RewardLevels, RewardMap, sparse_reward
+from tests.deep.networks import always
 from tests.library.cases import bag, hand_off
 
 DEMO = cut_demo(read_recording(io.BytesIO(bag())))
@@ -78,12 +82,18 @@ VALUES = [
     VARIED,
     ValueIteration(),
     MaxEntIRL(),
+    DQN(),
+    DDPG(),
+    TRPO(),
+    replace(POLICY, network=always((0.5, -0.25, 1e-30))),
     replace(PLAN, psm_m=None),
     PLAN,
     replace(PLAN, psm_m=PsmM((1.0, 0.0, 0.0), (160.0, 20.0, 20.0), (0.0, 0.0, 0.0, 1.0), "420006", "start", "a", "b")),
     certify(POLICY)[1],
     PLAYBACK,
     Pictures(b"mp4", b"gif", b"joints", b"clearance"),
+    Measured(None, np.array([], np.int64), np.array([]), np.array([])),
+    Measured(np.ones((STATES, 3)), np.array([2, 1]), np.array([0.1, 5e-324]), np.array([0.2, 0.3])),
 ]
 ARRAYS = some.arrays(
     st.sampled_from([np.float64, np.int64, np.int8, np.bool_, np.float32]),

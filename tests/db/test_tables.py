@@ -2,16 +2,19 @@
 
 from collections.abc import Iterator
 
+import numpy as np
 import pytest
 from sqlalchemy import inspect, text
 from sqlalchemy.exc import DatabaseError, IntegrityError
 
 from skills.db import models
 from skills.db.base import Base, now
-from skills.db.models import Erasure, StoredPictures, StoredPlayback
+from skills.db.models import Erasure, MeasuredShape, StoredCalibration, StoredPictures, StoredPlayback
 from skills.db.session import Database
 from skills.library.keys import create_key
 from skills.library.sign_ins import Lasts, sign_in
+from skills.style.comparing.measured import Measured
+from skills.style.comparing.shapes import STATES
 from skills.style.pictures import Pictures
 from tests import backends
 from tests.db.test_packed import PLAYBACK
@@ -23,15 +26,20 @@ FROZEN = (
     "recording_chunks",
     "reward_maps",
     "policy_versions",
+    "policy_demonstrations",
     "plans",
     "playbacks",
     "playback_pictures",
+    "calibrations",
     "events",
     "erasures",
 )
 GONE_WITH_ITS_RECORDING = {"recording_uploads"}  # a note beside it, of who has sent it
 WITHDRAWABLE = ("demonstrations", "releases")
-FREE = {"surgeons", "suture_types", "jobs", "retraining_styles", "executors", "keys", "key_surgeons", "sign_ins"}
+FREE = {
+    "surgeons", "suture_types", "jobs", "retraining_styles", "executors", "keys", "key_surgeons", "sign_ins",
+    "measured_shapes",
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module", params=backends.BACKENDS)
@@ -40,7 +48,8 @@ def full(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
     url = backends.fresh(request.param, tmp_path_factory.mktemp("full"))
     database = Database(url)
     cases.add_surgeon(database)
-    cases.add_demo(database)
+    demo, other = (cases.add_demo(database, cases.hand_off((shift, 0.0, 0.0))) for shift in (0.0, 2.5))
+    cases.train(database, demos=[demo.sha256, other.sha256])
     cases.train(database, release=True)
     plan = cases.add_plan(database)
     retrain(database)
@@ -49,7 +58,10 @@ def full(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
         session.add(played)
         session.flush()
         session.add(StoredPictures(playback_row=played.row, drawn=Pictures(b"mp4", b"gif", b"png", b"png")))
+        session.add(StoredCalibration(sha256="0" * 64, about={}))
         session.add(Erasure(salt="0" * 64, digest="0" * 64))
+        shape = Measured(np.zeros((STATES, 3)), np.array([1]), np.array([0.0]), np.array([0.0]))
+        session.add(MeasuredShape(demonstration_row=demo.row, version=1, measured=shape))
         key, _ = create_key(session, "ada", "reader", "test", surgeons=["kestrel"])
         sign_in(session, key.id, Lasts(60.0, 600.0))
     yield database

@@ -290,3 +290,19 @@ def test_everything_is_reached_with_the_keyboard_and_the_focus_is_seen(tab: Watc
     assert reached[0] == "Skip to the content"
     assert {"Styles", "Recordings", "Plans", "Jobs", "Catalogue"} <= set(reached)
     assert any("released" in one for one in reached)
+
+
+@pytest.mark.parametrize("name", ["desk-light", "phone-dark"])
+def test_a_demonstration_is_scored_from_the_page_of_its_style(browser: Browser, url: str, name: str) -> None:
+    with visiting(browser, url, phone="phone" in name, dark="dark" in name) as tab:
+        tab.open(f"/pages/styles/{STYLE}")
+        tab.page.get_by_role("link", name="Score").first.click()
+        tab.page.wait_for_url(re.compile("/pages/demos/[0-9a-f]{64}/score"))
+        expect(tab.page.get_by_role("heading", name="Where it deviates")).to_be_visible()
+        expect(tab.page.get_by_text("This is the reference itself")).to_be_visible()
+        way = tab.page.locator("#where polyline.apart-0").first
+        assert way.evaluate("way => getComputedStyle(way).strokeWidth") == "2px"
+        expect(tab.page.locator("#rating")).to_contain_text("Not calibrated")
+        expect(tab.page.get_by_text("not a credential")).to_be_visible()
+        assert tab.too_wide() <= 0
+        tab.shoot(f"score-{name}")

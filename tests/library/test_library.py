@@ -20,6 +20,7 @@ from skills.library.demos import find_demo, withdraw_demo
 from skills.library.erasure import erase_surgeon
 from skills.library.policies import learnt, policy_of
 from skills.library.recordings import recording_bytes
+from skills.settings import Settings
 from skills.style.evaluation import discretisation_rmse
 from skills.style.grid import PAPER_GRID, discretize
 from skills.style.learning.irl import MaxEntIRL
@@ -110,7 +111,7 @@ def test_a_job_performed_twice_makes_one_version(database: Database):
     cases.add_demo(database)
     job = cases.work(database, cases.ask_training(database, release=True))
     first = job.result
-    work.perform_job(database, job.row, job.attempt, None)
+    work.perform_job(database, job.row, job.attempt, Settings(database_url=database.url))
     assert cases.work(database, job).result == first
     assert counts(database)["policy_versions"] == counts(database)["releases"] == 1
 
@@ -175,7 +176,7 @@ def test_a_surgeon_erased_while_the_style_is_learnt_leaves_nothing(database: Dat
     interrupted(monkeypatch, erase)
     with database.writing() as session:
         session.get_one(Job, job.row).state = "running"
-    work.perform_job(database, job.row, job.attempt, None)
+    work.perform_job(database, job.row, job.attempt, Settings(database_url=database.url))
     assert set(counts(database)) == {"suture_types", "events", "erasures"}
 
 

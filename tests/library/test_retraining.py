@@ -175,11 +175,11 @@ def test_what_fails_inside_the_service_is_tried_again_and_then_given_up_alone(
     bad = styles_of(database, job)[1].demonstration_row
     learnt = []
 
-    def learn(lesson, request):
+    def learn(lesson, request, settings):
         learnt.append(lesson.row)
         if lesson.row == bad:
             raise RuntimeError("/srv/secret")
-        return learn_style(lesson, request)
+        return learn_style(lesson, request, settings)
 
     monkeypatch.setattr(batch_work, "learn_style", learn)
     work = Work(database, Settings(database_url=database.url), perform_job)
@@ -207,10 +207,10 @@ def test_a_style_at_which_its_worker_died_comes_last_the_next_time(database: Dat
     class Death(BaseException):
         """What no worker survives."""
 
-    def learn(lesson, request):
+    def learn(lesson, request, settings):
         if lesson.row == deadly:
             raise Death
-        return learn_style(lesson, request)
+        return learn_style(lesson, request, settings)
 
     monkeypatch.setattr(batch_work, "learn_style", learn)
     monkeypatch.setattr(batch_work, "TOGETHER_S", 60.0)  # on a slow machine too
@@ -234,11 +234,11 @@ def test_a_style_refused_at_the_last_moment_takes_none_of_its_transaction_along(
     (part,) = parts_of(database, job)
     withdrawn = styles_of(database, job)[1].demonstration.sha256
 
-    def learn(lesson, request):
+    def learn(lesson, request, settings):
         if lesson.sha256 == withdrawn:
             with database.writing() as session:
                 withdraw_demo(session, withdrawn, "test")
-        return learn_style(lesson, request)
+        return learn_style(lesson, request, settings)
 
     monkeypatch.setattr(batch_work, "learn_style", learn)
     cases.work(database, part)
@@ -255,9 +255,9 @@ def test_what_takes_long_is_committed_alone(database: Database, monkeypatch: pyt
     (part,) = parts_of(database, job)
     seen = []
 
-    def learn(lesson, request):
+    def learn(lesson, request, settings):
         seen.append((states_of(database, job).count("done"), look(database, job).progress))
-        return learn_style(lesson, request)
+        return learn_style(lesson, request, settings)
 
     monkeypatch.setattr(batch_work, "learn_style", learn)
     cases.work(database, part)
@@ -279,12 +279,12 @@ def test_a_cancelled_batch_stops_at_its_next_commit_and_keeps_no_late_result(
     job = ask_retraining(database)
     learnt = []
 
-    def learn(lesson, request):
+    def learn(lesson, request, settings):
         learnt.append(lesson.row)
         if len(learnt) == 3:
             with database.writing() as session:
                 jobs.cancel(session, job.id, "test")
-        return learn_style(lesson, request)
+        return learn_style(lesson, request, settings)
 
     monkeypatch.setattr(batch_work, "learn_style", learn)
     for part in parts_of(database, job):
@@ -345,14 +345,14 @@ def test_a_late_result_changes_nothing_and_its_worker_goes_on_with_what_is_left(
     (part,) = parts_of(database, job)
     others, ended = [], []
 
-    def learn(lesson, request):
+    def learn(lesson, request, settings):
         if not others:  # meanwhile another worker has taken the part over, and ends it
             others.append(lesson.row)
             with monkeypatch.context() as meanwhile:
                 meanwhile.setattr(batch_work, "learn_style", learn_style)
                 perform_job(database, part.row, 1, Settings(database_url=database.url))
             ended.append(look(database, job).ended_at)
-        return learn_style(lesson, request)
+        return learn_style(lesson, request, settings)
 
     monkeypatch.setattr(batch_work, "learn_style", learn)
     cases.work(database, part)

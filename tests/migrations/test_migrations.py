@@ -127,6 +127,17 @@ def test_what_the_first_version_stored_is_kept_whole_and_still_guarded(database:
     assert_guarded(database, "withdrawn_at", "NULL")
 
 
+def test_a_policy_of_several_demonstrations_is_not_brought_down_to_a_version_that_knows_one(database: Database):
+    database.migrate()
+    cases.add_surgeon(database)
+    demos = [cases.add_demo(database, cases.hand_off((shift, 0.0, 0.0))).sha256 for shift in (0.0, 2.5)]
+    cases.train(database, demos=demos)
+    with pytest.raises(RuntimeError, match="several demonstrations"):
+        go(database, command.downgrade, "0008")
+    with database.reading() as session:
+        assert session.scalar(text("SELECT count(*) FROM policy_demonstrations")) == 1
+
+
 def test_batches_go_with_their_table_and_those_that_had_not_ended_are_cancelled(database: Database):
     database.migrate()
     cases.add_surgeon(database)

@@ -3,12 +3,14 @@
 from base64 import b64encode
 from hashlib import sha256
 from importlib import resources
+from math import hypot
 
 from markupsafe import Markup, escape
 
 from skills.api.pages import coverage_drawing, drawing
 from skills.api.pages.page import templates
 from skills.library.cards import Card
+from skills.style.evaluation import discretisation_rmse
 
 STYLE = (resources.files("skills") / "api" / "pages" / "templates" / "card.css").read_text()
 # By its digest, so that no other style is taken; no script, picture or address at all.
@@ -25,7 +27,9 @@ def card_page(card: Card) -> str:
         .render(
             card=facts,
             metric={one["name"]: one for one in facts["metrics"]},
-            views=Markup(drawing.views(card.demo, card.path)),  # noqa: S704 - our own mark-up, in which names are escaped
+            path_states=len(card.path.states),
+            lost_mm=hypot(*discretisation_rmse(card.demo.tip_mm, card.path.grid, card.path.hysteresis)),
+            views=Markup(drawing.views(card.demo, card.path, card.combined)),  # noqa: S704 - our own mark-up, in which names are escaped
             layers=[(name, Markup(svg)) for name, svg in coverage_drawing.layers(card.coverage, card.path)],  # noqa: S704
             block=coverage_drawing.block_of(card.path),
             pauses=bool(card.demo.pauses),

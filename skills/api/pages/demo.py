@@ -95,6 +95,11 @@ def _moved(report: Report) -> str:
                 _or("{:.1f}", smoothness),
                 "log dimensionless jerk, nearer to 0 is smoother; one even stroke: -5.3",
             ),
+            (
+                "Smoothness of speed",
+                _or("{:.2f}", report["spectral_arc_length"]),
+                "spectral arc length, nearer to 0 is smoother; one even stroke: -1.41",
+            ),
             ("Jerk", _or("{:.0f} mm/s\u00b3", jerk), "root mean square, of the smoothed tip"),
             ("A1", f"{report['a1_s']:.2f} s", "until the tip comes to rest at its goal"),
             ("Turn in A1", _degrees(report["a1_orientation_change_rad"]), _about_the_turn(report)),

@@ -8,6 +8,7 @@ from math import floor, log10
 import numpy as np
 from numpy.typing import NDArray
 
+from skills.style.combining import Combined
 from skills.style.demo import Demo
 from skills.style.grid import GridPath
 from skills.style.movement import smoothed_speed
@@ -22,17 +23,22 @@ VIEWS = ((0, 1), (0, 2), (1, 2))
 AXES = "xyz"
 
 
-def views(demo: Demo, path: GridPath) -> str:
-    """Draw the path as it was recorded and in its grid, seen along z, y and x, all to one scale."""
+def views(demo: Demo, path: GridPath, combined: Combined | None = None) -> str:
+    """Draw the path as it was recorded and in its grid, seen along z, y and x, all to one scale.
+
+    Of several demonstrations, behind the way that was made of them, how wide it is.
+    """
     seen = np.concatenate((demo.tip_mm, path.tip_mm - path.grid.cell_mm / 2, path.tip_mm + path.grid.cell_mm / 2))
     if demo.partner is not None:
         seen = np.concatenate((seen, [demo.partner.position_mm]))
     low, high = seen.min(axis=0), seen.max(axis=0)
     middle, width = (low + high) / 2, float((high - low).max()) * 1.04
-    return "".join(_view(demo, path, axes, middle - width / 2, width) for axes in VIEWS)
+    return "".join(_view(demo, path, combined, axes, middle - width / 2, width) for axes in VIEWS)
 
 
-def _view(demo: Demo, path: GridPath, axes: tuple[int, int], low: Points, width: float) -> str:
+def _view(
+    demo: Demo, path: GridPath, combined: Combined | None, axes: tuple[int, int], low: Points, width: float
+) -> str:
     scale = (SIDE - MARGIN - 8) / width
 
     def place(points: Points) -> Points:
@@ -46,31 +52,41 @@ def _view(demo: Demo, path: GridPath, axes: tuple[int, int], low: Points, width:
         f'<rect class="cell" x="{x - cell / 2:.1f}" y="{y - cell / 2:.1f}" width="{cell:.1f}" height="{cell:.1f}"/>'
         for x, y in cells.tolist()
     )
+    wide = "" if combined is None else _corridor(place(combined.tip_mm), combined.width_mm * scale)
     pieces = pieces_of(demo)
-    recorded = "".join(_line("raw", place(_thinned(demo.tip_mm[piece]))) for piece in pieces)
+    recorded = "".join(line("raw", place(_thinned(demo.tip_mm[piece]))) for piece in pieces)
     gaps = "".join(
-        _line("pause", place(demo.tip_mm[[before.stop - 1, after.start]])) for before, after in pairwise(pieces)
+        line("pause", place(demo.tip_mm[[before.stop - 1, after.start]])) for before, after in pairwise(pieces)
     )
-    ends = _dot("start", place(demo.tip_mm[:1])) + _dot("goal", place(demo.tip_mm[-1:]))
+    ends = dot("start", place(demo.tip_mm[:1])) + dot("goal", place(demo.tip_mm[-1:]))
     if demo.partner is not None:
-        ends += _dot("partner", place(np.array([demo.partner.position_mm])))
+        ends += dot("partner", place(np.array([demo.partner.position_mm])))
     a, b = AXES[axes[0]], AXES[axes[1]]
     return (
         f'<figure><svg viewBox="0 0 {SIDE} {SIDE}" width="{SIDE}" height="{SIDE}" role="img" '
-        f'aria-label="The path in {a} and {b}">{_rulers(low[list(axes)], width, scale, (a, b))}{squares}'
-        f"{_line('grid', place(path.tip_mm))}{gaps}{recorded}{ends}</svg></figure>"
+        f'aria-label="The path in {a} and {b}">{_rulers(low[list(axes)], width, scale, (a, b))}{squares}{wide}'
+        f"{line('grid', place(path.tip_mm))}{gaps}{recorded}{ends}</svg></figure>"
     )
+
+
+def _corridor(points: Points, radii: Points) -> str:
+    """Draw how wide a way is, (T,) pixels at each of its points, (T, 2): a disc at each, all as one."""
+    discs = "".join(
+        f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius:.1f}"/>'
+        for (x, y), radius in zip(points.tolist(), radii.tolist(), strict=True)
+    )
+    return f'<g class="corridor">{discs}</g>'
 
 
 def _rulers(low: Points, width: float, scale: float, names: tuple[str, str]) -> str:
     drawn = []
-    for value in _ticks(float(low[0]), float(low[0]) + width):
+    for value in ticks(float(low[0]), float(low[0]) + width):
         x = MARGIN + (value - low[0]) * scale
-        drawn.append(_rule(x, 8, x, SIDE - MARGIN) + _text(x, SIDE - MARGIN + 14, f"{value:g}", "middle"))
-    for value in _ticks(float(low[1]), float(low[1]) + width):
+        drawn.append(rule(x, 8, x, SIDE - MARGIN) + label(x, SIDE - MARGIN + 14, f"{value:g}", "middle"))
+    for value in ticks(float(low[1]), float(low[1]) + width):
         y = SIDE - MARGIN - (value - low[1]) * scale
-        drawn.append(_rule(MARGIN, y, SIDE - 8, y) + _text(MARGIN - 4, y + 4, f"{value:g}", "end"))
-    drawn.append(_text(SIDE - 8, SIDE - 4, f"{names[0]} in mm", "end") + _text(2, 12, names[1], "start"))
+        drawn.append(rule(MARGIN, y, SIDE - 8, y) + label(MARGIN - 4, y + 4, f"{value:g}", "end"))
+    drawn.append(label(SIDE - 8, SIDE - 4, f"{names[0]} in mm", "end") + label(2, 12, names[1], "start"))
     return "".join(drawn)
 
 
@@ -95,26 +111,26 @@ def speed(demo: Demo, a1_s: float) -> str:
             f'<rect class="paused" x="{left:.1f}" y="{up:.1f}" width="{right - left:.1f}" '
             f'height="{HIGH - MARGIN - up:.1f}"/>'
         )
-    for value in _ticks(0.0, top):
+    for value in ticks(0.0, top):
         (_, y), *_ = place(np.zeros(1), np.array([value])).tolist()
-        parts.append(_rule(MARGIN, y, WIDE - 12, y) + _text(MARGIN - 4, y + 4, f"{value:g}", "end"))
-    for value in _ticks(0.0, end_s, 10):
+        parts.append(rule(MARGIN, y, WIDE - 12, y) + label(MARGIN - 4, y + 4, f"{value:g}", "end"))
+    for value in ticks(0.0, end_s, 10):
         (x, _), *_ = place(np.array([value]), np.zeros(1)).tolist()
-        parts.append(_text(x, HIGH - MARGIN + 14, f"{value:g}", "middle"))
+        parts.append(label(x, HIGH - MARGIN + 14, f"{value:g}", "middle"))
     (x, up), (_, down) = place(np.array([a1_s, a1_s]), np.array([top, 0.0])).tolist()
     parts.append(f'<line class="pause" x1="{x:.1f}" y1="{up:.1f}" x2="{x:.1f}" y2="{down:.1f}"/>')
-    parts.append(_text(x - 5, up + 10, "A1", "end"))
+    parts.append(label(x - 5, up + 10, "A1", "end"))
     if end_s - a1_s > 0.02 * end_s:
-        parts.append(_text(x + 5, up + 10, "A2", "start"))
-    lines = "".join(_line("raw", _thinned(place(seconds - demo.stamps_s[0], one))) for seconds, one in drawn)
-    labels = _text(WIDE - 12, HIGH - 4, "seconds", "end") + _text(2, 10, "mm/s", "start")
+        parts.append(label(x + 5, up + 10, "A2", "start"))
+    lines = "".join(line("raw", _thinned(place(seconds - demo.stamps_s[0], one))) for seconds, one in drawn)
+    labels = label(WIDE - 12, HIGH - 4, "seconds", "end") + label(2, 10, "mm/s", "start")
     return (
         f'<figure><svg viewBox="0 0 {WIDE} {HIGH}" width="{WIDE}" height="{HIGH}" role="img" '
         f'aria-label="The speed over time">{"".join(parts)}{lines}{labels}</svg></figure>'
     )
 
 
-def _ticks(low: float, high: float, most: int = 6) -> list[float]:
+def ticks(low: float, high: float, most: int = 6) -> list[float]:
     """Choose round numbers between two, six or fewer."""
     rough = (high - low) / most
     power = 10.0 ** floor(log10(rough))
@@ -129,18 +145,22 @@ def _thinned(points: Points) -> Points:
     return np.concatenate((points[:-1:every], points[-1:]))
 
 
-def _line(kind: str, points: Points) -> str:
+def line(kind: str, points: Points) -> str:
+    """Draw a line through points, (T, 2)."""
     places: Sequence[str] = [f"{x:.1f},{y:.1f}" for x, y in points.tolist()]
     return f'<polyline class="{escape(kind)}" points="{" ".join(places)}"/>'
 
 
-def _dot(kind: str, points: Points) -> str:
+def dot(kind: str, points: Points) -> str:
+    """Draw a dot at each of some points, (T, 2)."""
     return "".join(f'<circle class="{escape(kind)}" cx="{x:.1f}" cy="{y:.1f}" r="5"/>' for x, y in points.tolist())
 
 
-def _rule(x: float, y: float, to_x: float, to_y: float) -> str:
+def rule(x: float, y: float, to_x: float, to_y: float) -> str:
+    """Draw a line of a scale."""
     return f'<line class="axis" x1="{x:.1f}" y1="{y:.1f}" x2="{to_x:.1f}" y2="{to_y:.1f}"/>'
 
 
-def _text(x: float, y: float, words: str, anchor: str) -> str:
+def label(x: float, y: float, words: str, anchor: str) -> str:
+    """Write words."""
     return f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}">{escape(words)}</text>'

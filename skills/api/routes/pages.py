@@ -7,17 +7,19 @@ import orjson
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.exceptions import RequestValidationError
 from fastapi.routing import APIRoute
+from markupsafe import Markup
 from sqlalchemy.orm import Session
 
 from skills import errors
 from skills.api.access import Asking, needs, open_to_all
 from skills.api.answers import JSON
 from skills.api.deps import Db, Digest, Limit, Read, RowCursor, Slug, SlugCursor
+from skills.api.pages import score_drawing
 from skills.api.pages.assets import assets, build
 from skills.api.pages.page import render
 from skills.api.routes.policies import Version
 from skills.api.routes.trainings import JobId
-from skills.library import batches, jobs, overview, policies, retraining, views
+from skills.library import batches, jobs, overview, policies, retraining, scores, views
 from skills.library.demos import find_demo
 from skills.library.plans import find_plan
 from skills.library.recordings import find_recording
@@ -26,7 +28,9 @@ from skills.settings import MEBIBYTE
 from skills.style.handoff import Enters
 from skills.style.kinematics import INSTRUMENTS
 
-LOST = (errors.NotFound, errors.Erased, RequestValidationError)
+# What is told on a page; all else is 404.
+STATUS: dict[type[Exception], int] = {errors.Erased: 410, errors.Conflict: 409, errors.BadPath: 422}
+LOST: tuple[type[Exception], ...] = (errors.NotFound, RequestValidationError, *STATUS)
 FOR_GOOD = "public, max-age=31536000, immutable"
 
 Words = Annotated[str, Query(max_length=200)]
@@ -44,9 +48,16 @@ class PageRoute(APIRoute):
             try:
                 return await answer(request)
             except LOST as lost:
-                status = 410 if isinstance(lost, errors.Erased) else 404
+                status = next((code for kind, code in STATUS.items() if isinstance(lost, kind)), 404)
                 said = str(lost) if isinstance(lost, errors.SkillsError) else "There is no page of this address."
-                return render(request, "lost.html", request.scope.get("caller"), status=status, said=said)
+                return render(
+                    request,
+                    "lost.html",
+                    request.scope.get("caller"),
+                    status=status,
+                    said=said,
+                    there=status in (409, 422),
+                )
 
         return answer_or_tell
 
@@ -123,6 +134,31 @@ def view_demo(demo: Digest, caller: Asking, db: Db) -> Response:
     """Give what the 3-D view of a demonstration is drawn from."""
     with db.reading() as session:
         return _json(views.view_of_demo(session, find_demo(session, demo)))
+
+
+@router.get("/pages/demos/{demo}/score", dependencies=[needs("reader")])
+def show_score(
+    demo: Digest,
+    request: Request,
+    caller: Asking,
+    db: Db,
+    read: Read,
+    surgeon: Annotated[str, Query(max_length=64)] = "",
+) -> Response:
+    """Show the score of a demonstration against a surgeon's style; left out, an expert's, if there is one."""
+    with db.reading() as session:
+        found = find_demo(session, demo)
+        surgeons = scores.references(session, found.suture)
+    others = [one.slug for one in surgeons if one.row != found.surgeon_row]
+    against = surgeon or next(iter(others), found.surgeon.slug)
+    score = scores.score(db, scores.Asked(against, found.suture, found.sha256), read)
+    drawn: dict[str, Any] = {
+        "views": [(name, Markup(svg)) for name, svg in score_drawing.views(score["deviation"])],  # noqa: S704 - our own
+        "along": Markup(score_drawing.along(score["deviation"])),  # noqa: S704
+        "curve": Markup(score_drawing.over_time(score["curve"], found.sha256)) if len(score["curve"]) > 1 else None,  # noqa: S704
+        "key": score_drawing.key(),
+    }
+    return render(request, "score.html", caller, demo=found, score=score, surgeons=surgeons, **drawn)
 
 
 @router.get("/pages/recordings", dependencies=[needs("reader")])

@@ -41,6 +41,7 @@ def train(body: TrainingIn, db: Db, jobs: Jobs, actor: Actor, caller: Asking) ->
             body.suture,
             actor,
             demos=body.demos,
+            combine=body.combining,
             learner=body.chosen,
             seed=body.seed,
             release=body.release,

@@ -5,7 +5,7 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from skills.api.schemas.learnt import GridCertificate, TrainingFigures
+from skills.api.schemas.learnt import Combined, GridCertificate, TrainingFigures
 from skills.api.schemas.recorded import DemoReport, RewardLevels
 from skills.api.schemas.shapes import Count, Given, Grid, Point, PolicyName, Sha256, Share, Slug
 
@@ -103,6 +103,12 @@ class CardDemonstration(Given):
     lost_in_words: str
     where: str
     recording: CardRecording
+
+
+class CardCombined(Combined):
+    """How several demonstrations became one way, and a sentence of it."""
+
+    in_words: str
 
 
 class CardLearner(Given):
@@ -227,7 +233,8 @@ class PolicyCard(Given):
     status: CardStatus
     surgeon: CardSurgeon
     suture_type: CardSutureType
-    demonstrations: list[CardDemonstration]
+    demonstrations: list[CardDemonstration] = Field(description="The oldest first.")
+    combined: CardCombined | None = Field(description="Where there are several: how they became one way.")
     learner: CardLearner
     metrics: list[CardMetric]
     certificate: GridCertificate

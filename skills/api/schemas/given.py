@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 from pydantic import ConfigDict, Field
 
+from skills.api.schemas.atlas import Atlas
 from skills.api.schemas.card import PolicyCard
 from skills.api.schemas.keyed import Key, NewKey
 from skills.api.schemas.learnt import (
@@ -23,10 +24,12 @@ from skills.api.schemas.learnt import (
 )
 from skills.api.schemas.planned import Comparison, Plan, Playback, Trajectory
 from skills.api.schemas.recorded import Demonstration, DemoPath, Recording, RewardMap, SuturePoints
+from skills.api.schemas.score import Score
 from skills.api.schemas.shapes import Count, Given, Page, Slug
 
 __all__ = [
     "Alive",
+    "Atlas",
     "Comparison",
     "Consent",
     "DemoPath",
@@ -48,6 +51,7 @@ __all__ = [
     "Retraining",
     "RewardMap",
     "Rollout",
+    "Score",
     "Surgeon",
     "SuturePoints",
     "SutureType",

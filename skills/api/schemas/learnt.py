@@ -107,6 +107,30 @@ class GridCertificate(Given):
     note: str
 
 
+class Combined(Given):
+    """How the demonstrations of a policy became the one way that it follows (docs/combining.md)."""
+
+    kind: Literal["medoid", "barycentre", "corridor"]
+    medoid: Sha256 = Field(description="The demonstration that is nearest to all.")
+    at: Sha256 = Field(description="The demonstration whose place, arm and time it has.")
+    moved: bool = Field(description="Whether they were shown at different places, so that all were laid there.")
+    apart_mm: list[float] = Field(description="How far each of `demos` is from the way, at a state on average (DTW).")
+    width_mm: list[float] = Field(description="Within what the majority of them pass each of `waypoints`.")
+    hysteresis: float
+    bridged_cells: Count
+
+
+class SpaceRollouts(Given):
+    """A policy of the continuous space, followed there without a grid from starts that the seed drew, to the goal."""
+
+    starts: Count
+    reached: Count
+    seed: Count
+    dtw_total_mm: float = Field(description="To the demonstration, the mean over these starts.")
+    demonstrated_start_reached: bool
+    demonstrated_start_dtw_mm: float
+
+
 class TrainingFigures(Given):
     """What learning took."""
 
@@ -167,6 +191,8 @@ class Policy(PolicyName):
     metrics: Metrics
     coverage: Coverage
     grid_certificate: GridCertificate
+    combined: Combined | None = Field(default=None, description="Where it was learnt from several demonstrations.")
+    rollouts: SpaceRollouts | None = Field(default=None, description="Where it was learnt in the continuous space.")
     created_at: datetime
     released_at: datetime | None
     released_by: str | None

@@ -195,6 +195,7 @@ class DemoReport(Given):
     speed_peak_mm_s: float
     jerk_rms_mm_s3: float | None = None
     log_dimensionless_jerk: float | None = Field(default=None, description="The nearer to 0 the smoother.")
+    spectral_arc_length: float | None = Field(default=None, description="The nearer to 0 the smoother.")
     clutch_presses: Count
     clutched_s: float | None = None
     undriven_s: float | None = None

@@ -2,18 +2,22 @@
 
 from dataclasses import fields
 from datetime import date
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, StrictBool, StrictInt, create_model
+from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, StrictBool, StrictInt, create_model, model_validator
 
 from skills.api.deps import DIGEST, SLUG
+from skills.library.demos import Cut
 from skills.library.keys import OWNER
 from skills.library.plans import Beside, PlanRequest
+from skills.library.scores import Asked
 from skills.library.training import learner_of
 from skills.settings import Role
+from skills.style.combining import COMBININGS, Combining
 from skills.style.grid import MAX_HYSTERESIS, GridMode
 from skills.style.handoff import Enters
 from skills.style.kinematics import INSTRUMENTS, JAW_TIP_MM
+from skills.style.learning.beyond import DDPG, DQN, TRPO
 from skills.style.learning.irl import MaxEntIRL
 from skills.style.learning.learners import MAX_SEED, Learner
 from skills.style.learning.q_learning import CellQLearning, PhaseQLearning
@@ -129,13 +133,28 @@ def _learner(learner: type[Learner]) -> Any:
 
 
 LearnerIn: Any = Annotated[
-    _learner(PhaseQLearning) | _learner(CellQLearning) | _learner(ValueIteration) | _learner(MaxEntIRL),
+    _learner(PhaseQLearning)
+    | _learner(CellQLearning)
+    | _learner(ValueIteration)
+    | _learner(MaxEntIRL)
+    | _learner(DQN)
+    | _learner(DDPG)
+    | _learner(TRPO),
     Field(discriminator="kind"),
 ]
 
 
+class CombineIn(Schema):
+    """How several demonstrations become one way to follow (docs/combining.md)."""
+
+    kind: Literal["medoid", "barycentre", "corridor"]
+
+
 class TrainingIn(Schema):
-    """What is to be learnt. Left out: the newest active demonstration, the phase learner, seed 0, no release."""
+    """What is to be learnt. Left out: the newest active demonstration, the phase learner, seed 0, no release.
+
+    Several demonstrations are combined: as a corridor, if `combine` is left out.
+    """
 
     model_config = shown(
         {"surgeon": "kestrel", "suture": "simple-running", "release": True},
@@ -145,6 +164,7 @@ class TrainingIn(Schema):
     surgeon: SlugField
     suture: SlugField
     demos: list[DigestField] | None = None
+    combine: CombineIn | None = None
     learner: LearnerIn | None = None
     seed: Annotated[StrictInt, Field(ge=0, le=MAX_SEED)] = 0
     release: StrictBool = False
@@ -153,6 +173,11 @@ class TrainingIn(Schema):
     def chosen(self) -> Learner | None:
         """The learner as the core knows it."""
         return None if self.learner is None else learner_of(self.learner.model_dump())
+
+    @property
+    def combining(self) -> Combining | None:
+        """How demonstrations are combined, as the core knows it."""
+        return None if self.combine is None else COMBININGS[self.combine.kind]()
 
 
 class RetrainingIn(Schema):
@@ -176,6 +201,44 @@ class RetrainingIn(Schema):
     def chosen(self) -> Learner | None:
         """The learner as the core knows it."""
         return None if self.learner is None else learner_of(self.learner.model_dump())
+
+
+class ScoreIn(Schema):
+    """What is to be scored: a demonstration, or a part of a recording; and the style that it is scored against."""
+
+    model_config = shown(
+        {"surgeon": "kestrel", "suture": "simple-running", "demo": "0123456789abcdef" * 4},
+        {"surgeon": "kestrel", "suture": "simple-running", "recording": "0123456789abcdef" * 4, "end_s": 1.1},
+    )
+
+    surgeon: SlugField
+    suture: SlugField
+    demo: DigestField | None = None
+    recording: DigestField | None = None
+    arm: Name | None = None
+    topic: Name | None = None
+    start_s: Annotated[float, Field(ge=0, le=1e9)] | None = None
+    end_s: Annotated[float, Field(ge=0, le=1e9)] | None = None
+    reference: DigestField | None = Field(
+        default=None,
+        description="The demonstration of the style to compare with. Left out, the one that its released policy was "
+        "learnt from, else its newest.",
+    )
+
+    @model_validator(mode="after")
+    def _one_of_two(self) -> Self:
+        part = (self.arm, self.topic, self.start_s, self.end_s)
+        if (self.demo is None) == (self.recording is None):
+            raise ValueError("give either demo or recording")
+        if self.demo is not None and any(one is not None for one in part):
+            raise ValueError("arm, topic, start_s and end_s are of a recording; a demonstration has its own")
+        return self
+
+    @property
+    def asked(self) -> Asked:
+        """The request as the library knows it."""
+        part = Cut(self.surgeon, self.suture, self.arm, self.topic, self.start_s, self.end_s)
+        return Asked(self.surgeon, self.suture, self.demo, self.recording, part, self.reference)
 
 
 class RolloutIn(Schema):

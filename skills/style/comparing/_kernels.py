@@ -22,16 +22,16 @@ def warped(path: Any, reference: Any, row: Any) -> Any:
     return row[reference.shape[0]]
 
 
-def warp_each(
+def warp_pairs(
     paths: Any,  # (N, T, 3)
     references: Any,  # (M, R, 3)
+    pairs: Any,  # (K, 2): which path, and which reference
     row: Any,  # room for R + 1
-    totals: Any,  # (N, M), filled
+    totals: Any,  # (K,), filled
 ) -> None:
-    """Measure the distance of each path to each reference."""
-    for i in range(paths.shape[0]):
-        for j in range(references.shape[0]):
-            totals[i, j] = warped(paths[i], references[j], row)
+    """Measure how far the path and the reference of each pair are apart."""
+    for k in range(pairs.shape[0]):
+        totals[k] = warped(paths[pairs[k, 0]], references[pairs[k, 1]], row)
 
 
-warp_each_compiled = compiled(warp_each)
+warp_pairs_compiled = compiled(warp_pairs)

@@ -10,17 +10,21 @@ et al., "On Calibration of Modern Neural Networks", ICML 2017). Ours; the paper 
 """
 
 from dataclasses import dataclass
-from math import sqrt
+from math import exp, log, sqrt
 
 import numpy as np
+from numpy.typing import NDArray
 
 from skills.errors import BadInput
 from skills.style._arrays import Floats, Ints, frozen
 
 NORMAL_95 = 1.959964  # of the standard normal distribution, two-sided
-STEPS = 80  # of golden section: the scale is then known to 1e-15 of where it was looked for
+STEPS = 40  # of golden section: the scale is then known to 1e-7
+FOLDS = 20  # of sessions that the scale is fitted without: with more sessions some are left out together
 WIDEST = 1e3  # the scale is looked for between the median distance over this and times this
 GOLDEN = (sqrt(5.0) - 1.0) / 2.0
+
+Flags = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +62,11 @@ class Validated:
         return 1.0 / len(self.surgeons)
 
     @property
+    def sureness(self) -> float:
+        """What it gives its guesses, on average: the accuracy, where its probabilities hold."""
+        return float(self.probability.max(axis=1).mean())
+
+    @property
     def interval(self) -> tuple[float, float]:
         """Between what the true share lies at 95 %, if demonstrations were independent (Wilson)."""
         return wilson(self.right, len(self.tested))
@@ -66,7 +75,7 @@ class Validated:
 def validate(apart: Floats, surgeons: Ints, sessions: Ints) -> Validated:
     """Recognise every demonstration from those of other sessions, and see how often that is right.
 
-    The scale is fitted for each demonstration on all others that do not share its session, so that none is judged by a
+    The scale is fitted for each demonstration on others that do not share its session, so that none is judged by a
     calibration that has seen it; the one given back is fitted on all.
 
     Args:
@@ -86,8 +95,9 @@ def validate(apart: Floats, surgeons: Ints, sessions: Ints) -> Validated:
         raise BadInput("Recognition needs at least two surgeons who have two sessions each; record more.")
     away, truth = away[tested], truth[tested]
     probability = np.empty_like(away)
-    for session in np.unique(sessions[tested]):
-        mine = sessions[tested] == session
+    folds = np.unique(sessions[tested], return_inverse=True)[1] % FOLDS
+    for fold in np.unique(folds):
+        mine = folds == fold
         probability[mine] = probabilities(away[mine], calibrate(away[~mine], truth[~mine]) if (~mine).any() else None)
     right = int((away.argmin(axis=1) == truth).sum())
     of_truth = probability[np.arange(len(truth)), truth]
@@ -95,19 +105,27 @@ def validate(apart: Floats, surgeons: Ints, sessions: Ints) -> Validated:
     return Validated(labels, tested, probability, right, calibrate(away, truth), log_loss)
 
 
-def nearness(apart: Floats, surgeons: Ints, labels: Ints, other: Floats) -> Floats:
+def recognise(apart: Floats, surgeons: Ints, sessions: Ints, one: int, validated: Validated) -> Floats:
+    """Say whose style one of the demonstrations is, from those of other sessions: the probability of each, shape (S,).
+
+    The scale is that of the validation without its session, if it could be tested, else the one that is fitted on all.
+    """
+    if one in validated.tested:
+        return np.asarray(validated.probability[np.flatnonzero(validated.tested == one)[0]])
+    away = nearness(apart[[one]], surgeons, validated.surgeons, other=(sessions != sessions[one])[None, :])
+    return np.asarray(probabilities(away, validated.scale)[0])
+
+
+def nearness(apart: Floats, surgeons: Ints, labels: Ints, other: Flags) -> Floats:
     """Average distances, (M, N), over each surgeon's demonstrations that may be asked: (M, S); infinite where none may.
 
     Args:
         other: Which of the N may be asked about which of the M, shape (M, N), boolean.
     """
-    columns = []
-    for label in labels:
-        asked = other & (surgeons == label)
-        count = asked.sum(axis=1)
-        total = np.where(asked, apart, 0.0).sum(axis=1)
-        columns.append(np.where(count > 0, total / count.clip(1), np.inf))
-    return np.stack(columns, axis=1)
+    member = (surgeons[:, None] == labels).astype(float)
+    count = other @ member
+    total = np.where(other, apart, 0.0) @ member
+    return np.where(count > 0, total / count.clip(1), np.inf)
 
 
 def probabilities(away: Floats, scale: float | None) -> Floats:
@@ -122,21 +140,31 @@ def probabilities(away: Floats, scale: float | None) -> Floats:
 def calibrate(away: Floats, truth: Ints) -> float:
     """Fit the scale under which the true surgeons, (M,), are likeliest, given mean distances, (M, S).
 
-    The loss has one minimum in the reciprocal of the scale, of which it is a convex function; golden section finds it.
+    The loss is a convex function of the reciprocal of the scale; golden section finds its minimum, and looks for it by
+    the logarithm, so that a small scale is known as well as a large one.
     """
     typical = float(np.median(away[np.isfinite(away)]))
     if not typical > 0:
         raise BadInput("All demonstrations are the same; recognition needs motions that differ.")
-    low, high = 1.0 / (typical * WIDEST), WIDEST / typical
+    further = away - away.min(axis=1, keepdims=True)
+    of_truth = further[np.arange(len(truth)), truth]
 
     def loss(reciprocal: float) -> float:
-        sure = probabilities(away, 1.0 / reciprocal)[np.arange(len(truth)), truth]
-        return float(-np.log(sure.clip(np.finfo(float).tiny)).mean())
+        return float((of_truth * reciprocal + np.log(np.exp(-further * reciprocal).sum(axis=1))).mean())
 
+    low, high = -log(typical * WIDEST), log(WIDEST / typical)
+    one, two = high - GOLDEN * (high - low), low + GOLDEN * (high - low)
+    at_one, at_two = loss(exp(one)), loss(exp(two))
     for _ in range(STEPS):
-        one, two = high - GOLDEN * (high - low), low + GOLDEN * (high - low)
-        low, high = (low, two) if loss(one) <= loss(two) else (one, high)
-    return 2.0 / (low + high)
+        if at_one <= at_two:
+            high, two, at_two = two, one, at_one
+            one = high - GOLDEN * (high - low)
+            at_one = loss(exp(one))
+        else:
+            low, one, at_one = one, two, at_two
+            two = low + GOLDEN * (high - low)
+            at_two = loss(exp(two))
+    return exp(-(low + high) / 2.0)
 
 
 def wilson(right: int, of: int) -> tuple[float, float]:

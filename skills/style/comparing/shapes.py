@@ -2,8 +2,8 @@
 
     Demo --shape_of--> points equally far apart along the way, in a frame of the hand-off itself
 
-That frame has its origin at the start, x towards the goal, and z as far up the base's z axis as that allows; y closes
-it to the right. So two shapes begin together and go the same way; scaled, they end together too. Tempo is left out:
+That frame has its origin at the start, x towards the goal, and z as far up the base's z axis as that allows; y then
+points to the left. So two shapes begin together and go the same way; scaled, they end together too. Tempo is left out:
 states are even along the way, as in the paper's grid, where standing still adds no state. Ours; the paper compares
 paths only where they were recorded.
 """
@@ -29,6 +29,11 @@ def shape_of(demo: Demo, *, scaled: bool = False) -> Floats:
     """
     way_mm = resampled(smoothed_tip(demo.stamps_s, demo.tip_mm, TREMOR_S)[1])
     return placed(way_mm, scaled=scaled)
+
+
+def in_lengths(shape_mm: Floats) -> Floats:
+    """Write a shape, (T, 3) in mm, in lengths of start to goal: the scaled one of the same demonstration."""
+    return np.asarray(shape_mm / shape_mm[-1, 0])
 
 
 def resampled(tip_mm: Floats, states: int = STATES) -> Floats:

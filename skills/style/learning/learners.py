@@ -1,4 +1,7 @@
-"""The learners there are, and the one call that learns with any of them."""
+"""The learners there are, and the one call that learns with any of those that need no network.
+
+`skills.deep.learn_policy` learns with all of them.
+"""
 
 from typing import get_args
 
@@ -6,12 +9,14 @@ from skills.errors import BadSettings
 from skills.style._arrays import Floats
 from skills.style.domain import Domain
 from skills.style.grid import GridPath
+from skills.style.learning.beyond import DDPG, DQN, TRPO
 from skills.style.learning.irl import MaxEntIRL, learn_from_recovered
 from skills.style.learning.q_learning import CellQLearning, PhaseQLearning, Training, learn_q
 from skills.style.learning.value_iteration import ValueIteration, iterate_values
 from skills.style.reward import RewardLevels, RewardMap
 
-Learner = PhaseQLearning | CellQLearning | ValueIteration | MaxEntIRL
+Tabular = PhaseQLearning | CellQLearning | ValueIteration | MaxEntIRL
+Learner = Tabular | DQN | DDPG | TRPO
 LEARNERS: dict[str, type[Learner]] = {learner.kind: learner for learner in get_args(Learner)}
 LEARNER_VERSION = 4  # part of a training's identity: raise it when the same settings would learn something else
 MAX_SEED = 2**63 - 1
@@ -20,24 +25,33 @@ BYTES_A_ROW = 600  # of the domain, measured with 51 and 101 cells a side: Q val
 BYTES_A_SLIPPING_ROW = 2400  # the certificate keeps what each of the 27 actions leads to
 
 
-def learn_values(reward: RewardMap, learner: Learner, seed: int) -> tuple[Floats, Training]:
+def learn_values(reward: RewardMap, learner: Tabular, seed: int) -> tuple[Floats, Training]:
     """Learn the Q values of a reward map's domain, (rows, 27), and tell what it took.
 
     The same reward map, learner and seed give the same bytes; the learners that solve instead of trying use no seed.
 
     Raises:
-        BadSettings: The seed is not an integer from 0 to 2^63 - 1, or arriving would not pay (see `_refuse_loops`), or
-            the grid is too large for memory, or the path too long for the learner.
+        BadSettings: As for `check_learnable`, or the path is too long for the learner.
     """
-    if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed <= MAX_SEED:
-        raise BadSettings("The seed must be an integer from 0 to 2^63 - 1.")
-    _refuse_loops(reward.levels, learner)
-    refuse_too_large(reward.path, learner)
+    check_learnable(reward, learner, seed)
     if isinstance(learner, ValueIteration):
         return iterate_values(reward, learner), _without_moving(settled=True)
     if isinstance(learner, MaxEntIRL):
         return learn_from_recovered(reward, learner), _without_moving(settled=False)
     return learn_q(reward, learner, seed)
+
+
+def check_learnable(reward: RewardMap, learner: Learner, seed: int) -> None:
+    """Refuse what no learner should begin with.
+
+    Raises:
+        BadSettings: The seed is not an integer from 0 to 2^63 - 1, or arriving would not pay (see `_refuse_loops`), or
+            the grid is too large for memory.
+    """
+    if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed <= MAX_SEED:
+        raise BadSettings("The seed must be an integer from 0 to 2^63 - 1.")
+    _refuse_loops(reward.levels, learner)
+    refuse_too_large(reward.path, learner)
 
 
 def refuse_too_large(path: GridPath, learner: Learner) -> None:

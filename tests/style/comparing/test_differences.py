@@ -36,3 +36,16 @@ def test_nothing_differs_from_itself():
     assert found.total == 0.0
     assert not found.offsets.any()
     assert not found.shares.any()
+
+
+def test_where_they_cross_neither_lies_further():
+    reference = along(30)
+    shape = reference.copy()
+    shape[10:15, 1], shape[15:20, 1] = 3.0, -3.0
+    found = difference(shape, reference)
+    assert found.where == ("middle third", "sideways")
+    share, offset, size = found.most
+    assert (share, offset, size) == (pytest.approx(1.0), pytest.approx(0.0), pytest.approx(3.0))
+    assert found.direction is None
+    assert difference(reference + np.array([0, 0, 1.0]), reference).direction == "higher"
+    assert difference(reference, reference + np.array([0, 1.0, 0])).direction == "further right"

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from tslearn.metrics import dtw_path_from_metric
 
 from skills.style.comparing import _kernels
-from skills.style.comparing.distances import distances, medoid, spread
+from skills.style.comparing.distances import WORTH_A_THREAD, distances, distances_of, medoid, spread
 from skills.style.evaluation import dtw
 from tests.style.comparing.cohort import cohort
 
@@ -62,3 +62,13 @@ def test_a_cohorts_surgeons_are_nearer_to_themselves():
     same = drawn.surgeons[:, None] == drawn.surgeons[None, :]
     own, others = apart[same & ~np.eye(len(same), dtype=bool)], apart[~same]
     assert own.mean() < 0.5 * others.mean()
+
+
+def test_threads_change_no_bit_and_a_pair_is_what_it_is_among_all():
+    shapes = np.random.default_rng(7).normal(0, 10, (30, 12, 3))
+    every = np.array([(i, j) for i in range(30) for j in range(30)])
+    assert len(every) > 2 * WORTH_A_THREAD
+    found = distances_of(shapes, every)
+    assert (found == distances(shapes, shapes).ravel()).all()
+    assert [*found[:5]] == [distances_of(shapes, [pair])[0] for pair in every[:5]]
+    assert distances_of(shapes, np.empty((0, 2))).shape == (0,)

@@ -5,7 +5,7 @@ import pytest
 
 from skills.errors import BadInput
 from skills.style.comparing.distances import distances
-from skills.style.comparing.recognition import Validated, calibrate, probabilities, validate, wilson
+from skills.style.comparing.recognition import Validated, calibrate, probabilities, recognise, validate, wilson
 from skills.style.comparing.shapes import shape_of
 from tests.style.comparing.cohort import Cohort, cohort
 
@@ -83,3 +83,32 @@ def test_intervals_by_the_book():
     assert (round(low, 3), round(high, 3)) == (0.490, 0.943)
     assert wilson(0, 5)[0] == 0.0
     assert wilson(5, 5)[1] == 1.0
+
+
+def test_one_that_could_not_be_tested_is_recognised_by_the_others_and_its_own_session_says_nothing():
+    drawn = cohort(1)
+    shapes = [shape_of(demo) for demo in drawn.demos]
+    shapes += [shapes[7]]  # a motion of surgeon 1 under a name of its own, once in a session of its own ...
+    apart = distances(shapes, shapes)
+    stranger = np.append(drawn.surgeons, 99)
+    own = recognised(apart, stranger, np.append(drawn.sessions, 99))
+    assert own.argmax() == 1 and own[1] > 0.9
+    assert own[-1] == 0.0  # nobody of that name was seen in another session
+    assert own.sum() == pytest.approx(1.0)
+    beside = recognised(apart, stranger, np.append(drawn.sessions, drawn.sessions[7]))  # ... and once in that one
+    apart[7, -1] = apart[-1, 7] = 1e6
+    together = np.append(drawn.sessions, drawn.sessions[7])
+    np.testing.assert_array_equal(recognised(apart, stranger, together), beside)
+    assert recognised(apart, stranger, np.append(drawn.sessions, 99))[1] < own[1]
+
+
+def recognised(apart: np.ndarray, surgeons: np.ndarray, sessions: np.ndarray) -> np.ndarray:
+    return recognise(apart, surgeons, sessions, len(surgeons) - 1, validate(apart, surgeons, sessions))
+
+
+def test_one_that_was_tested_is_recognised_as_it_was():
+    drawn = cohort(3)
+    shapes = [shape_of(demo) for demo in drawn.demos]
+    apart, found = distances(shapes, shapes), validated(drawn)
+    assert (recognise(apart, drawn.surgeons, drawn.sessions, 12, found) == found.probability[12]).all()
+    assert abs(found.sureness - found.accuracy) < 0.25

@@ -7,10 +7,12 @@ from hypothesis import strategies as st
 
 from skills.errors import BadPath
 from skills.style.comparing.distances import distances
-from skills.style.comparing.shapes import STATES, placed, resampled, shape_of
+from skills.style.comparing.measured import VERSION
+from skills.style.comparing.shapes import STATES, in_lengths, placed, resampled, shape_of
 from tests.style.comparing.cohort import demo_of
 
 HUMPS_MM = np.array([[3.0, 6.0], [1.0, -2.0], [0.0, 1.0]])
+PINNED_MM = [[10.769038, 2.972388, 2.66079], [22.036847, 3.008288, 4.690078], [33.111112, 1.089212, 6.643578]]
 
 
 def test_a_quarter_circle_worked_by_hand():
@@ -56,3 +58,15 @@ def test_straight_up_is_a_way_too_and_none_at_all_is_refused():
         placed(around)
     with pytest.raises(BadPath):
         placed(np.full((3, 3), np.nan))
+
+
+def test_a_shape_in_lengths_is_the_scaled_one():
+    demo = demo_of(HUMPS_MM, 0.7, np.array([1.0, 2.0, -100.0]), 3.0)
+    np.testing.assert_allclose(in_lengths(shape_of(demo)), shape_of(demo, scaled=True), atol=1e-12)
+
+
+def test_what_is_kept_of_shapes_has_a_version_that_goes_up_when_they_change():
+    """Where this fails, shapes come out otherwise than before: raise `VERSION` in `measured.py`, then mend these."""
+    shape = shape_of(demo_of(HUMPS_MM, 0.7, np.array([1.0, 2.0, -100.0]), 3.0))
+    assert VERSION == 1
+    np.testing.assert_allclose(shape[[25, 50, 75]], PINNED_MM, atol=1e-6)

@@ -208,6 +208,7 @@ function made() {
   }));
   get("advice").replaceChildren(advice(report.advice));
   get("report").href = `${root}/demos/${demo.id}/report`;
+  get("score").href = `${root}/pages/demos/${demo.id}/score`;
   get("trained").hidden = true;
   tell("train-said", "");
   get("made").hidden = false;

@@ -1,0 +1,123 @@
+"""The atlas over HTTP: typed, conditional, and of nobody whom the key does not see."""
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from skills.api.pages import atlas_drawing
+from skills.library.atlas import _compare, _Member, _told
+from skills.library.atlas_parts import Atlas, LeftOut
+from skills.style.comparing.shapes import STATES
+from tests import backends
+from tests.api.keyed import As, key
+from tests.api.service import Service, assert_problem, serving
+from tests.library import cases, cohorts
+from tests.style.comparing.cohort import cohort
+
+ATLAS = f"/styles/{cases.SUTURE}/atlas"
+
+
+@pytest.fixture(scope="module")
+def compared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
+    """A service with two surgeons in three sessions each."""
+    with serving(backends.fresh("sqlite", tmp_path_factory.mktemp("atlas"))) as service:
+        cohorts.add_cohort(service.database, cohort(1, surgeons=2, sessions=3))
+        yield service
+
+
+def test_it_is_the_same_bytes_until_something_changes(compared: Service):
+    first = compared.http.get(ATLAS)
+    assert first.status_code == 200
+    again = compared.http.get(ATLAS, headers={"If-None-Match": first.headers["etag"]})
+    assert (again.status_code, again.content) == (304, b"")
+    scaled = compared.http.get(f"{ATLAS}?scaled=true")
+    assert scaled.json()["unit"] == "lengths of start to goal"
+    assert scaled.headers["etag"] != first.headers["etag"]
+
+
+def test_the_client_reads_it_and_asks_whose_style_one_is(compared: Service):
+    demo = compared.client.demos()[0]["id"]
+    found = compared.client.atlas(cases.SUTURE, clusters=2, demo=demo)
+    assert [one["demos"] for one in found["clusters"]] == [3, 3]
+    assert found["whose"]["demo"] == demo
+    assert found["whose"]["likely"][0]["surgeon"] == found["whose"]["surgeon"] == cohorts.name(1)
+    assert found["recognition"]["right"] == 6
+    assert sum(len(row) for row in found["distances"]) == 15
+
+
+@pytest.mark.parametrize(
+    ("path", "status"),
+    [
+        ("/styles/nothing/atlas", 404),
+        ("/styles/simple-interrupted/atlas", 404),
+        (f"{ATLAS}?demo={'0' * 64}", 404),
+        (f"{ATLAS}?demo=kestrel", 422),
+        (f"{ATLAS}?clusters=0", 422),
+        (f"{ATLAS}?clusters=7", 422),
+        (f"{ATLAS}?scaled=perhaps", 422),
+    ],
+)
+def test_what_cannot_be_answered_is_a_problem(compared: Service, path: str, status: int):
+    assert_problem(compared.http.get(path), status)
+
+
+def test_a_key_sees_an_atlas_of_its_surgeons_and_nothing_of_others(tmp_path: Path):
+    with serving(backends.fresh("sqlite", tmp_path)) as service:
+        cohorts.add_cohort(service.database, cohort(1, surgeons=2, sessions=2))
+        anna, ben = (
+            As(service, key(service, "anna", "admin")),
+            As(service, key(service, "ben", "reader", surgeons=[cohorts.name(0)])),
+        )
+        assert len(anna("GET", ATLAS).json()["demos"]) == 4
+        answer = ben("GET", ATLAS)
+        assert [one["surgeon"] for one in answer.json()["demos"]] == [cohorts.name(0)] * 2
+        assert cohorts.name(1) not in answer.text
+        others = anna("GET", f"/demos?surgeon={cohorts.name(1)}").json()["items"][0]["id"]
+        assert ben("GET", f"{ATLAS}?demo={others}").status_code == 404
+
+
+PAGE = f"/pages/atlas/{cases.SUTURE}"
+
+
+def test_the_page_draws_every_demonstration_and_every_distance(compared: Service):
+    said = compared.http.get(PAGE).text
+    assert said.count('class="mark c0" d="M') > 3 and said.count('class="mark c1" d="M') > 3
+    assert len(re.findall(r'<g transform="translate\([\d. -]+\)"><title>surgeon-\d, session', said)) == 6
+    assert len(re.findall(r'<rect class="s\d" [^>]*><title>', said)) == 36
+    assert said.count('class="medoid"') == 2
+    assert "Set-up and day go with the surgeon" in said and "6 of 6" in said
+    demo = compared.client.demos()[0]["id"]
+    asked = compared.http.get(f"{PAGE}?demo={demo}&clusters=2").text
+    assert f"stored as {cohorts.name(1)}" in asked.replace("&#39;", "'") and 'class="asked"' in asked
+    assert re.search(r"In the (first|middle|last) third, surgeon-0 lies", asked)
+
+
+@pytest.mark.parametrize(
+    ("query", "said"), [("clusters=7", "1 to 6 clusters"), (f"demo={'0' * 64}", "no such demonstration")]
+)
+def test_a_page_that_cannot_be_drawn_says_why(compared: Service, query: str, said: str):
+    answer = compared.http.get(f"{PAGE}?{query}")
+    assert (answer.status_code, said in answer.text) == (404, True)
+
+
+def test_more_than_can_be_seen_is_drawn_in_groups_that_hold_all_of_it():
+    shapes = np.random.default_rng(3).normal(0, 1, (70, 2))
+    far = np.abs(shapes[:, None] - shapes[None, :]).sum(axis=2)
+    drawn = atlas_drawing.matrix(drawn_from(far))
+    assert drawn.count("<title>") == atlas_drawing.MOST_GROUPS**2
+    groups = atlas_drawing._leaves(drawn_from(far))
+    assert sorted(one for group in groups for one in group.members) == list(range(70))
+    means = atlas_drawing._between(far, groups)
+    np.testing.assert_allclose(means[0, 5], far[np.ix_(groups[0].members, groups[5].members)].mean())
+    tree = re.search(r'class="tree" d="([^"]*)"', drawn)
+    assert tree is not None and tree[1].count("V") == atlas_drawing.MOST_GROUPS - 1
+
+
+def drawn_from(far: np.ndarray) -> Atlas:
+    """Give an atlas in which demonstrations have distances alone."""
+    members = [_Member(at, f"{at:064x}", f"surgeon-{at % 3}", None, at) for at in range(len(far))]
+    shapes = np.zeros((len(far), STATES, 3))
+    return _told(cases.SUTURE, _compare(members, shapes, far, False), LeftOut(0, [], []), 4, None)

@@ -1,0 +1,73 @@
+"""`skills score` and `skills calibrate`, on the application in this process."""
+
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from skills.cli import app
+from skills.seeds.recordings import sample_recordings
+from skills.settings import settings
+from tests.library import rated
+
+STYLE = ("--surgeon", "kestrel", "--suture", "simple-running")
+Run = Callable[..., tuple[int, str]]
+
+
+@pytest.fixture
+def skills(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Run]:
+    """Run a command on a database of this test's own: its exit code, and what it printed."""
+    monkeypatch.setenv("SKILLS_DATABASE_URL", f"sqlite:///{tmp_path / 'skills.sqlite'}")
+    monkeypatch.delenv("SKILLS_SERVER", raising=False)
+    settings.cache_clear()
+
+    def run(*words: str) -> tuple[int, str]:
+        result = CliRunner().invoke(app, list(words))
+        return result.exit_code, result.output
+
+    yield run
+    settings.cache_clear()
+
+
+def test_a_file_is_scored_by_its_proposed_hand_off(skills: Run, tmp_path: Path) -> None:
+    sample = next(one for one in sample_recordings() if one.surgeon == "plover")
+    several = next(one for one in sample_recordings() if len(one.segments) > 1)
+    file, many = tmp_path / "plover.mcap", tmp_path / "many.mcap"
+    file.write_bytes(sample.data)
+    many.write_bytes(several.data)
+    assert skills("seed")[0] == 0
+    code, said = skills("score", str(file), *STYLE, "--json")
+    assert code == 0, said
+    scored = json.loads(said)
+    assert scored["demo"] is None and scored["recording"]
+    (start_s, end_s) = sample.segments[0]
+    assert scored["start_s"] == pytest.approx(start_s, abs=0.3) and scored["end_s"] == pytest.approx(end_s, abs=0.6)
+    code, said = skills("score", str(file), *STYLE, "--start-s", str(start_s), "--end-s", str(end_s), "--json")
+    assert json.loads(said)["end_s"] == pytest.approx(end_s, abs=0.02)
+    code, said = skills("score", str(many), *STYLE)
+    assert (code, "5 proposed hand-offs; choose one" in said) == (1, True), said
+    code, said = skills("score", str(many), *STYLE, "--proposal", "2")
+    assert code == 0 and "not a credential" in said, said
+
+
+@pytest.mark.parametrize("what", ["nowhere.mcap", "0" * 64])
+def test_what_is_not_there_is_said(skills: Run, what: str) -> None:
+    assert skills("seed")[0] == 0
+    code, said = skills("score", what, *STYLE)
+    assert code == 1 and "There is no" in said, said
+
+
+def test_a_folder_is_calibrated_on_and_used_by_the_next_score(skills: Run, tmp_path: Path) -> None:
+    lab = rated.folder(tmp_path / "lab", trials=3)
+    code, said = skills("calibrate", str(lab), "--permutations", "20", "--json")
+    assert code == 0, said
+    about = json.loads(said)
+    assert about["data"]["trials"] == 24 and about["validated"]["all_figures"]["rho"] > 0.8
+    assert skills("seed")[0] == 0
+    demo = json.loads(skills("demo", "list", "--surgeon", "plover", "--json")[1])[0]["id"]
+    skill = json.loads(skills("score", demo, *STYLE, "--json")[1])["skill"]
+    assert skill["calibrated"] and skill["calibration"] == about["sha256"]
+    code, said = skills("calibrate", str(tmp_path / "lab" / "Suturing" / "transcriptions"))
+    assert code == 1 and "has no trials of JIGSAWS" in said, said
