@@ -24,7 +24,7 @@ $(READY): requirements.lock pyproject.toml
 	@if command -v uv >/dev/null 2>&1; then \
 	  uv venv -q --allow-existing --python $(PYTHON) $(VENV) && \
 	  $(SETUPTOOLS) | VIRTUAL_ENV=$(CURDIR)/$(VENV) uv pip install -q --require-hashes -r - && \
-	  VIRTUAL_ENV=$(CURDIR)/$(VENV) uv pip sync -q --require-hashes --no-build-isolation requirements.lock && \
+	  VIRTUAL_ENV=$(CURDIR)/$(VENV) uv pip sync -q --compile-bytecode --require-hashes --no-build-isolation requirements.lock && \
 	  VIRTUAL_ENV=$(CURDIR)/$(VENV) uv pip install -q --no-deps --no-build-isolation -e . ; \
 	else \
 	  $(PYTHON) -m venv $(VENV) && \
