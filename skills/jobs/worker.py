@@ -98,7 +98,7 @@ def _engine(work: Work, executor: str, watch: Watch) -> Iterator[None]:
     DBOS(config=configuration(work.settings, executor))
     DBOS.launch()
     for queue, at_once in QUEUES.items():
-        DBOS.register_queue(queue, worker_concurrency=at_once, polling_interval_sec=POLLING_S)
+        DBOS.register_queue(queue, worker_concurrency=at_once, polling_interval_sec=POLLING_S[queue])
     try:
         yield
     finally:

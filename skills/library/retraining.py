@@ -22,7 +22,7 @@ from skills.packing import canonical, sha256
 from skills.style.learning.learners import LEARNER_VERSION, Learner
 from skills.style.learning.q_learning import PhaseQLearning
 
-MOST_IN_A_PART = 25  # styles: the engine's cost of one, some 10 ms, is then spread over a third of a second of work
+MOST_IN_A_PART = 50  # styles: the engine's cost of one, some 30 ms, is then spread over a second of work
 FEWEST_PARTS = 16  # where there are so many styles: parts are what several workers share
 
 

@@ -132,7 +132,7 @@ def test_a_training_that_is_cancelled_ends_and_keeps_nothing(service: Service): 
 
     service.client.put_surgeon("kestrel")
     service.client.add_demo(cases.hand_off(), media_type=CSV, **KESTREL)
-    asked = service.client.train(**KESTREL, learner={"kind": "dqn", "steps": 10_000_000})
+    asked = service.client.train(**KESTREL, learner={"kind": "dqn", "steps": 1_000_000})
     worker = threading.Thread(target=service.work)
     worker.start()
     for _ in range(600):
