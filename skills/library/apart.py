@@ -64,7 +64,8 @@ def far_apart(database: Database, rows: Sequence[int]) -> Apart:
     if len(kept) == len(wanted) and not np.isnan(apart.apart_mm).any():
         return apart
     with _one_at_a_time():
-        kept |= _kept(database, [row for row in wanted if row not in kept])  # somebody may have measured it meanwhile
+        known = apart.rows[~np.isnan(apart.apart_mm).any(axis=1)]
+        kept |= _kept(database, sorted({*wanted} - {*known.tolist()}))  # somebody may have measured it meanwhile
         new = _shapes(database, [row for row in wanted if row not in kept])
         _keep(database, wanted, new)
         kept |= new
