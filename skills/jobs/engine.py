@@ -24,13 +24,13 @@ APPLICATION = "suture-skills"
 JOBS, BATCHES, ASIDE = "jobs", "batches", "aside"  # a person waits for the first, somebody for the second, nobody else
 # How many of each a worker process does at once, so that none holds up another. The engine keeps these numbers in its
 # database, the same for all workers: they are no setting, and a machine is limited by how many workers it has.
-# Two parts of batches: one learns while the other commits, or the engine looks for the next (`library.batch_work`).
+# Two parts of batches: one is learnt, and the next one is there when it ends (`library.batch_work`).
 QUEUES = {JOBS: 2, BATCHES: 2, ASIDE: 1}
 WORKFLOW = "perform_job"
 STEPS = "1"  # the engine's "application version": to be changed with the sequence of steps in `workflows`, only then
 # How often each worker looks for more of each. To look takes 3 ms of the processor, of idle workers too; a part of a
 # batch keeps one for a second.
-POLLING_S = {JOBS: 0.2, BATCHES: 0.5, ASIDE: 1.0}
+POLLING_S = {JOBS: 0.3, BATCHES: 0.3, ASIDE: 1.0}
 FAREWELL_S = 2.0
 
 log = logging.getLogger(__name__)

@@ -41,11 +41,12 @@ def learn_once() -> None:
     """Learn the shortest path there is, as a job would."""
     policy = learn_policy(sparse_reward(TWO_CELLS), PhaseQLearning())
     certify(policy)
-    palette_of(policy.q)
     measure(rollout_from(policy, TWO_CELLS.start))
+    palette_of(policy.q)
+    align_once()
 
 
 def align_once() -> None:
-    """Align the shortest path there is, and look for a palette, as a request would."""
-    dtw(TWO_CELLS.tip_mm, TWO_CELLS.tip_mm)
+    """Align the shortest path there is with itself backwards, and look for a palette, as a request would."""
+    dtw(TWO_CELLS.tip_mm, TWO_CELLS.tip_mm[::-1])
     palette_of(TWO_CELLS.tip_mm)

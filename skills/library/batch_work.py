@@ -3,17 +3,16 @@
 A style that cannot be learnt ends with its reason, and the others go on. A worker that is killed leaves its part to the
 next one, which goes on where it stopped; what it had begun comes last then, one by one, for it may be what killed it.
 
-What takes long is committed alone. Quick styles are committed a few together, each under a savepoint of its own: on
-SQLite a commit waits for the disk and holds the one write lock meanwhile, so that with one for each style several
-workers leave no room for anybody else's.
+What takes long is committed alone. Quick styles are committed a few together, and written together: on SQLite a commit
+waits for the disk and holds the one write lock meanwhile, so that with one for each style several workers leave no room
+for anybody else's.
 """
 
 import logging
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import zip_longest
-from threading import Condition, RLock
+from threading import RLock
 from time import monotonic
 from typing import Any, cast
 
@@ -21,20 +20,22 @@ from sqlalchemy import JSON, Table, bindparam, select, update
 from sqlalchemy.orm import Session
 
 from skills.db.base import now
-from skills.db.models import Job, PolicyVersion, Release, StyleToRetrain
+from skills.db.models import Demonstration, Job, PolicyVersion, Release, StyleToRetrain
 from skills.db.session import Database
 from skills.errors import Busy, Conflict, SkillsError
 from skills.library import batches, releases
-from skills.library.training import Learnt, Lesson, learn_style, lessons, store_style
+from skills.library.training import Learnt, Lesson, Stored, learn_style, lessons, store_styles
 from skills.settings import Settings
 
-TOGETHER = 10  # styles
-TOGETHER_S = 0.25  # so long at most does a result wait for the next one, and a cancelled batch go on
+TOGETHER = 25  # styles
+TOGETHER_S = 0.5  # so long at most does a result wait for the next one, and a cancelled batch go on
 LONGEST_REASON = 2000  # characters, as the column has it
 NEARLY_ONE = 1 - 1e-9  # what progress adds up to before the end, so that no rounding brings it above 1
 
 # Statements that every style goes through, built once: to build one takes as long as to run it.
-_STYLES, _JOBS = (cast(Table, one.__table__) for one in (StyleToRetrain, Job))
+_STYLES, _JOBS, _DEMOS, _VERSIONS = (
+    cast(Table, one.__table__) for one in (StyleToRetrain, Job, Demonstration, PolicyVersion)
+)
 QUEUED = select(_STYLES.c.row).where(
     _STYLES.c.row.in_(bindparam("styles", expanding=True)), _STYLES.c.state == "queued"
 )
@@ -56,45 +57,26 @@ RUNNING = (
     .values(state="running", started_at=bindparam("now"))
 )
 FURTHER = update(_JOBS).where(_JOBS.c.row == bindparam("batch")).values(progress=_JOBS.c.progress + bindparam("step"))
-SERVED = (
-    select(PolicyVersion.version, PolicyVersion.sha256, PolicyVersion.manifest)
-    .join(Release, Release.policy_row == PolicyVersion.row)
-    .where(Release.surgeon_row == bindparam("surgeon"), Release.suture == bindparam("suture"))
+_NEWEST = (
+    select(Release.policy_row)
+    .where(Release.surgeon_row == _DEMOS.c.surgeon_row, Release.suture == _DEMOS.c.suture)
     .where(Release.withdrawn_at.is_(None))
     .order_by(Release.row.desc())
     .limit(1)
+    .scalar_subquery()
+)
+SERVED = (
+    select(_DEMOS.c.row, _VERSIONS.c.version, _VERSIONS.c.sha256, _VERSIONS.c.manifest)
+    .select_from(_DEMOS.join(_VERSIONS, _VERSIONS.c.row == _NEWEST))
+    .where(_DEMOS.c.row.in_(bindparam("demonstrations", expanding=True)))
 )
 
 log = logging.getLogger(__name__)
 
 
-class _Turns:
-    """One part of a batch learns at a time, and of those that wait the oldest one.
-
-    In one interpreter two threads learn quick styles no faster than one, and take 40 % more time for it: there is a
-    worker for each core. A second part learns while the first one commits, and goes on while the engine looks for the
-    next one. Did they alternate, both would end at once, and nothing be learnt until then.
-    """
-
-    def __init__(self) -> None:
-        self._free = Condition(RLock())
-        self._waiting: list[int] = []
-
-    @contextmanager
-    def of(self, part: int) -> Iterator[None]:
-        """Wait for a part's turn, and have it for as long as the block."""
-        self._waiting.append(part)  # before it is free, so that who has it then sees who waits
-        with self._free:
-            while min(self._waiting) < part:
-                self._free.wait()
-            self._waiting.remove(part)
-            try:
-                yield
-            finally:
-                self._free.notify_all()
-
-
-TURNS = _Turns()
+# One part at a time: in one interpreter two threads are no faster than one, and take a fifth more of the processor for
+# it; there is a worker for each core. The engine hands a second part on meanwhile, so that nobody waits for the engine.
+AT_WORK = RLock()
 Store = Callable[[Session, str], dict[str, Any]]
 
 
@@ -134,6 +116,18 @@ def retrain_part(database: Database, request: dict[str, Any], settings: Settings
     with database.reading() as session:
         job = session.get_one(Job, request["retraining"])
         batch = _Batch(job.row, request["part"], job.request, job.asked_by, settings)
+    with AT_WORK:
+        _train_all(database, batch)
+
+    def store(session: Session, _actor: str) -> dict[str, Any]:
+        batches.settle(session, batch.row)
+        return {}
+
+    return store
+
+
+def _train_all(database: Database, batch: _Batch) -> None:
+    """Train what a part has left, and raise why a style could not be trained once nothing else is left."""
     broken: dict[int, Exception] = {}
     while waiting := [style for style in _waiting(database, batch.part) if style.row not in broken]:
         groups = _groups(waiting)
@@ -152,12 +146,6 @@ def retrain_part(database: Database, request: dict[str, Any], settings: Settings
             break  # cancelled, erased, ended by another worker, or broken: see what is left
     if broken:
         raise next(iter(broken.values()))
-
-    def store(session: Session, _actor: str) -> dict[str, Any]:
-        batches.settle(session, batch.row)
-        return {}
-
-    return store
 
 
 def _waiting(database: Database, part: int) -> list[_Style]:
@@ -181,8 +169,7 @@ def _train(database: Database, batch: _Batch, group: _Group, then: _Group) -> bo
     ended: list[tuple[_Style, Learnt | SkillsError]] = []
     since_s = monotonic()
     for style in group:
-        with TURNS.of(batch.part):
-            ended.append((style, _learn(batch, style)))
+        ended.append((style, _learn(batch, style)))
         if style is not group[-1] and monotonic() - since_s > TOGETHER_S:
             if not _commit(database, batch, ended, ()):
                 return False
@@ -205,8 +192,7 @@ def _commit(
         queued = set(session.scalars(QUEUED, {"styles": [style.row for style, _ in ended]}))
         wanted = [(style, learnt) for style, learnt in ended if style.row in queued]
         if wanted:
-            outcomes = [{"style": style.row, "now": now(), **_outcome(session, batch, one)} for style, one in wanted]
-            session.execute(OUTCOME, outcomes)
+            session.execute(OUTCOME, list(_outcomes(session, batch, wanted)))
             session.execute(FURTHER, {"batch": batch.row, "step": len(wanted) * NEARLY_ONE / batch.request["styles"]})
         if len(wanted) == len(ended) and then:
             _begin(session, batch, then)
@@ -219,32 +205,41 @@ def _begin(session: Session, batch: _Batch, group: _Group) -> None:
     session.execute(RUNNING, {"batch": batch.row, "now": now()})
 
 
-def _outcome(session: Session, batch: _Batch, learnt: Learnt | SkillsError) -> dict[str, Any]:
-    if isinstance(learnt, SkillsError):
-        return {"became": "failed", "policy": None, "compared": None, "why": str(learnt)[:LONGEST_REASON]}
-    try:
-        with session.begin_nested():
-            return _kept(session, batch, learnt)
-    except SkillsError as refused:
-        return _outcome(session, batch, refused)
+def _outcomes(
+    session: Session, batch: _Batch, ended: Sequence[tuple[_Style, Learnt | SkillsError]]
+) -> Iterator[dict[str, Any]]:
+    """Store what was learnt, each for itself, and say what became of each style."""
+    learnt = [one for _, one in ended if isinstance(one, Learnt)]
+    released = _released(session, [one.lesson.row for one in learnt])
+    stored = iter(store_styles(session, learnt))
+    for style, one in ended:
+        at = next(stored) if isinstance(one, Learnt) else one
+        ending = {"style": style.row, "now": now(), "policy": None, "compared": None, "why": None}
+        if isinstance(one, Learnt) and isinstance(at, Stored):
+            comparison = _kept(session, batch, one, at, released.get(one.lesson.row))
+            yield {**ending, "became": "done", "policy": at.row, "compared": comparison}
+        else:
+            yield {**ending, "became": "failed", "why": str(at)[:LONGEST_REASON]}
 
 
 # ---- what is released --------------------------------------------------------------------------------------------
 
 
-def _kept(session: Session, batch: _Batch, learnt: Learnt) -> dict[str, Any]:
-    """Store what was learnt, compare it with what is released, and release it if that was asked and it is not worse."""
-    stored = store_style(session, learnt)
-    after = {"version": stored.version, "sha256": learnt.sha256, **figures(learnt.manifest)}
-    comparison = compare(_released(session, learnt.lesson), after)
+def _kept(
+    session: Session, batch: _Batch, learnt: Learnt, stored: Stored, released: dict[str, Any] | None
+) -> dict[str, Any]:
+    """Compare what was stored with what is released, and release it if that was asked and it is not worse."""
+    trained = {"version": stored.version, "sha256": learnt.sha256, **figures(learnt.manifest)}
+    comparison = compare(released, trained)
     if batch.request["release"]:
         comparison |= _release(session, stored.row, comparison["worse_because"], batch.asked_by)
-    return {"became": "done", "policy": stored.row, "compared": comparison, "why": None}
+    return comparison
 
 
-def _released(session: Session, lesson: Lesson) -> dict[str, Any] | None:
-    found = session.execute(SERVED, {"surgeon": lesson.surgeon.row, "suture": lesson.suture}).first()
-    return None if found is None else {"version": found[0], "sha256": found[1], **figures(found[2])}
+def _released(session: Session, demonstrations: Sequence[int]) -> dict[int, dict[str, Any]]:
+    """Read what the styles of some demonstrations serve, those that serve nothing left out."""
+    found = session.execute(SERVED, {"demonstrations": demonstrations})
+    return {row: {"version": version, "sha256": sha, **figures(manifest)} for row, version, sha, manifest in found}
 
 
 def figures(manifest: dict[str, Any]) -> dict[str, Any]:

@@ -1,7 +1,9 @@
 """The record of who did what to what, when. People appear by the random subject of their row only."""
 
 import secrets
-from typing import cast
+from collections.abc import Sequence
+from datetime import datetime
+from typing import Any, cast
 
 from sqlalchemy import Table, insert
 from sqlalchemy.orm import Session
@@ -10,17 +12,31 @@ from skills.db.base import now
 from skills.db.models import Event, Surgeon
 from skills.packing import canonical, sha256
 
-ADD = insert(cast(Table, Event.__table__))
+_ADD = insert(cast(Table, Event.__table__))
 
 
 def record(
     session: Session, actor: str, action: str, object_kind: str, object_id: str, surgeon: Surgeon | None = None
 ) -> None:
     """Add an event to the caller's transaction."""
-    at = now()
+    record_each(session, actor, action, object_kind, [(object_id, surgeon)])
+
+
+def record_each(
+    session: Session, actor: str, action: str, object_kind: str, objects: Sequence[tuple[str, Surgeon | None]]
+) -> None:
+    """Add an event for each of some objects of one kind to the caller's transaction, each with whose it is."""
+    if objects:
+        at = now()
+        session.execute(_ADD, [_event(at, actor, action, object_kind, *one) for one in objects])
+
+
+def _event(
+    at: datetime, actor: str, action: str, object_kind: str, object_id: str, surgeon: Surgeon | None
+) -> dict[str, Any]:
     subject = surgeon.subject if surgeon else None
     identity = [at.isoformat(), actor, action, object_kind, object_id, subject, secrets.token_hex(8)]
-    event = {
+    return {
         "sha256": sha256(canonical(identity)),
         "at": at,
         "actor": actor,
@@ -29,4 +45,3 @@ def record(
         "object_id": object_id,
         "subject": subject,
     }
-    session.execute(ADD, event)

@@ -4,19 +4,19 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, NamedTuple, cast
 
-from sqlalchemy import LargeBinary, Table, bindparam, func, insert, select, type_coerce, update
+from sqlalchemy import LargeBinary, Result, Table, bindparam, func, insert, select, type_coerce, update
 from sqlalchemy.orm import Session
 
 from skills.db.models import Demonstration, Job, PolicyDemonstration, PolicyVersion, StoredRewardMap, Surgeon
 from skills.db.packed import seal, unpack_as
 from skills.db.session import Database
 from skills.deep.learning import Tell, learn_policy, require_installed
-from skills.errors import BadInput, BadSettings, Conflict, NotFound
+from skills.errors import BadInput, BadSettings, Conflict, NotFound, SkillsError
 from skills.library import jobs, releases
 from skills.library.catalogue import check_consent, find_surgeon, find_suture_type
 from skills.library.combined import BEST, choose_demos, combining_of, describe_combined
 from skills.library.demos import find_demo
-from skills.library.events import record
+from skills.library.events import record_each
 from skills.library.verified import policy_identity_of
 from skills.packing import canonical, sha256
 from skills.settings import Settings
@@ -37,19 +37,18 @@ Store = Callable[[Session, str], dict[str, Any]]
 # Statements that every style goes through, built once: to build one takes as long as to run it.
 _VERSIONS, _DEMOS = (cast(Table, one.__table__) for one in (PolicyVersion, Demonstration))
 _OF_STYLE = _VERSIONS.alias("of_style")
-STANDING = (
-    select(
-        _DEMOS.c.withdrawn_at,
-        select(func.max(_OF_STYLE.c.version))
-        .where(_OF_STYLE.c.surgeon_row == _DEMOS.c.surgeon_row, _OF_STYLE.c.suture == _DEMOS.c.suture)
-        .scalar_subquery(),
-        _VERSIONS.c.row,
-        _VERSIONS.c.version,
-    )
-    .select_from(_DEMOS.outerjoin(_VERSIONS, _VERSIONS.c.sha256 == bindparam("sha256")))
-    .where(_DEMOS.c.row == bindparam("demonstration"))
+STANDING = select(
+    _DEMOS.c.row,
+    _DEMOS.c.withdrawn_at,
+    select(func.max(_OF_STYLE.c.version))
+    .where(_OF_STYLE.c.surgeon_row == _DEMOS.c.surgeon_row, _OF_STYLE.c.suture == _DEMOS.c.suture)
+    .scalar_subquery()
+    .label("last"),
+).where(_DEMOS.c.row.in_(bindparam("demonstrations", expanding=True)))
+KNOWN = select(_VERSIONS.c.sha256, _VERSIONS.c.row, _VERSIONS.c.version).where(
+    _VERSIONS.c.sha256.in_(bindparam("digests", expanding=True))
 )
-ADD = insert(_VERSIONS).returning(_VERSIONS.c.row, _VERSIONS.c.version)
+ADD = insert(_VERSIONS).returning(_VERSIONS.c.sha256, _VERSIONS.c.row, _VERSIONS.c.version)
 CERTIFICATE_NOTE = (
     "Checked on the grid: every greedy action against exact dynamic programming, and every start by following it; "
     "the demonstrated pass against the arm's joint limits in closed form. It says nothing about the arm's accuracy. "
@@ -271,44 +270,62 @@ def store_style(session: Session, learnt: Learnt) -> Stored:
         NotFound: A demonstration was erased meanwhile.
         Conflict: One was withdrawn meanwhile.
     """
-    lesson = learnt.lesson
-    _refuse_gone(session, lesson.others)
-    found = session.execute(STANDING, {"demonstration": lesson.row, "sha256": learnt.sha256}).first()
-    if found is None:
-        raise NotFound("The demonstration was erased while it was being learnt.")
-    withdrawn_at, last, *known = found
-    if known[0] is not None:
-        return Stored(*known)
-    if withdrawn_at is not None:
-        raise Conflict("The demonstration was withdrawn while it was being learnt.")
-    values = {
+    (stored,) = store_styles(session, [learnt])
+    if isinstance(stored, SkillsError):
+        raise stored
+    return stored
+
+
+def store_styles(session: Session, learnt: Sequence[Learnt]) -> list[Stored | SkillsError]:
+    """Store what was learnt of several styles, no two of one style, as `store_style` does: or why one is not stored."""
+    standing = {one.row: one for one in session.execute(STANDING, {"demonstrations": [o.lesson.row for o in learnt]})}
+    known = _stored(session.execute(KNOWN, {"digests": [one.sha256 for one in learnt]}))
+    refused = {
+        one.sha256: _refusal(session, one.lesson, standing.get(one.lesson.row))
+        for one in learnt
+        if one.sha256 not in known
+    }
+    new = [one for one in learnt if one.sha256 in refused and refused[one.sha256] is None]
+    if new:
+        values = [_version(one, (standing[one.lesson.row].last or 0) + 1) for one in new]
+        known |= _stored(session.execute(ADD, values))
+        record_each(session, "worker", "train", "policy-version", [(one.sha256, one.lesson.surgeon) for one in new])
+    rests_on = [
+        {"policy_row": known[one.sha256].row, "demonstration_row": other} for one in new for other in one.lesson.others
+    ]
+    if rests_on:
+        session.execute(insert(PolicyDemonstration), rests_on)
+    return [refused.get(one.sha256) or known[one.sha256] for one in learnt]
+
+
+def _stored(found: Result[Any]) -> dict[str, Stored]:
+    return {one.sha256: Stored(one.row, one.version) for one in found}
+
+
+def _refusal(session: Session, lesson: Lesson, standing: Any) -> SkillsError | None:
+    """Say why what was learnt may not be stored: a demonstration that it rests on has gone meanwhile."""
+    others = [session.get(Demonstration, row) for row in lesson.others]
+    if standing is None or None in others:
+        return NotFound("A demonstration was erased while it was being learnt from.")
+    if any(one.withdrawn_at is not None for one in (standing, *others)):
+        return Conflict("A demonstration was withdrawn while it was being learnt from.")
+    return None
+
+
+def _version(learnt: Learnt, version: int) -> dict[str, Any]:
+    """Write what was learnt as a row."""
+    return {
         "sha256": learnt.sha256,
         "training": learnt.training,
-        "surgeon_row": lesson.surgeon.row,
-        "suture": lesson.suture,
-        "version": (last or 0) + 1,
-        "demonstration_row": lesson.row,
+        "surgeon_row": learnt.lesson.surgeon.row,
+        "suture": learnt.lesson.suture,
+        "version": version,
+        "demonstration_row": learnt.lesson.row,
         "manifest": learnt.manifest,
         "releasable": not learnt.manifest["grid_certificate"]["refused_because"],
         "learnt": learnt.policy,
         "covered": learnt.coverage,
     }
-    stored = session.execute(ADD, values).one()
-    if lesson.others:
-        rests_on = [{"policy_row": stored.row, "demonstration_row": other} for other in lesson.others]
-        session.execute(insert(PolicyDemonstration), rests_on)
-    record(session, "worker", "train", "policy-version", learnt.sha256, lesson.surgeon)
-    return Stored(*stored)
-
-
-def _refuse_gone(session: Session, demonstrations: Sequence[int]) -> None:
-    """Refuse to store what rests on these, too, where one of them has gone meanwhile."""
-    for row in demonstrations:
-        demo = session.get(Demonstration, row)
-        if demo is None:
-            raise NotFound("A demonstration was erased while it was being learnt from.")
-        if demo.withdrawn_at is not None:
-            raise Conflict("A demonstration was withdrawn while it was being learnt from.")
 
 
 def refusals(policy: Policy, certificate: Certificate, demo: Demo) -> list[str]:

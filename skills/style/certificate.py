@@ -110,9 +110,11 @@ def coverage(policy: Policy) -> Coverage:
 def _coverage(policy: Policy, finishing: NDArray[np.bool_]) -> Coverage:
     domain, path = policy.domain, policy.path
     reaches = finishing[: path.grid.n_states].copy()  # phase 0
-    for state in np.unique(path.states):
-        phase, at_end = domain.start(int(state))
-        reaches[state] = at_end or finishing[policy.row(phase, int(state))]
+    visited, first = np.unique(path.states, return_index=True)  # who starts on the path has counted the first visit
+    last = len(path.states) - 1
+    phases = np.minimum(first + 1, last) if domain.phased else np.zeros_like(first)
+    over = first == last if domain.phased else visited == path.goal
+    reaches[visited] = over | finishing[domain.rows_of(phases, path.grid.cells_of(visited))]
     return Coverage(reaches, _joins_nearest(policy))
 
 

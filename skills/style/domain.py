@@ -69,8 +69,11 @@ class Domain:
     @cached_property
     def cell_of(self) -> Ints:
         """The cell of each row, (rows, 3)."""
-        boxes = zip(self.low, self.size, strict=True)
-        return np.concatenate([low + np.indices(size).reshape(3, -1).T for low, size in boxes])
+        phase = self.phase_of
+        size, at = self.size[phase], np.arange(self.n_rows) - self.offset[phase]
+        rest, z = np.divmod(at, size[:, 2])
+        x, y = np.divmod(rest, size[:, 1])
+        return np.asarray(self.low[phase] + np.stack([x, y, z], axis=-1))
 
     @cached_property
     def state_of(self) -> Ints:

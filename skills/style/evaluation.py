@@ -49,12 +49,19 @@ def dtw(path_mm: ArrayLike, reference_mm: ArrayLike) -> Alignment:
         raise EmptyPath("Two paths with at least one point each can be aligned.")
     path = frozen(path, np.float64, (None, 3), "path_mm")
     reference = frozen(reference, np.float64, (None, 3), "reference_mm")
+    pairs = _warped(path, reference)
+    return Alignment(pairs, np.abs(path[pairs[:, 0]] - reference[pairs[:, 1]]))
+
+
+def _warped(path: Floats, reference: Floats) -> Ints:
+    """Find which point of the path stands beside which of the reference, (K, 2)."""
+    if np.array_equal(path, reference):  # both together costs nothing, and comes first among ties
+        return np.repeat(np.arange(len(path))[:, None], 2, axis=1)
     distance = np.abs(path[:, None, :] - reference[None, :, :]).sum(axis=-1)
     cost = np.full((len(path) + 1, len(reference) + 1), np.inf)
     cost[0, 0] = 0.0
     _kernels.warp_compiled(distance, cost)
-    pairs = _walk_back(cost)
-    return Alignment(pairs, np.abs(path[pairs[:, 0]] - reference[pairs[:, 1]]))
+    return _walk_back(cost)
 
 
 def _walk_back(cost: Floats) -> Ints:
@@ -103,7 +110,7 @@ def discretisation_rmse(tip_mm: ArrayLike, grid: GridWorld, hysteresis: float = 
     With hysteresis, in cells, these are not always the nearest ones (`GridWorld.cells_along`).
     """
     tip_mm = np.asarray(tip_mm, float)
-    apart = tip_mm - grid.centres_mm(grid.states_of(grid.cells_along(tip_mm, hysteresis)))
+    apart = tip_mm - grid.centres_of(grid.cells_along(tip_mm, hysteresis))
     return _xyz(np.sqrt((apart**2).mean(axis=0)))
 
 

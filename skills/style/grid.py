@@ -114,7 +114,11 @@ class GridWorld:
 
     def centres_mm(self, states: ArrayLike) -> Floats:
         """Place states, (...,), at the centres of their cells, (..., 3) mm."""
-        return np.asarray(np.asarray(self.origin_mm) + self.cell_mm * self.cells_of(states), np.float64)
+        return self.centres_of(self.cells_of(states))
+
+    def centres_of(self, cells: ArrayLike) -> Floats:
+        """Place cells, (..., 3), at their centres, (..., 3) mm."""
+        return np.asarray(np.asarray(self.origin_mm) + self.cell_mm * np.asarray(cells), np.float64)
 
 
 PAPER_GRID = GridWorld(paper.GRID_ORIGIN_MM, paper.CELL_MM, paper.GRID_SHAPE)

@@ -236,13 +236,12 @@ def _poses(tip_mm: ArrayLike, rotation: ArrayLike) -> tuple[Floats, Floats]:
     """Check poses given by a caller: finite, of one length, the rotations proper."""
     tip = frozen(tip_mm, np.float64, (None, 3), "tip_mm")
     turned = np.asarray(rotation, dtype=np.float64)
-    if turned.shape == (3, 3):
-        turned = np.broadcast_to(turned, (len(tip), 3, 3))
-    turned = frozen(turned, np.float64, (None, 3, 3), "rotation")
-    if len(turned) != len(tip):
+    held = turned.shape == (3, 3)
+    turned = frozen(turned[None] if held else turned, np.float64, (None, 3, 3), "rotation")
+    if not held and len(turned) != len(tip):
         raise BadInput(f"{len(tip)} positions came with {len(turned)} rotations; give as many, or one for all.")
     check_rotation(turned)
-    return tip, turned
+    return tip, np.broadcast_to(turned, (len(tip), 3, 3))
 
 
 def solutions_of(tip: Floats, rotation: Floats, tool: Instrument) -> Floats:
@@ -253,33 +252,33 @@ def solutions_of(tip: Floats, rotation: Floats, tool: Instrument) -> Floats:
     """
     hinge = rotation @ _TIP_IN_HINGE.T
     x6, z6 = hinge[:, :, 0], hinge[:, :, 2]
-    normal = np.cross(tip, z6)
+    normal = _cross(tip, z6)
     length = np.linalg.norm(normal, axis=1, keepdims=True)
     # The tip lies on z6: every perpendicular is a solution, x6 is one of them.
     z5 = np.where(length > 1e-9, normal / np.where(length > 1e-9, length, 1.0), x6)
-    wrists = [_one_wrist(tip, x6, z6, sign * z5, tool) for sign in (1.0, -1.0)]
+    wrists = _wrists(tip, x6, z6, np.stack([z5, -z5]), tool)
     turns = np.zeros((3, 6))
     turns[:, ROLL] = 0.0, 2 * pi, -2 * pi
-    return np.concatenate([wrist[:, None, :] + turns for wrist in wrists], axis=1)
+    return (wrists.swapaxes(0, 1)[:, :, None, :] + turns).reshape(len(tip), 6, 6)
 
 
-def _one_wrist(tip: Floats, x6: Floats, z6: Floats, z5: Floats, tool: Instrument) -> Floats:
-    """Solve all joints for one choice of the wrist's pitch axis z5, shape (T, 6); NaN where the shaft has no way."""
-    x5 = np.cross(z6, z5)
+def _wrists(tip: Floats, x6: Floats, z6: Floats, z5: Floats, tool: Instrument) -> Floats:
+    """Solve all joints for two choices of the wrist's pitch axis z5, (2, T, 6); NaN where the shaft has no way."""
+    x5 = _cross(z6, z5)
     wrist = tip - WRIST_MM * x5
-    depth = np.linalg.norm(wrist, axis=1)
+    depth = np.linalg.norm(wrist, axis=-1)
     # With the wrist in the remote centre the shaft's direction is anybody's guess; it is inside the cannula there.
-    shaft = wrist / np.where(depth > 1e-6, depth, np.nan)[:, None]
-    yaw = np.arctan2(shaft[:, 0], -shaft[:, 2])
-    pitch = -np.arcsin(np.clip(shaft[:, 1], -1.0, 1.0))
+    shaft = wrist / np.where(depth > 1e-6, depth, np.nan)[..., None]
+    yaw = np.arctan2(shaft[..., 0], -shaft[..., 2])
+    pitch = -np.arcsin(np.clip(shaft[..., 1], -1.0, 1.0))
     s1, c1, s2, c2 = np.sin(yaw), np.cos(yaw), np.sin(pitch), np.cos(pitch)
-    x3 = np.stack([-s1 * s2, -c2, c1 * s2], axis=1)
-    y3 = np.cross(shaft, x3)
+    x3 = np.stack([-s1 * s2, -c2, c1 * s2], axis=-1)
+    y3 = _cross(shaft, x3)
     roll = np.arctan2(-_dot(z5, x3), _dot(z5, y3))
-    x4 = np.cos(roll)[:, None] * x3 + np.sin(roll)[:, None] * y3
+    x4 = np.cos(roll)[..., None] * x3 + np.sin(roll)[..., None] * y3
     wrist_pitch = _wrapped(np.arctan2(-_dot(x5, shaft), _dot(x5, x4)) + pi / 2)
     wrist_yaw = _wrapped(np.arctan2(-_dot(x6, z5), _dot(x6, x5)) + pi / 2)
-    return np.stack([yaw, pitch, depth + tool.wrist_offset_mm, roll, wrist_pitch, wrist_yaw], axis=1)
+    return np.stack([yaw, pitch, depth + tool.wrist_offset_mm, roll, wrist_pitch, wrist_yaw], axis=-1)
 
 
 def _within_limits(solutions: Floats, tool: Instrument) -> Bools:
@@ -324,7 +323,14 @@ def _out_of_reach(sample: int, tip: Floats, solutions: Floats, tool: Instrument)
 
 
 def _dot(u: Floats, v: Floats) -> Floats:
-    return np.asarray(np.einsum("ti,ti->t", u, v))
+    return np.asarray(np.einsum("...i,...i->...", u, v))
+
+
+def _cross(u: Floats, v: Floats) -> Floats:
+    """The cross product; numpy's own, which takes any length of vectors, takes four times as long for a short path."""
+    a, b, c = u[..., 0], u[..., 1], u[..., 2]
+    x, y, z = v[..., 0], v[..., 1], v[..., 2]
+    return np.stack([b * z - c * y, c * x - a * z, a * y - b * x], axis=-1)
 
 
 def _wrapped(angle: Floats) -> Floats:

@@ -12,27 +12,32 @@ import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from itertools import count, islice
 from multiprocessing import active_children, get_context
 from pathlib import Path
 from statistics import median
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from rich.table import Table
 from sqlalchemy import func, select, update
 
-from skills.db.models import Demonstration, Executor, Job, StoredRewardMap, Surgeon, SutureType
+from skills.db.models import Demonstration, Executor, Job, Surgeon, SutureType
+from skills.db.packed import unpack_as
 from skills.db.session import Database
 from skills.errors import BadPath
 from skills.jobs.child import environment
+from skills.jobs.engine import Engine
+from skills.library.batches import PART, to_tell
 from skills.library.catalogue import put_surgeon, seed_catalogue
 from skills.library.demos import Cut, upload_demo
 from skills.library.retraining import request_retraining
+from skills.library.training import Lesson, describe_learner, learn_style, lessons
 from skills.settings import Settings
 from skills.style.certificate import Certificate, Coverage, certify
 from skills.style.grid import PAPER_GRID, discretize
+from skills.style.learning.learners import LEARNER_VERSION
 from skills.style.learning.q_learning import PhaseQLearning
 from skills.style.policy import learn_policy
 from skills.style.reward import RewardMap
@@ -44,6 +49,7 @@ ROUNDS = 2
 WORKERS = (1, 2, 4)
 FIRST = "warm-up"  # a surgeon whose style is trained before any clock runs
 MOST_S = 600.0
+T = TypeVar("T")
 
 
 class Took(NamedTuple):
@@ -57,16 +63,21 @@ def batches(table: Table, styles: int = STYLES, rounds: int = ROUNDS) -> None:
     """Train all styles of many synthetic surgeons with 1, 2 and 4 workers, beside a bare pool of as many processes."""
     with tempfile.TemporaryDirectory(prefix="skills-batches-") as folder:
         full = Path(folder) / "full.sqlite"
-        rewards = fill(full, styles)
+        asked_of = fill(full, styles)
+        pools = {
+            "learns and drops the results": (kernel, [reward for reward, _ in asked_of]),
+            "hands them to its parent": (returned, [reward for reward, _ in asked_of]),
+            "drops all that we work out": (worked_out, [lesson for _, lesson in asked_of]),
+        }
         for workers in WORKERS:
             took = [
-                (pool(rewards, workers, kernel), pool(rewards, workers, returned), ours(full, workers, styles))
+                (ours(full, workers, styles), *(pool(learn, given, workers) for learn, given in pools.values()))
                 for _ in range(rounds)
             ]
-            dropping, handing, whole = zip(*took, strict=True)
+            whole, *bare_pools = zip(*took, strict=True)
             name = f"{styles} styles, {workers} worker{'s' if workers > 1 else ''}"
             table.add_row(name, *said(whole, styles))
-            for what, pooled in (("drops its results", dropping), ("hands them to its parent", handing)):
+            for what, pooled in zip(pools, bare_pools, strict=True):
                 table.add_row(f"  a bare pool that {what}", *said(pooled, styles))
                 for by, index in (("the clock", 0), ("the processor", 1)):
                     part = (
@@ -94,8 +105,8 @@ def used_s(processes: Iterable[int]) -> float:
     return ticks / os.sysconf("SC_CLK_TCK")
 
 
-def fill(file: Path, styles: int) -> list[RewardMap]:
-    """Make a database with so many styles, as many surgeons as it takes; their reward maps."""
+def fill(file: Path, styles: int) -> list[tuple[RewardMap, Lesson]]:
+    """Make a database with so many styles, as many surgeons as it takes; what they are learnt from."""
     database = Database(f"sqlite:///{file}")
     database.migrate()
     with database.writing() as session:
@@ -111,11 +122,11 @@ def fill(file: Path, styles: int) -> list[RewardMap]:
         data = cases.table(tip_mm, rate_hz=RATE_HZ)
         upload_demo(database, cases.upload(data), Cut(surgeon, suture, grid="paper"), "bench")
     with database.reading() as session:
-        of_all = select(StoredRewardMap.map).join(Demonstration).order_by(Demonstration.row).offset(1)
-        rewards = list(session.scalars(of_all))
+        rows = list(session.scalars(select(Demonstration.row).order_by(Demonstration.row).offset(1)))
+        stored = lessons(session, rows)
     database.forget()
     database.close()
-    return rewards
+    return [(unpack_as(RewardMap, lesson.reward), lesson) for lesson in stored]
 
 
 def inside(number: int) -> Iterator[np.ndarray]:
@@ -136,13 +147,13 @@ def fits(tip_mm: np.ndarray) -> bool:
 # ---- a bare pool
 
 
-def pool(rewards: list[RewardMap], workers: int, work: Callable[[RewardMap], object]) -> Took:
-    """Time the learning and the certificate of every style and nothing else, in so many processes that are warm."""
+def pool(learn: Callable[[T], object], given: Sequence[T], workers: int) -> Took:
+    """Time what is worked out of every style and nothing else, in so many processes that are warm."""
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        list(pool.map(kernel, rewards[:1] * workers * 4))
+        list(pool.map(learn, given[:1] * workers * 4))
         processes = [child.pid for child in active_children()]
         began_s, before_s = time.monotonic(), used_s(processes)
-        for _ in pool.map(work, rewards, chunksize=5):
+        for _ in pool.map(learn, given, chunksize=5):
             pass
         return Took(time.monotonic() - began_s, used_s(processes) - before_s)
 
@@ -156,6 +167,23 @@ def returned(reward: RewardMap) -> tuple[np.ndarray, Certificate, Coverage]:
     return policy.q, *certify(policy)
 
 
+def worked_out(lesson: Lesson) -> None:
+    """Learn and certify, and check, measure, describe and pack it too: all that does not need the database."""
+    learn_style(lesson, training_of(lesson), Settings(database_url="sqlite://"))
+
+
+def training_of(lesson: Lesson) -> dict[str, object]:
+    return {
+        "surgeon": lesson.surgeon.slug,
+        "suture": lesson.suture,
+        "demos": [lesson.sha256],
+        "learner": describe_learner(PhaseQLearning()),
+        "learner_version": LEARNER_VERSION,
+        "seed": 0,
+        "release": False,
+    }
+
+
 # ---- ours
 
 
@@ -166,23 +194,29 @@ def ours(full: Path, workers: int, styles: int, *, consent: bool = True) -> Took
         shutil.copy(full, file)
         settings = Settings(database_url=f"sqlite:///{file}")
         database = Database(settings.database_url)
-        with working(settings, workers, database) as processes:
+        with working(settings, workers, database) as processes, closing(Engine(settings)) as engine:
             for number in range(2 * workers):  # everybody has learnt something
-                ended(database, asked(database, surgeon=FIRST, learner=PhaseQLearning(gamma=0.1 - number / 1000)))
+                other = PhaseQLearning(gamma=0.1 - number / 1000)
+                ended(database, asked(database, engine, surgeon=FIRST, learner=other))
             if not consent:
                 with database.writing() as session:
                     session.execute(update(Surgeon).values(consent={"uses": [], "until": None}))
             before_s = used_s(processes)
-            job = ended(database, asked(database))
+            job = ended(database, asked(database, engine))
             took = Took((job.ended_at - job.created_at).total_seconds(), used_s(processes) - before_s)
         database.close()
         assert job.result["done" if consent else "failed"] == styles + 1, (job.state, job.error)
         return took
 
 
-def asked(database: Database, **what: object) -> int:
+def asked(database: Database, engine: Engine, **what: object) -> int:
+    """Ask for a batch as the service does."""
     with database.writing() as session:
-        return request_retraining(session, "bench", **what)[0].row
+        job, _ = request_retraining(session, "bench", **what)
+        told = to_tell(session, job)
+    for row, attempt in told:
+        engine.tell(row, attempt, PART)
+    return job.row
 
 
 def ended(database: Database, row: int) -> Job:

@@ -12,7 +12,7 @@ from sqlalchemy.orm import Session
 from skills.db.session import Database
 from skills.jobs.lease import Leases
 from skills.jobs.watch import Watch
-from skills.library import batches, catalogue, demos, jobs, policies, retraining, training
+from skills.library import batch_work, batches, catalogue, demos, jobs, policies, retraining, training
 from skills.library.condition import condition_of
 from tests import backends
 from tests.library import hospital
@@ -63,6 +63,9 @@ HOT: dict[str, Callable[[Session], object]] = {
     "a version by its digest": lambda s: policies.find_by_digest(s, policies.policy_of(s, *STYLE).policy.sha256),
     "a training": lambda s: training.request_training(s, *STYLE, "test"),
     "a surgeon's stale styles": lambda s: retraining.request_retraining(s, "test", surgeon=STYLE[0], only_stale=True),
+    "where what was learnt stands": lambda s: s.execute(training.STANDING, {"demonstrations": [1, 2, 3]}).all(),
+    "what is known already": lambda s: s.execute(training.KNOWN, {"digests": ["0" * 64, "1" * 64]}).all(),
+    "what some styles serve": lambda s: s.execute(batch_work.SERVED, {"demonstrations": [1, 2, 3]}).all(),
     "jobs": lambda s: jobs.list_jobs(s, 10, 50, None),
     "jobs of a state": lambda s: jobs.list_jobs(s, 10, 50, "failed"),
     "the newest of equal jobs": lambda s: jobs.newest(s, "pictures", {}),

@@ -27,13 +27,14 @@ def touched():
 
 def test_a_worker_warms_up_when_it_starts_and_its_first_job_loads_and_compiles_nothing():
     code = "from skills.jobs.worker import _library\n_library()\nfinish()\nwarm = touched()\nlearn()\n"
-    each = told(start(WARM + code + "dtw(path.tip_mm, path.tip_mm)\ntell(warm=warm, after=touched())"))
+    each = told(start(WARM + code + "dtw(path.tip_mm, path.tip_mm[::-1])\ntell(warm=warm, after=touched())"))
     assert each["warm"] == each["after"]
     assert sum(each["after"].values()) >= 3
 
 
 def test_a_server_warms_up_what_a_rollout_calls():
-    code = "warm_up(align_once).join()\nwarm = touched()\ndtw(path.tip_mm, path.tip_mm)\npalette_of(path.tip_mm)\n"
+    asked = "dtw(path.tip_mm, path.tip_mm[::-1])\npalette_of(path.tip_mm)\n"
+    code = f"warm_up(align_once).join()\nwarm = touched()\n{asked}"
     each = told(start(WARM + code + "tell(warm=warm, after=touched())"))
     assert each["warm"] == each["after"]
     assert sum(each["after"].values()) == 2

@@ -161,7 +161,7 @@ def test_a_demonstration_withdrawn_while_it_is_learnt_leaves_no_policy(
 
     interrupted(monkeypatch, withdraw)
     job = cases.work(database, cases.ask_training(database, release=True))
-    assert (job.state, job.error) == ("failed", "The demonstration was withdrawn while it was being learnt.")
+    assert (job.state, job.error) == ("failed", "A demonstration was withdrawn while it was being learnt from.")
     assert {"policy_versions", "releases"}.isdisjoint(counts(database))
 
 

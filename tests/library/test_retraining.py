@@ -1,6 +1,8 @@
 """Batches: each style for itself, nothing twice, and released only what is asked for and not worse."""
 
 import math
+import time
+from threading import Thread
 
 import pytest
 from sqlalchemy import func, select
@@ -263,6 +265,30 @@ def test_what_takes_long_is_committed_alone(database: Database, monkeypatch: pyt
     cases.work(database, part)
     assert [done for done, _ in seen] == [0, 1, 2]
     assert [round(progress, 6) for _, progress in seen] == [0.0, round(1 / 3, 6), round(2 / 3, 6)]
+
+
+def test_a_worker_that_was_handed_two_parts_learns_one_after_the_other(
+    database: Database, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(retraining, "FEWEST_PARTS", 2)
+    add_styles(database, 6)
+    job = ask_retraining(database)
+    parts = {style.demonstration_row: style.part_row for style in styles_of(database, job)}
+    learnt = []
+
+    def learn(lesson, request, settings):
+        learnt.append(parts[lesson.row])
+        time.sleep(0.02)  # long enough for the other thread to come in between
+        return learn_style(lesson, request, settings)
+
+    monkeypatch.setattr(batch_work, "learn_style", learn)
+    both = [Thread(target=cases.work, args=(database, part)) for part in parts_of(database, job)]
+    for thread in both:
+        thread.start()
+    for thread in both:
+        thread.join()
+    assert states_of(database, job) == ["done"] * 6
+    assert learnt in (sorted(learnt), sorted(learnt, reverse=True))
 
 
 # ---- cancelling and erasing

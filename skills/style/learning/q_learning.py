@@ -198,6 +198,7 @@ class Sweeper:
     def __init__(self, reward: RewardMap, learner: PhaseQLearning) -> None:
         self.reward, self.learner, self.domain = reward, learner, Domain(reward.path, phased=True)
         domain, path = self.domain, reward.path
+        self.cells = path.cells
         self.phases = range(domain.phases - 1, -1, -1)  # the last one first, for values come from there
         self.q, self.value = np.zeros((domain.n_rows, paper.N_ACTIONS)), np.zeros(domain.n_rows)
         self.live = domain.certified & ~domain.terminal
@@ -255,7 +256,7 @@ class Sweeper:
         elif phase == domain.phases - 1:
             self.worth[path.goal] = self.reward.levels.goal
         else:
-            after = domain.rows_of(phase + 1, path.cells[phase])
+            after = domain.rows_of(phase + 1, self.cells[phase])
             self.worth[path.states[phase]] = self.reward.levels.visited + gamma * self.value[after]
         self.worth[domain.state_of[stays]] = self.reward.levels.other + gamma * self.value[stays]
 
