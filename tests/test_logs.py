@@ -13,7 +13,7 @@ import pytest
 
 from skills import logs
 from skills.client import Client
-from skills.db.models import Job
+from skills.db.books import Job
 from skills.db.session import Database
 from skills.demo import wait_until_ready
 from skills.errors import BadInput

@@ -9,7 +9,7 @@ from fastapi import Depends, Request, Response
 from skills.api.answers import JSON
 from skills.api.conditions import Condition, names, tag_of
 from skills.api.schemas.written import job_out
-from skills.db.models import Job
+from skills.db.books import Job
 
 
 class Give:

@@ -38,7 +38,7 @@ from sqlalchemy import (
 from sqlalchemy.types import NullType, TypeEngine
 
 from skills.db.base import Base, Moment, now, rfc3339
-from skills.db.models import Executor, SignIn
+from skills.db.books import Executor, SignIn
 from skills.db.packed import Packed
 from skills.db.schema import revision_of, revisions, upgrade
 from skills.errors import Conflict, Corrupt, UnknownFormat

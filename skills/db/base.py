@@ -1,10 +1,10 @@
 """The columns that every table is made of: names for constraints, moments in UTC, digests."""
 
 from datetime import UTC, datetime
-from typing import Any
+from typing import Annotated, Any
 
-from sqlalchemy import DateTime, Dialect, MetaData, String
-from sqlalchemy.orm import DeclarativeBase
+from sqlalchemy import BigInteger, DateTime, Dialect, Integer, MetaData, String
+from sqlalchemy.orm import DeclarativeBase, mapped_column
 from sqlalchemy.types import JSON, TypeDecorator
 
 NAMES = {
@@ -44,6 +44,13 @@ class Base(DeclarativeBase):
         list[Any]: JSON,
         str: String(200),
     }
+
+
+RowId = Annotated[
+    int, mapped_column(BigInteger().with_variant(Integer, "sqlite"), primary_key=True, autoincrement=True)
+]
+Sha256 = String(64)
+Slug = String(64)
 
 
 def now() -> datetime:

@@ -1,28 +1,25 @@
-"""The tables. A row is a label on a value: who, when, from what, and the value whole in one column.
+"""The tables of the library. A row is a label on a value: who, when, from what, and the value whole in one column.
 
 Append-only (triggers of the migrations refuse changes): recordings and their chunks, demonstrations, reward maps,
-policy versions and what they rest on, releases, plans, playbacks and their pictures, calibrations, events; a
-demonstration and a release can be withdrawn, once. Deleting is left to erasure alone. Keys are revoked and stay; a
-sign-in goes when it is over.
+policy versions and what they rest on, releases, plans, playbacks and their pictures, calibrations; a demonstration and
+a release can be withdrawn, once. Deleting is left to erasure alone. What the service does has its tables in
+`skills.db.books`.
 """
 
 from datetime import datetime
-from typing import Annotated, Any
+from typing import Any
 
 from sqlalchemy import (
     BigInteger,
-    CheckConstraint,
     ForeignKey,
     Index,
-    Integer,
     LargeBinary,
     String,
     UniqueConstraint,
-    text,
 )
 from sqlalchemy.orm import Mapped, mapped_column, relationship
 
-from skills.db.base import Base, now
+from skills.db.base import Base, RowId, Sha256, Slug, now
 from skills.db.packed import Packed, stored
 from skills.packing import added_later, few_numbers
 from skills.style.certificate import Coverage
@@ -52,12 +49,6 @@ added_later(Partner, "instrument")
 added_later(PhaseQLearning, "slip")
 added_later(ValueIteration, "slip")
 few_numbers(Policy, "q")
-
-RowId = Annotated[
-    int, mapped_column(BigInteger().with_variant(Integer, "sqlite"), primary_key=True, autoincrement=True)
-]
-Sha256 = String(64)
-Slug = String(64)
 
 
 class Surgeon(Base):
@@ -309,145 +300,3 @@ class StoredCalibration(Base):
     sha256: Mapped[str] = mapped_column(Sha256)
     about: Mapped[dict[str, Any]]
     created_at: Mapped[datetime] = mapped_column(default=now)
-
-
-class Job(Base):
-    """Work that was asked for. `identity` is the digest of its resolved inputs: one active or succeeded job each.
-
-    `attempt` counts what the engine was told; its workflow is named "<row>-<attempt>". `told_at` is when it was told.
-    """
-
-    __tablename__ = "jobs"
-
-    row: Mapped[RowId]
-    id: Mapped[str] = mapped_column(String(32), unique=True)
-    kind: Mapped[str] = mapped_column(String(20))
-    identity: Mapped[str] = mapped_column(Sha256)
-    state: Mapped[str] = mapped_column(String(10), default="queued")
-    progress: Mapped[float] = mapped_column(default=0.0)
-    request: Mapped[dict[str, Any]]
-    result: Mapped[dict[str, Any] | None]
-    error: Mapped[str | None] = mapped_column(String(2000))
-    attempt: Mapped[int] = mapped_column(default=1)
-    surgeon_row: Mapped[int | None] = mapped_column(ForeignKey("surgeons.row"), index=True)
-    asked_by: Mapped[str] = mapped_column(default="local")
-    told_at: Mapped[datetime | None]
-    created_at: Mapped[datetime] = mapped_column(default=now)
-    started_at: Mapped[datetime | None]
-    ended_at: Mapped[datetime | None]
-
-    __table_args__ = (
-        CheckConstraint("state IN ('queued', 'running', 'succeeded', 'failed', 'cancelled')", name="state"),
-        CheckConstraint("progress >= 0 AND progress <= 1", name="progress"),
-        Index("ix_jobs_identity", "identity", "row"),
-        Index("ix_jobs_state", "state", "row"),
-        Index("ix_jobs_kind", "kind", "state"),  # what is counted at every scrape
-        Index(
-            "uq_jobs_identity_live",
-            "identity",
-            unique=True,
-            sqlite_where=text("state IN ('queued', 'running', 'succeeded')"),
-            postgresql_where=text("state IN ('queued', 'running', 'succeeded')"),
-        ),
-    )
-
-
-class StyleToRetrain(Base):
-    """One style of a batch: what it is learnt from, the part of the batch that it is in, and what became of it.
-
-    `tries` counts how often a worker has begun with it, `stale` says why it was in need, `comparison` is the new policy
-    version beside the released one.
-    """
-
-    __tablename__ = "retraining_styles"
-
-    row: Mapped[RowId]
-    job_row: Mapped[int] = mapped_column(ForeignKey("jobs.row"))
-    part_row: Mapped[int] = mapped_column(ForeignKey("jobs.row"))
-    demonstration_row: Mapped[int] = mapped_column(ForeignKey("demonstrations.row"), index=True)
-    stale: Mapped[list[Any]]
-    state: Mapped[str] = mapped_column(String(10), default="queued")
-    tries: Mapped[int] = mapped_column(default=0)
-    policy_row: Mapped[int | None] = mapped_column(ForeignKey("policy_versions.row"), index=True)
-    reason: Mapped[str | None] = mapped_column(String(2000))
-    comparison: Mapped[dict[str, Any] | None]
-    ended_at: Mapped[datetime | None]
-
-    demonstration: Mapped[Demonstration] = relationship(lazy="joined", innerjoin=True)
-    policy: Mapped[PolicyVersion | None] = relationship(lazy="selectin")  # joined, SQLite reads all there are
-    __table_args__ = (
-        CheckConstraint("state IN ('queued', 'done', 'failed', 'cancelled')", name="state"),
-        UniqueConstraint("job_row", "demonstration_row", name="uq_retraining_styles_demonstration"),
-        Index("ix_retraining_styles_job", "job_row", "row"),
-        Index("ix_retraining_styles_state", "job_row", "state", "row"),
-        Index("ix_retraining_styles_part", "part_row", "state"),
-    )
-
-
-class Executor(Base):
-    """A worker process and when it last said that it lives; its `id` is never used twice."""
-
-    __tablename__ = "executors"
-
-    id: Mapped[str] = mapped_column(String(64), primary_key=True)
-    beat_at: Mapped[datetime] = mapped_column(default=now)
-
-
-class Key(Base):
-    """What lets a person or a program in: the digest of a secret that is stored nowhere, and what it may do.
-
-    `id` is the part of the key that is no secret. `restricted` keeps a key to its surgeons even when all are erased.
-    """
-
-    __tablename__ = "keys"
-
-    row: Mapped[RowId]
-    id: Mapped[str] = mapped_column(String(16), unique=True)
-    digest: Mapped[str] = mapped_column(Sha256)
-    owner: Mapped[str] = mapped_column(String(64))
-    role: Mapped[str] = mapped_column(String(10))
-    restricted: Mapped[bool]
-    created_at: Mapped[datetime] = mapped_column(default=now)
-    created_by: Mapped[str]
-    expires_at: Mapped[datetime | None]
-    revoked_at: Mapped[datetime | None]
-
-    surgeons: Mapped[list[Surgeon]] = relationship(secondary="key_surgeons", lazy="selectin", order_by=Surgeon.slug)
-    __table_args__ = (CheckConstraint("role IN ('reader', 'uploader', 'trainer', 'releaser', 'admin')", name="role"),)
-
-
-class KeySurgeon(Base):
-    """A key is restricted to this surgeon, among others; it goes with the surgeon."""
-
-    __tablename__ = "key_surgeons"
-
-    key_row: Mapped[int] = mapped_column(ForeignKey("keys.row"), primary_key=True)
-    surgeon_row: Mapped[int] = mapped_column(ForeignKey("surgeons.row", ondelete="CASCADE"), primary_key=True)
-
-
-class SignIn(Base):
-    """Somebody signed in to the page with a key: the digest of the cookie, and when it was last used."""
-
-    __tablename__ = "sign_ins"
-
-    digest: Mapped[str] = mapped_column(Sha256, primary_key=True)
-    key_row: Mapped[int] = mapped_column(ForeignKey("keys.row"))
-    created_at: Mapped[datetime] = mapped_column(default=now)
-    used_at: Mapped[datetime] = mapped_column(default=now)
-
-    key: Mapped[Key] = relationship(lazy="joined", innerjoin=True)
-
-
-class Event(Base):
-    """Who did what to what, when; people appear by their random subject only."""
-
-    __tablename__ = "events"
-
-    row: Mapped[RowId]
-    sha256: Mapped[str] = mapped_column(Sha256, unique=True)
-    at: Mapped[datetime] = mapped_column(default=now)
-    actor: Mapped[str]
-    action: Mapped[str]
-    object_kind: Mapped[str]
-    object_id: Mapped[str]
-    subject: Mapped[str | None] = mapped_column(String(32), index=True)

@@ -14,9 +14,9 @@ from sqlalchemy import ColumnElement, and_, event, exists, or_, select
 from sqlalchemy.orm import ORMExecuteState, Session, with_loader_criteria
 
 from skills.db.base import Base
+from skills.db.books import Job, StyleToRetrain
 from skills.db.models import (
     Demonstration,
-    Job,
     MeasuredShape,
     Plan,
     PolicyDemonstration,
@@ -28,7 +28,6 @@ from skills.db.models import (
     StoredPlayback,
     StoredRecording,
     StoredRewardMap,
-    StyleToRetrain,
     Surgeon,
 )
 

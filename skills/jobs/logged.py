@@ -5,7 +5,7 @@ import time
 
 from sqlalchemy import select
 
-from skills.db.models import Job
+from skills.db.books import Job
 from skills.db.session import Database
 from skills.jobs.workflows import Perform
 from skills.logs import job_id, told

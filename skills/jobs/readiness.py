@@ -14,7 +14,8 @@ from sqlalchemy.engine import make_url
 from sqlalchemy.exc import SQLAlchemyError
 
 from skills.db.base import now
-from skills.db.models import Executor, SutureType
+from skills.db.books import Executor
+from skills.db.models import SutureType
 from skills.db.schema import revision_of, revisions
 from skills.db.session import Database
 from skills.errors import NotReady, SkillsError

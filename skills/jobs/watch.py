@@ -13,7 +13,7 @@ from dbos import DBOSClient, WorkflowStatus
 from sqlalchemy import delete, select, update
 
 from skills.db.base import now
-from skills.db.models import Executor, Job
+from skills.db.books import Executor, Job
 from skills.db.session import Database
 from skills.jobs.engine import JOBS, QUEUES, STEPS, drop, tell, workflow_id
 from skills.jobs.lease import Leases

@@ -15,7 +15,7 @@ from dbos import DBOS
 from sqlalchemy import func, update
 
 from skills.db.base import now
-from skills.db.models import Job
+from skills.db.books import Job
 from skills.db.session import Database
 from skills.errors import Busy, SkillsError
 from skills.jobs.engine import WORKFLOW, workflow_id

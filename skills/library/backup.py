@@ -17,7 +17,8 @@ from skills import __version__
 from skills.db import archive
 from skills.db.archive import Manifest
 from skills.db.base import Base, rfc3339
-from skills.db.models import Demonstration, Erasure, Event, Job, Surgeon
+from skills.db.books import Event, Job
+from skills.db.models import Demonstration, Erasure, Surgeon
 from skills.db.session import Database
 from skills.errors import Conflict, Corrupt
 from skills.library.catalogue import salted

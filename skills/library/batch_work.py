@@ -20,7 +20,8 @@ from sqlalchemy import JSON, Table, bindparam, select, update
 from sqlalchemy.orm import Session
 
 from skills.db.base import now
-from skills.db.models import Demonstration, Job, PolicyVersion, Release, StyleToRetrain
+from skills.db.books import Job, StyleToRetrain
+from skills.db.models import Demonstration, PolicyVersion, Release
 from skills.db.session import Database
 from skills.errors import Busy, Conflict, SkillsError
 from skills.library import batches, releases

@@ -14,7 +14,7 @@ from sqlalchemy import delete, func, select, update
 from sqlalchemy.orm import Session
 
 from skills.db.base import now
-from skills.db.models import Job, StyleToRetrain
+from skills.db.books import Job, StyleToRetrain
 from skills.library.events import record
 
 BATCH, PART = "retraining", "retraining-part"

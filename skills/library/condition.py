@@ -9,7 +9,7 @@ from sqlalchemy import func, select, text
 from sqlalchemy.orm import Session
 
 from skills.db.base import now
-from skills.db.models import Event, Executor, Job
+from skills.db.books import Event, Executor, Job
 
 RECENT = 500  # jobs whose durations are told: enough for a 99th percentile to mean something
 QUANTILES = (0.5, 0.95, 1.0)

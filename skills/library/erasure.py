@@ -10,11 +10,11 @@ from collections.abc import Sequence
 from sqlalchemy import Select, delete, select
 from sqlalchemy.orm import Session
 
+from skills.db.books import Job
 from skills.db.changes import announce
 from skills.db.models import (
     Demonstration,
     Erasure,
-    Job,
     MeasuredShape,
     Plan,
     PolicyDemonstration,

@@ -9,7 +9,8 @@ from sqlalchemy import Table, insert
 from sqlalchemy.orm import Session
 
 from skills.db.base import now
-from skills.db.models import Event, Surgeon
+from skills.db.books import Event
+from skills.db.models import Surgeon
 from skills.packing import canonical, sha256
 
 _ADD = insert(cast(Table, Event.__table__))

@@ -14,9 +14,9 @@ from sqlalchemy import Column, Table, exists, func, select, text, tuple_
 from sqlalchemy.orm import Mapper, Session, defer, object_session
 
 from skills.db.base import Base
+from skills.db.books import Job
 from skills.db.models import (
     Demonstration,
-    Job,
     Plan,
     PolicyVersion,
     RecordingChunk,

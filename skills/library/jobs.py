@@ -8,7 +8,8 @@ from sqlalchemy import func, select, update
 from sqlalchemy.orm import Session
 
 from skills.db.base import now
-from skills.db.models import Job, Surgeon
+from skills.db.books import Job
+from skills.db.models import Surgeon
 from skills.db.seen import EVERYBODYS
 from skills.errors import Conflict, NotFound, TooMany
 from skills.library.batches import BATCH, PART, cancel_parts

@@ -22,7 +22,7 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from skills.db.base import now, rfc3339
-from skills.db.models import Key
+from skills.db.books import Key
 from skills.db.seen import Only
 from skills.errors import BadInput, Conflict, NotFound
 from skills.library.catalogue import find_surgeon

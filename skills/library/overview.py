@@ -12,9 +12,9 @@ from typing import Any, Literal
 from sqlalchemy import ColumnElement, func, select
 from sqlalchemy.orm import Session
 
+from skills.db.books import Job
 from skills.db.models import (
     Demonstration,
-    Job,
     Plan,
     PolicyVersion,
     Release,

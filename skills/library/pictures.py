@@ -9,7 +9,8 @@ from typing import Any
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from skills.db.models import Job, StoredPictures, StoredPlayback
+from skills.db.books import Job
+from skills.db.models import StoredPictures, StoredPlayback
 from skills.db.session import Database
 from skills.errors import Conflict, NotDrawnYet
 from skills.library import jobs

@@ -12,7 +12,8 @@ from typing import Any
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from skills.db.models import Job, StoredPlayback
+from skills.db.books import Job
+from skills.db.models import StoredPlayback
 from skills.db.session import Database
 from skills.errors import BadPlan, NotFound
 from skills.library import jobs, pictures, releases

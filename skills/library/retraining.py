@@ -11,7 +11,8 @@ from typing import Any
 from sqlalchemy import ColumnElement, func, insert, select
 from sqlalchemy.orm import Session
 
-from skills.db.models import Demonstration, Job, PolicyVersion, StyleToRetrain, Surgeon, SutureType
+from skills.db.books import Job, StyleToRetrain
+from skills.db.models import Demonstration, PolicyVersion, Surgeon, SutureType
 from skills.deep.learning import require_installed
 from skills.errors import Conflict, NotFound
 from skills.library import batches, jobs

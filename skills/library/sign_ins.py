@@ -14,7 +14,7 @@ from sqlalchemy import delete, or_, select, update
 from sqlalchemy.orm import Session
 
 from skills.db.base import now
-from skills.db.models import Key, SignIn
+from skills.db.books import Key, SignIn
 from skills.library.events import record
 from skills.library.keys import SECRET_BYTES, Holder, digest_of, held
 

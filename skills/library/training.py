@@ -7,7 +7,8 @@ from typing import Any, NamedTuple, cast
 from sqlalchemy import LargeBinary, Result, Table, bindparam, func, insert, select, type_coerce, update
 from sqlalchemy.orm import Session
 
-from skills.db.models import Demonstration, Job, PolicyDemonstration, PolicyVersion, StoredRewardMap, Surgeon
+from skills.db.books import Job
+from skills.db.models import Demonstration, PolicyDemonstration, PolicyVersion, StoredRewardMap, Surgeon
 from skills.db.packed import seal, unpack_as
 from skills.db.session import Database
 from skills.deep.learning import Tell, learn_policy, require_installed

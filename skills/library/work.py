@@ -7,7 +7,7 @@ from sqlalchemy import update
 from sqlalchemy.orm import Session
 
 from skills.db.base import now
-from skills.db.models import Job
+from skills.db.books import Job
 from skills.db.session import Database
 from skills.library.batch_work import retrain_part
 from skills.library.batches import PART

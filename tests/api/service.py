@@ -15,7 +15,7 @@ from starlette.testclient import TestClient
 from skills.api.app import create_app
 from skills.client import Client, Retrying
 from skills.db.base import Base
-from skills.db.models import Job
+from skills.db.books import Job
 from skills.library.batches import BATCH, PART
 from skills.settings import Settings
 from tests import backends

@@ -17,7 +17,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from sqlalchemy import update
 
 from skills.db.base import now
-from skills.db.models import Executor, Job
+from skills.db.books import Executor, Job
 from skills.db.session import Database
 from skills.errors import NotReady
 from skills.jobs.readiness import refuse_left_over, refuse_unready

@@ -14,7 +14,8 @@ from starlette.testclient import TestClient
 
 from skills.api.pages.assets import PLOTLY, PLOTLY_MAP_STYLE, assets, build
 from skills.api.pages.words import number, share, size
-from skills.db.models import Demonstration, Job, Plan, PolicyVersion, StoredRecording
+from skills.db.books import Job
+from skills.db.models import Demonstration, Plan, PolicyVersion, StoredRecording
 from skills.library.beside import agrees
 from skills.library.overview import matrix
 from skills.library.policies import find_version

@@ -9,7 +9,7 @@ from sqlalchemy import select
 
 from skills.api.gate import is_open
 from skills.db.base import Base
-from skills.db.models import Job
+from skills.db.books import Job
 from skills.db.seen import OF_NOBODY, Only
 from skills.library.batches import to_tell
 from skills.library.keys import held, list_keys

@@ -11,7 +11,7 @@ import pytest
 from sqlalchemy import select
 
 from skills.client import Problem
-from skills.db.models import Job
+from skills.db.books import Job
 from skills.recordings.replay_check import verify_bag
 from tests.api.service import GOAL_MM, KESTREL, Service, assert_problem
 from tests.library import cases

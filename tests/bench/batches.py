@@ -23,7 +23,8 @@ import numpy as np
 from rich.table import Table
 from sqlalchemy import func, select, update
 
-from skills.db.models import Demonstration, Executor, Job, Surgeon, SutureType
+from skills.db.books import Executor, Job
+from skills.db.models import Demonstration, Surgeon, SutureType
 from skills.db.packed import unpack_as
 from skills.db.session import Database
 from skills.errors import BadPath

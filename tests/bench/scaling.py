@@ -15,7 +15,8 @@ from sqlalchemy.orm import Session
 from starlette.testclient import TestClient
 
 from skills.api.answers import JSON, NPZ, Encoded
-from skills.db.models import Demonstration, Job
+from skills.db.books import Job
+from skills.db.models import Demonstration
 from skills.db.session import Database
 from skills.jobs.watch import Watch
 from skills.library import catalogue, demos, jobs, policies

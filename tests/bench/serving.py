@@ -16,8 +16,8 @@ from statistics import median
 from rich.table import Table
 from sqlalchemy import func, select
 
+from skills.db.books import Job
 from skills.db.changes import announce, changes_of
-from skills.db.models import Job
 from skills.db.session import Database
 from skills.jobs.child import environment
 from skills.library.training import request_training

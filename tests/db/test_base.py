@@ -7,7 +7,7 @@ from sqlalchemy import select
 from sqlalchemy.exc import StatementError
 
 from skills.db.base import now, rfc3339
-from skills.db.models import Executor
+from skills.db.books import Executor
 from skills.db.session import Database
 
 TOKYO = timezone(timedelta(hours=9))

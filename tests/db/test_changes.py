@@ -12,8 +12,8 @@ import pytest
 from sqlalchemy import text
 
 from skills.db.base import now
+from skills.db.books import Executor
 from skills.db.changes import APPLICATION, BOUND_S, Changes, Unasked, announce, changes_of
-from skills.db.models import Executor
 from skills.db.session import Database
 from skills.library.events import record
 from skills.library.releases import SERVED

@@ -7,7 +7,7 @@ import pytest
 from sqlalchemy import inspect, text
 from sqlalchemy.exc import DatabaseError, IntegrityError
 
-from skills.db import models
+from skills.db import books
 from skills.db.base import Base, now
 from skills.db.models import Erasure, MeasuredShape, StoredCalibration, StoredPictures, StoredPlayback
 from skills.db.session import Database
@@ -139,7 +139,7 @@ def test_row_numbers_are_never_used_twice(database: Database):
     numbers = []
     for name in ("one", "two"):
         with database.writing() as session:
-            job = models.Job(id=name, kind="training", identity=name, request={})
+            job = books.Job(id=name, kind="training", identity=name, request={})
             session.add(job)
             session.flush()
             numbers.append(job.row)
@@ -150,7 +150,7 @@ def test_row_numbers_are_never_used_twice(database: Database):
 def test_one_identity_has_one_live_job_and_any_number_of_ended_ones(database: Database):
     def add(name: str, state: str) -> None:
         with database.writing() as session:
-            session.add(models.Job(id=name, kind="training", identity="0" * 64, request={}, state=state))
+            session.add(books.Job(id=name, kind="training", identity="0" * 64, request={}, state=state))
 
     for name, state in (("1", "failed"), ("2", "cancelled"), ("3", "failed"), ("4", "queued")):
         add(name, state)

@@ -11,7 +11,7 @@ from pathlib import Path
 import httpx2 as httpx
 from sqlalchemy import ColumnElement, func, select, text
 
-from skills.db.models import Executor, Job
+from skills.db.books import Executor, Job
 from skills.db.session import Database
 from skills.jobs.child import environment
 from skills.jobs.engine import Engine

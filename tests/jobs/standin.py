@@ -6,7 +6,7 @@ from pathlib import Path
 
 from sqlalchemy import update
 
-from skills.db.models import Job
+from skills.db.books import Job
 from skills.db.session import Database
 from skills.errors import BadInput
 from skills.jobs.worker import run_worker

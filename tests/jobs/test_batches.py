@@ -14,7 +14,8 @@ from pathlib import Path
 import pytest
 from sqlalchemy import func, select, text
 
-from skills.db.models import Event, Executor, Job, PolicyVersion
+from skills.db.books import Event, Executor, Job
+from skills.db.models import PolicyVersion
 from skills.db.session import WRITE_LOCK, Database
 from skills.jobs.child import environment
 from skills.library import jobs

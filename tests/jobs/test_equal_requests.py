@@ -8,7 +8,8 @@ import httpx2 as httpx
 import pytest
 from sqlalchemy import select
 
-from skills.db.models import Event, Job, PolicyVersion
+from skills.db.books import Event, Job
+from skills.db.models import PolicyVersion
 from tests.backends import BACKENDS
 from tests.jobs.house import add_demonstration, site, until
 from tests.library import cases

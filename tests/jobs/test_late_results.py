@@ -12,7 +12,8 @@ from typing import Any
 import pytest
 from sqlalchemy import select, text
 
-from skills.db.models import Event, Executor, Job, PolicyVersion
+from skills.db.books import Event, Executor, Job
+from skills.db.models import PolicyVersion
 from skills.jobs.child import environment
 from skills.jobs.engine import workflow_id
 from skills.settings import Settings

@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 from sqlalchemy import inspect, text
 
-from skills.db.models import Executor
+from skills.db.books import Executor
 from skills.db.session import Database
 from skills.jobs.engine import connect, drop, workflow_id
 from skills.jobs.lease import Leases

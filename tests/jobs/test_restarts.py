@@ -19,7 +19,8 @@ import httpx2 as httpx
 import pytest
 from sqlalchemy import select, text
 
-from skills.db.models import Demonstration, Event, Executor, Job, PolicyVersion
+from skills.db.books import Event, Executor, Job
+from skills.db.models import Demonstration, PolicyVersion
 from skills.db.session import RESTART_S, Database
 from skills.errors import Busy
 from skills.jobs.engine import STEPS, WORKFLOW, connect, workflow_id

@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from skills.db.models import Demonstration, Job, Plan, PolicyVersion
+from skills.db.books import Job
+from skills.db.models import Demonstration, Plan, PolicyVersion
 from skills.db.session import Database
 from skills.jobs.workflows import Work
 from skills.library import perform_job

@@ -13,16 +13,14 @@ from sqlalchemy import LargeBinary, Table, insert, select, type_coerce
 from sqlalchemy.orm import Session
 
 from skills.db.base import now
+from skills.db.books import Event, Job, StyleToRetrain
 from skills.db.models import (
     Demonstration,
-    Event,
-    Job,
     PolicyVersion,
     RecordingChunk,
     Release,
     StoredRecording,
     StoredRewardMap,
-    StyleToRetrain,
     Surgeon,
     SutureType,
 )

@@ -2,9 +2,10 @@
 
 from itertools import count, islice
 
-from sqlalchemy import select, text
+from sqlalchemy import func, select, text
 
-from skills.db.models import Job, StyleToRetrain, SutureType
+from skills.db.books import Job, StyleToRetrain
+from skills.db.models import PolicyVersion, SutureType
 from skills.db.session import Database
 from skills.library import demos
 from skills.library.batches import PART
@@ -14,6 +15,8 @@ from skills.library.recordings import find_recording, keep
 from skills.library.retraining import request_retraining
 from skills.recordings import read_recording
 from tests.library import cases
+
+NO_CONSENT = {"consent": {"uses": ["atlas"], "until": None}}
 
 
 def add_styles(database: Database, number: int) -> list[tuple[str, str]]:
@@ -86,3 +89,14 @@ def damage(database: Database, demonstration: int) -> None:
         session.execute(
             text(f"UPDATE reward_maps SET map = {broken} WHERE demonstration_row = :row"), {"row": demonstration}
         )
+
+
+def versions(database: Database) -> int:
+    """Count the policy versions that there are."""
+    return counted(database, PolicyVersion)
+
+
+def counted(database: Database, table: type) -> int:
+    """Count the rows of a table."""
+    with database.reading() as session:
+        return session.scalar(select(func.count()).select_from(table))

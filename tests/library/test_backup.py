@@ -10,7 +10,8 @@ from sqlalchemy import inspect, select, text
 
 from skills.db import archive
 from skills.db.base import Base
-from skills.db.models import Demonstration, Erasure, Executor, Job, Surgeon
+from skills.db.books import Executor, Job
+from skills.db.models import Demonstration, Erasure, Surgeon
 from skills.db.schema import alembic_config, revisions
 from skills.db.session import Database
 from skills.errors import Conflict, Corrupt, Erased

@@ -7,7 +7,8 @@ import pytest
 from sqlalchemy import select, text
 
 from skills.db.base import Base
-from skills.db.models import Demonstration, Event, RecordingChunk
+from skills.db.books import Event
+from skills.db.models import Demonstration, RecordingChunk
 from skills.db.packed import Packed
 from skills.db.session import Database
 from skills.library import inspection

@@ -6,7 +6,8 @@ import pytest
 from sqlalchemy import select, text, update
 
 from skills.db.base import Base, now
-from skills.db.models import Key, SignIn, Surgeon
+from skills.db.books import Key, SignIn
+from skills.db.models import Surgeon
 from skills.db.session import Database
 from skills.errors import BadInput, Conflict, NotFound
 from skills.library.erasure import erase_surgeon

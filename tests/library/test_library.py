@@ -11,7 +11,8 @@ import pytest
 from sqlalchemy import func, select, text
 
 from skills.db.base import Base
-from skills.db.models import Event, Job, PolicyVersion, StoredRecording
+from skills.db.books import Event, Job
+from skills.db.models import PolicyVersion, StoredRecording
 from skills.db.session import Database
 from skills.errors import BadSettings, Conflict, Corrupt, Erased
 from skills.library import jobs, releases, work

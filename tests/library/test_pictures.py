@@ -6,7 +6,8 @@ import pytest
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from skills.db.models import Job, Plan, StoredPictures, StoredPlayback
+from skills.db.books import Job
+from skills.db.models import Plan, StoredPictures, StoredPlayback
 from skills.db.session import Database
 from skills.errors import NotDrawnYet, SimulationFailed
 from skills.library import pictures

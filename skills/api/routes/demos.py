@@ -19,7 +19,8 @@ from skills.api.schemas.given import Demonstration, DemoPath, Page, Recording, R
 from skills.api.schemas.sent import DemoIn, Schema
 from skills.api.schemas.written import demo_out, path_out, recording_out, reward_map_out
 from skills.api.strict import Strict
-from skills.db.models import Job, StoredRewardMap
+from skills.db.books import Job
+from skills.db.models import StoredRewardMap
 from skills.library import demos, erasure, recordings
 from skills.library.demos import Cut
 from skills.recordings import MEDIA_TYPES

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from skills.db import books
 from skills.db import models as rows
 from skills.db.base import rfc3339 as at
 
@@ -98,7 +99,7 @@ def reward_map_out(row: rows.Demonstration, kept: rows.StoredRewardMap) -> dict[
     }
 
 
-def job_out(row: rows.Job) -> dict[str, Any]:
+def job_out(row: books.Job) -> dict[str, Any]:
     """Write a job."""
     return {
         "id": row.id,
@@ -114,7 +115,7 @@ def job_out(row: rows.Job) -> dict[str, Any]:
     }
 
 
-def retrained_out(row: rows.StyleToRetrain) -> dict[str, Any]:
+def retrained_out(row: books.StyleToRetrain) -> dict[str, Any]:
     """Write what became of one style of a batch."""
     return {
         "surgeon": row.demonstration.surgeon.slug,

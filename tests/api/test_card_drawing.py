@@ -1,0 +1,61 @@
+"""The drawing on a policy's card: every start of every layer as what it is."""
+
+import re
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from skills.api.pages import coverage_drawing
+from skills.style.certificate import Coverage
+from skills.style.grid import GridPath, GridWorld
+
+
+def path_in(shape: tuple[int, int, int]) -> GridPath:
+    return GridPath(GridWorld((0.0, 0.0, 0.0), 5.0, shape), np.array([0, 1]))
+
+
+def drawn(coverage: Coverage, path: GridPath) -> dict[str, float]:
+    """Measure how much of the layers each kind of start takes, in tiles."""
+    area = dict.fromkeys(coverage_drawing.KINDS, 0.0)
+    for _, svg in coverage_drawing.layers(coverage, path):
+        for kind, width in re.findall(r'<rect class="(?!edge)(\w+)" x="\d+" y="\d+" width="(\d+)" height="10"', svg):
+            area[kind] += int(width) / coverage_drawing.TILE
+    return area
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.tuples(*[st.integers(1, 5)] * 2, st.integers(2, 5)), st.randoms(use_true_random=False))
+def test_every_start_is_drawn_as_what_it_is(shape: tuple[int, int, int], random):
+    n = int(np.prod(shape))
+    reaches = np.array([random.random() < 0.7 for _ in range(n)])
+    joins = reaches & np.array([random.random() < 0.5 for _ in range(n)])
+    path = path_in(shape)
+    assert coverage_drawing.block_of(path) == 1
+    assert drawn(Coverage(reaches, joins), path) == {
+        "follows": joins.sum(),
+        "otherwise": (reaches & ~joins).sum(),
+        "fails": (~reaches).sum(),
+    }
+
+
+def test_a_large_grid_is_drawn_in_blocks_that_hide_no_failure():
+    shape = (80, 50, 30)
+    reaches = np.ones(shape, bool)
+    reaches[79, 49, 29] = reaches[40, 10, 0] = False
+    path = path_in(shape)
+    assert coverage_drawing.block_of(path) == 3
+    area = drawn(Coverage(reaches.ravel(), reaches.ravel()), path)
+    assert area == {"fails": 2, "otherwise": 0, "follows": 27 * 17 * 10 - 2}
+    assert [name for name, _ in coverage_drawing.layers(Coverage(reaches.ravel(), reaches.ravel()), path)][-1] == (
+        "z 135 to 145 mm"
+    )
+
+
+def test_a_layer_stands_as_its_cells_stand():
+    """x to the right and y upwards: the one start that fails has the least x and the greatest y, and is top left."""
+    reaches = np.ones((3, 2, 2), bool)
+    reaches[0, 1, 0] = False
+    (_, lowest), (_, upper) = coverage_drawing.layers(Coverage(reaches.ravel(), reaches.ravel()), path_in((3, 2, 2)))
+    assert '<rect class="fails" x="0" y="0" width="10" height="10"/>' in lowest
+    assert "fails" not in upper

@@ -1,0 +1,222 @@
+"""Carrying out parts of batches: each style for itself, nothing twice, whoever else is at work on it."""
+
+import time
+from threading import Thread
+
+import pytest
+from sqlalchemy import func, select
+
+from skills.db.books import Event
+from skills.db.session import Database
+from skills.jobs.workflows import Work, fail, start
+from skills.library import batch_work, perform_job, retraining
+from skills.library.catalogue import put_surgeon
+from skills.library.demos import withdraw_demo
+from skills.library.training import learn_style
+from skills.settings import Settings
+from tests.library import cases
+from tests.library.styles import (
+    NO_CONSENT,
+    add_styles,
+    ask_retraining,
+    damage,
+    look,
+    parts_of,
+    states_of,
+    styles_of,
+    versions,
+)
+
+# ---- one bad style
+
+
+def test_of_eight_styles_with_one_poisoned_seven_are_done_and_one_failed_with_its_reason(database: Database):
+    add_styles(database, 8)
+    job = ask_retraining(database)
+    damage(database, styles_of(database, job)[3].demonstration_row)
+    for part in parts_of(database, job):
+        assert cases.work(database, part).state == "succeeded"
+    assert states_of(database, job) == ["done"] * 3 + ["failed"] + ["done"] * 4
+    bad = styles_of(database, job)[3]
+    assert "not what was stored" in bad.reason
+    assert (bad.policy_row, bad.comparison, bad.ended_at is None) == (None, None, False)
+    batch = look(database, job)
+    assert (batch.state, batch.progress) == ("failed", 1.0)
+    assert batch.error.startswith("1 of 8 styles failed")
+    assert batch.result == {"queued": 0, "done": 7, "failed": 1, "cancelled": 0}
+    assert versions(database) == 7
+
+
+def test_a_style_without_consent_or_whose_demonstration_was_withdrawn_fails_and_the_others_go_on(database: Database):
+    add_styles(database, 2)
+    demo = cases.add_demo(database)
+    cases.add_surgeon(database, "heron")
+    cases.add_demo(database, surgeon="heron")
+    job = ask_retraining(database)
+    with database.writing() as session:
+        put_surgeon(session, "kestrel", NO_CONSENT, "test")
+        heron = cases.Demonstration.surgeon.has(slug="heron")
+        withdraw_demo(session, session.scalars(select(cases.Demonstration).where(heron)).one().sha256, "test")
+    for part in parts_of(database, job):
+        cases.work(database, part)
+    reasons = {style.demonstration.surgeon.slug: style.reason for style in styles_of(database, job)}
+    assert reasons["surgeon-0"] is None
+    assert "does not cover training" in reasons["kestrel"]
+    assert "was withdrawn" in reasons["heron"]
+    assert (look(database, job).result["done"], look(database, job).result["failed"]) == (2, 2)
+    assert demo.sha256 not in str(reasons)
+
+
+def test_what_fails_inside_the_service_is_tried_again_and_then_given_up_alone(
+    database: Database, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(retraining, "FEWEST_PARTS", 1)
+    add_styles(database, 5)
+    job = ask_retraining(database)
+    (part,) = parts_of(database, job)
+    bad = styles_of(database, job)[1].demonstration_row
+    learnt = []
+
+    def learn(lesson, request, settings):
+        learnt.append(lesson.row)
+        if lesson.row == bad:
+            raise RuntimeError("/srv/secret")
+        return learn_style(lesson, request, settings)
+
+    monkeypatch.setattr(batch_work, "learn_style", learn)
+    work = Work(database, Settings(database_url=database.url), perform_job)
+    assert not work.try_once(part.row, 1, 0)
+    assert states_of(database, job) == ["done", "queued", "done", "done", "done"]
+    assert look(database, job).state == "running"
+    assert 0.79 < look(database, job).progress < 0.81
+    assert not work.try_once(part.row, 1, 1)
+    assert learnt.count(bad) == 3  # once among the others, and then alone
+    work.give_up(part.row, 1)
+    style = styles_of(database, job)[1]
+    assert style.state == "failed"
+    assert "failed inside the service" in style.reason and "secret" not in style.reason
+    batch = look(database, job)
+    assert (batch.state, batch.result["done"], batch.result["failed"]) == ("failed", 4, 1)
+
+
+def test_a_style_at_which_its_worker_died_comes_last_the_next_time(database: Database, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(retraining, "FEWEST_PARTS", 1)
+    add_styles(database, 4)
+    job = ask_retraining(database)
+    (part,) = parts_of(database, job)
+    deadly = styles_of(database, job)[1].demonstration_row
+
+    class Death(BaseException):
+        """What no worker survives."""
+
+    def learn(lesson, request, settings):
+        if lesson.row == deadly:
+            raise Death
+        return learn_style(lesson, request, settings)
+
+    monkeypatch.setattr(batch_work, "learn_style", learn)
+    monkeypatch.setattr(batch_work, "TOGETHER_S", 60.0)  # on a slow machine too
+    for done in (0, 1, 3):  # at first it took the others of its transaction along
+        assert start(database, part.row, 1)
+        with pytest.raises(Death):
+            perform_job(database, part.row, 1, Settings(database_url=database.url))
+        assert states_of(database, job).count("done") == done
+    assert [style.tries for style in styles_of(database, job)] == [2, 3, 2, 2]
+    assert fail(database, part.row, 1, "Its worker died every time while working on it.")
+    assert states_of(database, job) == ["done", "failed", "done", "done"]
+    assert look(database, job).state == "failed"
+
+
+def test_a_style_refused_at_the_last_moment_takes_none_of_its_transaction_along(
+    database: Database, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(retraining, "FEWEST_PARTS", 1)
+    add_styles(database, 3)
+    job = ask_retraining(database)
+    (part,) = parts_of(database, job)
+    withdrawn = styles_of(database, job)[1].demonstration.sha256
+
+    def learn(lesson, request, settings):
+        if lesson.sha256 == withdrawn:
+            with database.writing() as session:
+                withdraw_demo(session, withdrawn, "test")
+        return learn_style(lesson, request, settings)
+
+    monkeypatch.setattr(batch_work, "learn_style", learn)
+    cases.work(database, part)
+    assert states_of(database, job) == ["done", "failed", "done"]
+    assert "withdrawn while it was being learnt" in styles_of(database, job)[1].reason
+    assert versions(database) == 2
+
+
+def test_what_takes_long_is_committed_alone(database: Database, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(retraining, "FEWEST_PARTS", 1)
+    monkeypatch.setattr(batch_work, "TOGETHER_S", 0.0)
+    add_styles(database, 3)
+    job = ask_retraining(database)
+    (part,) = parts_of(database, job)
+    seen = []
+
+    def learn(lesson, request, settings):
+        seen.append((states_of(database, job).count("done"), look(database, job).progress))
+        return learn_style(lesson, request, settings)
+
+    monkeypatch.setattr(batch_work, "learn_style", learn)
+    cases.work(database, part)
+    assert [done for done, _ in seen] == [0, 1, 2]
+    assert [round(progress, 6) for _, progress in seen] == [0.0, round(1 / 3, 6), round(2 / 3, 6)]
+
+
+def test_a_worker_that_was_handed_two_parts_learns_one_after_the_other(
+    database: Database, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(retraining, "FEWEST_PARTS", 2)
+    add_styles(database, 6)
+    job = ask_retraining(database)
+    parts = {style.demonstration_row: style.part_row for style in styles_of(database, job)}
+    learnt = []
+
+    def learn(lesson, request, settings):
+        learnt.append(parts[lesson.row])
+        time.sleep(0.02)  # long enough for the other thread to come in between
+        return learn_style(lesson, request, settings)
+
+    monkeypatch.setattr(batch_work, "learn_style", learn)
+    both = [Thread(target=cases.work, args=(database, part)) for part in parts_of(database, job)]
+    for thread in both:
+        thread.start()
+    for thread in both:
+        thread.join()
+    assert states_of(database, job) == ["done"] * 6
+    assert learnt in (sorted(learnt), sorted(learnt, reverse=True))
+
+
+# ---- two workers at the same part
+
+
+def test_a_late_result_changes_nothing_and_its_worker_goes_on_with_what_is_left(
+    database: Database, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(retraining, "FEWEST_PARTS", 1)
+    add_styles(database, 3)
+    job = ask_retraining(database)
+    (part,) = parts_of(database, job)
+    others, ended = [], []
+
+    def learn(lesson, request, settings):
+        if not others:  # meanwhile another worker has taken the part over, and ends it
+            others.append(lesson.row)
+            with monkeypatch.context() as meanwhile:
+                meanwhile.setattr(batch_work, "learn_style", learn_style)
+                perform_job(database, part.row, 1, Settings(database_url=database.url))
+            ended.append(look(database, job).ended_at)
+        return learn_style(lesson, request, settings)
+
+    monkeypatch.setattr(batch_work, "learn_style", learn)
+    cases.work(database, part)
+    assert states_of(database, job) == ["done"] * 3
+    assert (versions(database), look(database, job).state) == (3, "succeeded")
+    assert [look(database, job).ended_at] == ended
+    with database.reading() as session:
+        finished = select(func.count()).where(Event.action == "finish", Event.object_id == job.id)
+        assert session.scalar(finished) == 1
