@@ -18,6 +18,7 @@ from skills.api.answers import JSON, NPZ, Encoded
 from skills.db.books import Job
 from skills.db.models import Demonstration
 from skills.db.session import Database
+from skills.jobs.lease import Leases
 from skills.jobs.watch import Watch
 from skills.library import catalogue, demos, jobs, policies
 from skills.library.batches import BATCH
@@ -67,7 +68,7 @@ class Hospital:
 
     def watching(self) -> None:
         """Look for jobs that have not ended, as every worker does in every round."""
-        watch = Watch(self.database, None, "bench", None, None)
+        watch = Watch(self.database, None, "bench", Leases(2.0), None)
         for _ in self.styles:
             watch._live()
 
