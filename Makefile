@@ -1,9 +1,14 @@
 # Everything a new machine needs: `make demo`, `make test`. Only Python 3.11 and make are taken for granted.
 PYTHON ?= python3.11
+IS_PYTHON := $(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] < (3, 14))' 2>/dev/null
+NO_PYTHON := echo 'Python 3.11 was not found as "$(PYTHON)". Install it (Debian: apt-get install python3.11-venv; uv: \
+uv python install 3.11), or say where yours is: make PYTHON=/path/to/python3.11' >&2; exit 1
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 export SKILLS_SAMPLE_RECORDINGS ?= $(abspath $(wildcard ../shared/recordings))
+# Compiled once: a process that compiles all of ours for itself takes three times as long to start.
+export PYTHONDONTWRITEBYTECODE :=
 export SKILLS_PAPER_DATA ?= $(abspath $(wildcard ../shared/paper/data))
 
 .PHONY: demo test serve bench nightly deep lint lock wheelhouse fixture clean
@@ -22,11 +27,12 @@ endif
 
 $(READY): requirements.lock pyproject.toml
 	@if command -v uv >/dev/null 2>&1; then \
-	  uv venv -q --allow-existing --python $(PYTHON) $(VENV) && \
+	  { uv venv -q --allow-existing --python $(PYTHON) $(VENV) || { $(NO_PYTHON); }; } && \
 	  $(SETUPTOOLS) | VIRTUAL_ENV=$(CURDIR)/$(VENV) uv pip install -q --require-hashes -r - && \
 	  VIRTUAL_ENV=$(CURDIR)/$(VENV) uv pip sync -q --compile-bytecode --require-hashes --no-build-isolation requirements.lock && \
 	  VIRTUAL_ENV=$(CURDIR)/$(VENV) uv pip install -q --no-deps --no-build-isolation -e . ; \
 	else \
+	  { $(IS_PYTHON) || { $(NO_PYTHON); }; } && \
 	  $(PYTHON) -m venv $(VENV) && \
 	  $(SETUPTOOLS) | $(BIN)/python -m pip install -q --require-hashes -r /dev/stdin && \
 	  $(BIN)/python -m pip install -q --require-hashes --no-build-isolation -r requirements.lock && \
@@ -49,8 +55,10 @@ serve: $(READY)
 bench: $(READY)
 	@$(BIN)/python -m tests.bench $(PARTS)
 
+# The sweeps, and ten runs of the suite in a row: none red, nothing left behind.
 nightly: $(READY)
-	@$(BIN)/python -m pytest -m nightly
+	@$(BIN)/python -m pytest --hypothesis-profile=nightly -m nightly
+	@for run in 1 2 3 4 5 6 7 8 9 10; do $(BIN)/python -m pytest --hypothesis-profile=nightly || exit 1; done
 
 lint: $(READY)
 	@$(BIN)/ruff check --fix .
@@ -82,6 +90,7 @@ lock:
 # What `requirements.lock` names, for this platform, into build/wheelhouse; what comes as source stays source, so that the
 # hashes of the lock hold there too. With pip, for uv downloads nothing.
 wheelhouse:
+	@$(IS_PYTHON) || { $(NO_PYTHON); }
 	@$(PYTHON) -m venv build/pip
 	@$(SETUPTOOLS) | build/pip/bin/python -m pip install -q --require-hashes -r /dev/stdin
 	@build/pip/bin/python -m pip download -q --no-deps --no-build-isolation --require-hashes -d build/wheelhouse -r requirements.lock

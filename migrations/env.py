@@ -3,7 +3,7 @@
 from alembic import context
 from sqlalchemy.schema import SchemaItem
 
-from skills.db import books  # noqa: F401 - declares all tables, with those of the library
+from skills.db import service_tables  # noqa: F401 - declares all tables, with those of the library
 from skills.db.base import Base
 
 

@@ -1,1 +1,1 @@
-"""What an empty installation starts with: the suture types, and synthetic surgeons with their recordings."""
+"""Initial content of an installation: the suture types, and synthetic surgeons with their recordings."""

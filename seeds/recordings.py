@@ -1,12 +1,12 @@
-"""Make the sample recordings: four synthetic surgeons with styles that can be told apart by eye.
+"""Synthesis of the sample recordings: four surgeons with styles that can be distinguished by eye.
 
     kestrel   direct and smooth                     heron    a wide high arc
     wren      a loop that crosses its own path      plover   hesitant, with clutching pauses and tremor
 
-and one recording of kestrel with five hand-offs. A hand moves along a smooth curve through a few points with the speed
-of a minimum-jerk movement; tremor of 8 to 12 Hz is added; before and after it rests; the jaw closes on the needle
+One more recording of kestrel has five hand-offs. A hand moves along a smooth curve through a few points with the speed
+of a minimum-jerk movement; tremor of 8 to 12 Hz is added; it rests before and after; the jaw closes on the needle
 before a hand-off and opens after it. Everything lies inside the paper's grid. Numbers are rounded to a nanometre before
-they are written, so that every machine makes the same bytes.
+they are written, so that every machine produces the same bytes.
 """
 
 import zlib
@@ -17,10 +17,10 @@ from functools import cache
 import numpy as np
 from numpy.typing import ArrayLike
 
-from skills.recordings.topics import CLUTCH_TOPICS, PRESSED, RELEASED
-from skills.recordings.writer import write_mcap
-from skills.style._arrays import Floats, Ints
-from skills.style.recording import Motion, Recording, Signal
+from skills.arrays import Floats, Ints
+from skills.demonstration.recording import Motion, Recording, Signal
+from skills.formats.topics import CLUTCH_TOPICS, PRESSED, RELEASED
+from skills.formats.writer import write_mcap
 
 ARM = "PSM2"
 FRAME = "PSM2_base"
@@ -33,14 +33,14 @@ REST_S, GRIP_S, SETTLE_S, BETWEEN_S, RETURN_S = 1.2, 0.3, 0.2, 0.5, 1.4
 
 @dataclass(frozen=True)
 class Sample:
-    """One sample recording.
+    """A sample recording.
 
     Attributes:
         name: A slug, unique among the samples.
         surgeon: The slug of a surgeon of surgeons.toml.
         suture: The slug of a suture type of suture_types.toml.
         data: The MCAP file.
-        segments: Where each hand-off really starts and ends, seconds from the first pose.
+        segments: The true start and end of each hand-off, in seconds from the first pose.
     """
 
     name: str
@@ -52,12 +52,13 @@ class Sample:
 
 @dataclass(frozen=True)
 class _Hand:
-    """How a hand moves.
+    """The motion characteristics of a hand.
 
     Attributes:
-        moves: Each a share of the way, its duration in s, the rest after it in s, and whether the clutch is down in it.
-        tremor_mm: Amplitude along each axis.
-        rate_hz: Of the recording.
+        moves: For each move its share of the path, its duration in s, the rest after it in s, and whether the clutch is
+            pressed during that rest.
+        tremor_mm: Amplitude of the tremor along each axis.
+        rate_hz: Sample rate of the recording.
     """
 
     moves: tuple[tuple[float, float, float, bool], ...]
@@ -67,7 +68,7 @@ class _Hand:
 
 @dataclass(frozen=True)
 class _Phase:
-    """A stretch of time in which the hand goes along a part of a curve while the jaw turns."""
+    """A time span in which the hand follows a part of a curve while the jaw turns."""
 
     duration_s: float
     curve_mm: Floats
@@ -120,7 +121,7 @@ _ALONG_THE_WOUND_MM = (1.5, 2.5, 0.0)  # from one of the five passes to the next
 
 @cache
 def sample_recordings() -> tuple[Sample, ...]:
-    """Make all samples; every call gives the same bytes."""
+    """Return all samples; every call and every machine produces the same bytes."""
     five = [np.add(_DIRECT_MM, np.multiply(number - 2, _ALONG_THE_WOUND_MM)) for number in range(5)]
     return (
         _sample("kestrel-simple-running", "simple-running", _KESTREL, [_DIRECT_MM]),
@@ -132,7 +133,7 @@ def sample_recordings() -> tuple[Sample, ...]:
 
 
 def _sample(name: str, suture: str, hand: _Hand, passes: Sequence[ArrayLike]) -> Sample:
-    rng = np.random.default_rng(zlib.crc32(name.encode()))
+    rng = np.random.default_rng(zlib.crc32(name.encode()))  # unlike hash(), the same in every process
     phases = list(_session(hand, [_smooth(np.asarray(points, dtype=np.float64)) for points in passes]))
     seconds, stamps_ns = _stamps(sum(phase.duration_s for phase in phases), hand.rate_hz, rng)
     tip_mm, jaw_rad = _play(phases, seconds)
@@ -150,7 +151,7 @@ def _sample(name: str, suture: str, hand: _Hand, passes: Sequence[ArrayLike]) ->
 
 
 def _session(hand: _Hand, curves: list[Floats]) -> Iterator[_Phase]:
-    """Rest, hand off once per curve with a way back in between, rest."""
+    """Yield the phases of a recording: a rest, a hand-off for each curve with a return in between, and a rest."""
     yield _Phase(REST_S, curves[0], along=(0.0, 0.0))
     for number, curve in enumerate(curves):
         if number > 0:
@@ -177,7 +178,8 @@ def _hand_off(hand: _Hand, curve: Floats) -> Iterator[_Phase]:
 
 
 def _smooth(points_mm: Floats) -> Floats:
-    """Draw a Catmull-Rom curve through the points; 1001 points on it at equal steps of arc length."""
+    """Return a Catmull-Rom curve through points: 1001 points at equal steps of arc length, shape (1001, 3) in mm."""
+    # reflected end points, so that the curve includes the first and the last point
     ends = np.vstack([2 * points_mm[0] - points_mm[1], points_mm, 2 * points_mm[-1] - points_mm[-2]])
     u = np.linspace(0.0, 1.0, 200)[:, None]
     pieces = []
@@ -190,14 +192,14 @@ def _smooth(points_mm: Floats) -> Floats:
 
 
 def _stamps(duration_s: float, rate_hz: float, rng: np.random.Generator) -> tuple[Floats, Ints]:
-    """Return stamps with the jitter of a real recorder, up to 5 % of a step; seconds from the first one."""
+    """Return time stamps with the jitter of a real recorder, up to 5 % of a step: seconds from the first, and ns."""
     steps = np.arange(int(duration_s * rate_hz)) + rng.uniform(0.0, 0.05, int(duration_s * rate_hz))
     offsets_ns = np.rint((steps - steps[0]) * (1e9 / rate_hz)).astype(np.int64)
     return offsets_ns / 1e9, EPOCH_NS + offsets_ns
 
 
 def _play(phases: list[_Phase], seconds: Floats) -> tuple[Floats, Floats]:
-    """Return where the tip is, shape (T, 3) in mm, and how open the jaw, shape (T,) in rad, at given times."""
+    """Return the tip position, shape (T, 3) in mm, and the jaw angle, shape (T,) in rad, at given times."""
     ends = np.cumsum([phase.duration_s for phase in phases])
     which = np.minimum(np.searchsorted(ends, seconds, side="right"), len(phases) - 1)
     tip_mm, jaw_rad = np.empty((len(seconds), 3)), np.empty(len(seconds))
@@ -212,14 +214,14 @@ def _play(phases: list[_Phase], seconds: Floats) -> tuple[Floats, Floats]:
 
 
 def _minimum_jerk(share: Floats) -> Floats:
-    """Return the share of the way at a share of the time: the smoothest start and stop (Flash and Hogan, 1985)."""
+    """Return the share of the path at a share of the time, for a minimum-jerk movement (Flash and Hogan, 1985)."""
     s = np.clip(share, 0.0, 1.0)
     way: Floats = s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
     return way
 
 
 def _tremor(seconds: Floats, amplitude_mm: float, rng: np.random.Generator) -> Floats:
-    """Return two beating oscillations of 8 to 12 Hz on each axis, shape (T, 3), never above the amplitude."""
+    """Return the mean of two oscillations of 8 to 12 Hz on each axis, shape (T, 3), never above the amplitude."""
     rates_hz, phases = rng.uniform(8.0, 12.0, (2, 3)), rng.uniform(0.0, 2 * np.pi, (2, 3))
     waves = np.sin(2 * np.pi * rates_hz * seconds[:, None, None] + phases)
     shaking: Floats = amplitude_mm * waves.mean(axis=1)
@@ -227,7 +229,7 @@ def _tremor(seconds: Floats, amplitude_mm: float, rng: np.random.Generator) -> F
 
 
 def _drifting(seconds: Floats, rng: np.random.Generator) -> Floats:
-    """Return orientations that wander slowly around tool-down, shape (T, 4)."""
+    """Return orientations that drift slowly around tool-down, as quaternions x, y, z, w, shape (T, 4)."""
     phases = rng.uniform(0.0, 2 * np.pi, 3)
     half = DRIFT_RAD * np.sin(2 * np.pi * seconds[:, None] / np.array([7.0, 9.0, 11.0]) + phases) / 2
     x, y, z = half.T
@@ -237,7 +239,7 @@ def _drifting(seconds: Floats, rng: np.random.Generator) -> Floats:
 
 
 def _pedal(phases: list[_Phase]) -> Signal:
-    """Return the clutch's events: released at the start, pressed and released around every clutched rest."""
+    """Return the clutch events: released at the start, pressed and released around every clutched rest."""
     events, now_s = [(0.0, RELEASED)], 0.0
     for phase in phases:
         if phase.clutched:
@@ -248,10 +250,11 @@ def _pedal(phases: list[_Phase]) -> Signal:
 
 
 def _truth(phases: list[_Phase]) -> tuple[tuple[float, float], ...]:
-    """Return when each hand-off starts and ends."""
+    """Return the start and end of each hand-off, in seconds from the first pose."""
     spans: list[tuple[float, float]] = []
     now_s, before = 0.0, False
     for phase in phases:
+        # successive phases of one hand-off make one span
         start_s = spans.pop()[0] if before and phase.hands_off else now_s
         now_s += phase.duration_s
         if phase.hands_off:

@@ -1,4 +1,4 @@
-"""`python -m skills`: the command line."""
+"""Entry point of `python -m skills`: the command line."""
 
 from skills.cli import app
 

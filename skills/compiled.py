@@ -1,11 +1,11 @@
-"""The door to numba: ordinary Python loops, compiled, and loaded only from where nobody else writes.
+"""Compilation of loops with numba: ordinary Python loops as machine code, loaded only from folders that are safe.
 
     loop --compiled--> the same loop as machine code
 
-Loops are in modules called `_kernels`. numba keeps machine code in files, and loads it from them without asking who
-wrote them: in NUMBA_CACHE_DIR where that is set, else beside the code, else in the user's cache folder. Where it can
-write to none of these, every process compiles for itself, which takes it a second or two. numba itself is loaded with
-the first loop that is called, for that takes an eighth of a server's start.
+The loops are in modules named `_kernels`. numba stores machine code in files and loads it without checking who wrote
+them: in NUMBA_CACHE_DIR if that is set, otherwise beside the code, otherwise in the user's cache folder. If none of
+these is writable, every process compiles for itself, which takes a second or two. numba is imported with the first loop
+that is called, because the import takes an eighth of a server's start.
 """
 
 import logging
@@ -23,79 +23,85 @@ PACKAGE = Path(__file__).resolve().parent
 
 log = logging.getLogger(__name__)
 
-_INNER: list[Callable[..., Any]] = []  # that numba has not been told of yet
+_INNER: list[Callable[..., Any]] = []  # not yet registered with numba
 _TELLING = Lock()
 
 
 class Loop:
-    """A loop that is compiled, or its machine code loaded, when it is first called."""
+    """A loop that is compiled, or whose machine code is loaded, at its first call."""
 
     def __init__(self, loop: Callable[..., Any]) -> None:
         self.loop = loop
 
     def __call__(self, *given: Any) -> Any:
-        """Run it as machine code."""
+        """Call the machine code."""
         return self.machine(*given)
 
     @cached_property
     def machine(self) -> Any:
-        """What numba makes of it."""
+        """The function that numba compiles from the loop."""
         from numba import njit
         from numba.extending import register_jitable
 
+        # Before the loop is compiled, because numba has to know the functions that it calls.
         with _TELLING:
             while _INNER:
                 register_jitable(_INNER.pop())
         try:
             return njit(nogil=True, cache=True)(self.loop)
-        except RuntimeError:  # numba's way to say that it has nowhere to write
+        except RuntimeError:  # raised by numba if no cache folder is writable
             return njit(nogil=True)(self.loop)
 
 
 def compiled(loop: Callable[..., Any]) -> Loop:
-    """Compile a loop at its first call, and keep its machine code for other processes.
+    """Return a loop that is compiled at its first call, and whose machine code is cached for other processes.
 
-    Call it with the same types always: two processes that compile it for different ones at once can keep one's code
-    under the other's name. Of an array the layout, the alignment and whether it is read-only are part of its type.
+    Always call it with the same argument types: two processes that compile it for different types at the same time can
+    store the code of one under the name of the other. The type of an array includes its layout, its alignment and
+    whether it is read-only.
     """
     return Loop(loop)
 
 
 def inner(loop: Callable[..., Any]) -> Callable[..., Any]:
-    """Make a function known to the compiled loops that call it."""
+    """Register a function that compiled loops call, so that numba compiles it with them."""
     _INNER.append(loop)
     return loop
 
 
 def kept_in(loop: Loop) -> Path | None:
-    """Find the folder that the machine code of a compiled loop and of those beside it is kept in; None: nowhere."""
+    """Return the folder in which the machine code of a loop's module is cached; None if there is none."""
     folder = loop.machine.stats.cache_path
     return None if folder is None else Path(folder).resolve()
 
 
 def check_kept(folder: Path | None) -> None:
-    """Refuse a folder that others can write to, and one that is not where NUMBA_CACHE_DIR wants it.
+    """Refuse a cache folder to which others can write, and one that is not inside NUMBA_CACHE_DIR if that is set.
+
+    Args:
+        folder: The folder that numba uses, as `kept_in` returns it.
 
     Raises:
-        BadSettings: It says which folder, and what to do.
+        BadSettings: The message names the folder and the remedy.
     """
     wanted = os.environ.get("NUMBA_CACHE_DIR")
     if wanted and (folder is None or Path(wanted).resolve() not in folder.parents):
-        raise BadSettings(f"NUMBA_CACHE_DIR={wanted} cannot be written to; name a folder of this user's own.")
+        raise BadSettings(f"NUMBA_CACHE_DIR={wanted} is not writable; name a folder that only this user can write to.")
     if folder is None:
         log.warning(
-            "Nothing is writable that compiled loops could be kept in, so every process compiles them for itself; "
-            "set NUMBA_CACHE_DIR to a folder of this user's own."
+            "No folder for compiled loops is writable, so every process compiles them again; set NUMBA_CACHE_DIR "
+            "to a folder that only this user can write to."
         )
-    elif folder.name != "__pycache__" or PACKAGE not in folder.parents:  # beside the code one could change the code
+    elif folder.name != "__pycache__" or PACKAGE not in folder.parents:
+        # Not checked beside the code: a user who can write there can change the code itself.
         _refuse_shared(folder, inside=True)
 
 
 def check_wanted() -> None:
-    """Refuse a NUMBA_CACHE_DIR that others can write to, before anything is begun and without loading numba.
+    """Refuse a NUMBA_CACHE_DIR to which others can write, before any work and without importing numba.
 
     Raises:
-        BadSettings: As `check_kept`, which has the last word when the first loop is loaded.
+        BadSettings: As for `check_kept`, which checks the folder that numba really uses when the first loop is loaded.
     """
     wanted = os.environ.get("NUMBA_CACHE_DIR")
     if wanted and Path(wanted).is_dir():
@@ -103,35 +109,39 @@ def check_wanted() -> None:
 
 
 def make_ready(work: Callable[[], object], folder: Path | None) -> None:
-    """Do some work once, so that the loops that it calls are compiled or loaded.
+    """Call a function once, so that the loops that it uses are compiled or loaded.
 
-    Where kept files are damaged, as a power cut leaves them, they are thrown away and the work is done again.
+    If cached files are damaged, as after a power failure, they are deleted and the function is called again.
+
+    Args:
+        work: The function.
+        folder: The cache folder; None if there is none.
     """
     try:
         work()
     except Exception:
         kept = [] if folder is None else sorted(folder.glob("_kernels.*.nb[ci]"))
-        if not kept:
+        if not kept:  # without cached files the failure has another cause
             raise
-        log.warning("The compiled loops in %s cannot be loaded; they are made anew.", folder, exc_info=True)
+        log.warning("The compiled loops in %s cannot be loaded; they are compiled again.", folder, exc_info=True)
         for file in kept:
             file.unlink(missing_ok=True)
         work()
 
 
 def _refuse_shared(folder: Path, *, inside: bool) -> None:
-    """Refuse a folder that other users can change, or put another one in its place; inside: it has files of ours."""
-    for part in (folder, *folder.parents):
+    """Refuse a folder that other users can change or replace; `inside`: it has files of ours."""
+    for part in (folder, *folder.parents):  # parents too: renaming one of them replaces the folder
         if _others_write(part, inside=inside and part == folder):
             raise BadSettings(
-                f"Machine code is loaded from {folder}, and other users can write to {part}: "
-                f"set NUMBA_CACHE_DIR to a folder of this user's own, or take the right away (chmod go-w {part})."
+                f"Machine code is loaded from {folder}, and other users can write to {part}: set NUMBA_CACHE_DIR "
+                f"to a folder that only this user can write to, or remove the right (chmod go-w {part})."
             )
 
 
 def _others_write(part: Path, *, inside: bool) -> bool:
-    """Tell whether other users than this one and root could put a file in a folder, or a folder in another's place."""
+    """Return whether users other than this one and root could put a file in a folder, or replace a folder in it."""
     found = part.stat()
     shared = bool(found.st_mode & (stat.S_IWGRP | stat.S_IWOTH))
-    sticky = bool(found.st_mode & stat.S_ISVTX) and not inside  # as /tmp: nobody moves what is another's
+    sticky = bool(found.st_mode & stat.S_ISVTX) and not inside  # as /tmp, where nobody can move files of another user
     return found.st_uid not in (0, os.geteuid()) or (shared and not sticky)

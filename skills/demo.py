@@ -1,9 +1,9 @@
-"""`make demo`: the main job, end to end, over HTTP, on a database that did not exist before.
+"""`make demo`: the complete data flow over HTTP, on a new database.
 
-Upload the sample recordings of synthetic surgeons, take the hand-offs that the service proposes, train and release,
-fetch the policies, roll them out, stack five suture points, play the plan in PyBullet; then the same with a real
-recording, where one is there. It exits with 0 only if every sample style is followed exactly, from every start, by a
-motion that the arm can make.
+It uploads the sample recordings of synthetic surgeons, cuts the hand-offs that the service proposes, trains and
+releases, downloads the policies, rolls them out, stacks five suture points and plays the plan in PyBullet; then it does
+the same with a real recording, if one is available. It exits with 0 only if every sample style is followed exactly,
+from every start, by a motion that the arm can make.
 """
 
 import os
@@ -21,39 +21,45 @@ import httpx2 as httpx
 from rich.console import Console
 from rich.table import Table
 
-from skills.api.schemas.given import Playback, Policy
 from skills.client import Client, JobFailed, Problem
 from skills.drawing import draw_styles
 from skills.samples import load_samples
+from skills.schemas.given import Playback, Policy
 from skills.settings import settings
 
 PICTURES = Path("build/demo")
-START_S = 60.0
+START_S = 180.0
 SPACING_MM = (6.0, 0.0, 0.0)  # between suture points, along the wound
 N_POINTS = 5
-SAMPLE_PSM_M = {  # invented, and the plan says so: how PSM_M would come for the needle, and where it would stand
+SAMPLE_PSM_M = {  # invented, and the plan says so: the approach and the base of PSM_M
     "approach": [-0.94, 0.10, -0.33],
     "base": {"position_mm": [160.0, 20.0, 20.0], "rotation_xyzw": [0.0, 0.300706, 0.0, 0.953717]},  # 35 degrees about y
     "source": "invented for the samples",
 }
 REAL_STYLE = ("recorded-psm2", "simple-running")
-REAL_GRID = ("--grid", "fit", "--cell-mm", "2.5")  # its motion ends near the insertion's limit: 5 mm cells overstep it
+# its motion ends near the limit of the insertion joint, which 5 mm cells exceed
+REAL_GRID = ("--grid", "fit", "--cell-mm", "2.5")
 
 out = Console(highlight=False, width=max(Console().width, 110))
 
 
 def main() -> int:
-    """Do the main job; the exit code."""
+    """Run the demo and return the exit code."""
     began = time.monotonic()
     PICTURES.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="suture-skills-") as folder, running_service(Path(folder)) as client:
         styles = tell_styles(client)
         report = Table("style", "states", "DTW mm", "starts", "verdict", "train s", "plan s", "play s", box=None)
-        checked = [check_style(client, *style, report) for style in styles]
+        checked = []
+        for style in styles:
+            checked.append(check_style(client, *style, report))
+            if len(checked) > 1:
+                cancel_films(client)
         out.print("\nLearnt, certified, released; stacked at five suture points; played back in PyBullet:")
         out.print(report)
         draw_samples(client, styles)
         real_recording(client)
+        cancel_films(client)
         save_film(client, checked[0][1], "-".join(styles[0]))
     out.print(f"\nPictures: {PICTURES}/  ({time.monotonic() - began:.1f} s in all). Research use only.")
     return 0 if all(good for good, _ in checked) else 1
@@ -61,7 +67,7 @@ def main() -> int:
 
 @contextmanager
 def running_service(folder: Path) -> Iterator[Client]:
-    """Start the real server on loopback, with an embedded SQLite database in a folder; stop it at the end."""
+    """Start the real server on loopback, with an SQLite database in a folder; stop it at the end."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -70,7 +76,7 @@ def running_service(folder: Path) -> Iterator[Client]:
     try:
         with Client(f"http://127.0.0.1:{port}") as client:
             wait_until_ready(client, server)
-            os.environ["SKILLS_SERVER"] = f"http://127.0.0.1:{port}"  # for the commands that this starts
+            os.environ["SKILLS_SERVER"] = f"http://127.0.0.1:{port}"  # for the commands that are run as subprocesses
             yield client
     finally:
         server.terminate()
@@ -78,7 +84,7 @@ def running_service(folder: Path) -> Iterator[Client]:
 
 
 def wait_until_ready(client: Client, server: subprocess.Popen[bytes]) -> None:
-    """Wait until the service answers."""
+    """Wait until the service answers; exit if it does not within `START_S`."""
     deadline = time.monotonic() + START_S
     while time.monotonic() < deadline and server.poll() is None:
         try:
@@ -91,7 +97,7 @@ def wait_until_ready(client: Client, server: subprocess.Popen[bytes]) -> None:
 
 
 def tell_styles(client: Client) -> list[tuple[str, str]]:
-    """Load the samples and say what was stored: the styles among them."""
+    """Load the samples, print a table of the stored demonstrations, and return their styles."""
     stored = Table("surgeon", "suture type", "demonstration", "from - to s", "states", "crossings", "clutch", box=None)
     styles: dict[tuple[str, str], None] = {}
     for demo in load_samples(client):
@@ -100,13 +106,17 @@ def tell_styles(client: Client) -> list[tuple[str, str]]:
         figures = (str(figure) for figure in (report.path_states, report.revisits, report.clutch_presses))
         stored.add_row(demo.surgeon, demo.suture, demo.id[:12], span, *figures)
         styles[demo.surgeon, demo.suture] = None
-    out.print("Stored, each hand-off as the service proposed it:")
+    out.print("Stored demonstrations, each hand-off as proposed by the service:")
     out.print(stored)
     return list(styles)
 
 
 def check_style(client: Client, surgeon: str, suture: str, report: Table) -> tuple[bool, str]:
-    """Train, release, roll out, plan and play a style: whether everything is as it should be, and the playback."""
+    """Train, release, roll out, plan and play a style, and add a row to the report.
+
+    Returns:
+        Whether the style is followed exactly, from every start, and feasible; and the playback's digest.
+    """
     laps = [time.monotonic()]
     client.wait(client.train(surgeon, suture, release=True))
     policy = client.policy(surgeon, suture)
@@ -131,14 +141,20 @@ def check_style(client: Client, surgeon: str, suture: str, report: Table) -> tup
 
 
 def played(client: Client, plan: str) -> Playback:
-    """Play a plan in the simulator, and give its verdict."""
+    """Play a plan in the simulator, and return the playback."""
     done = client.wait(client.play(plan))
     assert done.result is not None, done
     return client.playback(done.result["playback"])
 
 
+def cancel_films(client: Client) -> None:
+    """Cancel the films that wait to be drawn: one is shown, the others would slow the playbacks down."""
+    for job in client.jobs("queued", "pictures"):
+        client.cancel(job.id)
+
+
 def suture_points(policy: Policy) -> list[dict[str, list[float]]]:
-    """Lay five suture points in a line about the policy's goal."""
+    """Return five suture points on a line through the policy's goal."""
     middle = (N_POINTS - 1) / 2
     return [
         {"position_mm": [g + (i - middle) * d for g, d in zip(policy.goal_mm, SPACING_MM, strict=True)]}
@@ -161,7 +177,7 @@ def draw_samples(client: Client, styles: list[tuple[str, str]]) -> None:
 
 
 def save_film(client: Client, playback: str, name: str) -> None:
-    """Wait for what is drawn of a playback after its verdict, and save it."""
+    """Wait for the film and the plots of a playback, and save them."""
     client.wait(client.draw(playback))
     drawn = {
         "animation.mp4": client.animation(playback),
@@ -176,15 +192,15 @@ def save_film(client: Client, playback: str, name: str) -> None:
 
 
 def real_recording(client: Client) -> None:
-    """Take a real recording through the same line, with the command that a lab would use, where one is there."""
+    """Process a real recording with the command that a lab would use, if one is configured."""
     folder = settings().sample_recordings
     bag = None if folder is None else folder / "rosbag2"
     if bag is None or not bag.is_dir():
-        out.print("\nNo real recording: set SKILLS_SAMPLE_RECORDINGS to a folder with a bag folder rosbag2/ in it.")
+        out.print("\nNo real recording: set SKILLS_SAMPLE_RECORDINGS to a folder that contains a bag folder rosbag2/.")
         return
     surgeon, suture = REAL_STYLE
     client.put_surgeon(surgeon)
-    command = ["demo", "add", str(bag), "--surgeon", surgeon, "--suture", suture, "--proposal", "1", *REAL_GRID]
+    command = ["demo", "add", str(bag), "--surgeon", surgeon, "--suture", suture, *REAL_GRID]
     out.print(f"\nA real recording: skills {' '.join([*command[:2], bag.name, *command[3:]])}", soft_wrap=True)
     subprocess.run([sys.executable, "-m", "skills", *command], check=True)  # noqa: S603 - our own command
     try:
@@ -200,18 +216,22 @@ def real_recording(client: Client) -> None:
         + ("released." if result["released"] else f"not released: {result['not_released_because']}")
     )
     try:
-        plan = client.plan(surgeon, suture, [{"position_mm": policy.goal_mm}], version=policy.version)
+        plan = client.plan(surgeon, suture, [{"position_mm": policy.goal_mm}], version=policy.version, handoff="none")
     except Problem as refused:
         out.print(f"Not played back: {refused}", soft_wrap=True)
         return
     playback = played(client, plan.id)
     (PICTURES / "real-recording-playback.png").write_bytes(client.picture(playback.id))
-    out.print(f"Played back at its own place: {verdict(playback)}")
+    assert playback.headline is not None, playback
+    out.print(f"Played back at its own place: {playback.headline.text}", soft_wrap=True)
 
 
 def verdict(playback: Playback) -> str:
-    """Say a playback's verdict."""
-    return "feasible" if playback.feasible else str(playback.report.failure_in_words)
+    """Return a playback's verdict in words."""
+    line = playback.headline
+    if not playback.feasible or line is None or line.probability is None:
+        return "feasible, not judged" if playback.feasible else str(playback.report.failure_in_words)
+    return f"feasible, {line.probability.count} of {line.probability.of} worlds"
 
 
 if __name__ == "__main__":

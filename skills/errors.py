@@ -1,63 +1,100 @@
-"""Everything that this package refuses, as one tree.
+"""The errors of this package, as one tree.
 
     SkillsError
-    ├── BadInput                what was given is wrong, and nothing was kept
+    ├── BadInput                the input is wrong; nothing was stored
     │   ├── BadRecording        the file: unreadable, no usable topic, mixed frames, not metres ...
     │   ├── BadPath             the demonstration in its grid: outside it, never leaving the goal ...
-    │   ├── BadSettings         a learner, grid or request that cannot be meant
+    │   ├── BadSettings         a learner, grid or request with impossible settings
     │   ├── BadPlan             a plan or trajectory that the arm cannot follow
-    │   └── BadBag              a bag for replay that is not what its plan and its verdict say
-    ├── WrongHost               the request was meant for another name than those of this service
-    ├── NotSignedIn             who asks showed no key, or none that counts
-    ├── NotAllowed              who asks may not do this
-    ├── TooMany                 over a rate or an allowance of the key
-    ├── NotFound                no such thing here (and what there is instead)
-    │   └── NotDrawnYet         a picture that is being drawn, or that nobody asked for
-    ├── Erased                  it was here and was erased for good
-    ├── Conflict                it cannot be done in the present state
-    │   └── LearnerNotInstalled a learner that needs what is not installed here
-    ├── PreconditionFailed      it changed since the caller last looked
-    ├── UnknownFormat           the content is of no format that is read here
-    ├── TooLarge                over a limit of the settings
-    ├── TooSlow                 the body of a request did not come in time
-    ├── Corrupt                 what was stored is no longer what was stored
-    ├── Busy                    the database or the queue cannot take it now
+    │   ├── AmbiguousDigest     a digest prefix that several objects share
+    │   └── BadBag              a replay bag that does not match its plan and its verdict
+    ├── WrongHost               the request was sent to a name that is not one of this service
+    ├── NotSignedIn             the request has no valid credentials
+    ├── NotAllowed              the caller may not do this
+    ├── TooMany                 over a rate limit or an allowance of the key
+    ├── NotFound                no such object (with the existing ones)
+    │   └── NotDrawnYet         a picture that is being drawn, or was not requested
+    ├── Erased                  the object was erased permanently
+    ├── Conflict                not possible in the present state
+    │   └── LearnerNotInstalled a learner whose optional dependencies are not installed
+    ├── PreconditionFailed      the object changed since the caller last read it
+    ├── UnknownFormat           the content has no format that is read here
+    ├── TooLarge                over a size limit of the settings
+    ├── TooSlow                 the body of a request did not arrive in time
+    ├── Corrupt                 stored data no longer matches its digest
+    ├── Busy                    the database or the queue cannot be used now
+    │   ├── StorageFull         a disk is full: of the database, or of temporary files
     │   └── NotReady            a part of the installation cannot be used; the message says which
-    ├── SimulationFailed        the simulator crashed, hung or answered nonsense
-    ├── LearningFailed          the process that learns crashed, hung or took too much
-    └── Unanswered              a process of ours gave no answer; whoever asked it says so in words of its own
+    │       └── DatabaseUnusable    its database, and why: logged, and never sent over HTTP
+    ├── SimulationFailed        the simulator crashed, hung or returned nonsense
+    ├── LearningFailed          the learning process crashed, hung or exceeded its limits
+    └── Unanswered              a subprocess returned no result; its caller raises an error in words of its own
 
-An error is named after what is wrong, carries the offending numbers as attributes of `numbers`, and its message says
-what to do next. Only `skills.api.problems` knows which status code each one becomes.
+An error is named after the fault and has the offending numbers in its attribute `numbers`. Its message is "fault;
+remedy" if the remedy reads the same for every interface; otherwise the remedy is a `Remedy`, which HTTP, the command
+line and Python each word in their own terms (`skills.remedies`). Only `skills.api.problems` knows the status codes.
 """
+
+from collections.abc import Mapping
+from typing import TypeVar
+
+from skills.remedies import Door, Remedy
 
 
 class SkillsError(Exception):
-    """The root; `numbers` holds the offending values, safe to show to the caller."""
+    """Base class of all errors.
 
-    def __init__(self, message: str, **numbers: object) -> None:
+    Attributes:
+        message: The fault, in words that fit every interface.
+        remedies: Remedies: an action, or a sentence that fits every interface.
+        numbers: The offending values, safe to show to the caller.
+    """
+
+    def __init__(self, message: str, *remedies: Remedy | str, **numbers: object) -> None:
         super().__init__(message)
+        self.message = message
+        self.remedies = remedies
         self.numbers = numbers
+
+    def __str__(self) -> str:
+        """Return the fault and the remedies in the words of Python."""
+        return self.words(Door.PYTHON)
+
+    def words(self, door: Door | None = None) -> str:
+        """Return fault and remedies in the words of an interface; without one, as jobs store it, only what fits all."""
+        return " ".join([self.message, *self.advice(door)])
+
+    def advice(self, door: Door | None) -> list[str]:
+        """Return a sentence for each remedy."""
+        plain = (one if isinstance(one, str) else None if door is None else one.words(door) for one in self.remedies)
+        return [one for one in plain if one is not None]
+
+
+E = TypeVar("E", bound=SkillsError)
 
 
 class BadInput(SkillsError):
-    """What was given is wrong; nothing was kept."""
+    """The input is wrong; nothing was stored."""
+
+
+class AmbiguousDigest(BadInput):
+    """Several objects share the prefix of a digest; `numbers["candidates"]` has their digests."""
 
 
 class WrongHost(SkillsError):
-    """The request was meant for another name than those of this service."""
+    """The request was sent to a host name that is not one of this service."""
 
 
 class NotSignedIn(SkillsError):
-    """Who asks showed no key, or none that counts."""
+    """The request has no credentials, or invalid ones."""
 
 
 class NotAllowed(SkillsError):
-    """Who asks may not do this."""
+    """The caller may not do this."""
 
 
 class TooMany(SkillsError):
-    """Over a rate or an allowance of the key; it may go on after `wait_s`."""
+    """A rate limit or an allowance of the key is exceeded; it allows more after `wait_s` seconds."""
 
     def __init__(self, message: str, wait_s: float) -> None:
         super().__init__(message, wait_s=round(wait_s, 1))
@@ -65,60 +102,81 @@ class TooMany(SkillsError):
 
 
 class NotFound(SkillsError):
-    """No such thing here."""
+    """There is no such object."""
 
 
 class NotDrawnYet(NotFound):
-    """A picture that is being drawn, or that nobody asked for; the message says which."""
+    """A picture is being drawn, or was not requested; the message says which."""
 
 
 class Erased(SkillsError):
-    """It was here and was erased for good."""
+    """The object was erased permanently."""
 
 
 class Conflict(SkillsError):
-    """It cannot be done in the present state."""
+    """The request is not possible in the present state."""
 
 
 class PreconditionFailed(SkillsError):
-    """It changed since the caller last looked."""
+    """The object changed since the caller last read it."""
 
 
 class UnknownFormat(SkillsError):
-    """The content is of no format that is read here."""
+    """The content has no format that is read here."""
 
 
 class TooLarge(SkillsError):
-    """Over a limit of the settings."""
+    """A size limit of the settings is exceeded."""
 
 
 class TooSlow(SkillsError):
-    """The body of a request did not come in time."""
+    """The body of a request did not arrive in time."""
 
 
 class Corrupt(SkillsError):
-    """What was stored is no longer what was stored."""
+    """Stored data no longer matches its digest."""
 
 
 class Busy(SkillsError):
-    """The database or the queue cannot take it now."""
+    """The database or the queue cannot be used now."""
+
+
+class StorageFull(Busy):
+    """A disk is full, of the database or of temporary files: a retry does not help, free space does."""
 
 
 class NotReady(Busy):
     """A part of the installation cannot be used: its database, its queue, its workers."""
 
 
+class DatabaseUnusable(NotReady):
+    """The database cannot be used; the message names its file or server, so it is logged and never sent over HTTP."""
+
+
 class SimulationFailed(SkillsError):
-    """The simulator crashed, hung or answered nonsense: the check did not happen."""
+    """The simulator crashed, hung or returned nonsense: there is no verdict."""
 
 
 class Unanswered(SkillsError):
-    """A process of ours gave no answer: the `cause` in a word or three, and what it `did`, as a sentence goes on."""
+    """A subprocess returned no result: `cause` in one to three words, and `did` as the predicate of a sentence."""
 
     def __init__(self, cause: str, did: str) -> None:
-        super().__init__(f"A process of ours {did}.", cause=cause)
+        super().__init__(f"A subprocess {did}.", cause=cause)
         self.cause = cause
         self.did = did
+
+    def translated(self, kind: type[E], subject: str, advice: Mapping[str, str]) -> E:
+        """Return it as an error in the words of the caller, with the same cause and notes.
+
+        Args:
+            kind: The class of the error.
+            subject: The subject of its message, such as "The simulator".
+            advice: The remedy for each cause.
+        """
+        error = kind(f"{subject} {self.did}; {advice[self.cause]}.", cause=self.cause)
+        for words in getattr(self, "__notes__", ()):
+            error.add_note(words)
+        return error
 
 
 # ---- recordings ------------------------------------------------------------------------------------------------
@@ -129,43 +187,47 @@ class BadRecording(BadInput):
 
 
 class UnreadableRecording(BadRecording):
-    """Empty, truncated or corrupt."""
+    """The file is empty, truncated or corrupt."""
 
 
 class NoUsableTopic(BadRecording):
-    """No topic or column with the pose of an arm."""
+    """The file has no topic or column with the pose of an arm."""
 
 
 class MixedFrames(BadRecording):
-    """Poses of one topic are given in more than one frame."""
+    """The poses of one topic are in more than one frame."""
 
 
 class BackwardStamps(BadRecording):
-    """Time runs backwards."""
+    """Time stamps decrease."""
 
 
 class RepeatedStamps(BadRecording):
-    """More than half of the samples carry the stamp of the sample before: the clock stood still."""
+    """More than half of the samples have the time stamp of the sample before: the clock stood still."""
 
 
 class NotFinite(BadRecording):
-    """NaN or infinity among the numbers."""
+    """A number is NaN or infinite."""
 
 
 class NotMetres(BadRecording):
-    """A magnitude that cannot be metres of a PSM; never rescaled by guess."""
+    """A magnitude cannot be metres of a PSM; it is never rescaled by guess."""
 
 
 class NotAQuaternion(BadRecording):
-    """A quaternion whose length is not one."""
+    """A quaternion does not have length one."""
 
 
 class BadColumns(BadRecording):
-    """The header of a table is unknown, doubled, incomplete or ambiguous."""
+    """The header of a table is unknown, duplicated, incomplete or ambiguous."""
 
 
 class BadSegment(BadRecording):
-    """The part asked for is not in the recording."""
+    """The requested part is not in the recording."""
+
+
+class SegmentNotNamed(BadSegment):
+    """Several hand-offs are proposed in a recording, and the request names none of them."""
 
 
 # ---- the path in its grid ---------------------------------------------------------------------------------------
@@ -176,65 +238,69 @@ class BadPath(BadInput):
 
 
 class EmptyPath(BadPath):
-    """A path without points."""
+    """The path has no points."""
 
 
 class OutsideGrid(BadPath):
-    """Points outside the grid world."""
+    """Points are outside the grid world."""
 
 
 class NeverLeavesGoal(BadPath):
-    """All of the path lies in its goal's cell."""
+    """The complete path lies in the cell of its goal."""
 
 
 # ---- learning ---------------------------------------------------------------------------------------------------
 
 
 class BadSettings(BadInput):
-    """Settings that cannot be meant."""
+    """A setting has an impossible value."""
 
 
 class LearnerNotInstalled(Conflict):
-    """A learner that needs what is not installed here; the same request can be met once it is."""
+    """The learner's optional dependencies are not installed; the same request can succeed once they are."""
 
 
 class LearningFailed(SkillsError):
-    """The process that learns crashed, hung, or needed more than it may have: nothing was learnt."""
+    """The learning process crashed, hung, or exceeded its limits: nothing was learnt."""
 
 
 # ---- plans and motion -------------------------------------------------------------------------------------------
 
 
 class BadPlan(BadInput):
-    """A plan that cannot be made."""
+    """The plan cannot be made."""
 
 
 class Unreachable(BadPlan):
-    """A pose that the arm cannot take."""
+    """The arm cannot take a pose."""
 
 
 class UnknownInstrument(BadPlan):
-    """An instrument whose constants are not known here."""
+    """The constants of an instrument are not known here."""
 
 
 class ImproperRotation(BadPlan):
-    """A matrix or quaternion that is no rotation."""
+    """A matrix or quaternion is not a rotation."""
 
 
 class NoApproach(BadPlan):
-    """The direction in which PSM_M approaches is missing or has no length."""
+    """The approach direction of PSM_M is missing or has length zero."""
+
+
+class NoHandOff(BadPlan):
+    """The plan would hand nothing over, and was not requested as such."""
 
 
 class BadSpeed(BadPlan):
-    """A speed or rate that no motion can have."""
+    """The speed or rate is impossible for a motion."""
 
 
 class NoMotion(BadPlan):
-    """A pass in which nothing moves."""
+    """Nothing moves in a pass."""
 
 
 # ---- replay -----------------------------------------------------------------------------------------------------
 
 
 class BadBag(BadInput):
-    """A bag for replay that is not whole, or not what its plan and its verdict say: no arm should follow it."""
+    """A replay bag is incomplete or does not match its plan and its verdict: no arm should follow it."""

@@ -1,8 +1,8 @@
-"""What the processes say while they run: lines of text or of JSON, with the request or the job that they belong to.
+"""Logging: one line per record, as text or JSON, with the id of its request or job.
 
-A line may hold ids, routes, kinds, numbers and times. It never holds a pseudonym, a file's name, a body or a path: of
-an exception it gives the class and the places in the code, not the words, which may repeat what was sent or stored;
-of a library's message it gives the first line as that was written, without what would have been filled in.
+A line may contain ids, routes, kinds, numbers and times. It never contains a pseudonym, a file name, a body or a path.
+Of an exception it has the class and the places in the code, not the message, which may repeat data that was sent or
+stored. Of a library's record it has the first line of the format string, without the arguments.
 """
 
 import json
@@ -14,37 +14,37 @@ from types import TracebackType
 from typing import Any
 
 OURS = "skills"
-PLACES = 12  # of a traceback, the innermost
+PLACES = 12  # innermost frames of a traceback that are logged
 
 request_id: ContextVar[str | None] = ContextVar("request_id", default=None)
 job_id: ContextVar[str | None] = ContextVar("job_id", default=None)
 
 
 def configure(level: str, *, as_json: bool) -> None:
-    """Send what this process says to standard error: of ours all from a level on, of the libraries their warnings."""
+    """Configure logging to standard error: our loggers from `level` on, those of libraries from warnings on."""
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(Lines(as_json=as_json))
     root = logging.getLogger()
     root.handlers[:] = [handler]
     root.setLevel(logging.WARNING)
     logging.getLogger(OURS).setLevel(level.upper())
-    logging.getLogger("dbos").addHandler(logging.NullHandler())  # where it finds none, it writes past us
+    logging.getLogger("dbos").addHandler(logging.NullHandler())  # without a handler it would add one of its own
 
 
 def told(logger: logging.Logger, message: str, level: int = logging.INFO, **fields: Any) -> None:
-    """Write a line with fields."""
+    """Log a record with fields."""
     logger.log(level, message, extra={"fields": fields})
 
 
 class Lines(logging.Formatter):
-    """One line for each record."""
+    """Formatter that writes one line per record, without personal data."""
 
     def __init__(self, *, as_json: bool) -> None:
         super().__init__()
         self._as_json = as_json
 
     def format(self, record: logging.LogRecord) -> str:
-        """Write a record, and nothing of anybody in it."""
+        """Return a record as one line of text or JSON."""
         line = {
             "at": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
             "level": record.levelname.lower(),
@@ -68,7 +68,7 @@ def _message(record: logging.LogRecord) -> str:
 
 
 def _without_words(error: BaseException) -> dict[str, Any]:
-    """Say what was raised and where, and what that came from."""
+    """Return the class of an exception, its places in the code, and the classes of its causes, without messages."""
     causes: list[str] = []
     one = error
     while (cause := one.__cause__ or one.__context__) is not None and len(causes) < PLACES:

@@ -1,9 +1,13 @@
-"""Values as plain JSON and arrays, and back, without pickle.
+"""Serialisation of values as plain JSON and arrays, without pickle.
 
     value --flatten--> a tree of plain JSON whose leaves point to arrays --build--> the same value
 
-Both are laid out in one `.npz` archive. What is built back is of the classes that the reader names, no other, and their
-constructors check every number again.
+The tree and the arrays are stored in one `.npz` archive. `build` constructs only the classes that the reader passes,
+and their constructors check every number again.
+
+An array with few distinct numbers is stored as a *palette*: the distinct numbers, and for each element the index of its
+number. A policy has a hundred thousand Q values or more, of which some 130 are distinct, because a value depends only
+on the distance to the next waypoints. As a palette they take an eighth of the bytes, before any compression.
 """
 
 import hashlib
@@ -11,11 +15,50 @@ import json
 import zipfile
 from collections.abc import Mapping
 from dataclasses import Field, fields, is_dataclass
-from typing import IO, Any
+from typing import IO, Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from skills.style.palette import Palette, painted, palette_of
+from skills.arrays import Floats
+from skills.learning import _kernels
+
+MOST_COLOURS = 256  # so that an index is one byte
+SLOTS_BITS = 10  # 2^10 slots in the hash table, of which at most a quarter are filled
+
+
+class Palette(NamedTuple):
+    """The distinct numbers of an array, (colours,), in order of first appearance, and the index of each element."""
+
+    colours: Floats
+    places: NDArray[np.uint8]
+
+
+def palette_of(values: Floats) -> Palette | None:
+    """Return the palette of an array, exact to the bit, also for -0 and NaN; None if it exceeds `MOST_COLOURS`."""
+    # Compared as bits, so that -0 and 0 remain different and a NaN equals itself.
+    bits = np.require(values, np.float64, ("C", "A")).reshape(-1).view(np.uint64)
+    bits.flags.writeable = False  # always the same numba type: see `skills.compiled`
+    found, places = np.empty(MOST_COLOURS, np.uint64), np.empty(bits.size, np.uint8)
+    slots = np.full(1 << SLOTS_BITS, -1, np.int16)
+    colours = _kernels.tell_apart_compiled(bits, found, places, slots, np.uint64(64 - SLOTS_BITS))
+    if colours < 0:
+        return None
+    return Palette(found[:colours].view(np.float64).copy(), places.reshape(values.shape))
+
+
+def painted(palette: Palette) -> Floats:
+    """Return the array of a palette.
+
+    Raises:
+        ValueError: The arrays are not a palette.
+        IndexError: An index has no number.
+    """
+    colours, places = palette
+    if colours.dtype != np.float64 or colours.ndim != 1 or places.dtype != np.uint8:
+        raise ValueError("A palette is a row of numbers and the bytes that index them.")
+    return colours[places]
+
 
 Arrays = list[np.ndarray[Any, Any]]
 Known = Mapping[str, type]
@@ -25,72 +68,79 @@ _FEW: set[tuple[type, str]] = set()
 
 
 def known(*classes: type) -> dict[str, type]:
-    """Name the classes of values that may be built back."""
+    """Return the classes that `build` may construct, by name."""
     assert all(is_dataclass(one) for one in classes), classes
     return {one.__name__: one for one in classes}
 
 
 def added_later(value: type, field: str) -> None:
-    """Name a field that a class got after values of it had been stored; its default is what all of them had.
+    """Register a field that was added to a class after values of it had been stored.
 
-    It is left out while it holds that default, so that every value keeps its digest.
+    Its default is the value that all stored ones had. The field is omitted while it has that default, so that every
+    value has the same digest as before.
     """
     _ADDED.add((value, field))
 
 
 def few_numbers(value: type, field: str) -> None:
-    """Name a field whose array has few different numbers: it is written as their palette, if that can name them all."""
+    """Register a field whose array has few distinct numbers: it is stored as a palette, if that has room for them."""
     _FEW.add((value, field))
 
 
 def sha256(data: bytes) -> str:
-    """Compute the SHA-256 of bytes, in hex."""
+    """Return the SHA-256 of bytes, in hex."""
     return hashlib.sha256(data).hexdigest()
 
 
 def canonical(data: Any) -> bytes:
-    """Write JSON in the one way that digests are taken of: sorted keys, no spaces, no NaN."""
+    """Serialise JSON in the one form that digests are computed from: sorted keys, no spaces, no NaN."""
     return json.dumps(data, sort_keys=True, separators=(",", ":"), allow_nan=False, ensure_ascii=True).encode()
 
 
 def write(file: IO[bytes], value: Any, classes: Known) -> None:
-    """Lay a value out in a file, quickly."""
+    """Write a value to a file as an archive, uncompressed for speed."""
     arrays: Arrays = []
     tree = flatten(value, arrays, classes)
     np.savez(file, **named(tree, arrays))  # type: ignore[arg-type]
 
 
 def named(tree: Any, arrays: Arrays) -> dict[str, np.ndarray[Any, Any]]:
-    """Name the parts of a flattened value as an archive has them."""
+    """Return the parts of a flattened value under their names in the archive."""
     return {"tree": np.frombuffer(canonical(tree), np.uint8), **{f"a{i}": a for i, a in enumerate(arrays)}}
 
 
 def read(file: IO[bytes], classes: Known) -> Any:
-    """Build the value that was written.
+    """Read a value that `write` has written.
 
     Raises:
-        Exception: Of any class, where the file holds anything else.
+        Exception: Of any class, if the file contains anything else.
     """
-    with np.load(file, allow_pickle=False) as archive:
+    with np.load(file, allow_pickle=False) as archive:  # a pickle could run code
         return assemble(archive, classes)
 
 
 def assemble(archive: Mapping[str, np.ndarray[Any, Any]], classes: Known) -> Any:
-    """Build the value whose parts an archive holds."""
+    """Return the value whose parts are in an archive."""
     tree = json.loads(archive["tree"].tobytes())
     return build(tree, [archive[f"a{i}"] for i in range(len(archive) - 1)], classes)
 
 
 def unfolded_bytes(file: IO[bytes]) -> int:
-    """Say how much memory the arrays of an archive would take: a compressed one is smaller than what it holds."""
+    """Return the memory in bytes that the arrays of an archive take: more than the size of a compressed archive."""
     with zipfile.ZipFile(file) as archive:
         size = sum(entry.file_size for entry in archive.infolist())
-    file.seek(0)
+    file.seek(0)  # for the reader that follows
     return size
 
 
 def flatten(value: Any, arrays: Arrays, classes: Known) -> Any:
-    """Write a value as plain JSON, its arrays and bytes put into `arrays`."""
+    """Return a value as plain JSON; its arrays and bytes are appended to `arrays`.
+
+    Args:
+        value: A value: numbers, texts, arrays, bytes, tuples, lists, dicts and dataclasses of them.
+        arrays: The arrays to which the JSON refers by index.
+        classes: The classes of dataclasses that may occur, by name.
+    """
     if isinstance(value, np.ndarray):
         arrays.append(np.ascontiguousarray(value))
         return {"array": len(arrays) - 1}
@@ -101,6 +151,7 @@ def flatten(value: Any, arrays: Arrays, classes: Known) -> Any:
         arrays.append(np.frombuffer(value, np.uint8))
         return {"bytes": len(arrays) - 1}
     if is_dataclass(value) and not isinstance(value, type):
+        # A value of another class could be written, but not be read back.
         assert classes.get(type(value).__name__) is type(value), f"{type(value).__name__} is not declared"
         written = {f.name: _part(value, f.name) for f in fields(value) if _is_written(value, f)}
         return {
@@ -117,7 +168,16 @@ def flatten(value: Any, arrays: Arrays, classes: Known) -> Any:
 
 
 def build(tree: Any, arrays: Arrays, classes: Known) -> Any:
-    """Build the value that was flattened."""
+    """Return the value that was flattened; lists come back as tuples.
+
+    Args:
+        tree: The plain JSON.
+        arrays: The arrays to which it refers.
+        classes: The classes that may be constructed, by name.
+
+    Raises:
+        Exception: Of any class, if the tree is not one that `flatten` returned.
+    """
     if not isinstance(tree, dict):
         return tree
     if "array" in tree:

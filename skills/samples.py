@@ -1,11 +1,27 @@
-"""Loading the sample surgeons into a service, as a lab would load its own."""
+"""Loading of recordings into a service: the sample surgeons, and folders of the JIGSAWS data set.
 
+A JIGSAWS folder is sent trial by trial: a recording each, its surgeon, and the hand-offs proposed in it. The data set
+is available on request from its authors and is not part of this project. Sending it again changes nothing, because a
+recording is identified by its bytes and a demonstration by its part of the recording. An error is recorded for its
+trial, and the others continue.
+"""
+
+import io
+import re
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from importlib import resources
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import IO
 
-from skills.api.schemas.given import Demonstration
-from skills.client import Client
+from skills.client import Client, Problem
+from skills.errors import BadInput, SkillsError
+from skills.formats.archive import pack
+from skills.formats.jigsaws import Skill, Trial, meta_line, trials
+from skills.schemas.given import Demonstration, Recording
 from skills.seeds.recordings import sample_recordings
 
 
@@ -25,3 +41,135 @@ def load_samples(client: Client) -> Iterator[Demonstration]:
                 start_s=part.start_s,
                 end_s=part.end_s,
             )
+
+
+NOT_FOUND = "not-found"
+
+
+@dataclass
+class Sent:
+    """The outcome of sending one trial.
+
+    Attributes:
+        trial: Its name.
+        surgeon: The surgeon's pseudonym.
+        skill_level: As the surgeon stated; None if the meta file has none.
+        score: The global rating score, 6 to 30; None likewise.
+        recording: The recording's digest; None if it was refused.
+        proposed: The number of hand-offs that the service proposed, of the requested arm.
+        demos: The digests of those that became demonstrations.
+        problems: The errors, as text.
+    """
+
+    trial: str
+    surgeon: str
+    skill_level: Skill | None
+    score: int | None
+    recording: str | None = None
+    proposed: int = 0
+    demos: list[str] = field(default_factory=list)
+    problems: list[str] = field(default_factory=list)
+
+
+def find_trials(folder: Path, tasks: Sequence[str] = ()) -> list[Trial]:
+    """Return the trials in a folder, of all tasks or of some.
+
+    Raises:
+        BadInput: There are none.
+    """
+    found = [trial for trial in trials(folder) if not tasks or trial.task in tasks]
+    if not found:
+        raise BadInput(
+            f"{folder} has no trials of JIGSAWS{' in ' + ', '.join(tasks) if tasks else ''}; they are expected as "
+            "TASK/kinematics/AllGestures/TASK_B001.txt."
+        )
+    return found
+
+
+def send_trials(
+    client: Client,
+    found: Sequence[Trial],
+    *,
+    suture: str | None = None,
+    arm: str | None = None,
+    prefix: str = "jigsaws",
+) -> Iterator[Sent]:
+    """Send trials one after the other, each with its surgeon.
+
+    Args:
+        client: The service.
+        found: The trials, from `find_trials`.
+        suture: The suture type of the demonstrations; None stores recordings only.
+        arm: The arm of the hand-offs, "PSM_left" or "PSM_right"; None: both.
+        prefix: Prefix of pseudonyms, before the surgeon's letter.
+    """
+    known: set[str] = set()
+    for trial in found:
+        rated = trial.rated
+        sent = Sent(
+            trial=trial.name,
+            surgeon=f"{prefix}-{trial.user.lower()}",
+            skill_level=None if rated is None else rated.skill,
+            score=None if rated is None else rated.score,
+        )
+        try:
+            # once for each surgeon, not for each trial
+            if sent.surgeon not in known:
+                _make_known(client, sent.surgeon, sent.skill_level)
+                known.add(sent.surgeon)
+            with _packed(trial) as file:
+                stored = client.add_recording(file, surgeon=sent.surgeon)
+            sent.recording = stored.sha256
+            _cut(client, stored, sent, suture, arm)
+        except SkillsError as error:
+            # a refused trial does not stop the others
+            sent.problems.append(str(error))
+        yield sent
+
+
+def _make_known(client: Client, surgeon: str, skill_level: Skill | None) -> None:
+    """Create a surgeon, unless the surgeon exists."""
+    try:
+        client.surgeon(surgeon)
+    except Problem as problem:
+        if problem.kind != NOT_FOUND:
+            raise
+        client.put_surgeon(surgeon, skill_level=skill_level)
+
+
+def _cut(client: Client, stored: Recording, sent: Sent, suture: str | None, arm: str | None) -> None:
+    proposed = [part for part in stored.segments if arm in (None, part.arm)]
+    sent.proposed = len(proposed)
+    for part in proposed if suture else ():
+        session = re.sub(r"[^a-z0-9_-]", "-", sent.trial.lower())
+        try:
+            demo = client.cut_demo(
+                stored.sha256,
+                surgeon=sent.surgeon,
+                suture=str(suture),
+                arm=part.arm,
+                start_s=part.start_s,
+                end_s=part.end_s,
+                session=session,
+            )
+            sent.demos.append(demo.id)
+        except SkillsError as error:
+            sent.problems.append(f"{part.arm} {part.start_s:.1f} to {part.end_s:.1f} s: {error}")
+
+
+@contextmanager
+def _packed(trial: Trial) -> Iterator[Path]:
+    """Yield the file to send: the kinematics, zipped with its gestures and rating if there are any."""
+    if trial.transcription is None and trial.rated is None:
+        yield trial.kinematics
+        return
+    with TemporaryDirectory() as folder, trial.kinematics.open("rb") as kinematics:
+        members: dict[str, IO[bytes]] = {trial.kinematics.name: kinematics}
+        if trial.transcription is not None:
+            members[f"transcriptions/{trial.kinematics.name}"] = io.BytesIO(trial.transcription.read_bytes())
+        if trial.rated is not None:
+            members["meta_file.txt"] = io.BytesIO(meta_line(trial.rated).encode())
+        path = Path(folder) / "trial.zip"
+        with path.open("wb") as out:
+            pack(members, out)
+        yield path

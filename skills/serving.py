@@ -1,21 +1,33 @@
-"""Starting the service: the application in this process, its workers in children at lower priority.
+"""`skills serve`: the server with its time limits on connections, and its workers.
 
-First it answers, then it gets ready for what only some requests need.
+uvicorn closes only connections that are idle between two requests. Here the head of a request must arrive in time too,
+and so must the rest of a body when its response is out; and a client must read a response at a minimum rate. A closed
+connection still waits for its unsent bytes, so the rate is measured until the last byte is sent.
+
+The application runs in this process; its workers are child processes at lower priority, so that Python computation
+never delays a response. The service answers first; work that only some requests need, such as loading compiled loops,
+is done afterwards in a thread.
 """
 
+import errno
 import gc
 import logging
+import os
 import signal
 import socket
+import struct
 import subprocess
 import sys
 import threading
 import time
+from asyncio import TimerHandle, Transport
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from types import FrameType
+from typing import Any, cast
 
 import uvicorn
+from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 from skills import logs
 from skills.api.app import create_app, prepare_database
@@ -23,18 +35,171 @@ from skills.client import Client
 from skills.compiled import check_wanted
 from skills.db.session import Database
 from skills.errors import BadSettings, SkillsError
-from skills.jobs.child import start_worker_child
-from skills.jobs.warm import align_once, warm_up
+from skills.jobs.warm_up import align_once, warm_up
+from skills.library.backup import keep_erasures, keep_up_erasures
 from skills.library.keys import refuse_without_keys
-from skills.punctual import PunctualConnection
+from skills.remedies import Action, Remedy
 from skills.samples import load_samples
-from skills.settings import Settings
-
-GRACE_S = 12  # a worker finishes what it has begun within ten
-RESTART_S = 1.0
-FURTHER_S = 5.0  # from one worker to the next: several that start at once are all ready later than the first alone
+from skills.settings import PREFIX, Settings
 
 log = logging.getLogger("skills.serving")
+
+HEAD_S = 10.0
+LOOK_S = 1.0  # seconds between two checks of the unsent bytes
+# in the kernel's buffer, which without a limit takes MBs at once, and then none for many seconds
+UNSENT_BYTES = 128 << 10
+# TLS would buffer 512 KiB and pass them on at once: half a minute's bytes at the minimum rate
+BUFFERED_BYTES = 64 << 10
+AT_ONCE = struct.pack("ii", 1, 0)  # SO_LINGER of 0 s: closing the socket discards unsent bytes
+
+
+# Imports create no garbage, and looking for it takes a fifth of the start; `run_worker` enables the collector.
+_WORKER = "import gc; gc.disable(); from skills.jobs.worker import main; main()"
+GRACE_S = 12  # a worker finishes its work in progress within ten
+RESTART_S = 1.0
+ERASURES_EVERY_S = 1.0  # ours: an erasure may be missing in the list for this long
+FURTHER_S = 5.0  # between the starts of workers: several that start at once are all ready later than one alone
+
+
+class Counted:
+    """A proxy of a transport that counts the bytes written to it."""
+
+    def __init__(self, transport: Transport, written: Callable[[], None]) -> None:
+        self.written_bytes = 0
+        self._transport, self._written = transport, written
+
+    def write(self, data: bytes) -> None:
+        """Write the data, count it, and call the callback."""
+        self.written_bytes += len(data)
+        self._transport.write(data)
+        self._written()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._transport, name)
+
+
+class PunctualConnection(HttpToolsProtocol):
+    """An HTTP connection that is closed when its client is too slow.
+
+    It is closed after waiting `HEAD_S` for a head or for the rest of an answered request. It is aborted when the client
+    is `patience_s` behind: the time with unsent bytes, minus the time that the bytes taken meanwhile need at
+    `bytes_per_s`. Fast reading earlier earns no credit. `connections` creates the subclass with the values of the
+    settings.
+    """
+
+    patience_s: float
+    bytes_per_s: int
+    _due: TimerHandle | None = None
+    _look: TimerHandle | None = None
+    _behind_s = 0.0
+    _taken_bytes = 0  # at the last check
+    _counted: Counted
+
+    def connection_made(self, transport: Transport) -> None:  # type: ignore[override]
+        """Start the timeout of the first request."""
+        self._counted = Counted(transport, self._wrote)
+        # missing on some systems, where slow readers need a larger `patience_s`
+        if hasattr(socket, "TCP_NOTSENT_LOWAT"):
+            option = (socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, UNSENT_BYTES)
+            transport.get_extra_info("socket").setsockopt(*option)
+        transport.set_write_buffer_limits(high=BUFFERED_BYTES)
+        super().connection_made(cast(Transport, self._counted))
+        self._expect()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Cancel the timers."""
+        self._have()
+        if self._look is not None:
+            self._look.cancel()
+        super().connection_lost(exc)
+
+    def on_message_begin(self) -> None:
+        """Start the timeout of the rest of the head."""
+        self._expect()
+        super().on_message_begin()
+
+    def on_headers_complete(self) -> None:
+        """Cancel the timeout: the reader of the body has one of its own."""
+        self._have()
+        super().on_headers_complete()
+
+    def on_response_complete(self) -> None:
+        """Start the timeout of a body that nothing reads any more."""
+        if self.cycle.more_body:
+            self._expect()
+        super().on_response_complete()
+
+    def on_message_complete(self) -> None:
+        """Cancel the timeout at the end of a request."""
+        self._have()
+        super().on_message_complete()
+
+    def _expect(self) -> None:
+        self._have()
+        self._due = self.loop.call_later(HEAD_S, self._close)
+
+    def _have(self) -> None:
+        if self._due is not None:
+            self._due.cancel()
+            self._due = None
+
+    def _close(self) -> None:
+        if not self.transport.is_closing():
+            self.transport.close()
+
+    def _taken(self) -> int:
+        """Return the number of bytes that the system has taken for the client since the connection was made."""
+        return self._counted.written_bytes - self.transport.get_write_buffer_size()
+
+    def _wrote(self) -> None:
+        """Start checking the client's rate, unless everything written was taken at once."""
+        if self._look is None and self.transport.get_write_buffer_size():
+            self._taken_bytes, self._behind_s = self._taken(), 0.0
+            self._look = self.loop.call_later(LOOK_S, self._look_on)
+
+    def _look_on(self) -> None:
+        """Abort the connection if the client is too far behind; stop checking once it has taken everything."""
+        self._look = None
+        if not self.transport.get_write_buffer_size():
+            return
+        taken = self._taken()
+        self._behind_s = max(0.0, self._behind_s + LOOK_S - (taken - self._taken_bytes) / self.bytes_per_s)
+        self._taken_bytes = taken
+        if self._behind_s >= self.patience_s:
+            log.info("A client did not read its response; its connection was closed.")
+            self.transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, AT_ONCE)
+            self.transport.abort()
+        else:
+            self._look = self.loop.call_later(LOOK_S, self._look_on)
+
+
+def connections(settings: Settings) -> type[PunctualConnection]:
+    """Return the connection class of a server with these settings."""
+
+    class TimedConnection(PunctualConnection):
+        patience_s, bytes_per_s = settings.download_patience_s, settings.download_bytes_per_s
+
+    return TimedConnection
+
+
+def start_worker_child(settings: Settings) -> subprocess.Popen[bytes]:
+    """Start a worker in a new interpreter, at lower priority; it ends when this process does.
+
+    End it with `terminate()` and `wait()`: it finishes its work in progress, within ten seconds. It is not restarted
+    automatically.
+    """
+    return subprocess.Popen(  # noqa: S603 - our own interpreter and module
+        [sys.executable, "-c", _WORKER, str(os.getpid())],
+        env=environment(settings),
+        stdin=subprocess.DEVNULL,
+    )
+
+
+def environment(settings: Settings) -> dict[str, str]:
+    """Return the environment from which exactly these settings are read."""
+    others = {name: value for name, value in os.environ.items() if not name.upper().startswith(PREFIX)}
+    ours = {PREFIX + name.upper(): str(value) for name, value in settings if value is not None}
+    return others | ours
 
 
 def prepare(settings: Settings) -> None:
@@ -45,20 +210,55 @@ def prepare(settings: Settings) -> None:
 
 
 def refuse_keyless(settings: Settings) -> None:
-    """Refuse to be reached from other machines where nobody has a key.
+    """Check that a service reachable from other machines has a valid key, or an authenticating proxy.
 
     Raises:
-        Conflict: Neither a key that counts nor a proxy that says who asks.
+        Conflict: It has neither.
     """
     if settings.beyond_loopback and settings.proxy_header is None:
         with closing(Database(settings.database_url)) as database, database.reading() as session:
             refuse_without_keys(session)
 
 
+def refuse_taken(host: str, port: int) -> None:
+    """Check that this process can listen at an address, before anything else is started.
+
+    Raises:
+        BadSettings: Another process listens there, the address is not of this machine, or this user may not use the
+            port.
+    """
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind, protocol) as tried:
+            tried.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            tried.bind(address)
+    except socket.gaierror as error:
+        raise BadSettings(f"SKILLS_HOST={host} is not an address.", "For this machine alone use 127.0.0.1.") from error
+    except OSError as error:
+        other = f"Choose another port, such as {port + 1}: SKILLS_PORT={port + 1}"
+        if error.errno == errno.EADDRINUSE:
+            raise BadSettings(f"Port {port} of {host} is in use by another process.", other) from error
+        if error.errno == errno.EACCES:
+            raise BadSettings(
+                f"This user may not listen at port {port}.", "Choose one above 1023: SKILLS_PORT=8000"
+            ) from error
+        if error.errno == errno.EADDRNOTAVAIL:
+            raise BadSettings(
+                f"SKILLS_HOST={host} is not an address of this machine.", "For this machine alone use 127.0.0.1."
+            ) from error
+        raise
+
+
 def serve(settings: Settings, *, samples: bool = False) -> None:
-    """Serve until told to stop; the address must have been checked (`Settings.check_address`)."""
+    """Serve until a signal ends the process; the address must have been checked (`Settings.check_address`).
+
+    Raises:
+        BadSettings: `samples` is for loopback without TLS only; or the address cannot be used.
+        Conflict: See `refuse_keyless`.
+    """
     if samples and (settings.beyond_loopback or settings.tls_cert is not None):
-        raise BadSettings("--samples is for a look at this machine's own service; `skills seed` loads them anywhere.")
+        raise BadSettings("--samples is only for a service on this machine.", Remedy(Action.LOAD_SAMPLES))
+    refuse_taken(settings.host, settings.port)
     logs.configure(settings.log_level, as_json=settings.log_format == "json")
     check_wanted()
     prepare(settings)
@@ -66,7 +266,7 @@ def serve(settings: Settings, *, samples: bool = False) -> None:
     app = create_app(settings)
 
     def then() -> None:
-        gc.freeze()  # what is there by now stays, and is not looked through again
+        gc.freeze()  # everything imported so far stays, so later collections skip it
         gc.enable()
         if samples:
             threading.Thread(target=_load, args=(settings, app.state.access.own_key), daemon=True).start()
@@ -80,9 +280,9 @@ def serve(settings: Settings, *, samples: bool = False) -> None:
             root_path=settings.root_path,
             ssl_certfile=settings.tls_cert,
             ssl_keyfile=settings.tls_key,
-            proxy_headers=False,  # who asks is not taken from what anybody may send
-            http=PunctualConnection,
-            log_config=None,  # what it says goes where ours goes
+            proxy_headers=False,  # the caller is not derived from headers that anybody can send
+            http=connections(settings),
+            log_config=None,  # its records go through our logging
             log_level="warning",
             access_log=False,
             timeout_graceful_shutdown=GRACE_S,
@@ -90,16 +290,16 @@ def serve(settings: Settings, *, samples: bool = False) -> None:
         ),
         then,
     )
-    signal.signal(signal.SIGTERM, _leave)  # the server lets a signal through again once it has shut down
+    signal.signal(signal.SIGTERM, _leave)  # the server raises a signal again after its shutdown
     signal.signal(signal.SIGINT, _leave)
-    with working(settings):
+    with keeping_erasures(settings), working(settings):
         server.run()
     if server.refused is not None:
         raise server.refused
 
 
 class Server(uvicorn.Server):
-    """A server that does something more once it answers, beside answering, and ends if that is refused."""
+    """A server that runs a function in a thread once it answers, and stops if that function fails."""
 
     def __init__(self, config: uvicorn.Config, then: Callable[[], None]) -> None:
         super().__init__(config)
@@ -107,7 +307,7 @@ class Server(uvicorn.Server):
         self._then = then
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Begin to answer."""
+        """Start to listen, then start the thread."""
         await super().startup(sockets)
         if self.started:
             threading.Thread(target=self._settle, daemon=True).start()
@@ -120,8 +320,54 @@ class Server(uvicorn.Server):
 
 
 @contextmanager
+def keeping_erasures(settings: Settings) -> Iterator[None]:
+    """Keep the file of erasures up to date during the block, if the settings name one.
+
+    It is derived from the database's events, because workers and commands elsewhere erase and withdraw too.
+
+    Raises:
+        BadSettings: The file cannot be written.
+    """
+    file = settings.erasures_file
+    if file is None:
+        yield
+        return
+    over = threading.Event()
+
+    def keep(known: int) -> None:
+        pause_s = ERASURES_EVERY_S
+        while not over.wait(pause_s):
+            began_s = time.monotonic()
+            try:
+                known = keep_up_erasures(database, file, known)
+            except (OSError, SkillsError) as error:
+                log.error(
+                    "The list of erasures could not be written (%s); it will be tried again.", type(error).__name__
+                )
+            pause_s = max(ERASURES_EVERY_S, 10 * (time.monotonic() - began_s))  # a long list costs a tenth of a core
+
+    with closing(Database(settings.database_url)) as database:
+        try:
+            known = keep_up_erasures(database, file)
+            # there are no erasures yet; write the file anyway, to find out now whether that is possible
+            if not file.exists():
+                keep_erasures(database, file)
+        except OSError as error:
+            raise BadSettings(f"SKILLS_ERASURES_FILE cannot be written: {error.strerror or error}.") from error
+        keeper = threading.Thread(target=keep, args=(known,))
+        keeper.start()
+        try:
+            yield
+        finally:
+            over.set()
+            keeper.join()
+            with suppress(OSError, SkillsError):
+                keep_up_erasures(database, file)
+
+
+@contextmanager
 def working(settings: Settings) -> Iterator[None]:
-    """Keep workers at work for as long as the block; the first starts at once, and one that dies is replaced."""
+    """Run workers during the block; the first starts at once, and one that dies is replaced."""
     over = threading.Event()
 
     def watch() -> None:
@@ -130,7 +376,7 @@ def working(settings: Settings) -> Iterator[None]:
         while True:
             for place, worker in enumerate(crew):
                 if worker.poll() is not None:
-                    log.warning("A worker ended with %s; another one starts.", worker.returncode)
+                    log.warning("A worker ended with %s; another one is started.", worker.returncode)
                     crew[place] = start_worker_child(settings)
             if len(crew) < settings.workers and time.monotonic() - began_s >= len(crew) * FURTHER_S:
                 crew.append(start_worker_child(settings))
@@ -148,7 +394,7 @@ def working(settings: Settings) -> Iterator[None]:
 
 
 def _end(crew: list[subprocess.Popen[bytes]]) -> None:
-    """Let workers finish what they have begun, for as long as that is allowed."""
+    """Terminate workers, and kill those that have not finished their work in progress after `GRACE_S`."""
     for worker in crew:
         worker.terminate()
     deadline_s = time.monotonic() + GRACE_S
@@ -160,7 +406,7 @@ def _end(crew: list[subprocess.Popen[bytes]]) -> None:
 
 
 def _leave(_signal: int, _frame: FrameType | None) -> None:
-    """End well: being told to stop is no failure."""
+    """Exit with 0, because a signal to stop is no failure."""
     sys.exit(0)
 
 

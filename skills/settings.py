@@ -1,19 +1,24 @@
-"""The one place that reads the environment: `SKILLS_*` variables into one frozen object."""
+"""The settings of an installation, from `SKILLS_*` variables; nothing else reads the environment for settings."""
 
 import os
+import re
+from collections.abc import Iterable
 from functools import cache
 from ipaddress import ip_address
 from pathlib import Path
 from typing import Literal
 
-from pydantic import Field, SecretStr, ValidationError
+from pydantic import Field, SecretStr, ValidationError, field_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from skills.errors import BadSettings
+from skills.remedies import did_you_mean
 
 MEBIBYTE = 1 << 20
+PREFIX = "SKILLS_"
+FOR_TESTS = "SKILLS_TEST_"  # prefix of the test suite's variables, which nothing in the package reads
 Role = Literal["reader", "uploader", "trainer", "releaser", "admin"]
-PROXY_SECRET_LENGTH = 32  # of a random one, nobody guesses that
+PROXY_SECRET_LENGTH = 32  # characters; random ones of this length cannot be guessed
 LOOPBACK = ("localhost", "127.0.0.1", "[::1]")
 
 
@@ -22,70 +27,87 @@ def _data_folder() -> Path:
 
 
 def _cores() -> int:
-    """Count the cores that this process may use; beyond four a laptop wants to choose."""
+    """Return the number of cores that this process may use, at most 4: on a larger machine the user should choose."""
     return min(4, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
 
 
 class Settings(BaseSettings):
-    """How this installation runs."""
+    """The settings of an installation."""
 
-    model_config = SettingsConfigDict(env_prefix="SKILLS_", frozen=True, extra="ignore")
+    model_config = SettingsConfigDict(env_prefix=PREFIX, frozen=True, extra="ignore")
 
     database_url: str = Field(default_factory=lambda: f"sqlite:///{_data_folder() / 'skills.sqlite'}")
     host: str = "127.0.0.1"
     port: int = Field(default=8000, ge=0, le=65535)
     root_path: str = ""
-    server: str | None = None  # where the client finds the service; None: the application in this process
-    api_key: SecretStr | None = None  # what the client shows there
+    server: str | None = None  # address of the service for the client; None: the application in this process
+    api_key: SecretStr | None = None  # the client's key for it
+    erasures_file: Path | None = None  # list of erasures to apply after a restore; kept up to date if it is named
     sample_recordings: Path | None = None
     paper_data: Path | None = None
 
     max_upload_bytes: int = Field(default=256 * MEBIBYTE, gt=0)
     upload_deadline_s: float = Field(default=120.0, gt=0)
-    upload_patience_s: float = Field(default=20.0, gt=0)  # then a body must have come at this rate, a modem's:
+    # grace period of an upload; after it the body must have arrived at the following rate, a modem's
+    upload_patience_s: float = Field(default=20.0, gt=0)
     upload_bytes_per_s: int = Field(default=16 << 10, gt=0)
-    readers: int = Field(default=4, ge=1, le=24)  # uploads read at once, each in a process of its own, under these:
+    download_patience_s: float = Field(default=20.0, gt=0)  # grace period of a client that stops reading
+    download_bytes_per_s: int = Field(default=16 << 10, gt=0)  # a client that reads slower than this falls behind
+    readers: int = Field(default=4, ge=1, le=24)  # uploads read at once, each in a separate process with these limits:
     reading_memory_bytes: int = Field(default=1024 * MEBIBYTE, gt=0)  # a million poses in MCAP take 320 MiB
-    reading_cpu_s: int = Field(default=30, gt=0)  # they take 1 s, as a table 3
-    reading_wall_s: float = Field(default=60.0, gt=0)  # others may be read beside it
+    reading_cpu_s: int = Field(default=30, gt=0)  # a million poses take 1 s, as a table 3 s
+    reading_wall_s: float = Field(default=60.0, gt=0)  # other uploads may be read at the same time
     reading_file_bytes: int = Field(default=1024 * MEBIBYTE, gt=0)  # a bag unpacked from its archive
     reading_answer_bytes: int = Field(default=256 * MEBIBYTE, gt=0)  # 4 million poses
     playback_timeout_s: float = Field(default=120.0, gt=0)
     playback_memory_bytes: int = Field(default=1024 * MEBIBYTE, gt=0)
     learning_timeout_s: float = Field(
         default=3600.0, gt=0
-    )  # of a learner beyond the table: default budgets take ten minutes
-    learning_memory_bytes: int = Field(default=6144 * MEBIBYTE, gt=0)  # addresses: torch claims half, uses a tenth
-    replay_tip_error_mm: float = Field(default=0.65, ge=0)  # a calibrated dVRK's; under it every pass shall succeed
-    replay_lower_bound: float = Field(default=0.95, ge=0, le=1)  # as surely: samples do at 0.99, at 3 mm at 0.28
-    workers: int = Field(default_factory=_cores, ge=0, le=64)  # processes beside the service; 0: they run elsewhere
-    lease_s: float = Field(default=2.0, gt=0)  # a worker silent for longer is taken for dead
+    )  # of a learner that is not tabular: default budgets take ten minutes
+    # of address space: torch reserves half of it and uses a tenth
+    learning_memory_bytes: int = Field(default=6144 * MEBIBYTE, gt=0)
+    # tip error of a calibrated dVRK, under which every pass must succeed ...
+    replay_tip_error_mm: float = Field(default=0.65, ge=0)
+    # ... with this probability; samples: 0.99, with an error of 3 mm 0.28
+    replay_lower_bound: float = Field(default=0.95, ge=0, le=1)
+    workers: int = Field(default_factory=_cores, ge=0, le=64)  # worker processes; 0: workers run elsewhere
+    lease_s: float = Field(default=2.0, gt=0)  # a worker without a heartbeat for longer is considered dead
     job_attempts: int = Field(default=3, ge=1)
-    hosts: str = ""  # further names that this service is called by, with commas between them
+    hosts: str = ""  # further host names of this service, separated by commas
     tls_cert: Path | None = None
     tls_key: Path | None = None
-    tls_by_proxy: bool = False  # a proxy in front speaks TLS, and nobody but it reaches the address of this service
-    proxy_header: str | None = None  # the header in which an authenticating proxy names the person ...
-    proxy_secret: SecretStr | None = None  # ... beside X-Skills-Proxy-Secret, by which it is known to be the proxy
-    proxy_role: Role = "reader"  # of everybody whom it names
-    sign_in_idle_s: float = Field(default=2 * 3600.0, gt=120)  # a page left open over a long case is still signed in
+    # a proxy in front terminates TLS, and only the proxy can reach the address of this service
+    tls_by_proxy: bool = False
+    proxy_header: str | None = None  # header in which an authenticating proxy names the user ...
+    proxy_secret: SecretStr | None = None  # ... and value of X-Skills-Proxy-Secret, which authenticates the proxy
+    proxy_role: Role = "reader"  # role of every user whom the proxy names
+    # long enough for a page that stays open during a long case
+    sign_in_idle_s: float = Field(default=2 * 3600.0, gt=120)
     sign_in_s: float = Field(default=12 * 3600.0, gt=120)  # a working day
-    key_requests_per_s: float = Field(default=200.0, gt=0)  # of each key: a robot that asks at 100 Hz, and a page
+    key_requests_per_s: float = Field(default=200.0, gt=0)  # per key: a robot with requests at 100 Hz, and a web page
     key_upload_bytes_per_day: int = Field(default=20480 * MEBIBYTE, gt=0)  # 80 of the largest recordings
-    key_jobs: int = Field(default=100, ge=1)  # that an owner has waiting or running; a batch is one
+    key_watchers: int = Field(default=100, ge=1)  # event streams of a key at once: as many as its owner may have jobs
+    heartbeat_s: float = Field(default=15.0, gt=0)  # of event streams: proxies close an idle one after 30 to 60 s
+    key_jobs: int = Field(default=100, ge=1)  # unfinished jobs of an owner; a batch counts as one
     log_level: Literal["debug", "info", "warning", "error"] = "warning"  # "info" adds a line for each request and job
     log_format: Literal["text", "json"] = "text"
 
+    @field_validator("database_url")
+    @classmethod
+    def _of_postgresql(cls, url: str) -> str:
+        """Accept `postgres://`, the spelling of libpq and many hosts, for `postgresql://`."""
+        return url.replace("postgres://", "postgresql://", 1) if url.startswith("postgres://") else url
+
     @property
     def engine_url(self) -> str:
-        """The job engine's database: beside ours on SQLite, a schema of its own on PostgreSQL."""
+        """Return the job engine's database URL: a second SQLite file; on PostgreSQL ours, with a schema of its own."""
         if self.database_url.startswith("sqlite"):
             return self.database_url.removesuffix(".sqlite") + ".jobs.sqlite"
         return self.database_url
 
     @property
     def beyond_loopback(self) -> bool:
-        """Whether the address is reached from other machines."""
+        """Return whether the address can be reached from other machines."""
         host = "127.0.0.1" if self.host == "localhost" else self.host
         try:
             return not ip_address(host).is_loopback
@@ -94,33 +116,33 @@ class Settings(BaseSettings):
 
     @property
     def host_names(self) -> frozenset[str]:
-        """The names that requests may call this service by, without ports."""
+        """Return the host names at which requests are accepted, without ports."""
         names = (name.strip().lower() for name in (*LOOPBACK, self.host, *self.hosts.split(",")))
         return frozenset(f"[{name}]" if ":" in name and name[0] != "[" else name for name in names if name)
 
     def check_address(self) -> None:
-        """Refuse to speak in the clear beyond loopback, or to trust a proxy that cannot be told from anybody else.
+        """Check that traffic beyond loopback is encrypted, and that a proxy can be authenticated.
 
         Raises:
-            BadSettings: The settings do not go together; the message says which.
+            BadSettings: The settings contradict each other; the message says which.
         """
         if (self.tls_cert is None) != (self.tls_key is None):
-            raise BadSettings("SKILLS_TLS_CERT and SKILLS_TLS_KEY belong together; give both.")
+            raise BadSettings("SKILLS_TLS_CERT and SKILLS_TLS_KEY belong together; set both.")
         secret = "" if self.proxy_secret is None else self.proxy_secret.get_secret_value()
         if self.proxy_header is not None and len(secret) < PROXY_SECRET_LENGTH:
             raise BadSettings(
-                "SKILLS_PROXY_HEADER needs SKILLS_PROXY_SECRET, at least 32 random characters which the proxy sends as "
-                "X-Skills-Proxy-Secret: without it anybody could send that header."
+                "SKILLS_PROXY_HEADER needs SKILLS_PROXY_SECRET, at least 32 random characters which the proxy "
+                "sends as X-Skills-Proxy-Secret: without it any client could send that header."
             )
         if not self.beyond_loopback:
             return
         if self.tls_cert is None and not self.tls_by_proxy:
             raise BadSettings(
-                f"SKILLS_HOST={self.host} is reached from outside, where keys must not go in the clear: give "
-                "SKILLS_TLS_CERT and SKILLS_TLS_KEY, or SKILLS_TLS_BY_PROXY=true where a proxy in front speaks TLS."
+                f"SKILLS_HOST={self.host} is reachable from other machines, and keys must not be sent unencrypted.",
+                "Set SKILLS_TLS_CERT and SKILLS_TLS_KEY, or SKILLS_TLS_BY_PROXY=true if a proxy terminates TLS.",
             )
         if self.host in ("0.0.0.0", "::") and not self.hosts:  # noqa: S104 - compared, not bound
-            raise BadSettings("SKILLS_HOST is every address of this machine; name it in SKILLS_HOSTS as it is called.")
+            raise BadSettings("SKILLS_HOST is every address of this machine; list its host names in SKILLS_HOSTS.")
 
 
 @cache
@@ -128,10 +150,37 @@ def settings() -> Settings:
     """Read the environment, once.
 
     Raises:
-        BadSettings: A variable has a value that cannot be meant; it is named, its value is not: it may be secret.
+        BadSettings: A variable is not one of the settings, or has an invalid value. The message names it without its
+            value, which may be secret.
     """
+    refuse_unknown(os.environ)
     try:
         return Settings()
     except ValidationError as error:
-        said = [f"SKILLS_{'_'.join(map(str, one['loc'])).upper()}: {one['msg']}" for one in error.errors()]
-        raise BadSettings(f"{'; '.join(said)}.") from None
+        said = [
+            f"{PREFIX}{'_'.join(map(str, one['loc'])).upper()}: "
+            + one["msg"].replace("Input should be", "it must be").partition(", unable")[0]
+            for one in error.errors()
+        ]
+        raise BadSettings(f"{'; '.join(said)}.", "Set it to such a value, or unset it.") from None
+
+
+def refuse_unknown(environment: Iterable[str]) -> None:
+    """Refuse an unknown variable with our prefix: if a misspelt one were ignored, another database could be used.
+
+    Raises:
+        BadSettings: There is one; the message names the most similar setting.
+    """
+    known = {f"{PREFIX}{name.upper()}" for name in Settings.model_fields}
+    unknown = [
+        name
+        for name in sorted(environment)
+        if name.upper().startswith(PREFIX) and not name.upper().startswith(FOR_TESTS) and name.upper() not in known
+    ]
+    if unknown:
+        # without the prefix, which would make all names similar
+        names = [one.removeprefix(PREFIX) for one in sorted(known)]
+        said = (did_you_mean(name.upper().removeprefix(PREFIX), names) for name in unknown[:5])
+        near = [re.sub("'(?=[A-Z])", f"'{PREFIX}", one) for some in said for one in some]
+        words = "are not settings" if len(unknown) > 1 else "is not a setting"
+        raise BadSettings(f"{', '.join(unknown[:5])} {words} of suture-skills.", *near, "Correct it or unset it.")

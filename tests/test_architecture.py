@@ -1,4 +1,4 @@
-"""What stands where: floors that import downwards only, one door for each outside library, and a pure domain."""
+"""Architecture rules: imports go downwards only, each outside library has one door, and the domain is pure."""
 
 import ast
 import logging
@@ -16,7 +16,7 @@ PROJECT = ROOT.parent
 LAYERS = PROJECT / "pyproject.toml"
 DATA = {ROOT / "migrations", ROOT / "urdf"}
 FILES = sorted(file for file in ROOT.rglob("*.py") if not DATA & set(file.parents))
-FILES += [file for file in sorted((ROOT / "seeds").glob("*.py")) if file not in FILES]  # a link, which rglob passes by
+FILES += [file for file in sorted((ROOT / "seeds").glob("*.py")) if file not in FILES]  # a link, skipped by rglob
 
 
 def named(file: Path) -> str:
@@ -42,13 +42,13 @@ def importers(library: str) -> list[str]:
 
 
 def test_the_scan_sees_the_whole_package():
-    for part in ("errors.py", "settings.py", "style/grid.py", "style/learning/_kernels.py", "seeds/__init__.py"):
+    for part in ("errors.py", "settings.py", "gridworld/grid.py", "learning/_kernels.py", "seeds/__init__.py"):
         assert part in [named(file) for file in FILES]
 
 
 @pytest.fixture
 def loggers() -> Iterator[None]:
-    """Give every logger back as it was: import-linter switches them all off, for whatever runs after it too."""
+    """Restore every logger: import-linter disables them all, also for later tests."""
     off = {one: one.disabled for one in logging.Logger.manager.loggerDict.values() if isinstance(one, logging.Logger)}
     yield
     for one, was in off.items():
@@ -65,16 +65,17 @@ def test_imports_lead_downwards_only_and_every_module_has_its_floor(monkeypatch,
 @pytest.mark.parametrize(
     ("library", "door"),
     [
-        ("mcap", "recordings/"),
-        ("mcap_ros2", "recordings/"),
-        ("rosbags", "recordings/ros.py"),
-        ("pybullet", "sim/"),
-        ("pybullet_data", "sim/"),
+        ("mcap", "formats/"),
+        ("mcap_ros2", "formats/"),
+        ("rosbags", "formats/rosbag.py"),
+        ("yaml", "formats/bag_folder.py"),
+        ("pybullet", "simulation/"),
+        ("pybullet_data", "simulation/"),
         ("numba", "compiled.py"),
-        ("movement_primitives", "report/dmp.py"),
-        ("safetensors", "style/network.py"),
+        ("movement_primitives", "report/rivals.py"),
+        ("safetensors", "learning/network.py"),
         ("torch", "deep/"),
-        ("sklearn", "style/scoring/calibrating.py"),
+        ("sklearn", "scoring/calibration.py"),
         ("gymnasium", "deep/"),
         ("stable_baselines3", "deep/"),
         ("sb3_contrib", "deep/"),
@@ -83,6 +84,7 @@ def test_imports_lead_downwards_only_and_every_module_has_its_floor(monkeypatch,
         ("fastapi", "api/"),
         ("prometheus_client", "api/metrics.py"),
         ("typer", "cli/"),
+        ("cachetools", "library/cache.py"),
     ],
 )
 def test_each_outside_library_has_one_door(library, door):
@@ -106,12 +108,13 @@ def test_no_array_is_loaded_or_saved_with_pickles_in_it():
     assert allowed == []
 
 
-DOMAIN = [file for file in FILES if named(file).startswith("style/")]
+ROOMS = ("demonstration", "gridworld", "learning", "planning", "verification", "comparison", "scoring")
+DOMAIN = [file for file in FILES if named(file).split("/")[0].removesuffix(".py") in (*ROOMS, "arrays", "kinematics")]
 MAY_IMPORT = {
-    *("collections", "dataclasses", "functools", "itertools", "math", "types", "typing"),
+    *("bisect", "collections", "dataclasses", "functools", "itertools", "math", "types", "typing"),
     *("numpy", "safetensors", "skills", "scipy"),
-    *("sklearn", "threadpoolctl"),  # regression, and on how many threads it adds up
-    "concurrent",  # threads that count beside each other, and change nothing but their own part of an array
+    *("sklearn", "threadpoolctl"),  # regression, and the number of threads for its sums
+    "concurrent",  # threads that compute concurrently, each writing only its own part of an array
 }
 
 
@@ -132,3 +135,81 @@ def test_the_domain_draws_no_random_number_that_no_seed_decides():
 
 def test_only_the_api_knows_status_codes():
     assert "status_code" not in "".join(file.read_text() for file in DOMAIN)
+
+
+OPENS = {"reading", "writing", "connect", "begin", "_readers", "_writers"}  # of databases, engines and makers
+WAITS = (ast.Yield, ast.YieldFrom, ast.Await, ast.AsyncFor, ast.AsyncWith)
+FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda, ast.ClassDef)
+MAY_YIELD_A_SESSION = {
+    "db/session.py: reading",
+    "db/session.py: writing",
+}  # a `with` of their own
+
+
+def opens_a_session(call: ast.expr) -> bool:
+    """Return whether an expression opens a session or a connection."""
+    target = call.func if isinstance(call, ast.Call) else None
+    if isinstance(target, ast.Attribute):
+        return target.attr in OPENS
+    return isinstance(target, ast.Name) and target.id == "Session"
+
+
+def own(node: ast.AST) -> Iterator[ast.AST]:
+    """Walk through a node, but not into the functions that are defined in it."""
+    for child in ast.iter_child_nodes(node):
+        if not isinstance(child, FUNCTIONS):
+            yield child
+            yield from own(child)
+
+
+def waits_in_a_session(tree: ast.AST) -> list[str]:
+    """Name the functions that yield or await while a session or connection of the database is open."""
+    found = []
+    for function in ast.walk(tree):
+        if isinstance(function, ast.FunctionDef | ast.AsyncFunctionDef):
+            blocks = [node for node in own(function) if isinstance(node, ast.With | ast.AsyncWith)]
+            open_ = [one for one in blocks if any(opens_a_session(item.context_expr) for item in one.items)]
+            if any(isinstance(node, WAITS) for block in open_ for node in own(block)):
+                found.append(function.name)
+    return found
+
+
+def test_nothing_waits_for_its_caller_or_client_while_a_session_is_open():
+    """A generator that is abandoned at a `yield` keeps its resources until the garbage collector finds it."""
+    found = [f"{named(file)}: {name}" for file in FILES for name in waits_in_a_session(ast.parse(file.read_text()))]
+    assert set(found) == MAY_YIELD_A_SESSION
+
+
+@pytest.mark.parametrize(
+    ("source", "wrong"),
+    [
+        ("def f(db):\n with db.reading() as session:\n  yield from rows(session)", True),
+        ("def f(db):\n with a() as x, db.writing() as session:\n  for row in rows(session):\n   yield row", True),
+        ("async def f(db):\n with db.reading() as session:\n  await send(session)", True),
+        ("def f(db):\n def g():\n  with db.reading() as session:\n   yield 1\n return g", True),
+        ("def f(db):\n with db.reading() as session:\n  rows = list(session)\n yield rows", False),
+        ("def f(db):\n with open('x') as file:\n  yield file", False),
+    ],
+)
+def test_the_scan_for_open_sessions_finds_those_that_wait(source: str, wrong: bool):
+    assert bool(waits_in_a_session(ast.parse(source))) == wrong
+
+
+def test_routes_send_lazy_responses_only_through_the_closing_stream():
+    lazy = {"StreamingResponse", "FileResponse", "EventSourceResponse"}
+    users = [named(file) for file in FILES for node in nodes(file) if isinstance(node, ast.alias) and node.name in lazy]
+    assert users == ["api/streams.py"]
+
+
+def test_no_generator_of_the_api_takes_a_session():
+    """Its caller could leave the session before the generator, or the generator before its end."""
+    found = [
+        f"{named(file)}: {node.name}"
+        for file in FILES
+        if named(file).startswith("api/")
+        for node in nodes(file)
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+        and any(isinstance(inner, ast.Yield | ast.YieldFrom) for inner in own(node))
+        and any("Session" in ast.dump(one.annotation) for one in node.args.args if one.annotation is not None)
+    ]
+    assert found == []

@@ -1,4 +1,4 @@
-"""The command line, on the application in its own process: what a lab types, in order."""
+"""The command line, on the application in its own process: a lab's commands, in order."""
 
 import json
 import os
@@ -13,20 +13,21 @@ from typer.main import get_command
 from typer.testing import CliRunner
 
 from skills.cli import app
-from skills.cli.completing import surgeons, sutures
+from skills.cli.shell import complete_surgeons, complete_sutures
 from skills.db.session import Database
+from skills.formats import write_mcap
 from skills.library.catalogue import put_surgeon
-from skills.recordings import write_mcap
 from skills.seeds.recordings import sample_recordings
 from skills.settings import settings
-from tests.recordings import bags, trials
+from tests.formats import bags, trials
+from tests.library import cases
 
 STYLE = ("wren", "simple-running")
 
 
 @pytest.fixture
 def skills(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Run a command on a database of this test's own: its exit code, and what it printed."""
+    """Yield a function that runs a command on a separate database and returns its exit code and its output."""
     monkeypatch.setenv("SKILLS_DATABASE_URL", f"sqlite:///{tmp_path / 'skills.sqlite'}")
     monkeypatch.delenv("SKILLS_SERVER", raising=False)
     settings.cache_clear()
@@ -53,7 +54,7 @@ def test_from_a_bag_folder_to_a_released_policy_and_a_plan(skills, tmp_path: Pat
     added = json.loads(said)
     assert added["report"]["grid"]["chosen"] == "paper"
     code, said = skills(*add, "--proposal", "9")
-    assert (code, "1 proposed" in said) == (1, True)
+    assert (code, "1 hand-off is proposed" in said) == (1, True)
     _, said = skills("demo", "list", "--surgeon", "wren", "--json")
     assert added["id"] in [demo["id"] for demo in json.loads(said)]
     code, said = skills("train", *STYLE, "--release", "--json")
@@ -66,16 +67,16 @@ def test_from_a_bag_folder_to_a_released_policy_and_a_plan(skills, tmp_path: Pat
     exported = tmp_path / "policy.json"
     assert skills("policy", "export", *STYLE, str(exported))[0] == 0
     assert json.loads(exported.read_bytes())["surgeon"] == "wren"
-    code, said = skills("plan", *STYLE, "--point", "5,55,-120", "--json")
+    code, said = skills("plan", *STYLE, "--point", "5,55,-120", "--no-handoff", "--json")
     assert (code, len(json.loads(said)["passes"])) == (0, 1)
-    code, said = skills("plan", *STYLE, "--point", "5,555,-120")
+    code, said = skills("plan", *STYLE, "--point", "5,555,-120", "--no-handoff")
     assert (code, "insertion" in said) == (1, True)
     assert skills("policy", "withdraw", *STYLE)[0] == 0
     code, said = skills("policy", "show", *STYLE)
     assert (code, "No policy" in said) == (1, True)
     assert skills("erase", "wren", "--yes")[0] == 0
     code, said = skills("train", *STYLE)
-    assert (code, "erased for good" in said) == (1, True)
+    assert (code, "erased permanently" in said) == (1, True)
 
 
 def test_a_plan_is_played_drawn_exported_and_its_bag_verified(skills, tmp_path: Path) -> None:
@@ -109,6 +110,45 @@ def test_a_plan_is_played_drawn_exported_and_its_bag_verified(skills, tmp_path: 
     assert (code, "--point" in said) == (1, True), said
 
 
+def test_of_several_hand_offs_one_is_named_or_asked_for(
+    skills, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert skills("seed")[0] == 0
+    file = tmp_path / "five.mcap"
+    file.write_bytes(next(s for s in sample_recordings() if len(s.segments) > 1).data)
+    add = ("demo", "add", str(file), "--surgeon", "kestrel", "--suture", "simple-interrupted")
+    code, said = skills(*add)
+    assert (code, "--segment whole" in said) == (1, True), said
+    assert said.count("PSM2") >= 5, said
+    code, said = skills(*add, "--json")
+    assert (code, len(json.loads(said)["numbers"]["segments"])) == (1, 5)
+    code, said = skills(*add, "--segment", "2")
+    assert (code, "Taken: proposal 2 of 5" in said) == (0, True), said
+    code, said = skills(*add, "--segment", "whole")
+    assert (code, "Taken: the whole recording" in said) == (0, True), said
+    code, said = skills(*add, "--segment", "both")
+    assert (code, "not 'both'" in said) == (1, True), said
+    monkeypatch.setattr("skills.cli.recordings.on_terminal", lambda: True)
+    result = CliRunner().invoke(app, list(add), input="3\n")
+    assert (result.exit_code, "Taken: proposal 3 of 5" in result.output) == (0, True), result.output
+
+
+def test_the_first_real_bag_of_a_new_user_is_learnt_and_released(skills) -> None:
+    bag = str(bags.sample_folder() / "rosbag2")
+    assert skills("seed")[0] == 0
+    assert skills("surgeon", "put", "newcomer")[0] == 0
+    style = ("newcomer", "simple-running")
+    code, said = skills("demo", "add", bag, "--surgeon", style[0], "--suture", style[1])
+    assert (code, "Taken: proposal 1 of 1, 7.0" in said) == (0, True), said
+    code, said = skills("train", *style, "--release", "--json")
+    assert code == 0, said
+    assert json.loads(said)["result"]["released"], said
+    camera = (bag, "--surgeon", style[0], "--suture", style[1], "--topic", "/PSM2/measured_cp")
+    assert skills("demo", "add", *camera)[0] == 0
+    code, said = skills("train", *style, "--release")
+    assert (code, "ECM" in said, "local/measured_cp" in said) == (1, True, True), said  # the reason, and the remedy
+
+
 def test_a_style_is_learnt_from_several_demonstrations(skills, tmp_path: Path) -> None:
     assert (skills("migrate")[0], skills("seed")[0]) == (0, 0)
     style = ("kestrel", "simple-interrupted")
@@ -125,7 +165,7 @@ def test_a_style_is_learnt_from_several_demonstrations(skills, tmp_path: Path) -
     assert skills("train", *style, *named[:2], "--combine", "medoid")[0] == 1
 
 
-def test_styles_are_trained_in_a_batch_and_a_failure_is_named_and_told_by_the_exit_code(skills) -> None:
+def test_a_batch_trains_styles_names_failures_and_sets_the_exit_code(skills) -> None:
     assert skills("seed")[0] == 0
     code, said = skills("retrain", "--only-stale", "--release", "--json")
     batch = json.loads(said[said.index("{") :])
@@ -140,7 +180,21 @@ def test_styles_are_trained_in_a_batch_and_a_failure_is_named_and_told_by_the_ex
     assert (code, "1 failed" in said, "does not cover training" in said) == (1, True, True), said
 
 
-def test_a_demonstration_with_hysteresis_tells_its_states_crossings_and_loss(skills, tmp_path: Path) -> None:
+def test_an_unreleased_version_gives_reason_remedy_and_exit_code(skills, tmp_path: Path) -> None:
+    below = tmp_path / "below.csv"
+    below.write_bytes(cases.hand_off((0.0, 0.0, -400.0)))
+    assert skills("surgeon", "put", "kestrel")[0] == 0
+    assert skills("demo", "add", str(below), "--surgeon", "kestrel", "--suture", cases.SUTURE)[0] == 0
+    for words in (("train", "kestrel", cases.SUTURE), ("retrain",)):
+        code, said = skills(*words, "--release")
+        assert code == 1, said
+        assert "version 1 is not released: " in said.lower()
+        assert "joint limits" in said
+        assert "Record the hand-off further inside the arm's reach" in said
+        assert "Traceback" not in said
+
+
+def test_a_demo_with_hysteresis_reports_states_crossings_and_loss(skills, tmp_path: Path) -> None:
     bag = tmp_path / "plover.mcap"
     bag.write_bytes(next(s for s in sample_recordings() if s.surgeon == "plover").data)
     assert skills("seed")[0] == 0
@@ -158,7 +212,7 @@ def test_a_demonstration_with_hysteresis_tells_its_states_crossings_and_loss(ski
     page = (tmp_path / "report.html").read_text()
     assert page.startswith("<!doctype html>") and "plover" in page
     code, said = skills(*add, "--hysteresis", "0.6")
-    assert (code, "less than or equal to 0.5" in said) == (1, True), said
+    assert (code, "--hysteresis must be at most 0.5; 0.6 was given" in said) == (1, True), said
 
 
 def test_what_is_no_recording_is_refused_with_a_sentence(skills, tmp_path: Path) -> None:
@@ -231,7 +285,7 @@ def test_a_trial_that_is_refused_does_not_stop_the_others(skills, tmp_path: Path
     assert "Suturing_B001: " in said and "jigsaws-c" in said
 
 
-def test_a_refusal_is_a_problem_on_stderr_for_programs_and_a_sentence_for_people(skills, tmp_path: Path) -> None:
+def test_a_refusal_is_a_json_problem_for_programs_and_prose_for_people(skills, tmp_path: Path) -> None:
     def run(*words: str) -> tuple[int, str, str]:
         result = CliRunner().invoke(app, list(words))
         return result.exit_code, result.stdout, result.stderr
@@ -244,7 +298,7 @@ def test_a_refusal_is_a_problem_on_stderr_for_programs_and_a_sentence_for_people
     assert (code, out, json.loads(err)["type"]) == (1, "", "urn:suture-skills:bad-input")
     assert "3 numbers" in json.loads(err)["detail"]
     code, out, err = run("surgeon", "show", "nobody")
-    assert (code, out, err.startswith("Problem: There is no surgeon 'nobody'")) == (1, "", True)
+    assert (code, out, err.startswith("There is no surgeon 'nobody'.\n")) == (1, "", True)
 
 
 def test_what_is_printed_for_programs_is_one_document_and_nothing_else(skills, tmp_path: Path) -> None:
@@ -296,7 +350,7 @@ def test_every_command_of_the_interface_is_there_and_speaks_to_programs() -> Non
     assert silent == {("serve",), ("worker",)}, "they answer nothing"
 
 
-HEAVY = {  # pydantic is not among them: typer itself takes it to read what a command is given
+HEAVY = {  # pydantic is not among them: typer itself uses it to parse arguments
     *("numpy", "numba", "scipy", "matplotlib", "sqlalchemy", "alembic", "fastapi", "starlette", "uvicorn"),
     *("pydantic_settings", "httpx2", "orjson", "mcap", "rosbags", "dbos", "pybullet", "jinja2", "psycopg"),
 }
@@ -318,7 +372,7 @@ def test_help_is_quick_because_nothing_heavy_is_imported_for_it(words: list[str]
 
 
 def completed(line: str, **settings: str) -> tuple[list[str], str]:
-    """Press Tab at the end of a line, in bash: what is proposed, and what was said otherwise."""
+    """Press Tab at the end of a line, in bash; return the proposals, and all other output."""
     words = line.split(" ")
     environment = {name: value for name, value in os.environ.items() if not name.startswith("SKILLS_")} | settings
     asked = {"_SKILLS_COMPLETE": "complete_bash", "COMP_WORDS": line, "COMP_CWORD": str(len(words) - 1)}
@@ -330,16 +384,16 @@ def completed(line: str, **settings: str) -> tuple[list[str], str]:
 
 
 def test_tab_proposes_the_surgeons_and_sutures_that_there_are(skills, tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr("skills.cli.completing.LIMIT_S", 60.0)
-    assert surgeons("") == [], "there is no database yet"
+    monkeypatch.setattr("skills.cli.shell.LIMIT_S", 60.0)
+    assert complete_surgeons("") == [], "there is no database yet"
     assert not (tmp_path / "skills.sqlite").exists()
     for name in ("kestrel", "kite", "wren"):
         assert skills("surgeon", "put", name)[0] == 0
-    assert (surgeons(""), surgeons("k")) == (["kestrel", "kite", "wren"], ["kestrel", "kite"])
-    assert sutures("simple-") == ["simple-buried", "simple-interrupted", "simple-running"]
+    assert (complete_surgeons(""), complete_surgeons("k")) == (["kestrel", "kite", "wren"], ["kestrel", "kite"])
+    assert complete_sutures("simple-") == ["simple-buried", "simple-interrupted", "simple-running"]
     monkeypatch.setenv("SKILLS_SERVER", "http://127.0.0.1:9")
     settings.cache_clear()
-    assert surgeons("") == [], "where a service is set, it alone is asked"
+    assert complete_surgeons("") == [], "where a service is set, it alone is asked"
 
 
 def test_tab_in_a_shell_is_silent_whatever_is_wrong(tmp_path: Path) -> None:

@@ -1,7 +1,7 @@
-"""What docs/cli.md shows really runs, and prints what the page says.
+"""The examples of docs/cli.md run, and print the output on the page.
 
-Digests, ids, secrets and moments differ from one run to the next: the page's stand for those of this run in the order
-in which they are printed, and a command on the page that names one is given this run's. `...` is anything.
+Digests, ids, secrets and times differ from one run to the next: the page's stand for those of this run in the order
+in which they are printed, and a command that names one is given this run's. `...` matches anything.
 """
 
 import doctest
@@ -18,21 +18,22 @@ from skills.cli import app
 from skills.seeds.recordings import sample_recordings
 from skills.settings import settings
 from tests.e2e.conftest import running
+from tests.formats import trials
 from tests.library import rated
-from tests.recordings import trials
+from tests.needs import need
 
 PAGE = (Path(__file__).parent.parent / "docs" / "cli.md").read_text()
 BLOCKS = re.findall(r"```console\n(.*?)```", PAGE, re.DOTALL)
 NAME = re.compile(r"skills_[\w-]+|\b[0-9a-f]{8,64}\b")
 MOMENT = re.compile(r"\d{4}-\d\d-\d\d[T ][\d:.]+(?:Z|\+00:00)")
 AS_SHOWN, HOW = doctest.OutputChecker(), doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
-NOT_RUN = {"serve", "worker", "report"}  # they do not end, or are another page's
+NOT_RUN = {"serve", "worker", "report"}  # they do not end, or belong to another page
 
 
 @pytest.fixture
 def installation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """The real service, and a folder with what the page sends."""
-    pytest.importorskip("pybullet", reason="PyBullet has no wheel here: the page's playback cannot run")
+    """Start the real service, and make a folder with the files that the page uploads."""
+    need("simulator")
     sample = next(sample for sample in sample_recordings() if sample.surgeon == "wren")
     (tmp_path / "hand-off.mcap").write_bytes(sample.data)
     trials.folder(tmp_path / "jigsaws")
@@ -49,7 +50,7 @@ def installation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[No
 
 
 def steps() -> Iterator[tuple[str, bool, str]]:
-    """Give each command of the page, whether it fails, and what it prints."""
+    """Yield each command of the page, whether it fails, and its output."""
     for block in BLOCKS:
         for step in re.split(r"^\$ ", block, flags=re.MULTILINE)[1:]:
             line, _, printed = step.partition("\n")
@@ -58,10 +59,11 @@ def steps() -> Iterator[tuple[str, bool, str]]:
 
 
 def lasting(printed: str) -> str:
-    """Leave out what is of the moment."""
+    """Remove the parts that depend on the time."""
     return MOMENT.sub("MOMENT", NAME.sub("NAME", printed)).strip() + "\n"
 
 
+@pytest.mark.nightly  # 36 s of processor time; by day tests/test_cli.py runs commands
 def test_every_command_of_the_page_runs_and_prints_what_the_page_says(installation: None) -> None:
     now: dict[str, str] = {}
     for command, fails, printed in steps():
@@ -74,7 +76,7 @@ def test_every_command_of_the_page_runs_and_prints_what_the_page_says(installati
 
 
 def commands() -> Iterator[tuple[str, ...]]:
-    """Name every command there is."""
+    """Name every command of the command line."""
 
     def below(group: object, path: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
         for name, command in getattr(group, "commands", {}).items():

@@ -1,4 +1,4 @@
-"""What docs/client.md shows really runs, on the real service."""
+"""The examples of docs/client.md run, on the real service."""
 
 import ast
 import asyncio
@@ -31,7 +31,7 @@ def url(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
 
 
 def run(block: str, names: dict[str, Any], loop: asyncio.Runner) -> None:
-    """Run a block as a notebook runs a cell: `await` stands alone, and the last value is shown."""
+    """Run a block as a notebook runs a cell: top-level `await`, and the last value is shown."""
     code = compile(block, "client.md", "exec", flags=ast.PyCF_ALLOW_TOP_LEVEL_AWAIT)
     if code.co_flags & inspect.CO_COROUTINE:
         loop.run(eval(code, names))
@@ -39,6 +39,7 @@ def run(block: str, names: dict[str, Any], loop: asyncio.Runner) -> None:
         exec(code, names)
 
 
+@pytest.mark.nightly  # 11 s of processor time; by day tests/e2e calls the real service with the client
 def test_every_block_of_the_page_runs_in_the_order_of_the_page(url: str, capsys: pytest.CaptureFixture[str]) -> None:
     names: dict[str, Any] = {}
     with asyncio.Runner() as loop:
@@ -51,7 +52,7 @@ def test_every_block_of_the_page_runs_in_the_order_of_the_page(url: str, capsys:
     for said in (
         "22 states; 1331 starts reach the goal",
         "DTW 0.0 mm; 1 pass of",
-        "The way is the reference's all along: 0.0 mm from it on average. Not calibrated",
+        "The path follows the reference all along: 0.0 mm from it on average. Not calibrated",
         "['succeeded', 'succeeded', 'succeeded']",
         "100%\n",
         "succeeded 100%",

@@ -1,4 +1,4 @@
-"""What docs/keys.md shows really runs, and what it says is so."""
+"""The examples of docs/keys.md run, and its statements are true."""
 
 import json
 import re
@@ -24,7 +24,7 @@ UNITS = {"GiB": 2**30, "": 1}
 
 @pytest.fixture
 def installation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """An installation with two surgeons, as the commands find it."""
+    """Yield an installation with two surgeons, as the commands find it."""
     monkeypatch.setenv("SKILLS_DATABASE_URL", copy_of_trained(tmp_path))
     monkeypatch.delenv("SKILLS_SERVER", raising=False)
     monkeypatch.delenv("SKILLS_API_KEY", raising=False)
@@ -68,7 +68,7 @@ def test_what_cannot_be_done_says_so_and_exits_with_1(installation: Path):
         (("revoke", "00000000"), "skills keys list"),
         (("create", "local"), "An owner's name"),
         (("create", "bob", "--surgeon", "nobody"), "no surgeon 'nobody'"),
-        (("create", "bob", "--role", "admin", "--surgeon", "heron"), "An admin acts on the whole installation"),
+        (("create", "bob", "--role", "admin", "--surgeon", "heron"), "An admin key cannot be restricted"),
     ):
         result = CliRunner().invoke(app, ["keys", *words])
         assert (result.exit_code, why in result.output) == (1, True), result.output
@@ -76,13 +76,11 @@ def test_what_cannot_be_done_says_so_and_exits_with_1(installation: Path):
     assert json.loads(skills("keys", "list", "--json")) == []
 
 
-def test_the_commands_need_no_key_on_the_database_and_show_theirs_to_a_server(
-    installation: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_local_commands_need_no_key_and_send_theirs_to_a_server(installation: Path, monkeypatch: pytest.MonkeyPatch):
     made = json.loads(skills("keys", "create", "anna", "--role", "reader", "--json"))
     assert made["secret"].split("_")[1] == made["key"]
     with connect(settings()) as client:
-        client.put_surgeon("wren")  # an admin's
+        client.put_surgeon("wren")  # only an admin may
     service = Service(installation, workers=0)
     service.launch()
     assert service.process is not None

@@ -1,4 +1,4 @@
-"""What is logged: a line for each request and each job, with their ids, and nothing of anybody."""
+"""The logs: a line for each request and each job, with their ids, and no personal data."""
 
 import io
 import json
@@ -13,24 +13,25 @@ import pytest
 
 from skills import logs
 from skills.client import Client
-from skills.db.books import Job
+from skills.db.service_tables import Job
 from skills.db.session import Database
 from skills.demo import wait_until_ready
 from skills.errors import BadInput
-from skills.jobs.logged import logged
+from skills.jobs.worker import logged
 from skills.jobs.workflows import Work
 from skills.settings import Settings
 from tests import backends
 from tests.api.service import CSV, Service, serving
 from tests.e2e.conftest import Service as Processes
 from tests.library import cases
+from tests.waiting import END_S
 
 CANARY = "canary-7f3a91"
 
 
 @pytest.fixture
 def said(monkeypatch: pytest.MonkeyPatch) -> Iterator[io.StringIO]:
-    """All that is logged in this process, as JSON."""
+    """Yield all that is logged in this process, as JSON."""
     out = io.StringIO()
     monkeypatch.setattr(sys, "stderr", out)
     root, ours = logging.getLogger(), logging.getLogger(logs.OURS)
@@ -69,7 +70,7 @@ def test_as_text_it_is_a_line_too():
     assert "\n" not in text
 
 
-def test_of_an_exception_the_class_and_the_places_are_told_and_never_the_words(said: io.StringIO):
+def test_exceptions_are_logged_by_class_and_place_without_their_messages(said: io.StringIO):
     try:
         try:
             raise ValueError(f"no such file: /srv/{CANARY}.mcap")
@@ -100,7 +101,7 @@ def test_settings_choose_how_much_and_how(monkeypatch: pytest.MonkeyPatch):
         Settings()
 
 
-def test_requests_are_told_by_their_route_and_id_and_probes_only_when_debugging(said: io.StringIO, service: Service):
+def test_requests_are_logged_by_route_and_id_and_probes_at_debug_level(said: io.StringIO, service: Service):
     answer = service.http.get(f"/surgeons/{CANARY}", headers={"X-Request-ID": "4bf92f35-1"})
     service.http.get("/healthz")
     assert answer.headers["x-request-id"] == "4bf92f35-1"
@@ -142,9 +143,7 @@ def test_nobody_is_in_the_log_whatever_is_asked_and_however_it_fails(
 
 
 @pytest.mark.parametrize("error", [BadInput(f"no such surgeon: {CANARY}"), RuntimeError(f"/srv/{CANARY}.mcap")])
-def test_a_job_that_fails_is_told_by_its_id_kind_and_the_class_of_its_error(
-    said: io.StringIO, service: Service, error: Exception
-):
+def test_a_failed_job_is_logged_by_its_id_kind_and_error_class(said: io.StringIO, service: Service, error: Exception):
     cases.add_surgeon(service.database)
     cases.add_demo(service.database)
     job = cases.ask_training(service.database)
@@ -181,7 +180,7 @@ def test_a_job_that_succeeds_or_is_erased_on_the_way_is_told(said: io.StringIO, 
 
 
 class Overheard(Processes):
-    """A service whose words go to a file."""
+    """A service whose log goes to a file."""
 
     def start(self) -> None:
         with self.database.with_name("log").open("ab") as log:
@@ -191,7 +190,7 @@ class Overheard(Processes):
             wait_until_ready(client, self.process)
 
 
-def test_the_real_service_and_its_worker_tell_of_a_job_that_fails_and_of_nobody(tmp_path: Path):
+def test_the_real_service_logs_a_failed_job_without_naming_anybody(tmp_path: Path):
     service = Overheard(tmp_path, log_format="json", log_level="debug", job_attempts=1)
     service.start()
     try:
@@ -200,11 +199,11 @@ def test_the_real_service_and_its_worker_tell_of_a_job_that_fails_and_of_nobody(
             client.add_demo(cases.hand_off(), media_type=CSV, surgeon=CANARY, suture=cases.SUTURE)
             database = Database(f"sqlite:///{service.database}")
             with database.writing() as session:
-                session.connection().exec_driver_sql("DELETE FROM reward_maps")  # now training it fails inside
+                session.connection().exec_driver_sql("DELETE FROM reward_maps")  # so that training fails inside
             database.close()
             job = client.train(CANARY, cases.SUTURE)
             with pytest.raises(Exception, match="failed"):
-                client.wait(job, timeout_s=60)
+                client.wait(job, timeout_s=END_S)
             client.erase_surgeon(CANARY)
     finally:
         assert service.stop() == 0

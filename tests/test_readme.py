@@ -1,4 +1,4 @@
-"""What README shows really runs."""
+"""The examples of README.md run."""
 
 import re
 from pathlib import Path
@@ -8,8 +8,8 @@ import pytest
 README = (Path(__file__).parent.parent / "README.md").read_text()
 
 
+@pytest.mark.needs("simulator")
 def test_the_python_of_the_readme_runs_and_ends_with_a_feasible_playback(capsys: pytest.CaptureFixture[str]) -> None:
-    pytest.importorskip("pybullet", reason="PyBullet has no wheel here: the playback of the README cannot run")
     (code,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
     exec(compile(code, "README.md", "exec"), {})
     printed = capsys.readouterr().out.splitlines()

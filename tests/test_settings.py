@@ -1,4 +1,4 @@
-"""What an installation may be reached by: nothing beyond loopback in the clear, and nobody without a key there."""
+"""Settings for network access: beyond loopback only encrypted, and only with a key or an authenticating proxy."""
 
 from pathlib import Path
 
@@ -36,15 +36,15 @@ def test_these_go_together(how: dict[str, object]):
 @pytest.mark.parametrize(
     ("how", "why"),
     [
-        ({"host": "0.0.0.0"}, "must not go in the clear"),
-        ({"host": "::"}, "must not go in the clear"),
+        ({"host": "0.0.0.0"}, "must not be sent unencrypted"),
+        ({"host": "::"}, "must not be sent unencrypted"),
         ({"host": "10.1.2.3"}, "SKILLS_TLS_BY_PROXY"),
         ({"host": "skills.lab"}, "SKILLS_TLS_CERT"),
-        ({"host": "127.0.0.1.nip.io"}, "reached from outside"),
+        ({"host": "127.0.0.1.nip.io"}, "reachable from other machines"),
         ({"tls_cert": Path("cert.pem")}, "belong together"),
         ({"host": "0.0.0.0", **TLS}, "SKILLS_HOSTS"),
         ({"host": "::", "tls_by_proxy": True}, "SKILLS_HOSTS"),
-        ({"proxy_header": "X-Remote-User"}, "anybody could send that header"),
+        ({"proxy_header": "X-Remote-User"}, "any client could send that header"),
         ({"proxy_header": "X-Remote-User", "proxy_secret": "short"}, "at least 32"),
     ],
 )
@@ -61,10 +61,10 @@ def test_roles_are_those_of_the_ladder_and_secrets_are_not_shown():
     assert SECRET not in shown
 
 
-def test_beyond_loopback_it_does_not_start_until_somebody_has_a_key_or_a_proxy_says_who_asks(tmp_path: Path):
+def test_beyond_loopback_the_service_starts_only_with_a_key_or_a_proxy(tmp_path: Path):
     url = backends.fresh("sqlite", tmp_path)
     outside = Settings(database_url=url, host="skills.lab", tls_by_proxy=True)
-    with pytest.raises(Conflict, match="skills keys create OWNER --role admin"):
+    with pytest.raises(Conflict, match=r"no valid one.*[Aa]sk the operator of the service for a key"):
         refuse_keyless(outside)
     refuse_keyless(Settings(database_url=url))
     refuse_keyless(outside.model_copy(update={"proxy_header": "X-Remote-User"}))
@@ -75,15 +75,15 @@ def test_beyond_loopback_it_does_not_start_until_somebody_has_a_key_or_a_proxy_s
     refuse_keyless(outside)
 
 
-def test_the_samples_are_loaded_at_the_start_by_a_service_of_this_machine_only(tmp_path: Path):
+def test_samples_are_loaded_at_start_only_by_a_local_service(tmp_path: Path):
     url = f"sqlite:///{tmp_path / 'skills.sqlite'}"
     for how in (TLS, {"host": "skills.lab", "tls_by_proxy": True}):
-        with pytest.raises(BadSettings, match="`skills seed` loads them anywhere"):
+        with pytest.raises(BadSettings, match="only for a service on this machine"):
             serve(Settings(database_url=url, **how), samples=True)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_variable_that_cannot_be_meant_is_named_and_its_value_is_not_repeated(monkeypatch: pytest.MonkeyPatch):
+def test_an_invalid_variable_is_named_without_repeating_its_value(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("SKILLS_PORT", "70000")
     monkeypatch.setenv("SKILLS_WORKERS", "s3cret")
     with pytest.raises(BadSettings, match=r"SKILLS_PORT: .*65535; SKILLS_WORKERS: .*integer") as refused:

@@ -1,1 +1,1 @@
-"""The service over HTTP: a route parses, calls one library function, and answers."""
+"""The HTTP service: every route parses a request, calls one library function and returns the response."""

@@ -1,10 +1,10 @@
-"""The application: our calls, with one database, one engine, and problems for answers to what goes wrong."""
+"""The FastAPI application: routes, middleware, one database, one job engine, and errors as problem documents."""
 
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from typing import Any
 
-from anyio import to_thread
+from anyio import CapacityLimiter, to_thread
 from fastapi import FastAPI
 from fastapi.telemetry import TelemetryConfig
 from starlette.datastructures import MutableHeaders
@@ -12,53 +12,35 @@ from starlette.middleware.errors import ServerErrorMiddleware
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from skills import __version__
-from skills.api.answers import Encoded
-from skills.api.documented import complete
-from skills.api.gate import Access, Gate
-from skills.api.metrics import Metrics
-from skills.api.observed import Observed
+from skills.api.authentication import Access, Gate
+from skills.api.metrics import Observed, ServiceMetrics
+from skills.api.openapi import complete
+from skills.api.policy_cache import AtHand, PolicyCache
 from skills.api.problems import TOO_LARGE, answer_refusals
-from skills.api.routes import (
-    atlas,
-    atlas_pages,
-    cards,
-    catalogue,
-    demos,
-    keys,
-    operating,
-    pages,
-    pictures,
-    plans,
-    policies,
-    reference,
-    retrainings,
-    scores,
-    sign_in,
-    suture_points,
-    trainings,
-    trajectories,
-)
-from skills.api.served import AtHand, Served
-from skills.confined.limits import Limits
+from skills.api.responses import Encoded
+from skills.api.routes import catalogue, comparison, demos, jobs, operating, pages, plans, policies, sign_in
+from skills.api.streams import DOWNLOADS_READ, Watching
 from skills.db.session import Database
+from skills.formats.reader_process import ConfinedReader
 from skills.jobs.engine import Engine
 from skills.library.catalogue import seed_catalogue
 from skills.logs import request_id
-from skills.recordings.confined import ConfinedReader
+from skills.sandbox.limits import ProcessLimits
 from skills.settings import Settings
 
 DESCRIPTION = (
-    "Suture styles as a service: a surgeon's recorded needle hand-off, discretised, learnt, certified, served, stacked "
-    "at suture points and played back in simulation. Lengths are mm. **Research use only; not a medical device.**"
+    "Suture styles as a service: a recorded needle hand-off of a surgeon is discretised, learnt, certified, "
+    "served, stacked at suture points and played back in simulation. Lengths are mm. **Research use only; not a "
+    "medical device.**"
 )
 
-# OpenTelemetry came with other libraries: what it would send holds the words of errors, and asking whether it shall
-# send anything takes a tenth of the time of a short answer.
+# OpenTelemetry is installed by other libraries. Its exports would contain error messages, which may hold personal data,
+# and even the check whether to export takes a tenth of the time of a short response.
 NO_TELEMETRY = TelemetryConfig(tracing=False, metrics=False, logs=False, operation_spans=False, auto_configure=False)
 
 
 def create_app(settings: Settings) -> FastAPI:
-    """Make the application; its database is migrated and its catalogue seeded when it starts."""
+    """Create the application. Its start-up migrates the database and seeds the catalogue."""
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
@@ -76,7 +58,7 @@ def create_app(settings: Settings) -> FastAPI:
         description=DESCRIPTION,
         lifespan=lifespan,
         telemetry=NO_TELEMETRY,
-        docs_url=None,  # the stock page loads its scripts from elsewhere
+        docs_url=None,  # the default page loads its scripts from a CDN
         redoc_url=None,
         max_body_size=settings.max_upload_bytes,
         generate_unique_id_function=lambda route: route.name,
@@ -85,86 +67,126 @@ def create_app(settings: Settings) -> FastAPI:
     app.state.database = Database(settings.database_url)
     app.state.engine = Engine(settings)
     app.state.encoded = Encoded()
-    app.state.served = Served(app.state.database, app.state.encoded)
-    app.state.metrics = Metrics(app.state.database, settings.lease_s)
+    app.state.served = PolicyCache(app.state.database, app.state.encoded)
+    app.state.watching = Watching(app.state.database, app.state.served.changes, settings)
+    app.state.metrics = ServiceMetrics(app.state.database, settings.lease_s)
+    app.state.downloads = CapacityLimiter(DOWNLOADS_READ)
     app.state.access = Access(app.state.database, settings)
-    for part in (catalogue.router, demos.uploads, demos.router, trainings.router, policies.router, plans.router):
-        app.include_router(part)
-    app.include_router(trajectories.router)
-    app.include_router(suture_points.router)
-    app.include_router(pictures.router)
-    app.include_router(retrainings.router)
-    app.include_router(cards.router)
-    app.include_router(atlas.router)
-    app.include_router(scores.router)
-    app.include_router(operating.router)
-    app.include_router(reference.router)
-    app.include_router(pages.router)
-    app.include_router(atlas_pages.router)
-    app.include_router(sign_in.router)
-    app.include_router(keys.router)
+    for router in (  # the order of the calls in the OpenAPI document
+        catalogue.router,
+        demos.uploads,
+        demos.router,
+        jobs.router,
+        policies.router,
+        plans.router,
+        plans.trajectory_router,
+        plans.suture_point_router,
+        plans.picture_router,
+        jobs.retraining_router,
+        policies.card_router,
+        comparison.router,
+        comparison.score_router,
+        operating.router,
+        operating.reference_router,
+        pages.router,
+        comparison.page_router,
+        sign_in.router,
+        catalogue.key_router,
+    ):
+        app.include_router(router)
     answer_refusals(app)
     return app
 
 
 def prepare_database(database: Database) -> None:
-    """Migrate a database, and seed its catalogue where that is empty."""
+    """Migrate a database, and seed its catalogue if it is empty."""
     database.migrate()
     with database.writing() as session:
         seed_catalogue(session)
 
 
 def confined_reader(settings: Settings) -> ConfinedReader:
-    """Make the reader of what people send, under the limits of the settings."""
-    limits = Limits(
+    """Create the reader of uploaded recordings, with the resource limits of the settings."""
+    limits = ProcessLimits(
         memory_bytes=settings.reading_memory_bytes,
         wall_s=settings.reading_wall_s,
         cpu_s=settings.reading_cpu_s,
         file_bytes=settings.reading_file_bytes,
+        answer_bytes=settings.reading_answer_bytes,
         children=False,
     )
-    return ConfinedReader(limits, answer_bytes=settings.reading_answer_bytes, at_once=settings.readers)
+    return ConfinedReader(limits, at_once=settings.readers)
 
 
 class Service(FastAPI):
-    """FastAPI with the gate, `Headers` and `Observed` around everything, its own answers to failures included."""
+    """FastAPI with `Gate`, `Headers` and `Observed` around all responses, including its own 413 and 500 responses."""
 
     def openapi(self) -> dict[str, Any]:
-        """Describe every call, once."""
+        """Return the OpenAPI document, built at the first call and cached."""
         if self.openapi_schema is None:
             self.openapi_schema = complete(super().openapi())
         return self.openapi_schema
 
     def build_middleware_stack(self) -> ASGIApp:
-        """Put these outermost: middleware that is added stands inside of what answers 413 and 500."""
+        """Wrap FastAPI's middleware stack in ours.
+
+        `add_middleware` would place ours inside the handlers that answer 413 and 500, so those responses would miss
+        them.
+        """
         state = self.state
         failing = super().build_middleware_stack()
-        assert isinstance(failing, ServerErrorMiddleware)  # what answers 500 is outermost, and stays so
+        assert isinstance(failing, ServerErrorMiddleware)  # the handler of status 500 is outermost, and stays so
         at_hand = AtHand(failing.app, state.served, policies.get_policy, policies.router)
         failing.app = Gate(at_hand, state.access, state.settings)
-        return Observed(Headers(failing), state.metrics.seen)
+        return Observed(Headers(HeadAsGet(failing)), state.metrics)
 
 
 UNLESS_SAID = {
     "Content-Security-Policy": "default-src 'self'; object-src 'none'; base-uri 'none'; frame-ancestors 'none'",
-    "Referrer-Policy": "no-referrer",  # an address can hold a pseudonym
+    "Referrer-Policy": "no-referrer",  # a URL can contain a surgeon's pseudonym
 }
 ALWAYS = [
     (b"x-content-type-options", b"nosniff"),
     (b"cross-origin-opener-policy", b"same-origin"),
-    (b"cross-origin-resource-policy", b"same-origin"),  # no other site's page shows our pictures
+    (b"cross-origin-resource-policy", b"same-origin"),  # no other site's page can embed our pictures
     (b"permissions-policy", b"camera=(), geolocation=(), microphone=(), payment=(), usb=()"),
 ]
 
 
-class Headers:
-    """Give every answer its request's id, and forbid a browser to make more of it than it is."""
+class HeadAsGet:
+    """ASGI middleware that answers HEAD as GET without the body (RFC 9110, section 9.3.2), on every path with a GET."""
 
     def __init__(self, app: ASGIApp) -> None:
         self.app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass the request on, and add to the answer's headers."""
+        """Pass the request on as a GET, and end the response after its headers.
+
+        A generator that streams the body is closed as after a disconnect of the client.
+        """
+        if scope["type"] != "http" or scope["method"] != "HEAD":
+            await self.app(scope, receive, send)
+            return
+
+        async def headers_only(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                await send(message)
+                await send({"type": "http.response.body", "body": b"", "more_body": False})
+
+        await self.app({**scope, "method": "GET"}, receive, headers_only)
+
+
+class Headers:
+    """ASGI middleware that adds the request id and the security headers to every response."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self.app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass the request on, and add headers to the response.
+
+        A 413 that Starlette writes as plain text is replaced by the problem document.
+        """
         if scope["type"] != "http":
             await self.app(scope, receive, send)
             return

@@ -1,68 +1,101 @@
-"""`/metrics`, for Prometheus: requests by route, and at each scrape the figures of the installation."""
+"""Prometheus metrics, and one log line for each request.
 
+`/metrics` exports a histogram of requests by method, route and status, and at each scrape the figures of the
+installation from the database. Requests are counted and logged by route, never by path, which may hold a pseudonym.
+"""
+
+import logging
 import platform
+import re
 from collections.abc import Iterator
+from random import Random
+from time import perf_counter
 
-from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, Histogram, Info, ProcessCollector, generate_latest
+from prometheus_client import (
+    CONTENT_TYPE_LATEST,
+    CollectorRegistry,
+    Gauge,
+    Histogram,
+    Info,
+    ProcessCollector,
+    generate_latest,
+)
 from prometheus_client.core import GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.pool import QueuePool
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from skills import __version__
-from skills.db.schema import revisions
-from skills.db.session import Database
+from skills.db.session import Database, revisions
 from skills.errors import SkillsError
-from skills.library.condition import Condition, condition_of
+from skills.library.overview import Condition, condition_of
+from skills.logs import request_id, told
 
 BUCKETS_S = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 120.0)
 CONTENT_TYPE = CONTENT_TYPE_LATEST
 
 
-class Metrics:
+class ServiceMetrics:
     """The metrics of one application."""
 
     def __init__(self, database: Database, lease_s: float) -> None:
         self._registry = CollectorRegistry()
         self._requests = Histogram(
             "skills_request_seconds",
-            "Requests, from their first byte to the last of their answer.",
+            "Duration of requests, from the first byte to the last byte of the response.",
             ("method", "route", "status"),
             buckets=BUCKETS_S,
             registry=self._registry,
         )
+        self._in_progress = Gauge(
+            "skills_requests_in_progress", "Requests whose response is not complete yet.", registry=self._registry
+        )
         self._known: dict[tuple[str, str, int], Histogram] = {}
         about = {"version": __version__, "schema": revisions()[0], "python": platform.python_version()}
-        Info("skills_build", "What runs here.", registry=self._registry).info(about)
+        Info("skills_build", "Version, database schema and Python of this process.", registry=self._registry).info(
+            about
+        )
         ProcessCollector(registry=self._registry)
         self._registry.register(Installation(database, lease_s))
 
+    def begun(self) -> None:
+        """Count the start of a request."""
+        self._in_progress.inc()
+
     def seen(self, method: str, route: str, status: int, seconds: float) -> None:
-        """Count a request."""
+        """Count the end of a request, with its duration in seconds."""
+        self._in_progress.dec()
         key = (method, route, status)
+        # cached, because `labels` validates its arguments and takes a lock at every call
         one = self._known.get(key)
         if one is None:
             one = self._known[key] = self._requests.labels(method, route, str(status))
         one.observe(seconds)
 
     def text(self) -> bytes:
-        """Write all metrics in the format that is scraped."""
+        """Return all metrics in the Prometheus text format."""
         return generate_latest(self._registry)
 
 
 class Installation(Collector):
-    """What the database knows, read when it is asked for."""
+    """Prometheus collector of the figures in the database, queried at each scrape."""
 
     def __init__(self, database: Database, lease_s: float) -> None:
         self._database = database
         self._lease_s = lease_s
 
     def describe(self) -> list[Metric]:
-        """Name nothing beforehand: that would read the database when the application is made."""
+        """Return no descriptions; without this, registration would call `collect` and query the database."""
         return []
 
     def collect(self) -> Iterator[Metric]:
-        """Read the figures; where the database cannot be read, say just that."""
+        """Yield the figures; if the database cannot be read, only `skills_database_up` 0 and the connection counts."""
+        pool = self._database.engine.pool
+        assert isinstance(pool, QueuePool)
+        in_use, open_ = pool.checkedout(), pool.checkedin() + pool.checkedout()
+        yield GaugeMetricFamily("skills_database_connections_in_use", "Of this process.", in_use)
+        yield GaugeMetricFamily("skills_database_connections_open", "Of this process.", open_)
         try:
             with self._database.reading() as session:
                 found = condition_of(session, self._lease_s)
@@ -71,29 +104,81 @@ class Installation(Collector):
             return
         yield GaugeMetricFamily("skills_database_up", "Whether the database can be read.", 1)
         yield from _figures(found)
-        pool = self._database.engine.pool
-        assert isinstance(pool, QueuePool)
-        yield GaugeMetricFamily("skills_database_connections_in_use", "Of this process.", pool.checkedout())
-        yield GaugeMetricFamily(
-            "skills_database_connections_open", "Of this process.", pool.checkedin() + pool.checkedout()
-        )
 
 
 def _figures(found: Condition) -> Iterator[Metric]:
-    jobs = GaugeMetricFamily("skills_jobs", "Jobs that there are.", labels=("kind", "state"))
+    jobs = GaugeMetricFamily("skills_jobs", "Number of jobs.", labels=("kind", "state"))
     for labels, count in sorted(found.jobs.items()):
         jobs.add_metric(labels, count)
     yield jobs
-    took = GaugeMetricFamily("skills_job_seconds", "Of the jobs that ended last.", labels=("kind", "quantile"))
+    took = GaugeMetricFamily("skills_job_seconds", "Duration of the jobs that ended last.", labels=("kind", "quantile"))
     for kind, quantiles in sorted(found.seconds.items()):
         for quantile, seconds in quantiles.items():
             took.add_metric((kind, str(quantile)), seconds)
     yield took
     yield GaugeMetricFamily(
-        "skills_oldest_queued_seconds", "How long the first in the queue waits.", found.oldest_queued_s
+        "skills_oldest_queued_seconds", "Waiting time of the oldest queued job.", found.oldest_queued_s
     )
-    yield GaugeMetricFamily("skills_workers", "Workers that showed within their lease that they live.", found.workers)
+    yield GaugeMetricFamily("skills_workers", "Workers that renewed their lease in time.", found.workers)
     yield GaugeMetricFamily("skills_database_bytes", "Size of the database.", found.database_bytes)
     if found.last_event_at is not None:
         last = found.last_event_at.timestamp()
-        yield GaugeMetricFamily("skills_last_event_timestamp_seconds", "When the last event was written.", last)
+        yield GaugeMetricFamily(
+            "skills_last_event_timestamp_seconds", "Time at which the last event was written.", last
+        )
+
+
+METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "DELETE", "OPTIONS", "PATCH"})
+# requested every few seconds by monitoring, so logged at level debug
+PROBES = frozenset({"/healthz", "/readyz", "/metrics"})
+NO_ROUTE, NO_METHOD, NO_ANSWER = "none", "other", 0
+# The id of a trace or a UUID. Freer text could be somebody's name, and the id is logged.
+GIVEN = re.compile(rb"[0-9a-f]{8}[0-9a-f-]{0,56}")
+
+log = logging.getLogger("skills.api.request")
+
+
+class Observed:
+    """ASGI middleware that sets the request id, and records method, route, status and duration of each request."""
+
+    def __init__(self, app: ASGIApp, metrics: ServiceMetrics) -> None:
+        self.app = app
+        self._metrics = metrics
+        self._drawn = Random().getrandbits  # an id is not a secret: 64 pseudo-random bits, without a system call each
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass the request on; record and log it after its response."""
+        if scope["type"] != "http":
+            await self.app(scope, receive, send)
+            return
+
+        status = NO_ANSWER
+
+        async def noted(message: Message) -> None:
+            nonlocal status
+            if message["type"] == "http.response.start":
+                status = message["status"]
+            await send(message)
+
+        token = request_id.set(_given(scope) or f"{self._drawn(64):016x}")
+        began = perf_counter()
+        self._metrics.begun()
+        try:
+            await self.app(scope, receive, noted)
+        finally:
+            seconds = perf_counter() - began
+            method = scope["method"] if scope["method"] in METHODS else NO_METHOD
+            route = getattr(scope.get("route"), "path", NO_ROUTE)
+            self._metrics.seen(method, route, status, seconds)
+            level = logging.DEBUG if route in PROBES else logging.INFO
+            if log.isEnabledFor(level):
+                told(log, "request", level, method=method, route=route, status=status, ms=round(seconds * 1000, 2))
+            request_id.reset(token)
+
+
+def _given(scope: Scope) -> str | None:
+    """Return the X-Request-ID of the caller if it has the form of a trace id or UUID, else None."""
+    for name, value in scope["headers"]:
+        if name == b"x-request-id" and GIVEN.fullmatch(value):
+            return str(value, "ascii")
+    return None

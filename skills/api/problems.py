@@ -1,9 +1,11 @@
-"""Every error as `application/problem+json` (RFC 9457). Only this file knows status codes.
+"""Errors as `application/problem+json` (RFC 9457). Only this module knows HTTP status codes.
 
-A problem names its kind by a stable `type`, says in `detail` what is wrong and what to do next, and never repeats what
-the caller sent.
+A problem has a stable `type`; its `detail` states the error and the remedy in terms of HTTP, and never repeats text
+that the client sent. `reason` has the error alone and `remedies` the remedies as data, so that the client and the
+command line can word them in their own terms.
 """
 
+import errno
 import logging
 import math
 import re
@@ -16,26 +18,29 @@ from fastapi.exceptions import RequestValidationError
 from starlette.exceptions import HTTPException
 
 from skills import errors
+from skills.remedies import Door, did_you_mean
+from skills.schemas.requests import in_words
 
 log = logging.getLogger("skills.api")
 
 STATUS: tuple[tuple[type[errors.SkillsError], int, str], ...] = (
-    (errors.WrongHost, 400, "Not a name of this service"),
-    (errors.NotSignedIn, 401, "Who are you?"),
+    (errors.WrongHost, 400, "Unknown host name"),
+    (errors.NotSignedIn, 401, "Not signed in"),
     (errors.NotAllowed, 403, "Not allowed"),
     (errors.TooMany, 429, "Too many"),
-    (errors.UnknownFormat, 415, "This format is not read here"),
+    (errors.UnknownFormat, 415, "Unsupported format"),
     (errors.TooLarge, 413, "Too large"),
     (errors.TooSlow, 408, "Too slow"),
     (errors.NotFound, 404, "Not found"),
-    (errors.Erased, 410, "Erased for good"),
-    (errors.PreconditionFailed, 412, "It changed meanwhile"),
+    (errors.Erased, 410, "Erased permanently"),
+    (errors.PreconditionFailed, 412, "Changed meanwhile"),
     (errors.Conflict, 409, "Not possible in the present state"),
-    (errors.Corrupt, 503, "What is stored is damaged"),
+    (errors.Corrupt, 503, "Stored data is damaged"),
+    (errors.StorageFull, 507, "The disk is full"),
     (errors.Busy, 503, "Busy"),
     (errors.SimulationFailed, 503, "The simulator failed"),
-    (errors.LearningFailed, 503, "What learns failed"),
-    (errors.BadInput, 422, "What was sent cannot be used"),
+    (errors.LearningFailed, 503, "Learning failed"),
+    (errors.BadInput, 422, "The input cannot be used"),
 )
 HEADERS = {
     errors.Busy: {"Retry-After": "1"},
@@ -43,9 +48,9 @@ HEADERS = {
     errors.NotSignedIn: {"WWW-Authenticate": 'Bearer realm="suture-skills"'},
 }
 DETAILS = {
-    400: "The body cannot be read as JSON; mend it.",
-    404: "See /openapi.json for the calls there are.",
-    405: "See /openapi.json for the calls there are.",
+    400: "The body is not valid JSON; correct it.",
+    404: "See /openapi.json for the available calls.",
+    405: "See /openapi.json for the available calls.",
     413: "The body is over the limit of this call; send less.",
 }
 TITLES = {404: "Not found", 405: "This call does not exist here", 413: "Too large", 400: "Bad request"}
@@ -54,7 +59,7 @@ TITLES = {404: "Not found", 405: "This call does not exist here", 413: "Too larg
 def problem(
     status: int, kind: str, title: str, detail: str, *, headers: dict[str, str] | None = None, **more: Any
 ) -> Response:
-    """Write a problem."""
+    """Return a problem document as a response."""
     body = {"type": f"urn:suture-skills:{kind}", "title": title, "status": status, "detail": detail, **more}
     return Response(
         orjson.dumps(body, default=str),
@@ -64,43 +69,121 @@ def problem(
     )
 
 
-TOO_LARGE = problem(413, "http-413", TITLES[413], DETAILS[413])  # where Starlette would answer with plain text
+SHOWN = 1e12  # larger numbers are not repeated in messages
+LIMITS = {
+    "missing": "is missing",
+    "extra_forbidden": "there is no such field",
+    "greater_than": "must be more than {gt}",
+    "greater_than_equal": "must be at least {ge}",
+    "less_than": "must be less than {lt}",
+    "less_than_equal": "must be at most {le}",
+    "finite_number": "must be a finite number",
+    "float_type": "must be a number",
+    "float_parsing": "must be a number",
+    "int_type": "must be a whole number",
+    "int_parsing": "must be a whole number",
+    "int_parsing_size": "must be a smaller whole number",
+    "int_from_float": "must be a whole number",
+    "bool_type": "must be true or false",
+    "bool_parsing": "must be true or false",
+    "string_type": "must be a text",
+    "string_too_short": "must have at least {min_length} characters",
+    "string_too_long": "must have at most {max_length} characters",
+    "string_unicode": "must be a text",
+    "list_type": "must be a list",
+    "tuple_type": "must be a list of numbers",
+    "too_short": "must have at least {min_length} entries, and has {actual_length}",
+    "too_long": "must have at most {max_length} entries",
+    "model_attributes_type": "must be an object with named fields",
+    "model_type": "must be an object with named fields",
+    "dict_type": "must be an object with named fields",
+    "union_tag_not_found": "needs a kind",
+    "date_type": "must be a date such as 2030-12-31",
+    "date_parsing": "must be a date such as 2030-12-31",
+    "date_from_datetime_parsing": "must be a date such as 2030-12-31",
+    "datetime_type": "must be a time such as 2030-12-31T12:00:00Z",
+    "datetime_parsing": "must be a time such as 2030-12-31T12:00:00Z",
+    "datetime_from_date_parsing": "must be a time such as 2030-12-31T12:00:00Z",
+    "timezone_aware": "must have a time zone, such as 2030-12-31T12:00:00Z",
+}
+TOO_LARGE = problem(413, "http-413", TITLES[413], DETAILS[413])  # replaces Starlette's plain-text response
 
 
 def kind_of(error: errors.SkillsError) -> str:
-    """Turn an error's name into its stable kind: OutsideGrid becomes outside-grid."""
+    """Return the stable kind of an error from its class name: OutsideGrid becomes outside-grid."""
     return re.sub(r"(?<!^)(?=[A-Z])", "-", type(error).__name__).lower()
 
 
 def _where(one: dict[str, Any]) -> str:
-    """Say which field is refused; the name of one that there is not is the caller's, and is left out."""
+    """Return the path of a refused field; the name of an unknown field is omitted, as text that the client sent."""
     known = one["loc"][:-1] if one["type"] == "extra_forbidden" else one["loc"]
     return ".".join(str(part) for part in known)[:200]
 
 
 def _why(one: dict[str, Any]) -> str:
-    """Say why a field is refused, without what was sent."""
-    if one["type"] == "union_tag_invalid":
-        return f"The kind must be one of {one['ctx']['expected_tags']}."
-    if one["type"] == "json_invalid":
-        return f"{one['ctx']['error']}."
-    return str(one["msg"])
+    """Return why a field is refused, as a phrase that follows its name: the limit in words, and the given number.
+
+    Text that was sent is not repeated: the client, which has it, adds it to the message.
+    """
+    kind, about, given = one["type"], one.get("ctx", {}), one.get("input")
+    if kind == "json_invalid":
+        return f"{about['error']}."
+    if kind == "missing" and isinstance(one["loc"][-1], int):
+        return "is missing; give more numbers"
+    if kind == "string_pattern_mismatch":
+        one_of = re.fullmatch(r"\^\(([\w|-]+)\)\$", about["pattern"])
+        return in_words(about["pattern"]) if one_of is None else f"must be one of {one_of[1].replace('|', ', ')}"
+    if kind in ("literal_error", "union_tag_invalid"):
+        known = re.findall(r"'([^']+)'", about.get("expected") or about["expected_tags"])
+        near = did_you_mean(str(about.get("tag", given)), known)
+        meant = f" (did you mean {near[0].removeprefix('Did you mean ')})" if near else ""
+        return f"must be one of {', '.join(known)}{meant}"
+    words = LIMITS.get(kind)
+    said = (
+        str(one["msg"]).removeprefix("Value error, ")
+        if words is None
+        else words.format(**{name: _short(value) for name, value in about.items()})
+    )
+    given = _number(given)
+    if given is None or not abs(given) < SHOWN:
+        return said
+    # a small positive number below the minimum in mm was probably meant in metres
+    metres = str(one["loc"][-1]).endswith("_mm") and kind.startswith("greater") and 0 < given < 1
+    return f"{said}; {given:g} was given" + (f" (if metres were meant, give {1000 * given:g})" if metres else "")
+
+
+def _number(given: object) -> float | None:
+    """Return a given value as a number, or None; values from a query are strings."""
+    try:
+        return float(given) if isinstance(given, int | float | str) and not isinstance(given, bool) else None
+    except (ValueError, OverflowError):
+        return None
+
+
+def _short(limit: object) -> object:
+    return f"{limit:g}" if isinstance(limit, float) else limit
 
 
 def answer_to(error: errors.SkillsError) -> Response:
-    """Write what a refusal is answered with."""
+    """Return the response to an error; the location of the database is logged but never sent."""
+    if isinstance(error, errors.DatabaseUnusable):
+        log.error("%s", error.message)
+        error = errors.Busy("The database cannot be used now; the service's log has the cause.")
     for family, status, title in STATUS:
         if isinstance(error, family):
             headers = HEADERS.get(family)
             if isinstance(error, errors.TooMany):
                 headers = {"Retry-After": str(max(1, math.ceil(error.wait_s)))}
-            numbers = {"numbers": error.numbers} if error.numbers else {}
-            return problem(status, kind_of(error), title, str(error), headers=headers, **numbers)
+            more: dict[str, Any] = {"numbers": error.numbers} if error.numbers else {}
+            more["reason"] = error.message
+            if error.remedies:
+                more["remedies"] = [one if isinstance(one, str) else one.as_json() for one in error.remedies]
+            return problem(status, kind_of(error), title, error.words(Door.HTTP), headers=headers, **more)
     raise error
 
 
 def answer_refusals(app: FastAPI) -> None:
-    """Make an app answer everything that goes wrong with a problem."""
+    """Register the exception handlers that answer every error of an application with a problem document."""
 
     @app.exception_handler(errors.SkillsError)
     def refused(_request: Request, error: errors.SkillsError) -> Response:
@@ -113,7 +196,8 @@ def answer_refusals(app: FastAPI) -> None:
             422,
             "invalid-request",
             "The request does not have the form of this call",
-            "Mend what `errors` names; /openapi.json describes the call.",
+            "Correct the values named in `errors`; /openapi.json describes the call.",
+            reason="The request does not have the form of this call.",
             errors=wrong,
         )
 
@@ -123,10 +207,23 @@ def answer_refusals(app: FastAPI) -> None:
         detail = DETAILS.get(error.status_code, str(error.detail))
         return problem(error.status_code, f"http-{error.status_code}", title, detail, headers=dict(error.headers or {}))
 
+    @app.exception_handler(OSError)
+    def full(_request: Request, error: OSError) -> Response:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+            raise error
+        log.error("A disk is full: %s", error)
+        return answer_to(
+            errors.StorageFull("The disk for temporary files is full, so nothing was stored; free some space on it.")
+        )
+
     @app.exception_handler(Exception)
     def unexpected(_request: Request, error: Exception) -> Response:
         case = secrets.token_hex(8)
         log.error("unexpected error, case %s", case, exc_info=error)
         return problem(
-            500, "unexpected", "Our mistake", "Nothing was kept. Report the case number with what you did.", case=case
+            500,
+            "unexpected",
+            "Internal error",
+            "Nothing was stored. Report the case number and the request.",
+            case=case,
         )

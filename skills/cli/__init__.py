@@ -1,17 +1,86 @@
-"""`skills`: the installation's own commands, and the typed client's, from a shell.
+"""`skills`: the command line, for the installation itself and for the calls of the typed client.
 
-Tables for people, `--json` for programs; exit code 0 only on success. What is heavy is imported where it is used, so
-that `skills --help` is quick.
+Commands print tables for people, or one JSON document with `--json`; the exit code is 0 only on success. Slow imports
+are made inside the commands, so that `skills --help` is fast.
 """
 
-import typer
+import re
+import sys
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
 
-from skills.cli import atlas, installation, keys, learning, paper, plans, policies, recordings, scoring, surgeons
+import typer
+from typer.core import TyperGroup
+
+from skills.cli import comparison, installation, plans, policies, recordings
+from skills.cli.shell import err, tell
+from skills.remedies import did_you_mean
+
+CHOICES = re.compile(r"'([^']*)' is not one of (.+?)\.?$")
+
+
+class Commands(TyperGroup):
+    """The command group. Usage errors are printed like all other errors: the fault, then the remedy."""
+
+    def main(
+        self,
+        args: Sequence[str] | None = None,
+        prog_name: str | None = None,
+        complete_var: str | None = None,
+        standalone_mode: bool = True,
+        windows_expand_args: bool = True,
+        **extra: Any,
+    ) -> Any:
+        """Run a command; exit with 2 after a usage error, with 1 if a confirmation is declined."""
+        # not in standalone mode, in which Typer prints errors in its own form
+        run = partial(super().main, args, prog_name, complete_var, False, windows_expand_args, **extra)
+        if not standalone_mode:
+            return run()
+        try:
+            sys.exit(run() or 0)
+        except typer.Abort:
+            err.print()
+            tell("Nothing was done: it was not confirmed.", ["Answer y, or give --yes."])
+            sys.exit(1)
+        except typer.TyperException as error:
+            wrong, advice = _in_words(error)
+            tell(wrong, advice)
+            sys.exit(error.exit_code)
+
+
+def _in_words(error: typer.TyperException) -> tuple[str, list[str]]:
+    """Return a usage error as the fault and the remedies, with the most similar name if there is one."""
+    said = " ".join(error.format_message().split()).replace("Value error, ", "")
+    said = said.partition(", unable to parse")[0].replace("Input should be", "it must be")
+    wrong, _, suggested = said.partition(" Did you mean ")
+    wrong, _, options = wrong.partition(" (Possible options: ")
+    advice = [f"Did you mean {suggested}"] if suggested else []
+    if options:
+        advice += did_you_mean(wrong.rpartition(" ")[2], options.rstrip(")").split(", "))
+    if (choices := CHOICES.search(wrong)) is not None:
+        advice += did_you_mean(choices[1], re.findall(r"'([^']*)'", choices[2]))
+    context = getattr(error, "ctx", None)
+    path = "skills" if context is None else " ".join(["skills", *context.command_path.split()[1:]])
+    return wrong, [*advice, f"See the help: {path} --help"]
+
 
 app = typer.Typer(
+    cls=Commands,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     help="Suture styles: learn, certify, serve and check. Research use only.",
 )
-for part in (installation, keys, recordings, learning, policies, plans, atlas, scoring, paper, surgeons):
-    app.add_typer(part.commands)
+for commands in (  # the order of the commands in `skills --help`
+    installation.commands,
+    installation.key_commands,
+    recordings.commands,
+    policies.learning_commands,
+    policies.commands,
+    plans.commands,
+    comparison.commands,
+    comparison.scoring_commands,
+    comparison.report_commands,
+    recordings.surgeon_commands,
+):
+    app.add_typer(commands)

@@ -1,17 +1,34 @@
-"""The commands that act on this installation."""
+"""Commands that act on this installation: serve, worker, migrate, seed, backup, restore, erasures, verify, keys."""
 
 import gc
+import json
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
+from datetime import timedelta
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from skills.cli.shell import AsJson, err, out, print_json, refusing, service, show
+from skills.cli.shell import AsJson, about_path, err, out, print_json, refusing, service, show
 from skills.errors import SkillsError
 
 commands = typer.Typer()
+_ENDED = {
+    "surgeons_erased": "surgeons erased",
+    "demos_erased": "demonstrations erased",
+    "recordings_deleted": "recordings deleted",
+    "demos_withdrawn": "demonstrations withdrawn",
+    "styles_stopped": "styles no longer served",
+    "keys_revoked": "keys revoked",
+    "consents_narrowed": "consents narrowed",
+}
+_LISTED = {
+    "recordings": "recordings deleted",
+    "withdrawn": "demonstrations withdrawn",
+    "releases": "policies no longer served",
+    "keys": "keys revoked",
+}
 
 
 @commands.command()
@@ -19,11 +36,11 @@ commands = typer.Typer()
 def serve(
     samples: Annotated[bool, typer.Option(help="Load the sample surgeons and train them first.")] = False,
 ) -> None:
-    """Start the service and its worker; stop both with Ctrl-C."""
+    """Start the service and its workers; stop both with Ctrl-C."""
     from skills.settings import settings
 
-    settings().check_address()  # before anything is touched
-    gc.disable()  # nothing that is imported is garbage, and to look for some takes a fifth of the start
+    settings().check_address()  # before anything is imported or changed
+    gc.disable()  # imports create no garbage, and looking for it takes a fifth of the start
     from skills.serving import serve as run
 
     run(settings(), samples=samples)
@@ -32,7 +49,8 @@ def serve(
 @commands.command()
 @refusing
 def worker() -> None:
-    """Work on jobs in this process, beside those that a service has started."""
+    """Run jobs in this process, in addition to the workers that a service started."""
+    gc.disable()  # as in `serve`, until the worker runs
     from skills import logs
     from skills.jobs.worker import run_worker
     from skills.settings import settings
@@ -44,7 +62,7 @@ def worker() -> None:
 @commands.command()
 @refusing
 def migrate(as_json: AsJson = False) -> None:
-    """Bring the database to this version; an empty one gets its tables and the catalogue."""
+    """Migrate the database to this version; an empty one gets its tables and the catalogue."""
     from skills.serving import prepare
     from skills.settings import settings
 
@@ -65,7 +83,7 @@ def seed(as_json: AsJson = False) -> None:
 @commands.command()
 @refusing
 def backup(to: Annotated[Path, typer.Argument(help="A new file.", dir_okay=False)], as_json: AsJson = False) -> None:
-    """Write all that is stored into one file, while the service goes on working."""
+    """Write everything that is stored into one file, while the service goes on working."""
     from skills.db.session import Database
     from skills.library.backup import back_up
     from skills.settings import settings
@@ -83,12 +101,18 @@ def restore(
     source: Annotated[Path, typer.Argument(help="A file that `skills backup` wrote.", dir_okay=False)],
     erasures: Annotated[
         list[str] | None,
-        typer.Option(help="A list that `skills erasures` wrote, or the URL of the database that is replaced."),
+        typer.Option(
+            help="A list that `skills erasures` wrote, or the URL of the database that is replaced; repeatable. By "
+            "default the file of SKILLS_ERASURES_FILE."
+        ),
     ] = None,
-    check: Annotated[bool, typer.Option("--check", help="Only check the backup; nothing is written.")] = False,
+    check: Annotated[bool, typer.Option("--check", help="Only check the backup; write nothing.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Fill an empty database from a backup, and erase again who was erased since."""
+    """Fill an empty database from a backup, and repeat everything that was ended since the backup.
+
+    That is, erasures, withdrawals, revoked keys and narrowed consents, from the lists of --erasures.
+    """
     from skills.db.session import Database
     from skills.jobs.readiness import refuse_left_over
     from skills.library import backup as library
@@ -101,21 +125,28 @@ def restore(
             _say(f"{source} is whole: {rows} rows of {taken}.", as_json, whole=True, rows=rows, created_at=taken)
             return
         refuse_left_over(settings())
+        kept = settings().erasures_file
+        sources = erasures or ([str(kept)] if kept is not None and kept.exists() else [])
         listed = library.NOTHING
-        for one in erasures or ():
+        for one in sources:
             listed |= library.read_erasures(one)
         with closing(Database(settings().database_url)) as database, _telling("restoring") as told:
             done = library.restore(database, source, listed, told)
     rows, taken = sum(table.rows for table in done.manifest.tables), done.manifest.created_at
-    sentence = f"Restored {rows} rows, the state of {taken}; what was withdrawn since then stands again."
-    if erasures:
-        sentence += f"\nErased again: {done.surgeons_erased} surgeons, {done.demos_erased} demonstrations."
-    erased = {"surgeons_erased": done.surgeons_erased, "demos_erased": done.demos_erased}
-    _say(sentence, as_json, rows=rows, created_at=taken, **erased)
-    if not erasures:
+    ended = {name: count for name, count in vars(done).items() if name != "manifest"}
+    sentence = f"Restored {rows} rows, the state of {taken}."
+    if sources:
+        counts = ", ".join(f"{count} {_ENDED[name]}" for name, count in ended.items())
+        sentence += f"\nApplied again, from {', '.join(map(_without_password, sources))}: {counts}."
+        if done.styles_stopped:
+            sentence += "\nRelease a version of each style that is to be served: `skills policy release`."
+    _say(sentence, as_json, rows=rows, created_at=taken, **ended)
+    if not sources:
         err.print(
-            f"NO LIST OF ERASURES WAS GIVEN: whoever was erased after {taken} IS BACK. Erase them again before this "
-            "database is used, or restore into an empty one with --erasures.",
+            f"NO LIST OF ERASURES: surgeons who were erased after {taken} ARE BACK, policies that were withdrawn "
+            "or superseded since ARE SERVED, revoked keys ARE VALID and withdrawn consent IS IN FORCE. Restore "
+            "into an empty database with --erasures, or erase, withdraw and revoke all of this again before you "
+            "use this database.",
             style="red",
         )
 
@@ -123,10 +154,10 @@ def restore(
 @commands.command()
 @refusing
 def erasures(
-    to: Annotated[Path, typer.Argument(help="The list; it grows, and is kept apart from the backups.")],
+    to: Annotated[Path, typer.Argument(help="The list; it grows with each erasure. Keep it apart from the backups.")],
     as_json: AsJson = False,
 ) -> None:
-    """Write the list of who and what was erased, as digests, for `skills restore --erasures`."""
+    """Write the digests of everything that a restored backup must not bring back, for `skills restore --erasures`."""
     from skills.db.session import Database
     from skills.library.backup import keep_erasures
     from skills.settings import settings
@@ -134,18 +165,23 @@ def erasures(
     with closing(Database(settings().database_url)) as database, _files():
         listed = keep_erasures(database, to)
     surgeons, demos = len(listed.surgeons), len(listed.demos)
-    _say(f"{to}: {surgeons} surgeons, {demos} demonstrations.", as_json, file=to, surgeons=surgeons, demos=demos)
+    others = {kind: len(names) for kind, names in listed.ended.items() if kind != "demonstrations"}
+    more = ", ".join(f"{count} {_LISTED[kind]}" for kind, count in others.items())
+    sentence = f"{to}: {surgeons} surgeons and {demos} demonstrations erased, {more}."
+    _say(sentence, as_json, file=to, surgeons=surgeons, demos=demos, **others)
 
 
 @commands.command()
 @refusing
 def verify(
-    bag: Annotated[Path | None, typer.Argument(help="A bag for replay; left out, all of this installation.")] = None,
+    bag: Annotated[
+        Path | None, typer.Argument(help="A bag for replay; by default the whole installation is verified.")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Check every digest of this installation and what rests on what, or one bag; exit code 1 if anything is wrong."""
+    """Check every digest and reference of this installation, or one replay bag; exit code 1 if anything is wrong."""
     if bag is not None:
-        from skills.recordings.replay_check import verify_bag
+        from skills.formats.verify import verify_bag
 
         lines = list(verify_bag(bag))
         _say("\n".join(lines), as_json, whole=True, checked=lines)
@@ -172,8 +208,15 @@ def verify(
         raise typer.Exit(1)
 
 
+def _without_password(source: str) -> str:
+    """Return the name of a file, or the URL of a database without its password."""
+    from skills.db.session import parse_url
+
+    return parse_url(source).render_as_string(hide_password=True) if "://" in source else source
+
+
 def _say(sentence: str, as_json: bool, **facts: Any) -> None:
-    """Say what was done, to people or to programs."""
+    """Print the outcome: the sentence, or the facts as JSON."""
     if as_json:
         print_json(facts)
     else:
@@ -182,15 +225,94 @@ def _say(sentence: str, as_json: bool, **facts: Any) -> None:
 
 @contextmanager
 def _telling(doing: str) -> Iterator[Callable[[str], None]]:
-    """Show what is worked on."""
+    """Show a status line on stderr, and yield a callback that updates it."""
     with err.status(doing) as status:
         yield lambda what: status.update(f"{doing} {what}")
 
 
 @contextmanager
 def _files() -> Iterator[None]:
-    """Say what is wrong with a file that is named on the command line."""
+    """Convert an OSError about a path from the command line into a `SkillsError` with advice."""
     try:
         yield
     except OSError as error:
-        raise SkillsError(f"{error.filename or 'The file'}: {error.strerror or type(error).__name__}.") from error
+        raise SkillsError(f"{error.filename or 'The file'}: {error.strerror}.", *about_path(error)) from error
+
+
+if TYPE_CHECKING:
+    from skills.db.session import Database
+
+key_commands = typer.Typer()
+keys = typer.Typer(no_args_is_help=True, help="Keys: callers and their roles.")
+key_commands.add_typer(keys, name="keys")
+
+Role = Literal["reader", "uploader", "trainer", "releaser", "admin"]  # as in `skills.settings`, which is slow to import
+COLUMNS = ("key", "owner", "role", "surgeons", "created_at", "expires_at", "state")
+
+
+@keys.command()
+@refusing
+def create(
+    owner: Annotated[str, typer.Argument(help="The owner's name, which events and releases record.")],
+    role: Annotated[Role, typer.Option(help="Each role includes the rights of those before it.")] = "reader",
+    days: Annotated[int | None, typer.Option(min=1, max=3650, help="Validity in days; unlimited by default.")] = None,
+    surgeon: Annotated[list[str] | None, typer.Option(help="Restrict it to this surgeon; repeatable.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Create a key, and print its secret, which is shown only this once."""
+    from skills.db.base import now
+    from skills.library.keys import about_key, create_key
+
+    with _database() as database, database.writing() as session:
+        expires_at = None if days is None else now() + timedelta(days=days)
+        key, text = create_key(session, owner, role, "local", expires_at=expires_at, surgeons=surgeon)
+        about = about_key(key)
+    if as_json:
+        out.print_json(json.dumps(about | {"secret": text}))
+        return
+    out.print(text, markup=False, soft_wrap=True)
+    err.print("It is not stored and cannot be shown again; keep it where only its owner can read it.")
+
+
+@keys.command("list")
+@refusing
+def list_all(as_json: AsJson = False) -> None:
+    """List all keys, including those that were revoked or have expired; secrets are not stored."""
+    from skills.library.keys import about_key, list_keys
+
+    with _database() as database, database.reading() as session:
+        found = [about_key(key) for key in list_keys(session)]
+    show(found if as_json else [_in_words(one) for one in found], as_json, COLUMNS)
+
+
+@keys.command()
+@refusing
+def revoke(
+    key: Annotated[str, typer.Argument(help="Its id: the eight characters after skills_.")], as_json: AsJson = False
+) -> None:
+    """Revoke a key: within a second every service of this installation refuses it."""
+    from skills.library.keys import about_key, revoke_key
+
+    with _database() as database, database.writing() as session:
+        about = about_key(revoke_key(session, key, "local"))
+    show(about if as_json else _in_words(about), as_json, COLUMNS)
+
+
+@contextmanager
+def _database() -> Iterator["Database"]:
+    """Open the database of this installation, migrated, and update the file of erasures afterwards."""
+    from skills.db.session import Database
+    from skills.settings import settings
+
+    with closing(Database(settings().database_url)) as database:
+        database.migrate()
+        yield database
+        if (file := settings().erasures_file) is not None:
+            from skills.library.backup import keep_up_erasures
+
+            keep_up_erasures(database, file)
+
+
+def _in_words(about: dict[str, Any]) -> dict[str, Any]:
+    surgeons = "all" if about["surgeons"] is None else ", ".join(about["surgeons"]) or "none any more"
+    return about | {"surgeons": surgeons}

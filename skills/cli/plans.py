@@ -1,4 +1,4 @@
-"""Plans, their playback in the simulator, and the bag that a robot replays."""
+"""Commands of plans, their playback in the simulator, and the bag that a robot replays."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -32,10 +32,12 @@ PlanId = Annotated[str, typer.Argument(help="The plan's digest.")]
 def plan(
     surgeon: Surgeon,
     suture: Suture,
-    point: Annotated[list[str] | None, typer.Option(help="A suture point, as x,y,z in mm; once for each pass.")] = None,
+    point: Annotated[
+        list[str] | None, typer.Option(help="A suture point, as x,y,z in mm; repeatable, one for each pass.")
+    ] = None,
     scene: Annotated[
         Path | None,
-        typer.Option(help="Take the suture points from a simulator's MCAP file: where the needle comes out."),
+        typer.Option(help="Take the suture points from a simulator's MCAP file: the exit points of the needle."),
     ] = None,
     speed_mm_s: float = 20.0,
     rate_hz: Annotated[float, typer.Option(help="Samples per second, 100 to 200.")] = 200.0,
@@ -43,18 +45,29 @@ def plan(
     base: Annotated[
         str | None, typer.Option(help="PSM_M's base in the arm's frame, as x,y,z in mm and qx,qy,qz,qw.")
     ] = None,
+    no_handoff: Annotated[
+        bool, typer.Option("--no-handoff", help="Plan the tip's path alone, without a hand-off: no PSM_M, no A2.")
+    ] = False,
     tip_offset_mm: Annotated[
-        float, typer.Option(help="10.2: points are where the finger tips go, not the hinge.")
+        float,
+        typer.Option(
+            help="Distance of the finger tips from the hinge; with 10.2 the points are those of the finger tips."
+        ),
     ] = 0.0,
     as_json: AsJson = False,
 ) -> None:
     """Stack the released policy at suture points."""
     if bool(point) == (scene is not None):
-        raise BadInput("Give suture points, with --point for each, or the file of a scene that has them.")
+        raise BadInput(
+            "A plan needs suture points, from --point or from --scene.",
+            "For each pass: --point X,Y,Z in mm; or --scene with a simulator's file that contains them.",
+        )
     psm_m: dict[str, Any] = {} if approach is None else {"approach": triple(approach)}
     if base is not None:
-        x, y, z, *turned = numbers(base, 7)
+        x, y, z, *turned = numbers(base, 7)  # position, then quaternion
         psm_m["base"] = {"position_mm": (x, y, z), "rotation_xyzw": turned}
+    if no_handoff and psm_m:
+        raise BadInput("--no-handoff plans without PSM_M.", "Leave it out, or --approach and --base.")
     with service() as client:
         points: list[dict[str, Any]] = [{"position_mm": triple(one)} for one in point or ()]
         if scene is not None:
@@ -68,8 +81,11 @@ def plan(
             rate_hz=rate_hz,
             tip_offset_mm=tip_offset_mm,
             psm_m=psm_m or None,
+            handoff="none" if no_handoff else None,
         )
     show(made, as_json, ("id", "arm", "frame", "orientation", "trajectory.duration_s"))
+    if not as_json:
+        out.print(made.in_words, markup=False, soft_wrap=True)
 
 
 @commands.command()
@@ -82,7 +98,7 @@ def play(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Play a plan in the simulator, and print its verdict; exit code 1 where it is not feasible."""
+    """Play a plan in the simulator, and print the verdict; exit code 1 if it is not feasible."""
     with service(works=True) as client:
         playback = client.playback(result_of(finished(client, client.play(plan_id)))["playback"])
         if picture is not None:
@@ -98,7 +114,8 @@ def play(
     if as_json:
         print_json(playback)
     else:
-        out.print("feasible" if playback.feasible else playback.report.failure_in_words)
+        assert playback.headline is not None, playback
+        out.print(playback.headline.text, markup=False, soft_wrap=True)
         for under in playback.report.doubt.under:
             least = min(one.succeeds.lower for one in under.passes)
             error = f"tips {under.tip_error_mm:g} mm off"
@@ -112,14 +129,19 @@ def play(
 def export(
     plan_id: PlanId,
     to: Annotated[Path, typer.Argument(help="The zip to write.", dir_okay=False)],
-    pass_index: Annotated[int | None, typer.Option("--pass", help="One pass alone, counted from 0.")] = None,
+    pass_index: Annotated[int | None, typer.Option("--pass", help="A single pass, counted from 0.")] = None,
+    no_handoff: Annotated[
+        bool, typer.Option("--no-handoff", help="Needed for a plan without a hand-off: no PSM_M, no A2.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Write the bag of a plan that a robot or a simulator replays; first read docs/replay.md."""
+    """Write the bag of a plan that a robot or a simulator replays; read docs/replay.md first."""
     with service() as client, bar("fetching") as progress:
-        client.save_replay_bag(plan_id, to, pass_index, progress)
+        client.save_replay_bag(plan_id, to, pass_index, progress, handoff="none" if no_handoff else None)
     size = to.stat().st_size
     if as_json:
         print_json({"file": to, "size_bytes": size})
     else:
-        out.print(f"{to}: {size / 1e6:.1f} MB. Check it with `skills verify {to}` where it is used. Research use only.")
+        out.print(
+            f"{to}: {size / 1e6:.1f} MB. Check it with `skills verify {to}` before it is used. Research use only."
+        )

@@ -1,11 +1,193 @@
-"""Policies: what is served, its history, and what it does from a place."""
+"""Commands of training, jobs and policies."""
 
+import json
+import time
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from skills.cli.shell import AsJson, Surgeon, Suture, cell, out, print_json, refusing, service, show, triple
+from skills.cli.shell import (
+    AsJson,
+    OfSurgeon,
+    OfSuture,
+    Surgeon,
+    Suture,
+    cell,
+    err,
+    finished,
+    out,
+    print_json,
+    refusing,
+    result_of,
+    service,
+    show,
+    triple,
+)
+from skills.errors import BadInput, Conflict
+
+if TYPE_CHECKING:
+    from skills.client import Client
+    from skills.schemas.given import RetrainedStyle, Retraining
+
+WATCH_S = 0.3
+ABOUT = ("id", "kind", "state", "progress", "created_at", "error")
+
+learning_commands = typer.Typer()
+jobs = typer.Typer(no_args_is_help=True, help="Trainings, playbacks and other long work.")
+learning_commands.add_typer(jobs, name="job")
+
+JobId = Annotated[str, typer.Argument(help="The job's id.")]
+Kind = Annotated[str | None, typer.Option("--learner", help="Kind of the learner, such as value-iteration or dqn.")]
+Chosen = Annotated[
+    list[str] | None, typer.Option("--setting", help="A setting of the learner, such as steps=100000; repeatable.")
+]
+
+
+@learning_commands.command()
+@refusing
+def train(
+    surgeon: Surgeon,
+    suture: Suture,
+    demo: Annotated[list[str] | None, typer.Option(help="Learn from this demonstration; repeatable.")] = None,
+    combine: Annotated[
+        Literal["medoid", "barycentre", "corridor"] | None,
+        typer.Option(help="Way to combine several demonstrations into one path; a corridor by default."),
+    ] = None,
+    release: Annotated[bool, typer.Option(help="Release the version if it passes the gate.")] = False,
+    seed: int = 0,
+    learner: Kind = None,
+    setting: Chosen = None,
+    as_json: AsJson = False,
+) -> None:
+    """Learn a style from its newest demonstration, or from the given ones, and wait until it is learnt.
+
+    With --release, the exit code is 1 if the style does not serve the version afterwards.
+    """
+    chosen = _learner(learner, setting or [])
+    with service(works=True) as client:
+        asked = client.train(
+            surgeon, suture, demos=demo or None, combine=combine, learner=chosen, seed=seed, release=release
+        )
+        job = finished(client, asked)
+    result = result_of(job)
+    show(job if as_json else result, as_json, ("policy_version", "sha256", "releasable", "released"))
+    if release and not result["released"]:
+        said = f"Version {result['policy_version']} is not released: {result['not_released_because']}"
+        raise Conflict(f"{said} {result['remedy']}")
+
+
+@learning_commands.command()
+@refusing
+def retrain(
+    surgeon: OfSurgeon = None,
+    suture: OfSuture = None,
+    only_stale: Annotated[bool, typer.Option("--only-stale", help="Only styles with newer input or settings.")] = False,
+    release: Annotated[bool, typer.Option(help="Release versions that pass the gate and are not worse.")] = False,
+    learner: Kind = None,
+    setting: Chosen = None,
+    as_json: AsJson = False,
+) -> None:
+    """Learn many styles again, and wait for them; exit code 1 if one failed, or with --release was not released."""
+    chosen = _learner(learner, setting or [])
+    with service(works=True) as client:
+        job = client.retrain(surgeon=surgeon, suture=suture, only_stale=only_stale, learner=chosen, release=release)
+        ended = _watched(client, job.id)
+        styles = client.retrained(job.id)
+    if as_json:
+        print_json(ended.model_copy(update={"items": styles, "next": None}))
+    else:
+        out.print(", ".join(f"{number} {state}" for state, number in ended.styles if number) or "no styles")
+        if wanting := [style for style in styles if style.state != "done"]:
+            show(wanting, False, ("surgeon", "suture", "state", "reason"))
+    kept_back = [_kept_back(one) for one in styles if release and one.comparison and not one.comparison.now_released]
+    if kept_back:
+        raise Conflict("\n".join(kept_back))
+    if ended.state != "succeeded":
+        raise typer.Exit(1)
+
+
+def _kept_back(style: "RetrainedStyle") -> str:
+    """Return why a version trained by a batch is not released, with the remedy."""
+    assert style.comparison is not None, "it was trained"
+    because, remedy = style.comparison.not_released_because, style.comparison.remedy
+    return f"{style.surgeon}, {style.suture}: version {style.policy_version} is not released: {because} {remedy}"
+
+
+def _learner(kind: str | None, settings: list[str]) -> dict[str, Any] | None:
+    """Return the learner as JSON for the service; None for the default one."""
+    if kind is None:
+        if settings:
+            raise BadInput("--setting needs --learner.", "Example: --learner dqn --setting steps=100000")
+        return None
+    learner: dict[str, Any] = {"kind": kind}
+    for setting in settings:
+        name, _, value = setting.partition("=")
+        try:
+            # as JSON, so that numbers, lists and booleans have their type
+            learner[name] = json.loads(value)
+        except ValueError:
+            raise BadInput(f"{setting!r} is not a setting.", "Write it as name=number, such as steps=100000") from None
+    return learner
+
+
+def _watched(client: "Client", job: str) -> "Retraining":
+    """Wait until a batch has ended, with a progress bar of its styles; there is no timeout."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("styles"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as progress:
+        batch = client.retraining(job)
+        total = sum(number for _, number in batch.styles)
+        task = progress.add_task("styles", total=total)
+        while batch.state in ("queued", "running"):
+            time.sleep(WATCH_S)
+            batch = client.retraining(job)
+            progress.update(task, completed=total - batch.styles.queued)
+    return batch
+
+
+@jobs.command("list")
+@refusing
+def job_list(
+    state: Annotated[
+        Literal["queued", "running", "succeeded", "failed", "cancelled"] | None,
+        typer.Option(help="Only jobs in this state."),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """List jobs, the newest first."""
+    with service() as client:
+        show(client.jobs(state), as_json, ABOUT)
+
+
+@jobs.command("show")
+@refusing
+def job_show(job: JobId, as_json: AsJson = False) -> None:
+    """Show a job."""
+    with service() as client:
+        show(client.job(job), as_json, ABOUT)
+
+
+@jobs.command("wait")
+@refusing
+def job_wait(
+    job: JobId,
+    timeout_s: Annotated[float, typer.Option(help="Longest waiting time in seconds.")] = 600.0,
+    as_json: AsJson = False,
+) -> None:
+    """Wait until a job has ended; exit code 1 if it did not succeed."""
+    with service(works=True) as client:
+        show(finished(client, client.job(job), timeout_s), as_json, ABOUT)
+
+
+@jobs.command("cancel")
+@refusing
+def job_cancel(job: JobId, as_json: AsJson = False) -> None:
+    """Cancel a job that has not ended."""
+    with service() as client:
+        show(client.cancel(job), as_json, ABOUT)
+
 
 commands = typer.Typer()
 policies = typer.Typer(no_args_is_help=True, help="Learnt policies.")
@@ -17,7 +199,7 @@ FIGURES = ("metrics.dtw_total_mm", "metrics.exact_states", "metrics.path_states"
 @policies.command("list")
 @refusing
 def policy_list(as_json: AsJson = False) -> None:
-    """List what is served, one policy for each style."""
+    """List the released policies, one for each style."""
     with service() as client:
         served = sorted(client.policies(), key=lambda one: (one.surgeon, one.suture))
         show(served, as_json, ("surgeon", "suture", "version", "released_at", "released_by", *FIGURES))
@@ -50,25 +232,25 @@ def policy_show(surgeon: Surgeon, suture: Suture, version: int | None = None, as
 @policies.command("release")
 @refusing
 def policy_release(surgeon: Surgeon, suture: Suture, version: int, as_json: AsJson = False) -> None:
-    """Release a version, if it passes the gate; an older one too."""
+    """Release a version if it passes the gate; an older version may be released again."""
     with service() as client:
         released = client.release(surgeon, suture, version)
     if as_json:
         print_json(released)
     else:
-        out.print(f"Version {released.version} of {surgeon} {suture} is what is served now.")
+        out.print(f"Version {released.version} of {surgeon} {suture} is served now.")
 
 
 @policies.command("withdraw")
 @refusing
 def policy_withdraw(surgeon: Surgeon, suture: Suture, as_json: AsJson = False) -> None:
-    """Withdraw what is released of a style."""
+    """Withdraw the released policy of a style."""
     with service() as client:
         client.withdraw(surgeon, suture)
     if as_json:
         print_json({"surgeon": surgeon, "suture": suture, "released": None})
     else:
-        out.print(f"Nothing of {surgeon} {suture} is served until somebody releases again.")
+        out.print(f"No policy of {surgeon} {suture} is served until a version is released again.")
 
 
 @policies.command("export")
@@ -80,13 +262,13 @@ def policy_export(
     version: int | None = None,
     as_json: AsJson = False,
 ) -> None:
-    """Write the released policy, or a version, to a file, once every number of it is checked against its digest."""
+    """Write the released policy, or a version, to a file, after verifying every number of it against its digest."""
     with service() as client:
         client.save_policy(surgeon, suture, to, version)
     if as_json:
         print_json({"file": to, "size_bytes": to.stat().st_size})
     else:
-        out.print(f"{to}: it is what its digest names. Research use only.", soft_wrap=True)
+        out.print(f"{to}: verified against its digest. Research use only.", soft_wrap=True)
 
 
 @policies.command("card")
@@ -98,7 +280,7 @@ def policy_card(
     to: Annotated[Path, typer.Argument(help="A file that ends in .html, or in .json.", dir_okay=False)],
     as_json: AsJson = False,
 ) -> None:
-    """Write the card of a version: its data, learner, figures, limits, and what it rests on."""
+    """Write the card of a version: its data, learner, figures, limits, and everything that it rests on."""
     with service() as client:
         client.save_policy_card(surgeon, suture, version, to)
     if as_json:
@@ -112,15 +294,15 @@ def policy_card(
 def rollout(
     surgeon: Surgeon,
     suture: Suture,
-    start: Annotated[str, typer.Option(help="Where it starts, as x,y,z in mm of the policy's frame.")],
-    version: Annotated[int | None, typer.Option(help="Of this version, released or not.")] = None,
+    start: Annotated[str, typer.Option(help="The start, as x,y,z in mm in the policy's frame.")],
+    version: Annotated[int | None, typer.Option(help="The version, released or not.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Follow the released policy from a place to the goal."""
+    """Follow the released policy from a position to the goal."""
     with service() as client:
         followed = client.rollout(surgeon, suture, triple(start), version)
     if as_json:
         print_json(followed)
         return
-    told = "reaches the goal" if followed.finished else "stops on the way"
+    told = "reaches the goal" if followed.finished else "stops before the goal"
     out.print(f"It {told} after {len(followed.states)} states, DTW {followed.dtw_total_mm:g} mm to the demonstration.")

@@ -1,33 +1,127 @@
-"""Recordings and demonstrations."""
+"""Commands of surgeons, suture types, recordings and demonstrations."""
 
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from skills.cli.completing import surgeons, sutures
-from skills.cli.shell import AsJson, OfSurgeon, OfSuture, bar, err, out, print_json, refusing, service, show
+from skills.cli.shell import (
+    AsJson,
+    OfSurgeon,
+    OfSuture,
+    Surgeon,
+    bar,
+    complete_surgeons,
+    complete_sutures,
+    err,
+    out,
+    print_json,
+    refusing,
+    service,
+    show,
+)
 from skills.errors import BadInput
 
+surgeon_commands = typer.Typer()
+surgeons = typer.Typer(no_args_is_help=True, help="Surgeons, by pseudonym; never by name.")
+sutures = typer.Typer(no_args_is_help=True, help="The catalogue of suture types.")
+surgeon_commands.add_typer(surgeons, name="surgeon")
+surgeon_commands.add_typer(sutures, name="suture")
+
+ABOUT_SURGEON = ("surgeon", "skill_level", "handedness", "protocol", "created_at")
+
+
+@surgeons.command("put")
+@refusing
+def surgeon_put(
+    surgeon: Annotated[str, typer.Argument(help="A pseudonym: lower-case letters, digits, - and _.")],
+    skill_level: Annotated[Literal["novice", "intermediate", "expert"] | None, typer.Option()] = None,
+    handedness: Annotated[Literal["right", "left", "ambidextrous"] | None, typer.Option()] = None,
+    protocol: Annotated[str | None, typer.Option(help="The study's protocol, such as an ethics number.")] = None,
+    consent: Annotated[
+        list[str] | None, typer.Option(help="A use that the surgeon agreed to: training, export or atlas; repeatable.")
+    ] = None,
+    until: Annotated[str | None, typer.Option(help="The last day of the consent, such as 2030-12-31.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Create or replace a surgeon; options that are left out are cleared."""
+    agreed = {"uses": consent, "until": until} if consent else None
+    with service() as client:
+        written = client.put_surgeon(
+            surgeon, skill_level=skill_level, handedness=handedness, protocol=protocol, consent=agreed
+        )
+    show(written, as_json, ABOUT_SURGEON)
+
+
+@surgeons.command("list")
+@refusing
+def surgeon_list(as_json: AsJson = False) -> None:
+    """List the surgeons."""
+    with service() as client:
+        show(client.surgeons(), as_json, ABOUT_SURGEON)
+
+
+@surgeons.command("show")
+@refusing
+def surgeon_show(surgeon: Surgeon, as_json: AsJson = False) -> None:
+    """Show a surgeon."""
+    with service() as client:
+        show(client.surgeon(surgeon), as_json, (*ABOUT_SURGEON, "consent"))
+
+
+@sutures.command("list")
+@refusing
+def suture_list(as_json: AsJson = False) -> None:
+    """List the suture types."""
+    with service() as client:
+        show(client.suture_types(), as_json, ("suture", "name", "family"))
+
+
+@surgeon_commands.command()
+@refusing
+def erase(
+    surgeon: Surgeon,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask for confirmation.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Erase a surgeon and everything derived from their data, permanently."""
+    if not yes:
+        typer.confirm(f"Erase '{surgeon}', all recordings, policies and plans, permanently?", abort=True, err=True)
+    with service() as client:
+        client.erase_surgeon(surgeon)
+    if as_json:
+        print_json({"surgeon": surgeon, "erased": True})
+    else:
+        out.print(f"'{surgeon}' and everything derived from them is erased.")
+        out.print(
+            "Not reached: recordings that were uploaded without --surgeon and from which nothing was cut, since "
+            "their surgeon is unknown (`skills recording delete`), and older backups.",
+            soft_wrap=True,
+        )
+
+
 if TYPE_CHECKING:
-    from skills.api.schemas.given import Demonstration, Recording
     from skills.client import Progress
+    from skills.schemas.given import Demonstration, Recording
+
+    Part = Literal["whole"] | int | None
 
 commands = typer.Typer()
 recordings = typer.Typer(no_args_is_help=True, help="Raw recordings.")
 demos = typer.Typer(no_args_is_help=True, help="Demonstrations: one hand-off each.")
-jigsaws = typer.Typer(no_args_is_help=True, help="The JIGSAWS data set, which its authors give on request.")
+jigsaws = typer.Typer(no_args_is_help=True, help="The JIGSAWS data set, which its authors provide on request.")
 commands.add_typer(recordings, name="recording")
 commands.add_typer(demos, name="demo")
 commands.add_typer(jigsaws, name="jigsaws")
 
 RateHz = Annotated[float | None, typer.Option(help="Samples per second, for a table without times.")]
-Frame = Annotated[str | None, typer.Option(help="The frame of a table's positions; PSM_base where none is given.")]
+Frame = Annotated[str | None, typer.Option(help="The frame of a table's positions; PSM_base by default.")]
 RecordingPath = Annotated[
-    Path, typer.Argument(help="A recording, a bag folder, or a session's folder with one; pictures stay here.")
+    Path, typer.Argument(help="A recording, a bag folder, or a session's folder with one; pictures are not sent.")
 ]
 Demo = Annotated[str, typer.Argument(help="The demonstration's digest.")]
 
@@ -36,8 +130,8 @@ ABOUT = ("id", "surgeon", "suture", "arm", "state", "created_at")
 
 @contextmanager
 def ready(path: Path) -> Iterator[tuple[Path, "Progress"]]:
-    """Make the recording that a path means ready to be sent: the file to send, and what is told of bytes sent."""
-    from skills.recordings.folder import find_bag, ready_to_send
+    """Yield the file to upload for a path, and the callback for its progress; a bag folder becomes one file."""
+    from skills.formats.upload import find_bag, ready_to_send
 
     bag = find_bag(path)
     read = 0
@@ -54,10 +148,21 @@ def ready(path: Path) -> Iterator[tuple[Path, "Progress"]]:
 
 @recordings.command("add")
 @refusing
-def recording_add(path: RecordingPath, rate_hz: RateHz = None, frame: Frame = None, as_json: AsJson = False) -> None:
-    """Store a recording and see which hand-offs it seems to hold."""
+def recording_add(
+    path: RecordingPath,
+    rate_hz: RateHz = None,
+    frame: Frame = None,
+    surgeon: Annotated[
+        str | None,
+        typer.Option(
+            help="The surgeon who was recorded: `skills erase` then finds it.", autocompletion=complete_surgeons
+        ),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Store a recording, and list the hand-offs proposed in it."""
     with service() as client, ready(path) as (file, progress):
-        stored = client.add_recording(file, rate_hz=rate_hz, frame=frame, progress=progress)
+        stored = client.add_recording(file, rate_hz=rate_hz, frame=frame, surgeon=surgeon, progress=progress)
     _tell(stored, as_json)
 
 
@@ -66,9 +171,23 @@ def recording_add(path: RecordingPath, rate_hz: RateHz = None, frame: Frame = No
 def recording_show(
     recording: Annotated[str, typer.Argument(help="The recording's digest.")], as_json: AsJson = False
 ) -> None:
-    """Show what is in a recording, and the hand-offs that it seems to hold."""
+    """Show the content of a recording, and the hand-offs proposed in it."""
     with service() as client:
         _tell(client.recording(recording), as_json)
+
+
+@recordings.command("delete")
+@refusing
+def recording_delete(
+    recording: Annotated[str, typer.Argument(help="The recording's digest.")], as_json: AsJson = False
+) -> None:
+    """Delete a recording without demonstrations permanently; allowed to its uploader and to admins."""
+    with service() as client:
+        client.delete_recording(recording)
+    if as_json:
+        print_json({"recording": recording, "deleted": True})
+    else:
+        out.print(f"The recording {recording} is deleted.", soft_wrap=True)
 
 
 def _tell(stored: "Recording", as_json: bool) -> None:
@@ -86,27 +205,44 @@ def _tell(stored: "Recording", as_json: bool) -> None:
 @refusing
 def demo_add(
     path: RecordingPath,
-    surgeon: Annotated[str, typer.Option(autocompletion=surgeons)],
-    suture: Annotated[str, typer.Option(autocompletion=sutures)],
-    arm: Annotated[str | None, typer.Option(help="Needed where a recording has several arms.")] = None,
+    surgeon: Annotated[str, typer.Option(autocompletion=complete_surgeons)],
+    suture: Annotated[str, typer.Option(autocompletion=complete_sutures)],
+    arm: Annotated[str | None, typer.Option(help="Needed if a recording has several arms.")] = None,
     topic: Annotated[str | None, typer.Option()] = None,
     start_s: Annotated[float | None, typer.Option(help="Start of the hand-off in the recording.")] = None,
-    end_s: Annotated[float | None, typer.Option(help="Its end.")] = None,
-    proposal: Annotated[int | None, typer.Option(help="Take this proposed hand-off, counted from 1.")] = None,
+    end_s: Annotated[float | None, typer.Option(help="End of the hand-off in the recording.")] = None,
+    segment: Annotated[
+        str | None,
+        typer.Option(
+            help="A proposed hand-off, counted from 1, or whole; without it and without times, the only proposal is "
+            "taken."
+        ),
+    ] = None,
+    proposal: Annotated[int | None, typer.Option(help="The same as --segment with a number.")] = None,
     grid: Annotated[Literal["auto", "paper", "fit"], typer.Option(help="auto, paper or fit.")] = "auto",
     cell_mm: Annotated[float | None, typer.Option()] = None,
     hysteresis: Annotated[
-        float, typer.Option(help="How far beyond its cell a sample stays in it: 0 to 0.5 cells, 0.25 against tremor.")
+        float,
+        typer.Option(
+            help="Hysteresis in cells: a sample this far beyond its cell still counts to it; 0 to 0.5, 0.25 against "
+            "tremor."
+        ),
     ] = 0.0,
     session: Annotated[str | None, typer.Option()] = None,
     rate_hz: RateHz = None,
     frame: Frame = None,
     as_json: AsJson = False,
 ) -> None:
-    """Store a recording and one demonstration of it."""
+    """Store a recording and one demonstration of it; if several hand-offs are proposed, name one with --segment."""
+    if segment is not None and proposal is not None:
+        raise BadInput("Use --segment or --proposal, not both.")
+    from skills.client import Problem
+
+    part = proposal if segment is None else _part_of(segment)
     with service() as client, ready(path) as (file, progress):
-        if proposal is None:
-            added = client.add_demo(
+
+        def add(part: "Part") -> "Demonstration":
+            return client.add_demo(
                 file,
                 surgeon=surgeon,
                 suture=suture,
@@ -114,6 +250,7 @@ def demo_add(
                 topic=topic,
                 start_s=start_s,
                 end_s=end_s,
+                segment=part,
                 grid=grid,
                 cell_mm=cell_mm,
                 hysteresis=hysteresis,
@@ -122,26 +259,40 @@ def demo_add(
                 frame=frame,
                 progress=progress,
             )
-        else:
-            stored = client.add_recording(file, rate_hz=rate_hz, frame=frame, progress=progress)
-            proposed = [part for part in stored.segments if arm in (None, part.arm)]
-            if not 1 <= proposal <= len(proposed):
-                raise BadInput(f"The recording has {len(proposed)} proposed hand-offs; see `skills recording add`.")
-            part = proposed[proposal - 1]
-            added = client.cut_demo(
-                stored.sha256,
-                surgeon=surgeon,
-                suture=suture,
-                arm=part.arm,
-                topic=topic,
-                start_s=part.start_s,
-                end_s=part.end_s,
-                grid=grid,
-                cell_mm=cell_mm,
-                hysteresis=hysteresis,
-                session=session,
-            )
+
+        try:
+            added = add(part)
+        except Problem as problem:
+            # a program has to name the segment; only a user at a terminal is prompted
+            if problem.kind != "segment-not-named" or as_json:
+                raise
+            _list_proposals(problem.body["numbers"]["segments"])
+            if not on_terminal():
+                raise
+            added = add(_part_of(typer.prompt("Which one? A number, or whole", err=True).strip()))
     _measured(added, as_json)
+    if added.segment is not None and not as_json:
+        which = f"{added.segment.taken}, {added.segment.start_s:.2f} to {added.segment.end_s:.2f} s"
+        out.print(f"Taken: {which}; {added.segment.because}", markup=False, soft_wrap=True)
+
+
+def _part_of(segment: str) -> "Part":
+    """Return the value of --segment: a number, or "whole"."""
+    if segment == "whole":
+        return "whole"
+    if not segment.isdecimal():
+        raise BadInput(f"--segment is the number of a proposed hand-off, or whole, not {segment!r}.")
+    return int(segment)
+
+
+def on_terminal() -> bool:
+    """Return whether a user can be prompted."""
+    return sys.stdin.isatty()
+
+
+def _list_proposals(proposed: "list[dict[str, Any]]") -> None:
+    shown = [one | {name: f"{one[name]:.2f}" for name in ("start_s", "end_s")} for one in proposed]
+    show(shown, False, ("segment", "arm", "start_s", "end_s", "reason"))
 
 
 def _measured(demo: "Demonstration", as_json: bool) -> None:
@@ -163,7 +314,7 @@ def demo_list(surgeon: OfSurgeon = None, suture: OfSuture = None, as_json: AsJso
 @demos.command("show")
 @refusing
 def demo_show(demo: Demo, as_json: AsJson = False) -> None:
-    """Show a demonstration, and what was measured of it when it was stored."""
+    """Show a demonstration, with the figures measured when it was stored."""
     with service() as client:
         shown = client.demo(demo)
     _measured(shown, as_json)
@@ -175,10 +326,10 @@ def demo_show(demo: Demo, as_json: AsJson = False) -> None:
 @refusing
 def demo_report(
     demo: Demo,
-    html: Annotated[Path | None, typer.Option(help="Write it to this file as a page for a browser.")] = None,
+    html: Annotated[Path | None, typer.Option(help="Write the report to this file as HTML.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Tell how good a demonstration is, and what would make it better."""
+    """Report the quality of a demonstration, and how to improve it."""
     with service() as client:
         if html is not None:
             html.write_bytes(client.demo_report_page(demo))
@@ -194,7 +345,7 @@ def demo_report(
 @demos.command("save")
 @refusing
 def demo_save(demo: Demo, to: Annotated[Path, typer.Argument(dir_okay=False)], as_json: AsJson = False) -> None:
-    """Write the recording of a demonstration to a file, exactly as it was sent."""
+    """Write the recording of a demonstration to a file, exactly as it was uploaded."""
     with service() as client, bar("fetching") as progress:
         client.save_recording(demo, to, progress)
     _written(to, as_json)
@@ -211,7 +362,7 @@ def _written(to: Path, as_json: bool) -> None:
 @refusing
 def demo_withdraw(
     demo: Demo,
-    erase: Annotated[bool, typer.Option("--erase", help="Delete it and all that was derived from it.")] = False,
+    erase: Annotated[bool, typer.Option("--erase", help="Delete it and everything derived from it.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Withdraw a demonstration and the releases that rest on it."""
@@ -221,26 +372,32 @@ def demo_withdraw(
     if as_json:
         print_json({"demo": demo, "state": done})
     else:
-        out.print(f"The demonstration is {done}, and no release rests on it.")
+        out.print(f"The demonstration is {done}, and no release depends on it.")
 
 
 @jigsaws.command("add")
 @refusing
 def jigsaws_add(
-    folder: Annotated[Path, typer.Argument(help="With TASK/kinematics/AllGestures/*.txt and what belongs to them.")],
-    task: Annotated[list[str] | None, typer.Option(help="Only this task, such as Suturing; once for each.")] = None,
+    folder: Annotated[
+        Path,
+        typer.Argument(help="A folder with TASK/kinematics/AllGestures/*.txt, their transcriptions and meta files."),
+    ],
+    task: Annotated[list[str] | None, typer.Option(help="Only this task, such as Suturing; repeatable.")] = None,
     suture: Annotated[
         str | None,
-        typer.Option(help="Make demonstrations of this suture type of the proposed hand-offs.", autocompletion=sutures),
+        typer.Option(
+            help="Make a demonstration of this suture type from each proposed hand-off.",
+            autocompletion=complete_sutures,
+        ),
     ] = None,
-    arm: Annotated[str | None, typer.Option(help="Of PSM_left or PSM_right only.")] = None,
-    prefix: Annotated[str, typer.Option(help="Before a surgeon's letter, in their pseudonym.")] = "jigsaws",
+    arm: Annotated[str | None, typer.Option(help="Only PSM_left or PSM_right.")] = None,
+    prefix: Annotated[str, typer.Option(help="Prefix of the pseudonyms, before the surgeon's letter.")] = "jigsaws",
     as_json: AsJson = False,
 ) -> None:
-    """Store every trial of a folder; exit code 1 where one was refused, and the others are stored."""
+    """Store every trial of a folder; exit code 1 if one was refused, while the others are stored."""
     from rich.progress import track
 
-    from skills.dataset import find_trials, send_trials
+    from skills.samples import find_trials, send_trials
 
     found = find_trials(folder, task or ())
     with service() as client:

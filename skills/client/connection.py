@@ -1,48 +1,140 @@
-"""What all calls are made with: one request, a list page by page, a file out, a file in."""
+"""The base of both clients: one definition of a call for blocking and asynchronous use, and the sending of requests.
+
+    @call
+    async def surgeon(self, surgeon: str) -> Surgeon: ...
+
+is `client.surgeon("kestrel")` of a `Client`, and `await client.surgeon("kestrel")` of an `AsyncClient`. Editors and
+type checkers see the parameters, the return type and the docstring of both.
+
+`Connection` has the operations of which all calls are made: one request, a list with all of its pages, an upload, and a
+download.
+"""
 
 import hashlib
 import random
-from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Mapping
 from contextlib import aclosing, asynccontextmanager
-from functools import partial
+from functools import partial, update_wrapper, wraps
+from inspect import signature
 from pathlib import Path
-from typing import Any, TypeVar
+from types import MethodType
+from typing import Any, Concatenate, Generic, ParamSpec, Self, TypeVar, cast, overload
+from urllib.parse import quote
 
 import httpx2 as httpx
 from pydantic import BaseModel, ValidationError
 
-from skills.client.files import Arriving, Progress, Upload, check, named_by
 from skills.client.problems import NotReached, NotUnderstood, Problem, problem_of
-from skills.client.retrying import Retrying, may_repeat
-from skills.client.transport import Transport
+from skills.client.transport import (
+    Arriving,
+    FileUpload,
+    Progress,
+    Retrying,
+    Transport,
+    check,
+    finished,
+    may_repeat,
+    named_by,
+)
+from skills.remedies import did_you_mean
 
+P = ParamSpec("P")
 T = TypeVar("T")
+
+
+class Now:
+    """Marker base class of a client whose calls block and return the result."""
+
+
+class Later:
+    """Marker base class of a client whose calls return coroutines."""
+
+
+class call(Generic[P, T]):  # noqa: N801 - lower case, because it is used as a decorator, like `property`
+    """Descriptor that makes a coroutine function a method of both clients."""
+
+    def __init__(self, method: Callable[Concatenate[Any, P], Coroutine[Any, Any, T]]) -> None:
+        self.method = method
+        update_wrapper(cast(Any, self), method)
+
+    @overload
+    def __get__(self, client: None, owner: type) -> Self: ...
+    @overload
+    def __get__(self, client: Now, owner: type) -> Callable[P, T]: ...
+    @overload
+    def __get__(self, client: Later, owner: type) -> Callable[P, Coroutine[Any, Any, T]]: ...
+    def __get__(self, client: Now | Later | None, owner: type) -> Any:
+        """Bind the method to a client: blocking for `Now`, a coroutine function for `Later`."""
+        if client is None:
+            return self
+        bound: Callable[P, Coroutine[Any, Any, T]] = MethodType(self.method, client)
+
+        @wraps(bound)
+        async def later(*args: P.args, **kwargs: P.kwargs) -> T:
+            return await self._told(client, *args, **kwargs)
+
+        if isinstance(client, Later):
+            return later
+
+        @wraps(bound)
+        def now(*args: P.args, **kwargs: P.kwargs) -> T:
+            return finished(later(*args, **kwargs))
+
+        return now
+
+    async def _told(self, client: Any, *args: P.args, **kwargs: P.kwargs) -> T:
+        """Run the call; a `Problem` is completed with the argument names and values of this call.
+
+        Raises:
+            TypeError: An argument is missing, or unknown; then the most similar name is suggested.
+        """
+        takes = signature(self.method)
+        any_name = any(one.kind is one.VAR_KEYWORD for one in takes.parameters.values())
+        if unknown := [name for name in kwargs if not any_name and name not in takes.parameters]:
+            near = did_you_mean(unknown[0], takes.parameters)
+            raise TypeError(" ".join([f"{self.method.__name__}() takes no argument {unknown[0]!r}.", *near]))
+        try:
+            return await self.method(client, *args, **kwargs)
+        except Problem as problem:
+            problem.told(takes.bind(client, *args, **kwargs).arguments)
+            raise
+
+
+def at(*parts: str | int) -> str:
+    """Return the path of a call from its parts; each part is quoted, so that it stays one segment of the path."""
+    return "".join(f"/{quote(str(part), safe='')}" for part in parts)
+
+
 M = TypeVar("M", bound=BaseModel)
 
-PAGE = 200  # the largest that the service gives
+PAGE = 200  # the largest page that the service returns
 
 
 class Connection:
-    """A service, behind a transport."""
+    """A connection to the service over a transport."""
 
     _transport: Transport
     _headers: Mapping[str, str]
     _timeout_s: float
     _retrying: Retrying
     _clock: Callable[[], float]
-    _streams: bool  # whether answers come while they are made; within one process they may not
+    _streams: bool  # whether responses arrive while they are produced; not so with an in-process application
 
     # ---- answers
 
     def _read(self, kind: type[M], said: Any) -> M:
-        """Make the model of an answer; fields that it does not know are passed over."""
+        """Return a response as its model; unknown fields are ignored.
+
+        Raises:
+            NotUnderstood: The response does not fit the model.
+        """
         try:
             return kind.model_validate(said)
         except ValidationError as error:
             where = ", ".join(".".join(str(part) for part in one["loc"]) for one in error.errors()[:5])
             raise NotUnderstood(
-                f"The answer is no {kind.__name__} as this client knows it ({where}); bring service and client to one "
-                "version, or take it as it is with `get_json`."
+                f"The response is not a {kind.__name__} of this client's version ({where}); update the client or "
+                "the service, or read the raw JSON with `get_json`."
             ) from error
 
     async def _get(self, kind: type[M], path: str, /, **query: Any) -> M:
@@ -55,14 +147,14 @@ class Connection:
         return _as_json(await self._send(method, path, **how))
 
     async def _bytes(self, path: str, accept: str | None = None, **query: Any) -> bytes:
-        """Get bytes that are what their ETag says."""
+        """Return the bytes of a response, after they were compared with its ETag."""
         headers = {} if accept is None else {"Accept": accept}
         answer = await self._send("GET", path, headers=headers, params=given(query))
         check(hashlib.sha256(answer.content).hexdigest(), named_by(answer.headers.get("etag", "")))
         return answer.content
 
     async def _all(self, kind: type[M], path: str, /, **query: Any) -> list[M]:
-        """Get a list, all pages of it."""
+        """Return all items of a paged list."""
         items: list[M] = []
         cursor: Any = None
         while True:
@@ -75,11 +167,11 @@ class Connection:
     # ---- requests
 
     async def _send(self, method: str, path: str, *, harmless: bool = True, **how: Any) -> httpx.Response:
-        """Send a request, again where that may help, and read the answer.
+        """Send a request, with retries where they are safe, and return the response with its body.
 
         Raises:
-            Problem: The service refused.
-            NotReached: It gave no answer.
+            Problem: The service returned an error.
+            NotReached: There was no response.
         """
 
         async def attempt() -> httpx.Response:
@@ -98,8 +190,8 @@ class Connection:
         progress: Progress | None,
         query: Any,
     ) -> M:
-        """Send a file as the body, read anew for each attempt."""
-        upload = await self._transport.aside(lambda: Upload.of(content, media_type))
+        """Send a file as the request body; each attempt reads it again from the start."""
+        upload = await self._transport.aside(lambda: FileUpload.of(content, media_type))
 
         async def attempt() -> M:
             body = self._transport.body(upload.pieces(), upload.told(progress))
@@ -119,7 +211,7 @@ class Connection:
         accept: str | None = None,
         query: Mapping[str, Any] | None = None,
     ) -> Path:
-        """Fetch a file piece by piece; it stands at `to` only when it is whole and has its digest, else its ETag's."""
+        """Download a file; `to` appears only once it is complete and has the digest: `sha256`, else its ETag's."""
         headers = {} if accept is None else {"Accept": accept}
         aside = self._transport.aside
 
@@ -151,10 +243,10 @@ class Connection:
         timeout_s: float | None = None,
         **how: Any,
     ) -> AsyncIterator[httpx.Response]:
-        """Send a request once; the answer's body is still to be read.
+        """Send a request once, and yield the response before its body is read.
 
         Raises:
-            Problem: The service refused.
+            Problem: The service returned an error.
         """
         request = self._transport.http.build_request(
             method, path, headers={**self._headers, **(headers or {})}, timeout=timeout_s or self._timeout_s, **how
@@ -169,7 +261,7 @@ class Connection:
             await self._transport.close(answer)
 
     async def _attempts(self, attempt: Callable[[], Awaitable[T]], *, harmless: bool) -> T:
-        """Try, and try again after a pause, for as long as that is harmless and may help (`skills.client.retrying`)."""
+        """Run an attempt, and retry it after pauses while that is safe, may help, and is within `Retrying`."""
         began, failed = self._clock(), 0
         while True:
             try:
@@ -180,8 +272,8 @@ class Connection:
             except httpx.TransportError as error:
                 failed_s = self._clock() - began
                 failure = NotReached(
-                    f"{self._transport.http.base_url} gave no answer in {failed_s:.1f} s and {failed + 1} attempts "
-                    f"({type(error).__name__}); see that the service runs there."
+                    f"{self._transport.http.base_url} gave no answer in {failed_s:.1f} s and {failed + 1} "
+                    "attempts; check that the service runs there."
                 )
                 failure.__cause__ = error
                 passes, asked_s = may_repeat(error, harmless=harmless), 0.0
@@ -198,10 +290,11 @@ def _as_json(answer: httpx.Response) -> Any:
         return answer.json()
     except ValueError as error:
         raise NotUnderstood(
-            f"{answer.request.url.host} answers, and not as this service does; see what stands between."
+            f"{answer.request.url.host} answered, but not as suture-skills does; check the address and the "
+            "proxies in between."
         ) from error
 
 
 def given(query: Mapping[str, Any]) -> dict[str, Any]:
-    """Leave out what was not given."""
+    """Return the entries that are not None."""
     return {name: value for name, value in query.items() if value is not None}

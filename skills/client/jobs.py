@@ -1,4 +1,4 @@
-"""Trainings, and jobs of every kind: asked for, watched, waited for."""
+"""Calls of trainings, retrainings, and jobs of every kind."""
 
 import json
 from collections.abc import AsyncGenerator, Callable, Mapping, Sequence
@@ -7,10 +7,9 @@ from typing import Any, Literal
 
 import httpx2 as httpx
 
-from skills.api.schemas.given import Job, RetrainedStyle, Retraining
-from skills.client.calls import at, call
-from skills.client.connection import Connection, given
+from skills.client.connection import Connection, at, call, given
 from skills.client.problems import JobFailed, JobTakesLonger, NotReached, NotUnderstood, Problem
+from skills.schemas.given import Job, RetrainedStyle, Retraining
 
 State = Literal["queued", "running", "succeeded", "failed", "cancelled"]
 Kind = Literal["training", "retraining", "playback", "pictures"]
@@ -18,12 +17,12 @@ Combining = Literal["medoid", "barycentre", "corridor"]
 Watcher = Callable[[Job], None]
 
 ENDED = ("succeeded", "failed", "cancelled")
-PAUSES_S = (0.05, 0.5)  # between two looks at a job: the first, and the longest
+PAUSES_S = (0.05, 0.5)  # between two polls of a job: the first pause, and the longest
 EVENTS = "text/event-stream"
 
 
 class Jobs(Connection):
-    """The calls."""
+    """Calls of trainings and jobs."""
 
     @call
     async def train(
@@ -37,21 +36,26 @@ class Jobs(Connection):
         seed: int = 0,
         release: bool = False,
     ) -> Job:
-        """Ask for a style to be trained; an equal request gives the same job.
+        """Request the training of a style; an equal request returns the same job.
+
+        The job's `did` states the effect of the request. With `release`, the request is not retried after a lost
+        connection, because somebody may have decided otherwise in between.
 
         Args:
             surgeon: The surgeon's pseudonym.
             suture: The suture type.
-            demos: What is learnt from; left out, the newest active demonstration.
-            combine: How several become one way to follow; left out, as a corridor.
-            learner: Its `kind` and settings; left out, Q-learning in the phase state.
-            seed: Of the exploration.
-            release: Release the version if it passes the gate.
+            demos: Digests of the demonstrations to learn from; default: the newest active one.
+            combine: Method that combines several demonstrations into one path; default: a corridor.
+            learner: Its `kind` and settings; default: Q-learning in the phase state.
+            seed: Seed of the exploration.
+            release: Release the version if it passes the gate; also if an equal training is done already and its
+                version is
+                not the one that the style serves now.
         """
         asked = {"surgeon": surgeon, "suture": suture, "seed": seed, "release": release}
         how = None if combine is None else {"kind": combine}
         asked |= given({"demos": demos, "combine": how, "learner": learner})
-        return await self._ask(Job, "POST", at("trainings"), asked)
+        return await self._ask(Job, "POST", at("trainings"), asked, harmless=not release)
 
     @call
     async def retrain(
@@ -63,13 +67,16 @@ class Jobs(Connection):
         learner: Mapping[str, Any] | None = None,
         release: bool = False,
     ) -> Job:
-        """Ask for styles to be trained again, as one job: all, or a surgeon's, or a suture type's."""
+        """Request the training of styles again, as one job: all, or those of a surgeon or of a suture type.
+
+        With `release`, the request is not retried after a lost connection, as with `train`.
+        """
         asked = {"surgeon": surgeon, "suture": suture, "only_stale": only_stale, "learner": learner, "release": release}
-        return await self._ask(Job, "POST", at("retrainings"), given(asked))
+        return await self._ask(Job, "POST", at("retrainings"), given(asked), harmless=not release)
 
     @call
     async def retraining(self, job: str) -> Retraining:
-        """Look a batch up: its job, and in `styles` how many are in which state."""
+        """Return a batch: its job, and in `styles` the number of styles in each state."""
         return await self._get(Retraining, at("retrainings", job), limit=1)
 
     @call
@@ -81,7 +88,7 @@ class Jobs(Connection):
 
     @call
     async def job(self, job: str) -> Job:
-        """Look a job up."""
+        """Return a job."""
         return await self._get(Job, at("jobs", job))
 
     @call
@@ -96,14 +103,14 @@ class Jobs(Connection):
 
     @call
     async def wait(self, job: Job | str, timeout_s: float = 600.0, progress: Watcher | None = None) -> Job:
-        """Wait until a job has ended, and give it back.
+        """Wait until a job has ended, and return it.
 
-        The service tells of each change as it happens; where its events do not come through, it is asked instead.
+        Changes are received as server-sent events; if the stream fails, the job is polled instead.
 
         Args:
             job: The job, or its id.
-            timeout_s: For how long.
-            progress: Is told of each change.
+            timeout_s: Longest time to wait.
+            progress: Called with the job at each change.
 
         Raises:
             JobTakesLonger: It has not ended in time.
@@ -124,7 +131,7 @@ class Jobs(Connection):
         raise JobTakesLonger(told, timeout_s)
 
     async def _seen(self, job: str, deadline_s: float) -> AsyncGenerator[Job, None]:
-        """Look at a job, and again whenever it may have changed, until the time is up."""
+        """Yield the state of a job now, and again whenever it may have changed, until the deadline."""
         yield await self._get(Job, at("jobs", job))
         streams, pause_s = self._streams, PAUSES_S[0]
         while True:
@@ -137,16 +144,16 @@ class Jobs(Connection):
                         async for seen in events:
                             yield seen
                 except httpx.ReadTimeout:
-                    pass  # nothing changed for long
+                    pass  # no event within the timeout
                 except (Problem, NotUnderstood, ValueError, httpx.TransportError):
                     streams = False
             await self._transport.sleep(min(pause_s, max(0.0, deadline_s - self._clock())))
             pause_s = min(PAUSES_S[1], pause_s * 1.3)
-            with suppress(NotReached):  # it was there before: it is being started anew, and the job goes on
+            with suppress(NotReached):  # the service answered before, so it is restarting, and the job goes on
                 yield await self._get(Job, at("jobs", job))
 
     async def _events(self, job: str, left_s: float) -> AsyncGenerator[Job, None]:
-        """Follow the service's events of a job, for as long as they come and time is left."""
+        """Yield the job of each server-sent event, until the stream or the time ends."""
         over_s = self._clock() + left_s
         patience_s = min(self._timeout_s, left_s)
         async with self._opened("GET", at("jobs", job, "events"), timeout_s=patience_s) as answer:
@@ -154,7 +161,7 @@ class Jobs(Connection):
                 return
             async with aclosing(self._transport.lines(answer)) as lines:
                 async for line in lines:
-                    if line.startswith("data:"):  # each of the service's events has one such line
+                    if line.startswith("data:"):  # the service writes each event's data on one line
                         yield self._read(Job, json.loads(line.removeprefix("data:")))
-                    if self._clock() >= over_s:  # the service may send signs of life for ever
+                    if self._clock() >= over_s:  # heartbeats may continue for ever
                         return

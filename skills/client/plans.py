@@ -1,27 +1,27 @@
-"""Plans, their playback in the simulator, and the bag that a robot replays."""
+"""Calls of plans, their playback in the simulator, and the bag that a robot replays."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-from skills.api.schemas.given import Comparison, Job, Plan, Playback, SuturePoints, Trajectory
-from skills.client.calls import at, call
-from skills.client.connection import Connection, given
-from skills.client.files import Progress
+from skills.client.connection import Connection, at, call, given
 from skills.client.policies import Position
+from skills.client.transport import Progress
+from skills.errors import BadInput
+from skills.schemas.given import Comparison, Job, Plan, Playback, SuturePoints, Trajectory
 
 BAG = "application/zip"
 
 
 class Plans(Connection):
-    """The calls."""
+    """Calls of plans and playbacks."""
 
     @call
     async def plan(
         self,
         surgeon: str,
         suture: str,
-        suture_points: Sequence[Mapping[str, Any]],
+        suture_points: Sequence[Mapping[str, Any] | Position],
         *,
         version: int | None = None,
         starts_mm: Sequence[Position | None] | None = None,
@@ -33,30 +33,40 @@ class Plans(Connection):
         tip_offset_mm: float | None = None,
         psm_m: Mapping[str, Any] | None = None,
         realignment: bool | None = None,
+        handoff: Literal["none"] | None = None,
     ) -> Plan:
         """Stack a style at suture points.
 
         Args:
             surgeon: The surgeon's pseudonym.
             suture: The suture type.
-            suture_points: Of each pass the `position_mm` of its goal and, where it is turned, the `rotation_xyzw`.
-            version: Left out, the released one.
-            starts_mm: Where each pass begins; None is the demonstrated start, moved with the grid.
-            arm: Refused where it is not the demonstrated one; so are `frame` and `instrument`.
-            frame: Of the positions.
-            instrument: Of the arm.
-            speed_mm_s: At most, of the tip.
+            suture_points: For each pass the position of its goal as (x, y, z) in mm; or, if the grid is rotated there,
+                a
+                mapping with `position_mm` and `rotation_xyzw`.
+            version: The policy version; default: the released one.
+            starts_mm: Start of each pass; None is the demonstrated start, moved with the grid.
+            arm: Refused if it is not the demonstrated one; so are `frame` and `instrument`.
+            frame: Frame of the positions.
+            instrument: Instrument of the arm.
+            speed_mm_s: Largest speed of the tip.
             rate_hz: Samples per second, 100 to 200.
-            tip_offset_mm: How far down from the jaw's hinge positions are meant.
+            tip_offset_mm: Distance of the planned points from the jaw's hinge along its approach, towards the finger
+                tips.
             psm_m: The arm that takes the needle: `approach`, `base`, `instrument`, `enters`, `source`.
-            realignment: False plans A1 alone, without A2's turn.
+            realignment: False plans A1 alone, without the rotation of A2; `handoff` replaces it.
+            handoff: "none" plans A1 alone, which hands nothing over.
+
+        Raises:
+            Problem: Of kind "no-hand-off" if neither `psm_m` nor the demonstration gives the pose of PSM_M, and
+                `handoff` is
+                not "none".
         """
         body = {
-            **{"surgeon": surgeon, "suture": suture, "suture_points": [dict(point) for point in suture_points]},
+            **{"surgeon": surgeon, "suture": suture, "suture_points": [_point(point) for point in suture_points]},
             **{"version": version, "arm": arm, "frame": frame, "instrument": instrument, "psm_m": psm_m},
             **{"starts_mm": None if starts_mm is None else [None if s is None else list(s) for s in starts_mm]},
             **{"speed_mm_s": speed_mm_s, "rate_hz": rate_hz, "tip_offset_mm": tip_offset_mm},
-            **{"realignment": realignment},
+            **{"realignment": realignment, "handoff": handoff},
         }
         return await self._ask(Plan, "POST", at("plans"), given(body))
 
@@ -69,66 +79,90 @@ class Plans(Connection):
 
     @call
     async def plan_of(self, plan: str) -> Plan:
-        """Look a plan up."""
+        """Return a plan."""
         return await self._get(Plan, at("plans", plan))
 
     @call
     async def trajectory(self, plan: str, pass_index: int | None = None) -> Trajectory:
-        """Get a plan's motion, sampled; or that of one pass, counted from 0."""
+        """Return a plan's sampled motion, or that of one pass, counted from 0."""
+        # `pass` is a keyword of Python, so it cannot be a keyword argument
         return await self._get(Trajectory, at("plans", plan, "trajectory"), **{"pass": pass_index})
 
     @call
-    async def replay_bag(self, plan: str, pass_index: int | None = None) -> bytes:
-        """Get the bag that a robot replays, a zip; or that of one pass, counted from 0.
+    async def replay_bag(
+        self, plan: str, pass_index: int | None = None, *, handoff: Literal["none"] | None = None
+    ) -> bytes:
+        """Return the bag that a robot replays, a zip, or that of one pass, counted from 0.
+
+        The bag of a plan that hands nothing over needs `handoff="none"`.
 
         Raises:
-            Problem: It is 409 while the plan may not be replayed, and says why.
+            Problem: Of status 409 while the plan may not be replayed, with the reason.
         """
-        return await self._bytes(at("plans", plan, "trajectory"), BAG, **{"pass": pass_index})
+        return await self._bytes(at("plans", plan, "trajectory"), BAG, **{"pass": pass_index, "handoff": handoff})
 
     @call
     async def save_replay_bag(
-        self, plan: str, to: Path, pass_index: int | None = None, progress: Progress | None = None
+        self,
+        plan: str,
+        to: Path,
+        pass_index: int | None = None,
+        progress: Progress | None = None,
+        *,
+        handoff: Literal["none"] | None = None,
     ) -> Path:
-        """Fetch the same into a file, which is there only if it is whole.
+        """Download the bag of `replay_bag` to a file, which appears only when it is complete.
 
         Raises:
-            Problem: It is 409 while the plan may not be replayed, and says why.
+            Problem: Of status 409 while the plan may not be replayed, with the reason.
         """
         path = at("plans", plan, "trajectory")
-        return await self._save(path, to, progress, accept=BAG, query={"pass": pass_index})
+        return await self._save(path, to, progress, accept=BAG, query={"pass": pass_index, "handoff": handoff})
 
     @call
     async def compare(self, plan: str, demo: str, pass_index: int = 0) -> Comparison:
-        """Compare a pass of a plan, counted from 0, with a demonstration that is the recording of its replay."""
+        """Compare a pass of a plan, counted from 0, with a demonstration cut from the recording of its replay."""
         return await self._get(Comparison, at("plans", plan, "comparison"), demo=demo, **{"pass": pass_index})
 
     @call
     async def play(self, plan: str) -> Job:
-        """Ask for a plan to be played in the simulator."""
+        """Request the playback of a plan in the simulator."""
         return await self._ask(Job, "POST", at("playbacks"), {"plan": plan})
 
     @call
     async def playback(self, playback: str) -> Playback:
-        """Get the simulator's verdict."""
+        """Return the simulator's verdict."""
         return await self._get(Playback, at("playbacks", playback))
 
     @call
     async def picture(self, playback: str) -> bytes:
-        """Get the picture of a playback, a PNG."""
+        """Return the picture of a playback, a PNG."""
         return await self._bytes(at("playbacks", playback, "picture.png"))
 
     @call
     async def draw(self, playback: str) -> Job:
-        """Ask for the film and the plots of a playback: the job to wait for, which each new playback starts itself."""
+        """Request the film and plots of a playback; returns the job, which each new playback starts itself."""
         return await self._ask(Job, "POST", at("playbacks", playback, "pictures"))
 
     @call
     async def animation(self, playback: str, kind: Literal["mp4", "gif"] = "mp4") -> bytes:
-        """Get the film of a playback, once it is drawn."""
+        """Return the film of a playback, once it is drawn."""
         return await self._bytes(at("playbacks", playback, f"animation.{kind}"))
 
     @call
     async def plot(self, playback: str, of: Literal["joints", "clearance"]) -> bytes:
-        """Get a plot of a playback over time, a PNG, once it is drawn."""
+        """Return a plot of a playback over time, a PNG, once it is drawn."""
         return await self._bytes(at("playbacks", playback, f"{of}.png"))
+
+
+def _point(given: Any) -> dict[str, Any]:
+    """Return a suture point in the form of the service's JSON.
+
+    Raises:
+        BadInput: It is neither a position nor a mapping.
+    """
+    if isinstance(given, Mapping):
+        return dict(given)
+    if isinstance(given, str) or not isinstance(given, Iterable):
+        raise BadInput("Suture points are a list of positions in mm; for one point give [(0, 55, -125)].")
+    return {"position_mm": [float(number) for number in given]}

@@ -1,72 +1,130 @@
-"""Policies: what is served, its history, and what it does from a place."""
+"""Calls of policies (versions, releases, cards, rollouts), of atlases of a suture type, and of scores."""
 
 import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from skills.api.schemas.given import NextStep, Policy, PolicyCard, PolicySummary, Rollout, Version
-from skills.client.calls import at, call
-from skills.client.connection import Connection
-from skills.client.files import keep
+from skills.client.connection import Connection, at, call, given
+from skills.client.transport import keep
 from skills.errors import BadInput
-
-if TYPE_CHECKING:
-    from skills.style.policy import Policy as LearntPolicy
-
-Position = Sequence[float]
+from skills.schemas.given import Atlas, NextStep, Policy, PolicyCard, PolicySummary, Rollout, Score, Version
 
 JSON, NPZ = "application/json", "application/x-npz"
 
 
+class Atlases(Connection):
+    """Calls of atlases."""
+
+    @call
+    async def atlas(
+        self, suture: str, *, scaled: bool = False, clusters: int | None = None, demo: str | None = None
+    ) -> Atlas:
+        """Return the atlas of a suture type.
+
+        Args:
+            suture: The suture type.
+            scaled: Normalise size too; distances are then in units of the distance from start to goal.
+            clusters: Number of clusters; default: as many as are found.
+            demo: Digest of a demonstration in the atlas; the atlas then says whose style it resembles.
+        """
+        return await self._get(Atlas, at("styles", suture, "atlas"), scaled=scaled, clusters=clusters, demo=demo)
+
+
+class Scores(Connection):
+    """Calls of scores."""
+
+    @call
+    async def score(
+        self,
+        surgeon: str,
+        suture: str,
+        *,
+        demo: str | None = None,
+        recording: str | None = None,
+        arm: str | None = None,
+        topic: str | None = None,
+        start_s: float | None = None,
+        end_s: float | None = None,
+        reference: str | None = None,
+    ) -> Score:
+        """Score a demonstration, or a part of a recording, against a style; nothing is stored. Not a credential.
+
+        Args:
+            surgeon: The surgeon whose style is the reference.
+            suture: The suture type.
+            demo: Digest of the demonstration to score; give either this or `recording`.
+            recording: Digest of the recording of which a part is scored.
+            arm: The arm in the recording.
+            topic: The topic in the recording.
+            start_s: Start of the part in the recording.
+            end_s: End of the part.
+            reference: The demonstration of the style to compare with; default: that of its released policy, else its
+                newest.
+        """
+        body = {
+            **{"surgeon": surgeon, "suture": suture, "demo": demo, "recording": recording, "reference": reference},
+            **{"arm": arm, "topic": topic, "start_s": start_s, "end_s": end_s},
+        }
+        return await self._ask(Score, "POST", at("scores"), given(body))
+
+
+if TYPE_CHECKING:
+    from skills.learning.policy import Policy as LearntPolicy
+
+Position = Sequence[float]
+
+
 class Policies(Connection):
-    """The calls."""
+    """Calls of policies."""
 
     @call
     async def policies(self, surgeon: str | None = None, suture: str | None = None) -> list[PolicySummary]:
-        """List what is served."""
+        """List the released policies."""
         return await self._all(PolicySummary, at("policies"), surgeon=surgeon, suture=suture)
 
     @call
     async def policy(self, surgeon: str, suture: str, version: int | None = None) -> Policy:
-        """Get the released policy of a style, or one of its versions."""
+        """Return the released policy of a style, or one of its versions."""
         return await self._get(Policy, _path(surgeon, suture, version))
 
     @call
     async def policy_version(self, policy: str) -> Policy:
-        """Get a policy version by its digest, as it is cited."""
+        """Return a policy version by the digest under which it is cited."""
         return await self._get(Policy, at("policy-versions", policy))
 
     @call
     async def learnt(self, surgeon: str, suture: str, version: int | None = None) -> "LearntPolicy":
-        """Fetch a policy with its Q values, to be followed here, and check all of it against its digest.
+        """Download a policy with its Q values, to be followed locally, and verify all of it against its digest.
 
             policy = client.learnt("kestrel", "simple-running")
             skills.rollout(policy, (-30, 25, -140)).tip_mm
 
         Raises:
-            Corrupt: The numbers, or anything that is said of them, are not what the digest was taken of.
+            Corrupt: The arrays or the metadata do not match the digest.
         """
         _, _, policy = await self._verified(surgeon, suture, version)
         return policy
 
     @call
     async def save_policy(self, surgeon: str, suture: str, to: Path, version: int | None = None) -> Path:
-        """Write a policy to a file that ends in .json, or in .npz with its Q values, once it is checked as by `learnt`.
+        """Write a policy to a .json file, or to an .npz file with its Q values, after verifying it as `learnt` does.
 
         Raises:
-            BadInput: The file ends in neither.
-            Corrupt: It is not what its digest was taken of; nothing was kept.
+            BadInput: The file name has neither suffix.
+            Corrupt: The policy does not match its digest; no file is written.
         """
         if to.suffix not in (".json", ".npz"):
-            raise BadInput("A policy is written to a file that ends in .json or .npz.")
+            raise BadInput(
+                f"{to.name} ends in neither .json nor .npz.", "Name a .json file, or a .npz for its Q values."
+            )
         said, arrays, _ = await self._verified(surgeon, suture, version)
         await self._transport.aside(lambda: keep(said if to.suffix == ".json" else arrays, to))
         return to
 
     @call
     async def policy_arrays(self, policy: str) -> bytes:
-        """Get a policy version's arrays, an .npz with the Q values, by its digest."""
+        """Return a policy version's arrays by its digest: an .npz with the Q values."""
         return await self._bytes(at("policy-versions", policy), NPZ)
 
     @call
@@ -76,18 +134,18 @@ class Policies(Connection):
 
     @call
     async def policy_card(self, surgeon: str, suture: str, version: int) -> PolicyCard:
-        """Get the card of a version: its data, learner, figures, limits, and the digests of what it rests on."""
+        """Return the card of a version: data, learner, figures, limits, and the digests of all that it rests on."""
         return await self._get(PolicyCard, at("policies", surgeon, suture, "versions", version, "card"))
 
     @call
     async def save_policy_card(self, surgeon: str, suture: str, version: int, to: Path) -> Path:
-        """Write the card of a version to a file that ends in .json, or in .html for people.
+        """Write the card of a version to a .json file, or to an .html file for people.
 
         Raises:
-            BadInput: The file ends in neither.
+            BadInput: The file name has neither suffix.
         """
         if to.suffix not in (".json", ".html"):
-            raise BadInput("A policy card is written to a file that ends in .json or .html.")
+            raise BadInput(f"{to.name} ends in neither .json nor .html.", "Name a .html for people, or a .json.")
         path = at("policies", surgeon, suture, "versions", version, "card")
         return await self._save(path, to, None, accept=JSON if to.suffix == ".json" else "text/html")
 
@@ -95,31 +153,32 @@ class Policies(Connection):
     async def release(self, surgeon: str, suture: str, version: int) -> Version:
         """Release a version, or an older one again.
 
-        It is not repeated where the line breaks: somebody may have released another one meanwhile.
+        The request is not retried after a lost connection, because somebody may have released another version
+        meanwhile.
         """
         path = at("policies", surgeon, suture, "versions", version, "release")
         return await self._ask(Version, "POST", path, harmless=False)
 
     @call
     async def withdraw(self, surgeon: str, suture: str) -> None:
-        """Withdraw what is released; as `release`, it is not repeated where the line breaks."""
+        """Withdraw the released policy; like `release`, the request is not retried after a lost connection."""
         await self._send("DELETE", at("policies", surgeon, suture, "release"), harmless=False)
 
     @call
     async def rollout(self, surgeon: str, suture: str, start_mm: Position, version: int | None = None) -> Rollout:
-        """Follow a policy from a place."""
+        """Follow a policy from a position to the goal."""
         body = {"start_mm": list(start_mm), "version": version}
         return await self._ask(Rollout, "POST", at("policies", surgeon, suture, "rollouts"), body)
 
     @call
     async def next(self, surgeon: str, suture: str, position_mm: Position, phase: int | None = None) -> NextStep:
-        """Ask what the released policy would do at a place; nothing moves."""
+        """Return the next action of the released policy at a position; nothing moves."""
         body = {"position_mm": list(position_mm), "phase": phase}
         return await self._ask(NextStep, "POST", at("policies", surgeon, suture, "next"), body)
 
     async def _verified(self, surgeon: str, suture: str, version: int | None) -> tuple[bytes, bytes, "LearntPolicy"]:
-        """Fetch what is said of a policy and its arrays, and put it together."""
-        from skills.client.verifying import rebuilt  # the learning core, slow to import
+        """Return a policy's JSON, its arrays, and the policy rebuilt from them and verified."""
+        from skills.client.verification import rebuilt  # the learning core, slow to import
 
         said = await self._bytes(_path(surgeon, suture, version), JSON)
         about = json.loads(said)

@@ -1,18 +1,74 @@
-"""Recordings, and the demonstrations that are cut out of them."""
+"""Calls of surgeons, suture types, recordings, and the demonstrations cut out of recordings."""
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
-from skills.api.schemas.given import Demonstration, DemoPath, Recording, RewardMap
-from skills.client.calls import at, call
-from skills.client.connection import Connection, given
-from skills.client.files import Progress
+from skills.client.connection import Connection, at, call, given
+from skills.client.transport import Progress
+from skills.schemas.base import Handedness, SkillLevel
+from skills.schemas.given import Demonstration, DemoPath, Recording, RewardMap, Surgeon, SutureType
+
+
+class Catalogue(Connection):
+    """Calls of surgeons and suture types."""
+
+    @call
+    async def put_surgeon(
+        self,
+        surgeon: str,
+        *,
+        skill_level: SkillLevel | None = None,
+        handedness: Handedness | None = None,
+        protocol: str | None = None,
+        consent: Mapping[str, Any] | None = None,
+    ) -> Surgeon:
+        """Create or replace a surgeon under a pseudonym; `consent` has `uses` and `until`.
+
+        Fields that are left out are cleared.
+        """
+        about = {"skill_level": skill_level, "handedness": handedness, "protocol": protocol, "consent": consent}
+        return await self._ask(Surgeon, "PUT", at("surgeons", surgeon), about)
+
+    @call
+    async def surgeon(self, surgeon: str) -> Surgeon:
+        """Return a surgeon."""
+        return await self._get(Surgeon, at("surgeons", surgeon))
+
+    @call
+    async def surgeons(self, search: str | None = None, skill_level: SkillLevel | None = None) -> list[Surgeon]:
+        """List the surgeons: all, or those whose pseudonym contains `search`."""
+        return await self._all(Surgeon, at("surgeons"), search=search, skill_level=skill_level)
+
+    @call
+    async def erase_surgeon(self, surgeon: str) -> None:
+        """Erase a surgeon and everything derived from their data, permanently."""
+        await self._send("DELETE", at("surgeons", surgeon))
+
+    @call
+    async def put_suture_type(
+        self, suture: str, *, name: str, family: str, also_called: list[str] | None = None, description: str = ""
+    ) -> SutureType:
+        """Create or replace a suture type."""
+        about = {"name": name, "family": family, "also_called": also_called or [], "description": description}
+        return await self._ask(SutureType, "PUT", at("suture-types", suture), about)
+
+    @call
+    async def suture_type(self, suture: str) -> SutureType:
+        """Return a suture type."""
+        return await self._get(SutureType, at("suture-types", suture))
+
+    @call
+    async def suture_types(self, search: str | None = None) -> list[SutureType]:
+        """List the suture types: all, or those whose slug, name or family contains `search`."""
+        return await self._all(SutureType, at("suture-types"), search=search)
+
 
 GridMode = Literal["auto", "paper", "fit"]
 
 
 class Recordings(Connection):
-    """The calls."""
+    """Calls of recordings and demonstrations."""
 
     @call
     async def add_recording(
@@ -22,24 +78,32 @@ class Recordings(Connection):
         *,
         rate_hz: float | None = None,
         frame: str | None = None,
+        surgeon: str | None = None,
         progress: Progress | None = None,
     ) -> Recording:
-        """Store a recording: its digest, its topics and the hand-offs proposed in it.
+        """Store a recording; returns its digest, its topics and the hand-offs proposed in it.
 
         Args:
-            recording: A file, which is never held in memory, or bytes. They are sent with their digest.
-            media_type: What they are; left out, it is told by the content.
+            recording: A path, whose file is streamed and never held in memory, or bytes. The digest is sent along.
+            media_type: The media type; default: determined by the content.
             rate_hz: Samples per second, of a table without times.
-            frame: The frame of a table's positions.
-            progress: Is told how many bytes went out, of how many; where it begins anew, the line had broken.
+            frame: Frame of a table's positions.
+            surgeon: The recorded surgeon; erasing the surgeon then deletes the recording even if nothing was cut out of
+                it.
+            progress: Called with the bytes sent and the total; it starts again from 0 when a lost upload is retried.
         """
-        query = {"rate_hz": rate_hz, "frame": frame}
+        query = {"rate_hz": rate_hz, "frame": frame, "surgeon": surgeon}
         return await self._upload(Recording, at("recordings"), recording, media_type, progress, query)
 
     @call
     async def recording(self, recording: str) -> Recording:
-        """Look a recording up, by its digest."""
+        """Return a recording by its digest."""
         return await self._get(Recording, at("recordings", recording))
+
+    @call
+    async def delete_recording(self, recording: str) -> None:
+        """Delete a recording without demonstrations, by its digest."""
+        await self._send("DELETE", at("recordings", recording))
 
     @call
     async def add_demo(
@@ -52,6 +116,7 @@ class Recordings(Connection):
         topic: str | None = None,
         start_s: float | None = None,
         end_s: float | None = None,
+        segment: Literal["whole"] | int | None = None,
         grid: GridMode | None = None,
         cell_mm: float | None = None,
         hysteresis: float | None = None,
@@ -64,7 +129,7 @@ class Recordings(Connection):
         """Store a recording and one demonstration of it; see `add_recording` and `cut_demo`."""
         query = {
             **{"surgeon": surgeon, "suture": suture, "arm": arm, "topic": topic, "start_s": start_s, "end_s": end_s},
-            **{"grid": grid, "cell_mm": cell_mm, "hysteresis": hysteresis, "session": session},
+            **{"segment": segment, "grid": grid, "cell_mm": cell_mm, "hysteresis": hysteresis, "session": session},
             **{"rate_hz": rate_hz, "frame": frame},
         }
         return await self._upload(Demonstration, at("demos"), recording, media_type, progress, query)
@@ -80,29 +145,38 @@ class Recordings(Connection):
         topic: str | None = None,
         start_s: float | None = None,
         end_s: float | None = None,
+        segment: Literal["whole"] | int | None = None,
         grid: GridMode | None = None,
         cell_mm: float | None = None,
         hysteresis: float | None = None,
         session: str | None = None,
     ) -> Demonstration:
-        """Cut a demonstration out of a stored recording, named by its digest.
+        """Cut a demonstration out of a stored recording.
 
         Args:
-            recording: The digest.
-            surgeon: Whose hand-off it is.
+            recording: Digest of the recording.
+            surgeon: Pseudonym of the surgeon who did the hand-off.
             suture: Its suture type.
-            arm: Needed where several arms moved.
-            topic: Needed where an arm was recorded on several.
-            start_s: Where it begins in the recording; left out, the hand-off is found.
-            end_s: Where it ends.
-            grid: "auto" takes the paper's where the path lies in it, and otherwise fits one.
-            cell_mm: The edge of a cell of a fitted grid.
-            hysteresis: Cells by which a sample must be beyond its cell to leave it, 0 to 0.5; 0.25 against tremor.
-            session: A name for what was recorded together.
+            arm: Needed if several arms moved.
+            topic: Needed if an arm was recorded on several topics.
+            start_s: Start in the recording.
+            end_s: End in the recording.
+            segment: Instead of times: a proposed hand-off, counted from 1, or "whole". If neither is given, the only
+                proposal
+                is used, or the whole recording if there is none; `segment` of the response says which.
+            grid: "auto" uses the paper's grid if the path lies in it, and fits one otherwise.
+            cell_mm: Edge of a cell of a fitted grid.
+            hysteresis: Distance beyond its cell, in cells, at which a sample leaves it: 0 to 0.5; 0.25 suppresses
+                tremor.
+            session: A name for recordings that were made together.
+
+        Raises:
+            Problem: Of kind "segment-not-named" if several hand-offs are proposed and none was named;
+                `body["numbers"]["segments"]` lists them.
         """
         body = {
             **{"surgeon": surgeon, "suture": suture, "arm": arm, "topic": topic, "start_s": start_s, "end_s": end_s},
-            **{"grid": grid, "cell_mm": cell_mm, "hysteresis": hysteresis, "session": session},
+            **{"segment": segment, "grid": grid, "cell_mm": cell_mm, "hysteresis": hysteresis, "session": session},
         }
         return await self._ask(Demonstration, "POST", at("recordings", recording, "demos"), given(body))
 
@@ -115,52 +189,52 @@ class Recordings(Connection):
         recording: str | None = None,
         active: bool | None = None,
     ) -> list[Demonstration]:
-        """List demonstrations, the newest first; `active` true leaves out what was withdrawn, false all else."""
+        """List demonstrations, the newest first; `active` true leaves out withdrawn ones, false all others."""
         asked = {"surgeon": surgeon, "suture": suture, "recording": recording, "active": active}
         return await self._all(Demonstration, at("demos"), **asked)
 
     @call
     async def demo(self, demo: str) -> Demonstration:
-        """Look a demonstration up."""
+        """Return a demonstration."""
         return await self._get(Demonstration, at("demos", demo))
 
     @call
     async def demo_report(self, demo: str) -> Demonstration:
-        """Get a demonstration with its report, measured anew."""
+        """Return a demonstration with its report, measured anew."""
         return await self._get(Demonstration, at("demos", demo, "report"))
 
     @call
     async def demo_report_page(self, demo: str) -> bytes:
-        """Get a demonstration's report as a page, which needs nothing from outside."""
+        """Return a demonstration's report as a standalone HTML page."""
         answer = await self._send("GET", at("demos", demo, "report"), headers={"Accept": "text/html"})
         return answer.content
 
     @call
     async def demo_path(self, demo: str) -> DemoPath:
-        """Get a demonstration's states, and its motion as it was recorded."""
+        """Return a demonstration's states, and its motion as recorded."""
         return await self._get(DemoPath, at("demos", demo, "path"))
 
     @call
     async def reward_map(self, demo: str) -> RewardMap:
-        """Get the rewards of Algorithm 1 along a demonstration."""
+        """Return the rewards of Algorithm 1 along a demonstration."""
         return await self._get(RewardMap, at("demos", demo, "reward-map"))
 
     @call
     async def demo_recording(self, demo: str) -> bytes:
-        """Get the recording's bytes back; `save_recording` keeps a large one out of memory."""
+        """Return the recording's bytes; use `save_recording` for a large one, which is not held in memory."""
         return await self._bytes(at("demos", demo, "recording"))
 
     @call
     async def save_recording(self, demo: str, to: Path, progress: Progress | None = None) -> Path:
-        """Fetch a demonstration's recording into a file, which is there only if it is whole and has its digest.
+        """Download a demonstration's recording to a file, which appears only when it is complete and has its digest.
 
         Raises:
-            Corrupt: What came is not the recording; nothing was kept.
+            Corrupt: The download is not the recording; no file is written.
         """
         about = await self._get(Demonstration, at("demos", demo))
         return await self._save(at("demos", demo, "recording"), to, progress, sha256=about.recording)
 
     @call
     async def withdraw_demo(self, demo: str, *, erase: bool = False) -> None:
-        """Withdraw a demonstration, or erase it and all that was derived from it."""
+        """Withdraw a demonstration, or erase it and everything derived from it."""
         await self._send("DELETE", at("demos", demo), params={"erase": erase})

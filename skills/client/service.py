@@ -1,34 +1,77 @@
-"""The two clients: the same calls, made at once or awaited."""
+"""The two clients, `Client` (blocking) and `AsyncClient`, and the calls about API keys, which are for admins.
+
+An installation's first key is created by `skills keys create`.
+"""
 
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
+from datetime import datetime
 from ipaddress import ip_address
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import httpx2 as httpx
 
-from skills.client.atlas import Atlases
-from skills.client.calls import Later, Now, call
-from skills.client.catalogue import Catalogue
-from skills.client.connection import given
+from skills.client.connection import Connection, Later, Now, at, call, given
 from skills.client.jobs import Jobs
-from skills.client.keys import Keys
 from skills.client.plans import Plans
-from skills.client.policies import Policies
+from skills.client.policies import Atlases, Policies, Scores
 from skills.client.problems import UnprotectedKey
-from skills.client.recordings import Recordings
-from skills.client.retrying import Retrying
-from skills.client.scores import Scores
-from skills.client.transport import Awaited, Blocking, Transport
+from skills.client.recordings import Catalogue, Recordings
+from skills.client.transport import Awaited, Blocking, Retrying, Transport
 from skills.errors import BadSettings
+from skills.remedies import Action, Remedy
+from skills.schemas.given import Key, NewKey, Ready
 
-TIMEOUT_S = 60.0  # ours: reading a large recording takes the service 30 s at most, and it may be queued
+
+class Keys(Connection):
+    """Calls about API keys, and the readiness check."""
+
+    @call
+    async def keys(self) -> list[Key]:
+        """List all keys, including those that were revoked or have expired."""
+        return await self._all(Key, at("keys"))
+
+    @call
+    async def make_key(
+        self,
+        owner: str,
+        role: Literal["reader", "uploader", "trainer", "releaser", "admin"] = "reader",
+        *,
+        expires_at: datetime | None = None,
+        surgeons: Sequence[str] | None = None,
+    ) -> NewKey:
+        """Create a key; its `secret` is in this response only.
+
+        The request is not retried after a lost connection, because that could create two keys.
+
+        Args:
+            owner: The owner's name.
+            role: The role; each may do everything that those before it may.
+            expires_at: When the key expires, with a time zone; default: never.
+            surgeons: Pseudonyms of the surgeons to whose data the key is restricted; default: no restriction.
+        """
+        until = None if expires_at is None else expires_at.isoformat()
+        body = {"owner": owner, "role": role, "expires_at": until, "surgeons": surgeons}
+        return await self._ask(NewKey, "POST", at("keys"), given(body), harmless=False)
+
+    @call
+    async def revoke_key(self, key: str) -> Key:
+        """Revoke a key permanently; `key` is its id, the eight characters after "skills_"."""
+        return await self._ask(Key, "DELETE", at("keys", key))
+
+    @call
+    async def ready(self) -> Ready:
+        """Check whether the service can work; while it starts, the request is retried as for every busy response."""
+        return await self._get(Ready, at("readyz"))
+
+
+TIMEOUT_S = 60.0  # ours: the service reads a large recording in at most 30 s, and the request may be queued before
 AGAIN = Retrying()
 
 
 class Calls(Atlases, Catalogue, Recordings, Jobs, Policies, Plans, Keys, Scores):
-    """All calls, and what they are made with."""
+    """All calls, and the state that they share."""
 
     def _connect(
         self,
@@ -47,42 +90,42 @@ class Calls(Atlases, Catalogue, Recordings, Jobs, Policies, Plans, Keys, Scores)
         self._timeout_s, self._retrying, self._clock = timeout_s, retrying, clock
 
     def __repr__(self) -> str:
-        """Say where the service is, and never the key."""
+        """Return the class and the service's address, never the key."""
         signed = ", with a key" if self._headers else ""
         return f"<{type(self).__name__} of {self._transport.http.base_url}{signed}>"
 
     @call
     async def send(self, /, method: str, path: str, **how: Any) -> httpx.Response:
-        """Send any request, and raise what is refused; `how` is as in `httpx.Client.request`.
+        """Send any request, and raise `Problem` for an error response; `how` is as in `httpx.Client.request`.
 
-        It is sent again only where nothing was done, unless it is a GET.
+        Only a GET is retried after a lost connection; other methods only if the service certainly did nothing.
         """
         return await self._send(method, path, harmless=method == "GET", **how)
 
     @call
     async def get_json(self, /, path: str, **query: Any) -> Any:
-        """Get an answer as the plain JSON that the service sent."""
+        """Return a response as the plain JSON that the service sent."""
         return await self._json("GET", path, params=given(query))
 
 
 class Client(Calls, Now):
-    """The service, each call answered at once.
+    """The blocking client of the service.
 
-    with Client("http://127.0.0.1:8000") as client:
-        client.policy("kestrel", "simple-running").goal_mm
+        with Client("http://127.0.0.1:8000") as client:
+            client.policy("kestrel", "simple-running").goal_mm
 
     Args:
-        server: Its address; or an `httpx.Client`, such as one that has proxies or certificates of its own.
-        api_key: Left out, that of the settings, SKILLS_API_KEY, where the server is an address. "" is none.
-        plain_http: Send the key although others on the way can read it.
-        timeout_s: For how long the service may be silent.
-        retrying: How often and how long a request is sent again where that is harmless.
-        clock: Seconds, for deadlines.
-        sleep: Waits so many seconds.
+        server: The service's address; or an `httpx.Client`, for example one with proxies or certificates of its own.
+        api_key: The API key; default: SKILLS_API_KEY of the settings if the server is an address. "" sends none.
+        plain_http: Send the key over plain HTTP, where others on the way can read it.
+        timeout_s: Longest silence of the service before a request fails.
+        retrying: How often, and for how long, a request is retried where that is safe.
+        clock: Returns seconds, for deadlines.
+        sleep: Sleeps for a number of seconds.
 
     Raises:
-        BadSettings: The server is no address.
-        UnprotectedKey: A key would travel over plain HTTP, beyond this machine.
+        BadSettings: The server is not an http or https address.
+        UnprotectedKey: The key would be sent over plain HTTP to another machine.
     """
 
     def __init__(
@@ -102,7 +145,7 @@ class Client(Calls, Now):
         self._connect(Blocking(self.http, sleep), key, plain_http, timeout_s, retrying, clock, streams=named)
 
     def __enter__(self) -> Self:
-        """Use it in a with block."""
+        """Return the client."""
         return self
 
     def __exit__(
@@ -117,7 +160,7 @@ class Client(Calls, Now):
 
 
 class AsyncClient(Calls, Later):
-    """The service, each call awaited; otherwise it is a `Client`.
+    """The asynchronous client of the service; its arguments and errors are those of `Client`.
 
     async with AsyncClient("http://127.0.0.1:8000") as client:
         (await client.policy("kestrel", "simple-running")).goal_mm
@@ -140,7 +183,7 @@ class AsyncClient(Calls, Later):
         self._connect(Awaited(self.http, sleep), key, plain_http, timeout_s, retrying, clock, streams=named)
 
     async def __aenter__(self) -> Self:
-        """Use it in an async with block."""
+        """Return the client."""
         return self
 
     async def __aexit__(
@@ -155,22 +198,25 @@ class AsyncClient(Calls, Later):
 
 
 def _of(server: str) -> dict[str, Any]:
-    """Say how an address is reached: what is on this machine, past any proxy.
+    """Return the `httpx` options for an address; loopback addresses bypass the proxies of the environment.
 
     Raises:
-        BadSettings: It is no address.
+        BadSettings: It is not an http or https address.
     """
     try:
         url = httpx.URL(server)
     except httpx.InvalidURL:
         url = httpx.URL()
     if url.scheme not in ("http", "https") or not url.host:
-        raise BadSettings("Write the address of the service as http://127.0.0.1:8000, or https:// and its name.")
+        raise BadSettings(
+            "The address of the service begins with neither http:// nor https://, or names no host.",
+            "Write it as http://127.0.0.1:8000, or https:// and its name.",
+        )
     return {"base_url": url, "trust_env": not _on_this_machine(url)}
 
 
 def _own_key() -> str | None:
-    """Read the key of the settings."""
+    """Return the API key of the settings, or None."""
     from skills.settings import settings
 
     key = settings().api_key
@@ -178,15 +224,15 @@ def _own_key() -> str | None:
 
 
 def _protect(url: httpx.URL) -> None:
-    """Refuse to send a key where others can read it.
+    """Check that the key is not sent where others can read it.
 
     Raises:
-        UnprotectedKey: It would go over plain HTTP, beyond this machine.
+        UnprotectedKey: It would be sent over plain HTTP to another machine.
     """
     if url.scheme != "https" and not _on_this_machine(url):
         raise UnprotectedKey(
-            f"The key would travel to {url.host} over plain HTTP, where others can read it. Use https://, or a tunnel "
-            "to this machine; where the network itself is protected, plain_http=True sends it."
+            f"The key would be sent to {url.host} over plain HTTP, where others can read it.",
+            Remedy(Action.PROTECT_KEY),
         )
 
 

@@ -1,12 +1,12 @@
-"""A backup: every table of ours in one zip file, the same from SQLite and from PostgreSQL.
+"""Backups: every table of ours in one zip file, in the same format for SQLite and PostgreSQL.
 
-    manifest.json        the format, the schema's revision, and of every table its columns, rows and SHA-256
-    surgeons.rows, ...   a line of JSON for each row; where a column holds bytes the line has their number, and they
-                         follow it
-    the last 64 bytes    (a zip's comment) the SHA-256 of all that stands before them, in hex
+    manifest.json        the format, the schema's revision, and for every table its columns, number of rows and SHA-256
+    surgeons.rows, ...   a line of JSON for each row; for a column of bytes the line has their number, and the bytes
+                         follow the line
+    the last 64 bytes    (the zip's comment) the SHA-256 of all bytes before them, in hex
 
-Rows stand in the order of their keys, and tables after those that they refer to. Nothing is compressed: most of it is
-already. Whatever is read or written here is held a few mebibytes at a time.
+Rows are in the order of their keys, and tables after those that they refer to. Nothing is compressed, because most of
+the data is already. Reading and writing hold a few MiB in memory at a time.
 """
 
 import hashlib
@@ -38,33 +38,34 @@ from sqlalchemy import (
 from sqlalchemy.types import NullType, TypeEngine
 
 from skills.db.base import Base, Moment, now, rfc3339
-from skills.db.books import Executor, SignIn
 from skills.db.packed import Packed
-from skills.db.schema import revision_of, revisions, upgrade
+from skills.db.service_tables import Executor, SignIn
+from skills.db.session import revision_of, revisions, upgrade
 from skills.errors import Conflict, Corrupt, UnknownFormat
+from skills.remedies import Action, Remedy
 
 FORMAT = "suture-skills backup 1"
 MANIFEST = "manifest.json"
 SEAL_BYTES = 64
-CUT_OFF = "its end is missing or damaged, as of a file that was cut off"
+CUT_OFF = "its end is missing or damaged, as in a truncated file"
 PIECE_BYTES = 1 << 20
-LEFT_OUT = {Executor.__tablename__, SignIn.__tablename__}  # workers that live and people who are in: elsewhere none
+LEFT_OUT = {Executor.__tablename__, SignIn.__tablename__}  # running workers and browser sessions: gone after a restore
 ROWS_AT_ONCE = 500
-ROWS_WITH_BYTES_AT_ONCE = 8  # a recording's chunk has a mebibyte
+ROWS_WITH_BYTES_AT_ONCE = 8  # a recording's chunk has 1 MiB
 
 KINDS: dict[str, TypeEngine[Any]] = {
     "bytes": LargeBinary(),
     "json": JSON(none_as_null=True),
     "moment": Moment(),
     "truth": Boolean(),
-    "plain": NullType(),  # text and numbers, which every driver and JSON have
+    "plain": NullType(),  # text and numbers, which all drivers and JSON represent alike
 }
 PLAIN = (String, Integer, BigInteger, Float, Double)
 
 
 @dataclass(frozen=True)
 class Dumped:
-    """What a backup says of a table; `counter` is the column that numbers its rows, `last` its highest number ever."""
+    """The manifest's entry of a table; `counter` is its autoincrement column, `last` the highest number ever used."""
 
     name: str
     columns: list[list[str]]  # name and kind of each
@@ -80,13 +81,13 @@ class Dumped:
 
     @property
     def table(self) -> Table:
-        """The table as it is stored: values stay the bytes that they are packed in."""
+        """The table with raw columns: serialised values stay bytes."""
         return Table(self.name, MetaData(), *(Column(name, KINDS[kind]) for name, kind in self.columns))
 
 
 @dataclass(frozen=True)
 class Manifest:
-    """What a backup says of itself."""
+    """The contents of manifest.json."""
 
     format: str
     code: str
@@ -97,32 +98,40 @@ class Manifest:
 
 
 def tables() -> list[Table]:
-    """List the tables that are backed up, each after those that it refers to."""
+    """Return the tables that are backed up, each after those that it refers to."""
     return [table for table in Base.metadata.sorted_tables if table.name not in LEFT_OUT]
 
 
 def kind_of(column: Column[Any]) -> str:
-    """Say how a column is written."""
+    """Return the kind of a column, a key of `KINDS`, which decides how its values are written."""
     if isinstance(column.type, Packed | LargeBinary):
         return "bytes"
     for kind, types in (("json", JSON), ("moment", Moment), ("truth", Boolean), ("plain", PLAIN)):
         if isinstance(column.type, types):
             return kind
-    raise AssertionError(f"how is {column} backed up?")
+    raise AssertionError(f"no backup format for {column}")
 
 
 # ---- writing -----------------------------------------------------------------------------------------------------
 
 
 def write(file: IO[bytes], connection: Connection, code: str, told: Callable[[str], None]) -> Manifest:
-    """Write all tables into an empty file that can be read and sought, from the caller's one transaction.
+    """Write all tables into an empty file, from the caller's single transaction.
+
+    Args:
+        file: Empty; readable and seekable, because the digest is computed from it at the end.
+        connection: In the transaction whose state is backed up.
+        code: Version of the code, for the manifest.
+        told: Progress callback, called with the name of each table.
 
     Raises:
         Conflict: The tables are of another version of the code.
     """
     schema = revision_of(connection)
     if schema != revisions()[0]:
-        raise Conflict("The tables are of another version; run `skills migrate`, or back up with the code they are of.")
+        raise Conflict(
+            "The tables are of another version; back up with the code of that version.", Remedy(Action.MIGRATE)
+        )
     created_at = rfc3339(now()) or ""
     with ZipFile(file, "w", ZIP_STORED) as archive:
         dumped = []
@@ -131,7 +140,7 @@ def write(file: IO[bytes], connection: Connection, code: str, told: Callable[[st
             dumped.append(_write_table(archive, connection, table))
         manifest = Manifest(FORMAT, code, schema, connection.dialect.name, created_at, dumped)
         archive.writestr(MANIFEST, json.dumps(asdict(manifest), indent=1))
-        archive.comment = b"0" * SEAL_BYTES
+        archive.comment = b"0" * SEAL_BYTES  # replaced below: the digest covers the finished archive
     file.seek(-SEAL_BYTES, io.SEEK_END)
     end = file.tell()
     seal = _digest(file, end)
@@ -177,30 +186,37 @@ def _lay_out(row: Sequence[Any], columns: list[list[str]]) -> Iterator[bytes]:
 
 
 def check(file: IO[bytes]) -> Manifest:
-    """Check every byte of a backup, and read its manifest.
+    """Verify every byte of a backup, and return its manifest.
 
     Raises:
-        UnknownFormat: It is no backup, or one of another format.
-        Corrupt: Something of it is damaged or missing; the message names it.
+        UnknownFormat: It is not a backup, or one of another format.
+        Corrupt: A part is damaged or missing; the message names it.
         Conflict: It was written by a newer version of the code.
     """
     if file.read(4) != b"PK\x03\x04":
-        raise UnknownFormat("This is no backup of suture-skills.")
+        raise UnknownFormat("This is not a backup of suture-skills.", "Name a file that was written as a backup.")
     end = file.seek(0, io.SEEK_END) - SEAL_BYTES
     if end < 0 or _digest(file, end) != file.read(SEAL_BYTES).decode("ascii", "replace"):
-        raise Corrupt(f"The backup is damaged: {_damage(file)}. Nothing of it is used; take another one.")
+        raise Corrupt(f"The backup is damaged: {_damage(file)}. Nothing of it was restored; use another one.")
     try:
         with ZipFile(file) as archive:
             manifest = _manifest(archive)
     except (KeyError, TypeError, ValueError) as error:
-        raise UnknownFormat("This zip file is no backup of suture-skills that this version reads.") from error
+        raise UnknownFormat("This zip file is not a backup of suture-skills that this version can read.") from error
     if manifest.schema not in revisions():
         raise Conflict(f"The backup was written by a newer version ({manifest.code}); restore it with that one.")
     return manifest
 
 
 def load(file: IO[bytes], manifest: Manifest, connection: Connection, told: Callable[[str], None]) -> None:
-    """Make the tables, fill them as they were, and bring them to this version, in the caller's transaction."""
+    """Create the tables, insert the rows of a backup, and migrate them to this version, in the caller's transaction.
+
+    Args:
+        file: The backup.
+        manifest: Its manifest, from `check`.
+        connection: In the transaction; the database is empty.
+        told: Progress callback, called with the name of each table.
+    """
     upgrade(connection, manifest.schema)
     with ZipFile(file) as archive:
         for dumped in manifest.tables:
@@ -241,13 +257,13 @@ def _manifest(archive: ZipFile) -> Manifest:
 
 
 def _damage(file: IO[bytes]) -> str:
-    """Name what is damaged in a file that is known to be."""
+    """Return which part of a damaged file is damaged, in words."""
     try:
         archive = ZipFile(file)
-    except Exception:  # whatever a damaged zip makes of the reader
+    except Exception:  # a damaged zip makes the reader raise anything
         return CUT_OFF
     with archive:
-        if MANIFEST not in archive.namelist():  # it was written last; a packed value's own end was taken for the file's
+        if MANIFEST not in archive.namelist():  # written last: a value's end was mistaken for the zip's
             return CUT_OFF
         try:
             manifest = _manifest(archive)
@@ -263,11 +279,11 @@ def _damage(file: IO[bytes]) -> str:
                 same = False
             if not same:
                 return f"{dumped.member} is damaged"
-    return "its parts are whole, its directory or its last bytes are not"
+    return "its members are intact, its directory or its last bytes are damaged"
 
 
 def _digest(file: IO[bytes], end: int) -> str:
-    """Digest a file from its beginning to a place, and stay there."""
+    """Return the SHA-256 of the file's first `end` bytes; the position is `end` afterwards."""
     file.seek(0)
     seen = hashlib.sha256()
     while piece := file.read(min(PIECE_BYTES, end - file.tell())):
@@ -275,7 +291,7 @@ def _digest(file: IO[bytes], end: int) -> str:
     return seen.hexdigest()
 
 
-# ---- the numbers of rows, which are never used twice -------------------------------------------------------------
+# ---- row numbers, which are never reused ------------------------------------------------------------------------
 
 
 def _last_number(connection: Connection, table: str, column: str) -> int:

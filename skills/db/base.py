@@ -1,5 +1,6 @@
-"""The columns that every table is made of: names for constraints, moments in UTC, digests."""
+"""Shared definitions for all tables: names of constraints, UTC timestamps, digests, row numbers."""
 
+from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from typing import Annotated, Any
 
@@ -15,27 +16,32 @@ NAMES = {
     "pk": "pk_%(table_name)s",
 }
 
+PARAMETERS = 10_000  # ours: per statement, well below the limit of either database
+
 
 class Moment(TypeDecorator[datetime]):
-    """A moment in UTC on every database; a naive one is our own mistake (SQLite would store it as anything)."""
+    """A column of UTC timestamps on every database.
+
+    A timestamp without time zone is a programming error, which is asserted: SQLite would store it unchecked.
+    """
 
     impl = DateTime(timezone=True)
     cache_ok = True
 
     def process_bind_param(self, value: datetime | None, dialect: Dialect) -> datetime | None:
-        """Store UTC."""
+        """Convert to UTC before storing."""
         if value is None:
             return None
-        assert value.tzinfo is not None, "moments carry their time zone"
+        assert value.tzinfo is not None, "times must have a time zone"
         return value.astimezone(UTC)
 
     def process_result_value(self, value: datetime | None, dialect: Dialect) -> datetime | None:
-        """Read UTC: SQLite gives it back without its zone."""
+        """Return the timestamp in UTC; SQLite returns it without its time zone."""
         return value if value is None else value.replace(tzinfo=UTC) if value.tzinfo is None else value.astimezone(UTC)
 
 
 class Base(DeclarativeBase):
-    """The root of all tables."""
+    """The declarative base class of all tables."""
 
     metadata = MetaData(naming_convention=NAMES)
     type_annotation_map = {  # noqa: RUF012 - SQLAlchemy reads it from the class
@@ -53,11 +59,20 @@ Sha256 = String(64)
 Slug = String(64)
 
 
+def in_parts(rows: Sequence[int]) -> Iterator[Sequence[int]]:
+    """Split row numbers into batches of at most `PARAMETERS` for `IN` clauses.
+
+    A statement has at most 32,766 parameters on SQLite and 65,535 on PostgreSQL.
+    """
+    for at in range(0, len(rows), PARAMETERS):
+        yield rows[at : at + PARAMETERS]
+
+
 def now() -> datetime:
-    """Tell the present moment, in UTC."""
+    """Return the current time in UTC."""
     return datetime.now(UTC)
 
 
 def rfc3339(moment: datetime | None) -> str | None:
-    """Write a moment as RFC 3339 in UTC."""
+    """Return a timestamp in UTC as RFC 3339 text; None for None."""
     return None if moment is None else moment.isoformat().replace("+00:00", "Z")

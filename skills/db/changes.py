@@ -1,16 +1,16 @@
-"""Whether what is served may have changed, told at every request without reading a table.
+"""Change detection: whether served policies may have changed, checked at every request without reading a table.
 
-`Changes.version()` is a number: for as long as it stays the same, no commit has changed what is served. It is taken
-before the tables are read, never after. None means that it cannot be told now, so that the tables must be read. One
-object belongs to one event loop and is used on its thread only.
+`Changes.version()` is a number: as long as it stays the same, no commit has changed the served policies. Callers read
+it before they read the tables, never after. None means that changes cannot be detected now, so the tables must be read.
+An instance belongs to one event loop and is used on its thread only.
 
 On SQLite it is `PRAGMA data_version` of a connection that never writes, outside any transaction. Every commit changes
-it, a worker's heartbeat too, and whatever was committed before the question is in the answer.
+it, including a worker's heartbeat, and it includes every commit that finished before the call.
 
 On PostgreSQL it counts the notifications that have arrived at a listening connection, and the commits of this process.
-The commit of another process is told a moment after it, and never later than `BOUND_S`, whatever becomes of the line:
-the listener sends itself a beat, which comes back in order with the notifications; where the last one that came back
-was sent longer ago than that, nothing is told.
+A commit of another process is noticed shortly after it, and never later than `BOUND_S`, even if the connection fails:
+the listener sends itself a heartbeat, which returns in order with the notifications; if the last one that returned was
+sent longer ago than that, the version is None.
 """
 
 import asyncio
@@ -33,57 +33,62 @@ if TYPE_CHECKING:
     from psycopg.pq.abc import PGconn
 
 CHANNEL = "skills_served"
-BEAT_S = 0.5  # each is a transaction of the server's
-BOUND_S = 1.5  # two beats may be late; later, the tables are read at every request
-GIVEN_UP_S = 5  # a line that was silent for so long is dropped, and another one opened
-AGAIN_S = 0.5  # between two attempts at that
-APPLICATION = "suture-skills listening"  # as the server's list of its connections names it
+BEAT_S = 0.5  # interval of heartbeats; each is a transaction of the server
+BOUND_S = 1.5  # two heartbeats may be late; after that the tables are read at every request
+GIVEN_UP_S = 5  # a connection without heartbeats for this long is replaced
+AGAIN_S = 0.5  # between two attempts to connect
+APPLICATION = "suture-skills listening"  # its name in pg_stat_activity
 
 log = logging.getLogger(__name__)
 
 
 def announce(session: Session) -> None:
-    """Tell all services that what is served has changed, as soon as the caller's transaction is committed.
+    """Notify all services that served policies have changed, when the caller's transaction commits.
 
-    Whatever releases, withdraws or erases calls this. SQLite tells of every commit by itself.
+    Every function that releases, withdraws or erases calls this. SQLite needs no notification, since `PRAGMA
+    data_version` shows every commit.
     """
     if session.get_bind().dialect.name == "postgresql":
         session.execute(text(f"NOTIFY {CHANNEL}"))
 
 
 class Unasked(Exception):
-    """The question was not asked: its answer would have to be waited for."""
+    """The query was not run, because the event loop would have to wait for its result."""
 
 
 class Changes:
-    """Those of a database of which nothing is known, so that the tables are always read."""
+    """The interface of change detection; this base class detects nothing, so the tables are always read."""
+
+    every_commit = False  # whether the version changes at every commit, and not only where served policies may change
 
     async def open(self) -> None:
-        """Begin to look, on this event loop."""
+        """Start watching, on this event loop."""
 
     async def close(self) -> None:
-        """Look no more."""
+        """Stop watching."""
 
     def version(self) -> int | None:
-        """Tell the version of what is served; None where it cannot be told."""
+        """Return the version of the served policies; None where it is unknown."""
         return None
 
     def first(self, _question: Select[*tuple[Any, ...]], _values: dict[str, Any]) -> tuple[Any, ...] | None:
-        """Ask for one row, by an index, where that takes microseconds.
+        """Query one row by an index on the event loop, where that takes microseconds.
 
         Raises:
-            Unasked: It may take longer; ask the database, in a thread.
+            Unasked: It may take longer; run the query in a thread.
         """
         raise Unasked
 
 
 def changes_of(database: Database) -> Changes:
-    """Choose how the changes of a database are seen."""
-    return InFile(database.engine) if database.engine.dialect.name == "sqlite" else Told(database.engine)
+    """Return the change detection for a database."""
+    return InFile(database.engine) if database.engine.dialect.name == "sqlite" else Notified(database.engine)
 
 
 class InFile(Changes):
-    """Those of SQLite's file, seen by a connection that does nothing else."""
+    """Change detection for a SQLite file, by a dedicated read-only connection."""
+
+    every_commit = True
 
     def __init__(self, engine: Engine) -> None:
         self._file = Path(engine.url.database or "")
@@ -92,18 +97,18 @@ class InFile(Changes):
 
     async def open(self) -> None:
         """Open the connection."""
-        address = f"{self._file.resolve().as_uri()}?mode=rw"  # so that a file that is missing is not made
+        address = f"{self._file.resolve().as_uri()}?mode=rw"  # mode=rw does not create a missing file
         self._connection = sqlite3.connect(address, uri=True, isolation_level=None, timeout=0)
         self._cursor = self._connection.execute("PRAGMA query_only=ON")
 
     async def close(self) -> None:
-        """Close it."""
+        """Close the connection."""
         if self._connection is not None:
             self._connection.close()
             self._connection = self._cursor = None
 
     def version(self) -> int | None:
-        """Tell what SQLite counts: changes that others have committed."""
+        """Return SQLite's data version, which changes with each commit of another connection."""
         try:
             ((version,),) = self._ask("PRAGMA data_version")
         except Unasked:
@@ -111,7 +116,7 @@ class InFile(Changes):
         return int(version)
 
     def first(self, question: Select[*tuple[Any, ...]], values: dict[str, Any]) -> tuple[Any, ...] | None:
-        """Ask here and now: beside a write-ahead log, a reader waits for nobody."""
+        """Run the query at once: in WAL mode a reader never waits for a writer."""
         statement, given = _in_sqlite(question)
         return next(iter(self._ask(statement, given | values)), None)
 
@@ -119,40 +124,40 @@ class InFile(Changes):
         if self._cursor is None:
             raise Unasked
         try:
-            return self._cursor.execute(statement, values).fetchall()  # all, which ends its transaction
+            return self._cursor.execute(statement, values).fetchall()  # fetching all rows ends its read transaction
         except sqlite3.OperationalError as error:
             raise Unasked from error
 
 
 @cache
 def _in_sqlite(question: Select[*tuple[Any, ...]]) -> tuple[str, dict[str, Any]]:
-    """Write a question in SQLite's words, with the values that are its own."""
+    """Compile a query for SQLite, and return it with its bound values."""
     from sqlalchemy.dialects import sqlite
 
     compiled = question.compile(dialect=sqlite.dialect(paramstyle="named"))
     return str(compiled), dict(compiled.params)
 
 
-class Told(Changes):
-    """Those that PostgreSQL notifies of, and those of this process, which need no telling."""
+class Notified(Changes):
+    """Change detection on PostgreSQL, by notifications, and by a hook for the commits of this process."""
 
     def __init__(self, engine: Engine) -> None:
         self._engine = engine
         self._broken = engine.dialect.loaded_dbapi.Error
-        self._own = f"skills_beat_{secrets.token_hex(8)}"  # the channel of the beats
-        self._counter = count(1)  # between whose steps no thread can come
+        self._own = f"skills_beat_{secrets.token_hex(8)}"  # the channel of the heartbeats
+        self._counter = count(1)  # its steps are atomic between threads
         self._version = 0
         self._line: PGconn | None = None
-        self._beat_s = self._known_s = 0.0  # when the last beat was sent, and the last of those that came back
+        self._beat_s = self._known_s = 0.0  # when the last heartbeat was sent, and the last one that returned
         self._listening: asyncio.Task[None] | None = None
 
     async def open(self) -> None:
-        """Listen, in the background, and again whenever the line is lost."""
+        """Start listening in the background; it reconnects whenever the connection is lost."""
         event.listen(Session, "after_commit", self._committed)
         self._listening = asyncio.create_task(self._listen())
 
     async def close(self) -> None:
-        """Hang up."""
+        """Stop listening and disconnect."""
         if self._listening is None:
             return
         event.remove(Session, "after_commit", self._committed)
@@ -162,17 +167,20 @@ class Told(Changes):
         self._listening = None
 
     def version(self) -> int | None:
-        """Count the changes that have arrived: whatever came before the loop took up a request is among them."""
+        """Return the number of changes seen.
+
+        It includes all notifications that arrived before the event loop started the request.
+        """
         return None if self._line is None or monotonic() - self._known_s >= BOUND_S else self._version
 
     def _committed(self, session: Session) -> None:
-        """Count a commit of this process, in the thread that made it, before anybody is told of it."""
+        """Count a commit of this process, in the thread that made it, before the commit is acknowledged."""
         if session.bind is not None and session.bind.engine.pool is self._engine.pool:
             self._version = next(self._counter)
 
     async def _listen(self) -> None:
-        """Keep a line, without an end."""
-        from psycopg import AsyncConnection  # SQLite's users need not wait for it
+        """Listen, and reconnect after errors, until cancelled."""
+        from psycopg import AsyncConnection  # imported here: it is slow, and not needed with SQLite
 
         _, how = self._engine.dialect.create_connect_args(self._engine.url)
         how = {**how, "autocommit": True, "connect_timeout": GIVEN_UP_S, "application_name": APPLICATION}
@@ -187,13 +195,13 @@ class Told(Changes):
                 finally:
                     await connection.close()
             except (self._broken, OSError):
-                log.info("PostgreSQL cannot be asked to tell of changes.", exc_info=True)
+                log.info("Cannot listen for change notifications of PostgreSQL.", exc_info=True)
             await asyncio.sleep(AGAIN_S)
 
     async def _hold(self, line: "PGconn", began_s: float) -> None:
-        """Use a line that listens since a moment, for as long as its beats come back."""
+        """Use a listening connection for as long as its heartbeats return."""
         loop = asyncio.get_running_loop()
-        self._version = next(self._counter)  # of what was before, it has told nothing
+        self._version = next(self._counter)  # changes before LISTEN were not notified, so count one
         self._beat_s = self._known_s = began_s
         self._line = line
         loop.add_reader(line.socket, self._take_in, line, line.socket)
@@ -207,10 +215,12 @@ class Told(Changes):
         finally:
             if self._line is line:
                 self._drop(line.socket)
-        log.warning("PostgreSQL no longer tells of changes; until it does, every request looks for them.")
+        log.warning(
+            "The change notifications of PostgreSQL stopped; until they return, every request queries for changes."
+        )
 
     def _take_in(self, line: "PGconn", socket: int) -> None:
-        """Read what has arrived."""
+        """Process the notifications that have arrived."""
         try:
             line.consume_input()
         except self._broken:
@@ -222,9 +232,9 @@ class Told(Changes):
             else:
                 self._version = next(self._counter)
         while not line.is_busy() and line.get_result() is not None:
-            pass  # that a beat was sent; it counts when it comes back
+            pass  # the result of NOTIFY; the heartbeat counts only when it returns
 
     def _drop(self, socket: int) -> None:
-        """Look at the line no more, at once: another's socket may soon have the same number."""
+        """Stop watching the connection's socket at once: the system may soon give its number to another socket."""
         asyncio.get_running_loop().remove_reader(socket)
         self._line = None

@@ -1,9 +1,11 @@
-"""The tables of the library. A row is a label on a value: who, when, from what, and the value whole in one column.
+"""The tables of the library.
+
+A row labels a value: it has the value's owner, time and origin, and the value itself serialised in one column.
 
 Append-only (triggers of the migrations refuse changes): recordings and their chunks, demonstrations, reward maps,
-policy versions and what they rest on, releases, plans, playbacks and their pictures, calibrations; a demonstration and
-a release can be withdrawn, once. Deleting is left to erasure alone. What the service does has its tables in
-`skills.db.books`.
+policy versions and their further demonstrations, releases, plans, playbacks and their pictures, calibrations; a
+demonstration and a release can be withdrawn, once. Only erasure deletes. The tables of the service's own state are in
+`skills.db.service_tables`.
 """
 
 from datetime import datetime
@@ -19,26 +21,26 @@ from sqlalchemy import (
 )
 from sqlalchemy.orm import Mapped, mapped_column, relationship
 
+from skills.comparison.distances import Measured
 from skills.db.base import Base, RowId, Sha256, Slug, now
 from skills.db.packed import Packed, stored
+from skills.demonstration.demonstration import Demo, Partner, Pause
+from skills.gridworld.grid import GridPath, GridWorld
+from skills.gridworld.reward import RewardLevels, RewardMap
+from skills.learning.certificate import Coverage
+from skills.learning.dynamic_programming import ValueIteration
+from skills.learning.learners import LEARNERS
+from skills.learning.network import Network
+from skills.learning.policy import Policy
+from skills.learning.q_learning import PhaseQLearning, Training
 from skills.packing import added_later, few_numbers
-from skills.style.certificate import Coverage
-from skills.style.comparing.measured import Measured
-from skills.style.demo import Demo, Partner, Pause
-from skills.style.grid import GridPath, GridWorld
-from skills.style.handoff import PsmM
-from skills.style.learning.learners import LEARNERS
-from skills.style.learning.q_learning import PhaseQLearning, Training
-from skills.style.learning.value_iteration import ValueIteration
-from skills.style.network import Network
-from skills.style.pictures import Pictures
-from skills.style.plan import Pass, SuturePlan, SuturePoint
-from skills.style.playback import Playback
-from skills.style.policy import Policy
-from skills.style.reward import RewardLevels, RewardMap
+from skills.planning.handoff import PsmM
+from skills.planning.plan import Pass, SuturePlan, SuturePoint
+from skills.verification.playback import Pictures, Playback
 
 stored(GridWorld, GridPath, RewardLevels, *LEARNERS.values(), Training, Network)
 stored(SuturePoint, Pass, Pause, Partner, PsmM)
+# Left out of the serialised value while they hold their default, so that the digests of older values stay the same.
 added_later(GridPath, "hysteresis")
 added_later(Policy, "network")
 added_later(Demo, "pauses")
@@ -48,11 +50,11 @@ added_later(Partner, "base_xyzw")
 added_later(Partner, "instrument")
 added_later(PhaseQLearning, "slip")
 added_later(ValueIteration, "slip")
-few_numbers(Policy, "q")
+few_numbers(Policy, "q")  # some 130 different values in 200,000 places: stored as a palette
 
 
 class Surgeon(Base):
-    """A surgeon, known by a pseudonym; `subject` is the random name that events use and erasure forgets."""
+    """A surgeon, identified by a pseudonym; `subject` is the random name in events, which erasure deletes."""
 
     __tablename__ = "surgeons"
 
@@ -67,7 +69,7 @@ class Surgeon(Base):
 
 
 class Erasure(Base):
-    """Remembers that a surgeon was erased, without remembering who: a salted digest of the pseudonym."""
+    """A record that a surgeon was erased, with a salted digest of the pseudonym instead of the pseudonym."""
 
     __tablename__ = "erasures"
 
@@ -78,7 +80,7 @@ class Erasure(Base):
 
 
 class SutureType(Base):
-    """One kind of suture of the catalogue."""
+    """One suture type of the catalogue."""
 
     __tablename__ = "suture_types"
 
@@ -90,7 +92,7 @@ class SutureType(Base):
 
 
 class StoredRecording(Base):
-    """A raw file as it was uploaded, known by the SHA-256 of its bytes."""
+    """An uploaded file, identified by the SHA-256 of its bytes."""
 
     __tablename__ = "recordings"
 
@@ -100,13 +102,13 @@ class StoredRecording(Base):
     media_type: Mapped[str]
     format: Mapped[str]
     integrity: Mapped[str]
-    reading: Mapped[dict[str, Any]]  # how it was read: rate_hz and frame where the file does not say them
+    reading: Mapped[dict[str, Any]]  # arguments of the reader: rate_hz and frame, where the file has none
     about: Mapped[dict[str, Any]]  # topics, quality, proposed hand-offs
     created_at: Mapped[datetime] = mapped_column(default=now)
 
 
 class RecordingUpload(Base):
-    """Somebody sent a recording's bytes, and may see them for that."""
+    """An upload of a recording by a caller, which may see the recording for that reason."""
 
     __tablename__ = "recording_uploads"
 
@@ -114,8 +116,17 @@ class RecordingUpload(Base):
     actor: Mapped[str] = mapped_column(primary_key=True)
 
 
+class RecordingSurgeon(Base):
+    """A surgeon that a recording was uploaded for, one of possibly several; used to find recordings at erasure."""
+
+    __tablename__ = "recording_surgeons"
+
+    recording_row: Mapped[int] = mapped_column(ForeignKey("recordings.row", ondelete="CASCADE"), primary_key=True)
+    surgeon_row: Mapped[int] = mapped_column(ForeignKey("surgeons.row"), primary_key=True, index=True)
+
+
 class RecordingChunk(Base):
-    """A mebibyte of a recording."""
+    """A chunk of 1 MiB of a recording."""
 
     __tablename__ = "recording_chunks"
 
@@ -125,7 +136,7 @@ class RecordingChunk(Base):
 
 
 class Demonstration(Base):
-    """One hand-off cut out of a recording, as a path in its grid world."""
+    """One hand-off segment cut from a recording, with its path in a grid world."""
 
     __tablename__ = "demonstrations"
 
@@ -141,7 +152,7 @@ class Demonstration(Base):
     start_s: Mapped[float]
     end_s: Mapped[float]
     session: Mapped[str | None]
-    hysteresis: Mapped[float]  # cells; 0 in all that were stored before there was any
+    hysteresis: Mapped[float]  # cells; 0 in rows stored before the setting existed
     demo: Mapped[Demo] = mapped_column(Packed(Demo), deferred=True)
     path: Mapped[GridPath] = mapped_column(Packed(GridPath), deferred=True)
     report: Mapped[dict[str, Any]]
@@ -158,9 +169,10 @@ class Demonstration(Base):
 
 
 class MeasuredShape(Base):
-    """What the atlas has measured of a demonstration: it may be dropped at any time, and is then measured again.
+    """A cache of the atlas's measurements of a demonstration.
 
-    `version` is that of `skills.style.comparing.measured`; what another one measured is not used.
+    A row may be deleted at any time and is then computed again. `version` is that of `skills.comparison.distances`;
+    rows of another version are not used.
     """
 
     __tablename__ = "measured_shapes"
@@ -171,7 +183,7 @@ class MeasuredShape(Base):
 
 
 class StoredRewardMap(Base):
-    """What Algorithm 1 wrote for a demonstration."""
+    """The reward map that Algorithm 1 computed for a demonstration."""
 
     __tablename__ = "reward_maps"
 
@@ -182,13 +194,13 @@ class StoredRewardMap(Base):
 
 
 class PolicyVersion(Base):
-    """One learnt policy of a style; `manifest` is what a client is told of it, all but the release."""
+    """One learnt policy of a style; `manifest` is its description for clients, without the release."""
 
     __tablename__ = "policy_versions"
 
     row: Mapped[RowId]
     sha256: Mapped[str] = mapped_column(Sha256, unique=True)
-    training: Mapped[str] = mapped_column(Sha256, index=True)  # identity of the training that made it
+    training: Mapped[str] = mapped_column(Sha256, index=True)  # identity of the training that produced it
     surgeon_row: Mapped[int] = mapped_column(ForeignKey("surgeons.row"))
     suture: Mapped[str] = mapped_column(ForeignKey("suture_types.slug"))
     version: Mapped[int]
@@ -206,22 +218,22 @@ class PolicyVersion(Base):
 
     @property
     def demonstrations(self) -> list[Demonstration]:
-        """All that it was learnt from, the oldest first."""
+        """All demonstrations that it was learnt from, oldest first."""
         return sorted([self.demonstration, *self.others], key=lambda one: one.row)
 
     @property
     def newest_demonstration_row(self) -> int:
-        """The row of the newest of them; of one alone nothing is loaded for it."""
+        """The row number of the newest demonstration; needs no query where there is only one."""
         return self.demonstrations[-1].row if "combined" in self.manifest else self.demonstration_row
 
     @property
     def rests_on_withdrawn(self) -> bool:
-        """Whether one of them was withdrawn."""
+        """True if one of its demonstrations was withdrawn."""
         return any(one.withdrawn_at is not None for one in self.demonstrations)
 
 
 class PolicyDemonstration(Base):
-    """A policy was learnt from this demonstration too, beside the one that its row names."""
+    """A further demonstration of a policy, in addition to the one named in the policy's row."""
 
     __tablename__ = "policy_demonstrations"
 
@@ -230,7 +242,7 @@ class PolicyDemonstration(Base):
 
 
 class Release(Base):
-    """A policy version was released; the newest of a style that is not withdrawn is what is served."""
+    """A release of a policy version; the newest release of a style that is not withdrawn is served."""
 
     __tablename__ = "releases"
 
@@ -247,7 +259,7 @@ class Release(Base):
 
 
 class Plan(Base):
-    """Grid worlds stacked at suture points."""
+    """A plan: grid worlds stacked at suture points."""
 
     __tablename__ = "plans"
 
@@ -262,7 +274,7 @@ class Plan(Base):
 
 
 class StoredPlayback(Base):
-    """What the simulator measured on a plan, and the verdict."""
+    """The simulator's measurements of a plan, and the verdict."""
 
     __tablename__ = "playbacks"
 
@@ -278,7 +290,7 @@ class StoredPlayback(Base):
 
 
 class StoredPictures(Base):
-    """What was drawn of a playback, after its verdict."""
+    """The pictures of a playback, drawn after its verdict."""
 
     __tablename__ = "playback_pictures"
 
@@ -289,9 +301,9 @@ class StoredPictures(Base):
 
 
 class StoredCalibration(Base):
-    """A model of skill as plain numbers, what it was calibrated on, and how good it is; the newest is used.
+    """A calibrated model of skill as plain numbers, with its data set and its accuracy; the newest one is used.
 
-    It is of a laboratory's rated trials, not of the surgeons here; no trial and no pseudonym of one is in it.
+    It is calibrated on rated trials of a laboratory, not on the surgeons here; it contains no trial and no pseudonym.
     """
 
     __tablename__ = "calibrations"

@@ -1,50 +1,104 @@
-"""Opening the database: SQLite in one file, or PostgreSQL by its URL; the same sessions on both.
+"""Sessions on the database, its disk, and the revision of its tables: a SQLite file or PostgreSQL, by URL.
 
-`reading()` and `writing()` give a session that is one transaction; `writing()` commits when its block ends well. A
-writing transaction takes the one write lock at once (BEGIN IMMEDIATE; an advisory lock on PostgreSQL), so that two of
-them wait for each other instead of failing half way or overwriting what the other has just written; a reading one sees
-one state from its beginning to its end.
+`reading()` and `writing()` yield a session that is one transaction; `writing()` commits if its block ends without an
+exception. A writing transaction takes the single write lock at its beginning (BEGIN IMMEDIATE; an advisory lock on
+PostgreSQL), so that concurrent writers wait for each other instead of failing midway or overwriting each other's
+changes; a reading one sees one consistent state from beginning to end.
 
-Nothing is tried again here but connecting, before anything was asked of the database: whoever loses it in the middle
-is told `Busy`, and does not know whether what he wrote was kept. What is uploaded, asked for and released is known by
-what it is, so he may send it again: it is found, or kept then, and never kept twice.
+Nothing is retried here except connecting, before any statement was sent. A caller that loses the database during a
+transaction gets `Busy`, and does not know whether its changes were committed. It may repeat the request: uploads, jobs
+and releases are identified by their content, so a repeated one is found or stored, and never stored twice.
+
+A full disk is reported as such (`StorageFull`); earlier data stay valid, and requests succeed again once there is
+space. A write or fsync that fails is different: the operating system may have dropped data that SQLite and this process
+assume to be stored, and a second fsync would report success. So the process exits, with `EXIT_CODE`, and the next
+process reads what is really stored (Rebello et al., "Can Applications Recover from fsync Failures?", USENIX ATC 2020).
+
+Alembic runs the migrations of the tables and is imported only for them: to check that tables are up to date, as every
+start does, does not need it. A migration is in a file named after its revision, "0001_what_it_does.py"; revisions are
+ordered by number.
 """
 
+import logging
+import os
 import sqlite3
+import stat
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from copy import copy
+from functools import cache
+from importlib import resources
 from pathlib import Path
 from time import monotonic, sleep
-from typing import Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
-from sqlalchemy import URL, Connection, Dialect, Engine, create_engine, event
-from sqlalchemy.engine import make_url
+from sqlalchemy import URL, Connection, Dialect, Engine, create_engine, event, inspect, text
+from sqlalchemy.engine import ExceptionContext, make_url
 from sqlalchemy.engine.interfaces import DBAPIConnection
-from sqlalchemy.exc import OperationalError, TimeoutError
+from sqlalchemy.exc import ArgumentError, DatabaseError, DBAPIError, OperationalError, TimeoutError
 from sqlalchemy.orm import Session, sessionmaker
 
-from skills.db.schema import upgrade
-from skills.db.seen import ONLY, Only
-from skills.errors import Busy, Conflict
+from skills.db.row_visibility import ONLY, Only
+from skills.errors import BadSettings, Busy, Conflict, Corrupt, DatabaseUnusable, SkillsError, StorageFull
+from skills.remedies import Action, Remedy
+
+if TYPE_CHECKING:
+    from alembic.config import Config
 
 BUSY_TIMEOUT_MS = 10_000
-WRITE_LOCK = 0x5C111  # ours: the number of the advisory lock, any that nobody else uses
-WAL_LIMIT_BYTES = 64 << 20  # the write-ahead log would stay as large as the largest upload
-KEPT_OPEN, AT_ONCE = 10, 40  # connections; so many threads answer requests (Starlette's default), and each needs one
-RESTART_S = 3.0  # for how long a server that does not take connections may be restarting; most are back in one
-AGAIN_S = 0.1
+WRITE_LOCK = 0x5C111  # ours: the number of the advisory lock, an arbitrary unused one
+WAL_LIMIT_BYTES = 64 << 20  # without a limit the write-ahead log stays as large as the largest upload
+KEPT_OPEN, AT_ONCE = 10, 40  # connections; 40 threads handle requests (Starlette's default), and each needs one
+RESTART_S = 3.0  # timeout for a server that refuses connections, as while restarting; most are back within 1 s
+AGAIN_S = 0.1  # between two attempts to connect
+SPELLING = (
+    "Write SKILLS_DATABASE_URL as sqlite:////folder/skills.sqlite or postgresql://user:password@host:5432/database."
+)
+STARTED = "Start it, or correct SKILLS_DATABASE_URL."
+SQLITE_HEAD = b"SQLite format 3\x00"
+UNUSABLE = {  # by SQLite's result code: the message and the remedy
+    sqlite3.SQLITE_CANTOPEN: (
+        "cannot be opened",
+        "Check that it is a file in a folder that this user may write to, or name another in SKILLS_DATABASE_URL.",
+    ),
+    sqlite3.SQLITE_READONLY: (
+        "cannot be written to",
+        "Give this user the right to write to the file and its folder, or name another in SKILLS_DATABASE_URL.",
+    ),
+    sqlite3.SQLITE_NOTADB: (
+        "is not an SQLite database",
+        "Name another file in SKILLS_DATABASE_URL; a missing file is created.",
+    ),
+}
+MIGRATIONS = resources.files("skills") / "migrations"
+AT = "alembic_version"  # Alembic's own table of one row
+EXIT_CODE = 74  # EX_IOERR of sysexits.h
+POSTGRESQL_FULL = "53100"  # disk_full
+# SQLite's codes for a full disk; the index of the write-ahead log cannot grow on one either.
+_FULL = (sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR_SHMSIZE)
+# I/O errors that leave the stored data unchanged: reading, memory, locks.
+_HARMLESS = (
+    *(sqlite3.SQLITE_IOERR_READ, sqlite3.SQLITE_IOERR_SHORT_READ, sqlite3.SQLITE_IOERR_NOMEM),
+    *(sqlite3.SQLITE_IOERR_BLOCKED, sqlite3.SQLITE_IOERR_LOCK, sqlite3.SQLITE_IOERR_RDLOCK),
+    *(sqlite3.SQLITE_IOERR_CHECKRESERVEDLOCK, sqlite3.SQLITE_IOERR_ACCESS, sqlite3.SQLITE_IOERR_GETTEMPPATH),
+)
+
+log = logging.getLogger(__name__)
 
 
 class Database:
-    """Sessions on one database."""
+    """Sessions on one database; thread-safe."""
 
     def __init__(self, url: str, *, patience_ms: int | None = None) -> None:
-        """Open a database; it connects when it is first used.
+        """Open a database; it connects on first use.
 
         Args:
-            url: SQLAlchemy's, of a SQLite file or a PostgreSQL database.
-            patience_ms: How long to wait for locks and for connections; `BUSY_TIMEOUT_MS` unless it is given.
+            url: SQLAlchemy URL of a SQLite file or a PostgreSQL database.
+            patience_ms: Timeout for locks and for connections, `BUSY_TIMEOUT_MS` by default.
+
+        Raises:
+            BadSettings: The URL is not one of these, or the folder of the file cannot be created.
+            DatabaseUnusable: The file cannot be opened or created, or is not a SQLite database.
         """
         self.url = url
         self.engine = _open(url, patience_ms or BUSY_TIMEOUT_MS)
@@ -54,17 +108,17 @@ class Database:
     @contextmanager
     def reading(self) -> Iterator[Session]:
         """Open a session that reads one consistent state."""
-        with _in_words(), self._readers() as session:
+        with self._in_words(), self._readers() as session:
             yield session
 
     @contextmanager
     def writing(self) -> Iterator[Session]:
-        """Open a session whose block is one transaction, committed if it ends well."""
-        with _in_words(), self._writers.begin() as session:
+        """Open a session whose block is one transaction, committed if it ends without an exception."""
+        with self._in_words(), self._writers.begin() as session:
             yield session
 
     def seen_by(self, only: Only | None) -> "Database":
-        """Open sessions that find nothing but what somebody may see; None: all of it."""
+        """Return this database restricted to the rows that a caller may see; None: without restriction."""
         if only is None:
             return self
         narrowed = copy(self)
@@ -74,64 +128,126 @@ class Database:
         return narrowed
 
     def migrate(self) -> None:
-        """Bring the tables to this version, from an empty database or any older one.
+        """Migrate the tables to this version, from an empty database or any older version.
 
         Raises:
             Conflict: The database was written by a newer version of the code.
             Busy: It cannot be reached or written.
         """
-        with _in_words(), self.engine.execution_options(writes=True).connect() as connection:
+        with self._in_words(), self.engine.execution_options(writes=True).connect() as connection:
             upgrade(connection)
             connection.commit()
 
     def forget(self) -> None:
-        """Leave nothing of what was deleted in SQLite's write-ahead log; call it after the commit.
+        """Remove deleted data from SQLite's write-ahead log; call it after the commit.
 
-        While a reader holds on to the log it waits, up to the busy timeout; then the log keeps it until it is reused.
+        It waits for readers of the log, up to the busy timeout; after that the data stay in the log until it is reused.
         """
         if self.engine.dialect.name != "sqlite":
-            return  # the server's own vacuum does it
-        with self.engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
+            return  # PostgreSQL's vacuum does it
+        with self._in_words(), self.engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
             connection.exec_driver_sql("PRAGMA wal_checkpoint(TRUNCATE)")
 
     def close(self) -> None:
         """Close all connections."""
         self.engine.dispose()
 
+    def _in_words(self) -> AbstractContextManager[None]:
+        return _in_words(self.engine.url)
+
 
 @contextmanager
-def _in_words() -> Iterator[None]:
-    """Say what a database that cannot be used right now means."""
+def _in_words(url: URL) -> Iterator[None]:
+    """Translate SQLAlchemy's exceptions for an unusable database into `SkillsError`s with a remedy."""
     try:
         yield
     except TimeoutError as error:
-        raise Busy("The database has too much to do; try again in a moment.") from error
+        raise Busy("The database is overloaded; try again in a moment.") from error
     except OperationalError as error:
+        if is_full(error):
+            log.error("The database's disk is full: %s", str(error.orig).strip())
+            raise StorageFull(
+                "The disk of the database is full, so nothing was stored; free some space on it."
+            ) from error
         if "no such table" in str(error.orig):
-            raise Conflict("The database has no tables of this version yet; run `skills migrate`.") from error
+            raise Conflict("The database has no tables of this version yet.", Remedy(Action.MIGRATE)) from error
+        if (unusable := _unusable(url, error)) is not None:
+            raise unusable from error
         if getattr(error.orig, "sqlite_errorcode", None) == sqlite3.SQLITE_ERROR:
-            raise  # a statement that is wrong, and will be wrong in a moment too
-        raise Busy("The database cannot take this now; try again in a moment.") from error
+            raise  # a wrong statement, which would fail again: a bug
+        log.warning("The database could not be used: %s", str(error.orig).strip())
+        raise Busy("The database cannot be used now; try again in a moment.") from error
+    except DatabaseError as error:
+        if (unusable := _unusable(url, error)) is not None:
+            raise unusable from error
+        raise
+
+
+def _unusable(url: URL, error: DBAPIError) -> SkillsError | None:
+    """Return the error for a database that cannot be used at all, without its password.
+
+    Returns:
+        None where the database was reached and is only busy.
+    """
+    code = getattr(error.orig, "sqlite_errorcode", None)
+    if code is not None:
+        if code & 0xFF == sqlite3.SQLITE_CORRUPT:
+            return Corrupt("The file of the database is damaged.", "Restore a backup into another file.")
+        reason = UNUSABLE.get(code & 0xFF)
+        return None if reason is None else DatabaseUnusable(f"The database {url.database} {reason[0]}.", reason[1])
+    if url.get_backend_name() == "sqlite" or error.statement is not None or error.connection_invalidated:
+        return None
+    said = str(error.orig)
+    at = f"{url.host or 'localhost'}:{url.port or 5432}"
+    if "password" in said or "authentication" in said:
+        return DatabaseUnusable(f"The PostgreSQL server at {at} does not let the user '{url.username}' in.", SPELLING)
+    if f'database "{url.database}" does not exist' in said:
+        return DatabaseUnusable(
+            f"The PostgreSQL server at {at} has no database '{url.database}'.", "Create it with createdb."
+        )
+    if "starting up" in said or "shutting down" in said or "too many" in said:
+        return None
+    return DatabaseUnusable(f"The database cannot be reached: no PostgreSQL server answers at {at}.", STARTED, SPELLING)
+
+
+def parse_url(url: str) -> URL:
+    """Parse the URL of a database.
+
+    Raises:
+        BadSettings: It is not a URL, or of a database other than SQLite or PostgreSQL. The message does not repeat it,
+            because it may contain a password.
+    """
+    try:
+        parsed = make_url(url)
+    except (ArgumentError, ValueError):
+        raise BadSettings("The URL of the database cannot be read.", SPELLING) from None
+    if parsed.drivername in ("postgres", "postgresql"):
+        return parsed.set(drivername="postgresql+psycopg")
+    if parsed.drivername not in ("sqlite", "sqlite+pysqlite", "postgresql+psycopg"):
+        raise BadSettings(
+            f"The URL of the database begins with {parsed.drivername}://, which is not supported.", SPELLING
+        )
+    if parsed.drivername.startswith("sqlite") and parsed.database in (None, "", ":memory:"):
+        raise BadSettings("The URL of the database names no file.", SPELLING)
+    return parsed
 
 
 def _open(url: str, patience_ms: int) -> Engine:
-    parsed = make_url(url)
-    if parsed.drivername == "postgresql":
-        parsed = parsed.set(drivername="postgresql+psycopg")
+    parsed = parse_url(url)
     if parsed.get_backend_name() != "sqlite":
         return _open_postgresql(parsed, patience_ms)
     if parsed.database:
-        Path(parsed.database).parent.mkdir(parents=True, exist_ok=True)
+        _make_file(Path(parsed.database))
     engine = create_engine(parsed, connect_args={"check_same_thread": False}, **_pool(patience_ms))
 
     @event.listens_for(engine, "connect")
     def _prepare(connection: Any, _record: object) -> None:
-        connection.isolation_level = None  # the driver would begin transactions by its own rules
+        connection.isolation_level = None  # otherwise the driver begins transactions by its own rules
         for pragma in (
             f"busy_timeout={patience_ms}",
-            "synchronous=FULL",
+            "synchronous=FULL",  # a commit is durable; in WAL mode NORMAL may lose the last ones
             "foreign_keys=ON",
-            "secure_delete=ON",
+            "secure_delete=ON",  # erased data must not remain in the file
             f"journal_size_limit={WAL_LIMIT_BYTES}",
         ):
             connection.execute(f"PRAGMA {pragma}")
@@ -144,45 +260,80 @@ def _open(url: str, patience_ms: int) -> Engine:
     return engine
 
 
+def _make_file(file: Path) -> None:
+    """Create a private SQLite file, or restrict the permissions of an existing one.
+
+    Raises:
+        DatabaseUnusable: It is a folder or a file of another kind, whose permissions are not changed, or it cannot be
+            created.
+        BadSettings: Its folder cannot be created.
+    """
+    if file.is_dir():
+        raise DatabaseUnusable(f"The database {file} cannot be opened.", UNUSABLE[sqlite3.SQLITE_CANTOPEN][1])
+    try:
+        with file.open("rb") as there:
+            begins = there.read(len(SQLITE_HEAD))
+        if begins and begins != SQLITE_HEAD:  # another program's file: its permissions must not change
+            reason, advice = UNUSABLE[sqlite3.SQLITE_NOTADB]
+            raise DatabaseUnusable(f"The database {file} {reason}.", advice)
+    except OSError:
+        pass  # it does not exist yet, or opening it reports the error
+    try:
+        make_private(file)
+    except OSError as error:
+        if file.parent.is_dir():
+            advice = UNUSABLE[sqlite3.SQLITE_CANTOPEN][1]
+            raise DatabaseUnusable(f"The database {file} cannot be created: {error.strerror}.", advice) from error
+        why = "is a file" if isinstance(error, FileExistsError | NotADirectoryError) else "cannot be created"
+        raise BadSettings(
+            f"The folder {file.parent} of the database {why}: {error.strerror}.", "Name another in SKILLS_DATABASE_URL."
+        ) from error
+
+
 def _pool(patience_ms: int) -> dict[str, Any]:
-    """Say how many connections there may be, and how long to wait for one of them."""
+    """Return the engine's options for the size of the connection pool and the timeout for a connection."""
     return {"pool_size": KEPT_OPEN, "max_overflow": AT_ONCE - KEPT_OPEN, "pool_timeout": patience_ms / 1000}
 
 
 class Returning:
-    """A server that may be restarting: whoever connects waits for it, but no longer than a restart takes.
+    """Connecting to a server that may be restarting: retries, but no longer than a restart takes.
 
-    The time runs from the first refusal, for all threads together. So when the server stays away, nobody waits any
-    more: threads that wait for what is down would be missed where something else could be answered.
+    A server that this engine has never reached is not waited for: its address is more likely wrong.
+
+    The timeout runs from the first refusal, for all threads together. So while the server stays unavailable, no thread
+    waits: threads that wait for it could not process requests that do not need the database.
     """
 
     def __init__(self, patience_s: float) -> None:
         self._patience_s = patience_s
         self._away_since_s: float | None = None
+        self._was_there = False
 
     def connect(self, dialect: Dialect, _record: object, args: tuple[Any, ...], how: dict[str, Any]) -> DBAPIConnection:
-        """Connect, as an engine's `do_connect`.
+        """Connect, as an engine's `do_connect` callback.
 
         Raises:
-            OperationalError: The driver's; the server has been away for too long.
+            OperationalError: The driver's; the server has been unavailable for too long.
         """
         while True:
             try:
                 connection = dialect.connect(*args, **how)
             except dialect.loaded_dbapi.OperationalError:
                 since_s = self._away_since_s = self._away_since_s or monotonic()
-                if monotonic() - since_s >= self._patience_s:
+                if not self._was_there or monotonic() - since_s >= self._patience_s:
                     raise
                 sleep(AGAIN_S)
             else:
                 self._away_since_s = None
+                self._was_there = True
                 return connection
 
 
 def _write_ahead(connection: sqlite3.Connection, patience_ms: int) -> None:
-    """Switch a file to its write-ahead log; others that open the same new file now are waited for.
+    """Switch a file to WAL mode, retrying while other processes that open the same new file do the same.
 
-    SQLite does not wait by its busy timeout for this one change: both would hold a lock that the other needs.
+    SQLite does not apply its busy timeout to this change, because both processes would hold a lock that the other
+    needs.
     """
     deadline = monotonic() + patience_ms / 1000
     while True:
@@ -198,6 +349,7 @@ def _write_ahead(connection: sqlite3.Connection, patience_ms: int) -> None:
 def _open_postgresql(url: URL, patience_ms: int) -> Engine:
     waits = {"options": f"-c lock_timeout={patience_ms}", "connect_timeout": max(2, patience_ms // 1000)}
     engine = create_engine(url, pool_pre_ping=True, connect_args=waits, **_pool(patience_ms))
+    # A restart of the server must not fail the requests that connect during it.
     event.listen(engine, "do_connect", Returning(min(RESTART_S, patience_ms / 1000)).connect)
 
     @event.listens_for(engine, "begin")
@@ -208,3 +360,130 @@ def _open_postgresql(url: URL, patience_ms: int) -> Engine:
             connection.exec_driver_sql("SET TRANSACTION ISOLATION LEVEL REPEATABLE READ")
 
     return engine
+
+
+# ---- the disk --------------------------------------------------------------------------------------------------------
+
+
+def make_private(database: Path) -> None:
+    """Create a SQLite file that only this user can read, or restrict the permissions of an existing one.
+
+    A new file has mode 0600, and a new folder 0700; SQLite gives its auxiliary files the permissions of the database.
+    Wider permissions of an existing file are restricted, which is logged; an existing folder is left alone, because it
+    may hold other files.
+    """
+    database.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    for path in (database, *(Path(f"{database}{ending}") for ending in ("-wal", "-shm"))):
+        try:
+            mode = stat.S_IMODE(path.stat().st_mode)
+        except FileNotFoundError:
+            continue
+        if mode & 0o077:
+            try:
+                path.chmod(0o600)
+                log.warning("%s could be read by others; its permissions are 0600 now.", path.name)
+            except PermissionError:
+                log.warning("%s can be read by others and belongs to another user; run chmod 600 on it.", path.name)
+    if not database.exists():
+        os.close(os.open(database, os.O_RDWR | os.O_CREAT, 0o600))
+
+
+def is_full(error: DBAPIError) -> bool:
+    """Return whether a statement failed because the database's disk is full."""
+    code = getattr(error.orig, "sqlite_errorcode", None)
+    return code in _FULL or getattr(error.orig, "sqlstate", None) == POSTGRESQL_FULL
+
+
+def is_failed(error: BaseException | None) -> bool:
+    """Return whether SQLite failed to write, or does not know whether it has written.
+
+    No cached state of this process can be trusted then.
+    """
+    code = getattr(error, "sqlite_errorcode", None)
+    if code is None or code & 0xFF != sqlite3.SQLITE_IOERR:
+        return False
+    return code not in _FULL and code not in _HARMLESS
+
+
+def end_process(error: BaseException) -> NoReturn:
+    """Exit this process at once, without rollbacks, flushing of caches or exit handlers."""
+    name = getattr(error, "sqlite_errorname", "")
+    log.critical(
+        "The database's disk failed (%s, %s). The last writes may be lost, so this process ends; check the disk, "
+        "run `skills verify`, and start again.",
+        name,
+        error,
+    )
+    logging.shutdown()
+    os._exit(EXIT_CODE)
+
+
+@event.listens_for(Engine, "handle_error")
+def _end_on_failure(context: ExceptionContext) -> None:
+    """Check the errors of every engine in this process, including the job engine's."""
+    if is_failed(context.original_exception):
+        end_process(context.original_exception)
+
+
+# ---- the revision of the tables --------------------------------------------------------------------------------------
+
+
+def alembic_config() -> "Config":
+    """Return an Alembic configuration that points to our migrations."""
+    from alembic.config import Config
+
+    config = Config()
+    config.set_main_option("script_location", str(MIGRATIONS))
+    return config
+
+
+@cache
+def revisions() -> tuple[str, ...]:
+    """Return the revisions that this version knows, newest first."""
+    files = (file.name for file in (MIGRATIONS / "versions").iterdir() if file.name.endswith(".py"))
+    return tuple(sorted((name.partition("_")[0] for name in files), reverse=True))
+
+
+def revision_of(connection: Connection) -> str | None:
+    """Return the revision of the tables; None where there are none."""
+    if not inspect(connection).has_table(AT):
+        return None
+    revision: str | None = connection.scalar(text(f"SELECT version_num FROM {AT}"))  # noqa: S608 - a name of ours
+    return revision
+
+
+def refuse_other_tables(connection: Connection) -> None:
+    """Refuse a database whose tables are not of this version.
+
+    Raises:
+        Conflict: They are older, newer, or missing.
+    """
+    current = revision_of(connection)
+    _refuse_newer(current)
+    if current != revisions()[0]:
+        raise Conflict("The database has no tables of this version yet.", Remedy(Action.MIGRATE))
+
+
+def upgrade(connection: Connection, to: str = "head") -> None:
+    """Migrate the tables to a revision, within the caller's transaction.
+
+    Raises:
+        Conflict: They are of a newer version of the code.
+    """
+    current = revision_of(connection)
+    _refuse_newer(current)
+    if to == "head" and current == revisions()[0]:
+        return
+    from alembic import command  # imported here: it is slow, and rarely needed
+
+    config = alembic_config()
+    config.attributes["connection"] = connection
+    command.upgrade(config, to)
+
+
+def _refuse_newer(current: str | None) -> None:
+    if current is not None and current not in revisions():
+        raise Conflict(
+            "This database was written by a newer version of suture-skills; nothing was changed.",
+            "Update the code, or name another database in SKILLS_DATABASE_URL.",
+        )

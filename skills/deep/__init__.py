@@ -1,7 +1,7 @@
-"""The learners beyond the table: environments, and what learns in them, with torch.
+"""Network learners: Gymnasium environments, and training with torch in a separate process.
 
-`learn_policy` learns with any learner there is. torch is the extra `deep`: it is imported in the process that learns
-and nowhere else, so that a service starts without it, and serves what was learnt elsewhere.
+`learn_policy` learns with any learner. torch is the extra `deep`: it is imported only in the process that trains, so
+that a service starts without it, and serves policies that were learnt elsewhere.
 """
 
 from skills.deep.learning import learn_policy, require_installed

@@ -1,10 +1,11 @@
-"""The grid world and the space around it as Gymnasium environments, for any learner that speaks to those.
+"""The grid world and its continuous space as Gymnasium environments, for any library that uses Gymnasium.
 
     gymnasium.make("skills.deep.environments:SutureGrid-v0", reward=sparse_reward(path))
     gymnasium.make("skills.deep.environments:SutureSpace-v0", reward=sparse_reward(path), gamma=0.95)
 
-The grid pays what Algorithm 1 says; the space pays what `skills.style.space` says, and why. An episode starts anywhere
-but in the goal's cell, or where `options={"start_mm": (x, y, z)}` says; it ends there, or after the paper's 100 steps.
+The rewards of the grid are those of Algorithm 1; those of the space are defined, with their reasons, in
+`skills.learning.deep_settings`. An episode starts anywhere but in the goal's cell, or at the position of
+`options={"start_mm": (x, y, z)}`; it ends at the goal, or after the paper's 100 steps.
 """
 
 from typing import Any
@@ -13,17 +14,17 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from skills.style import paper
-from skills.style.grid import MOVES
-from skills.style.reward import RewardMap
-from skills.style.space import Space
+from skills.gridworld import paper
+from skills.gridworld.grid import MOVES
+from skills.gridworld.reward import RewardMap
+from skills.learning.deep_settings import Space
 
 GRID, SPACE = "SutureGrid-v0", "SutureSpace-v0"
 Info = dict[str, Any]
 
 
 class SutureGrid(gymnasium.Env[NDArray[np.int64], np.int64]):
-    """Sec. III-C of the paper: one is in a cell, three whole numbers, and makes one of the 27 moves."""
+    """The grid world of Sec. III-C: the observation is a cell, three integers, and the action one of the 27 moves."""
 
     def __init__(self, reward: RewardMap) -> None:
         path = reward.path
@@ -34,18 +35,18 @@ class SutureGrid(gymnasium.Env[NDArray[np.int64], np.int64]):
         self.action_space = gymnasium.spaces.Discrete(paper.N_ACTIONS)
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[NDArray[np.int64], Info]:
-        """Start anew."""
+        """Start an episode in a random cell or at `options["start_mm"]`; return the cell."""
         super().reset(seed=seed)
         if options and "start_mm" in options:
             state = int(self._grid.states_at(options["start_mm"]))
         else:
             state = int(self.np_random.integers(self._grid.n_states - 1))
-            state += state >= self._goal
+            state += state >= self._goal  # a uniform draw of all states but the goal
         self._cell = tuple(self._grid.cells_of(state).tolist())
         return np.array(self._cell), {}
 
     def step(self, action: np.int64) -> tuple[NDArray[np.int64], float, bool, bool, Info]:
-        """Make a move; one off the grid stays."""
+        """Make a move; a move off the grid stays in the cell."""
         (x, y, z), (nx, ny, nz) = self._cell, self._grid.shape
         dx, dy, dz = _MOVES[int(action)]
         x, y, z = x + dx, y + dy, z + dz
@@ -57,7 +58,7 @@ class SutureGrid(gymnasium.Env[NDArray[np.int64], np.int64]):
 
 
 class SutureSpace(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
-    """The same without cells: one is at a position in mm, and steps up to a cell's length along each axis."""
+    """The same without cells: the observation is a position in mm, the action a step of up to a cell on each axis."""
 
     def __init__(self, reward: RewardMap, gamma: float = 0.95) -> None:
         self._space, self._gamma = Space(reward.path, reward.levels), gamma
@@ -67,7 +68,7 @@ class SutureSpace(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (3,), np.float32)
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[NDArray[np.float32], Info]:
-        """Start anew."""
+        """Start an episode at a random position or at `options["start_mm"]`; return the position in mm."""
         super().reset(seed=seed)
         space = self._space
         if options and "start_mm" in options:
@@ -79,7 +80,7 @@ class SutureSpace(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         return self._at_mm.astype(np.float32), {}
 
     def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float32], float, bool, bool, Info]:
-        """Take a step; at a face of the box it ends."""
+        """Make a step; at a face of the box it ends."""
         before, space = self._at_mm, self._space
         self._at_mm = space.moved(before, action)
         pays = space.pays(before[None], action[None], self._at_mm[None], self._gamma)

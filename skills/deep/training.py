@@ -1,13 +1,12 @@
-"""The process that learns: Stable-Baselines3 in our environments, from bytes to bytes.
+"""The training process: Stable-Baselines3 in our environments, from a serialised request to a serialised response.
 
-One thread, for the networks are small and two would wait for each other, and so that sums are taken in the same order
-each time. Every random number comes from the seed.
+It runs in one thread, because the networks are small, so that two threads would wait for each other, and because sums
+are then computed in the same order each time. Every random number comes from the seed.
 """
 
 import sys
 from collections.abc import Callable
-from io import BytesIO
-from typing import Any
+from typing import Any, BinaryIO
 
 import gymnasium
 import numpy as np
@@ -21,33 +20,31 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from skills import packing
 from skills.deep.environments import GRID, SPACE
-from skills.deep.lesson import KNOWN, Learnt, Lesson
-from skills.style.learning.beyond import DDPG, DQN, TRPO, Deep
-from skills.style.learning.q_learning import Training
-from skills.style.network import Network
+from skills.deep.learning import KNOWN, LearntNetwork, NetworkLesson
+from skills.learning.deep_settings import DDPG, DQN, TRPO, Deep
+from skills.learning.network import Network
+from skills.learning.q_learning import Training
 
-REMEMBERED = 400_000  # moves, the latest ones: 100 MB, and each cell of the paper's grid three hundred times
-FIRST = 2000  # moves before the first update, so that a batch is not the same few moves again and again
-SLOWEST = 0.02  # of its learning rate DQN ends with
-SPREAD = -0.5  # log of the deviation, in cells, with which TRPO begins to try
-TOLD = 200  # times that progress is told
+REMEMBERED = 400_000  # the latest moves: 100 MB, and each cell of the paper's grid three hundred times
+FIRST = 2000  # moves before the first update, so that the first batches do not repeat the same few moves
+SLOWEST = 0.02  # DQN's last learning rate, as a share of the first
+SPREAD = -0.5  # log of the standard deviation, in cells, with which TRPO starts to explore
+TOLD = 200  # number of progress reports
 
 
-def train(request: bytes) -> bytes:
-    """Learn what is asked for."""
-    lesson = packing.read(BytesIO(request), KNOWN)
-    assert isinstance(lesson, Lesson)
+def train(given: BinaryIO, answer: BinaryIO) -> None:
+    """Read a `NetworkLesson`, train its network, and write a `LearntNetwork`."""
+    lesson = packing.read(given, KNOWN)
+    assert isinstance(lesson, NetworkLesson)
     torch.set_num_threads(1)
-    torch.use_deterministic_algorithms(True)
-    answer = BytesIO()
+    torch.use_deterministic_algorithms(True)  # the same settings and seed give the same bytes
     packing.write(answer, learn(lesson), KNOWN)
-    return answer.getvalue()
 
 
-def learn(lesson: Lesson) -> Learnt:
-    """Learn a network, and count what it took."""
+def learn(lesson: NetworkLesson) -> LearntNetwork:
+    """Train a network, and count the steps, updates and episodes."""
     learner = lesson.learner
-    # The libraries take 32 bits of seed.
+    # The libraries accept seeds of 32 bits only.
     seed = int(np.random.SeedSequence(lesson.seed).generate_state(1)[0] >> 1)
     worlds = DummyVecEnv([_world(lesson)] * learner.worlds)
     model = _MODELS[type(learner)](learner, worlds, seed)
@@ -62,10 +59,10 @@ def learn(lesson: Lesson) -> Learnt:
         out_of_time=0,
         settled=False,
     )
-    return Learnt(_network(learner, model), training)
+    return LearntNetwork(_network(learner, model), training)
 
 
-def _world(lesson: Lesson) -> Callable[[], Any]:
+def _world(lesson: NetworkLesson) -> Callable[[], Any]:
     learner = lesson.learner
     if isinstance(learner, DQN):
         return lambda: gymnasium.make(GRID, reward=lesson.reward, disable_env_checker=True)
@@ -74,7 +71,7 @@ def _world(lesson: Lesson) -> Callable[[], Any]:
 
 
 class _Counted(BaseCallback):
-    """Counts episodes by how they ended, and tells how far it is."""
+    """Callback that counts episodes by how they ended, and reports the progress on stderr."""
 
     def __init__(self, steps: int) -> None:
         super().__init__()
@@ -125,7 +122,7 @@ def _ddpg(learner: DDPG, worlds: DummyVecEnv, seed: int) -> Any:
 
 
 def _replay(learner: DQN | DDPG) -> dict[str, Any]:
-    """Say what is remembered, and how often it is learnt from: every so many moves of all worlds together."""
+    """Return the settings of the replay memory, and the frequency of updates in steps of all environments together."""
     moves, updates = (
         max(1, learner.steps_per_update // learner.worlds),
         max(1, learner.worlds // learner.steps_per_update),
@@ -156,7 +153,7 @@ _MODELS: dict[type[Deep], Callable[..., Any]] = {DQN: _dqn, DDPG: _ddpg, TRPO: _
 
 
 def _network(learner: Deep, model: Any) -> Network:
-    """Take what acts out of what was learnt, and leave what judges."""
+    """Return the network that acts, without the critic."""
     if isinstance(learner, DQN):
         acting = [model.q_net.q_net]
     elif isinstance(learner, DDPG):

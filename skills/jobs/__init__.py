@@ -1,13 +1,13 @@
-"""Durable work: the library's use cases as workflows of a job engine (DBOS Transact), on SQLite or PostgreSQL.
+"""Durable background jobs: the library's use cases as workflows of a job engine, DBOS Transact.
 
-The row of a job in our database is the truth; the engine only sees to it that somebody works on it.
+The engine stores its workflows in SQLite or PostgreSQL. The row of a job in our database is authoritative; the engine
+only makes sure that a worker processes it.
 
-    engine      how both sides reach the engine; `Engine`, through which the service tells it of a job
-    workflows   what a worker does with one job: try, try again, give up
-    lease       who has fallen silent, whatever the clocks say
-    watch       what a worker does between jobs: show that it lives, tell, take over, read back
-    warm        the compiled loops, ready before they are needed
-    memory      what is freed, kept for the next style
-    worker      the worker process
-    child       that process as a child of the service
+    engine      access to the engine for both sides; `Engine`, with which the service enqueues jobs
+    workflows   the workflow of one job: try, retry, give up
+    watch       a worker's periodic tasks: leases and heartbeats, enqueueing, taking over from dead workers, reading
+                back outcomes
+    warm_up     compiles or loads the compiled loops before they are needed
+    readiness   checks of the database, the engine and the workers, for health checks
+    worker      the worker process; `skills.serving` starts it as a child of the service
 """

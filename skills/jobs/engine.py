@@ -1,7 +1,7 @@
-"""How both sides reach the job engine: the worker that runs it, and the service that only tells it things.
+"""Access to the job engine (DBOS): its configuration in the worker, and a client with which the service enqueues jobs.
 
-The engine's inputs are the row and the attempt of a job, as plain JSON: nothing personal is kept in its tables, and
-nothing in them is ever unpickled. DBOS takes over a second to import, so it is imported where it is first needed.
+The engine's inputs are the row and the attempt of a job, as plain JSON: its tables hold no personal data, and none of
+their contents is ever unpickled. Importing DBOS takes over a second, so it is imported where it is first needed.
 """
 
 import logging
@@ -14,52 +14,54 @@ from typing import TYPE_CHECKING
 
 from sqlalchemy.engine import make_url
 
-from skills.library.batches import PART
+from skills.db.session import make_private
+from skills.library.jobs import PART
 from skills.settings import Settings
 
 if TYPE_CHECKING:
     from dbos import DBOSClient, DBOSConfig
 
 APPLICATION = "suture-skills"
-JOBS, BATCHES, ASIDE = "jobs", "batches", "aside"  # a person waits for the first, somebody for the second, nobody else
-# How many of each a worker process does at once, so that none holds up another. The engine keeps these numbers in its
-# database, the same for all workers: they are no setting, and a machine is limited by how many workers it has.
-# Two parts of batches: one is learnt, and the next one is there when it ends (`library.batch_work`).
+# Queues by urgency: a user waits for JOBS, somebody needs BATCHES soon, and nobody waits for ASIDE.
+JOBS, BATCHES, ASIDE = "jobs", "batches", "aside"
+# Concurrent jobs of each queue in a worker process, so that no queue blocks another. The engine stores these limits in
+# its database for all workers, so they are constants, not settings; the load of a machine is set by its number of
+# workers. Two parts of batches: one is learnt while the next one is already there (`library.batch_work`).
 QUEUES = {JOBS: 2, BATCHES: 2, ASIDE: 1}
 WORKFLOW = "perform_job"
-STEPS = "1"  # the engine's "application version": to be changed with the sequence of steps in `workflows`, only then
-# How often each worker looks for more of each. To look takes 3 ms of the processor, of idle workers too; a part of a
-# batch keeps one for a second.
+STEPS = "1"  # the engine's "application version": change it if and only if the sequence of steps in `workflows` changes
+# Polling interval of each queue. A poll takes 3 ms of processor time, in idle workers too; a part of a batch occupies a
+# worker for a second.
 POLLING_S = {JOBS: 0.3, BATCHES: 0.3, ASIDE: 1.0}
-FAREWELL_S = 2.0
+FAREWELL_S = 2.0  # timeout of `Engine.close`, within which it processes its pending calls
 
 log = logging.getLogger(__name__)
 Errand = Callable[["DBOSClient"], None]
 
 
 def workflow_id(row: int, attempt: int) -> str:
-    """Name the workflow of one attempt at one job; the same name can never run twice to an end."""
+    """Return the workflow id of an attempt at a job; the engine completes a workflow of one id at most once."""
     return f"{row}-{attempt}"
 
 
 def configuration(settings: Settings, executor: str) -> "DBOSConfig":
-    """Configure the engine of one worker process."""
+    """Return the engine's configuration for one worker process."""
     from dbos import DBOSPortableJSONSerializer
 
     return {
         "name": APPLICATION,
         "system_database_url": settings.engine_url,
         "dbos_system_schema": "dbos",
-        "serializer": DBOSPortableJSONSerializer(),  # the default is pickle
+        "serializer": DBOSPortableJSONSerializer(),  # the default is pickle, which can execute stored bytes
         "executor_id": executor,
         "application_version": STEPS,
         "log_level": "WARNING",
-        "use_listen_notify": False,  # queues poll anyway, and we send no messages
+        "use_listen_notify": False,  # queues are polled anyway, and we send no messages
     }
 
 
 def connect(settings: Settings) -> "DBOSClient":
-    """Open a client of the engine; it connects when it is first used."""
+    """Return a client of the engine; it connects on first use."""
     from dbos import DBOSClient, DBOSPortableJSONSerializer
 
     prepare(settings)
@@ -74,11 +76,14 @@ def connect(settings: Settings) -> "DBOSClient":
 
 
 def prepare(settings: Settings) -> None:
-    """Give the engine's SQLite file a write-ahead log, which it keeps from then on: DBOS itself does not."""
+    """Create the engine's SQLite file in WAL mode, readable by this user only.
+
+    DBOS itself does not set the mode; SQLite stores it in the file. Does nothing on PostgreSQL.
+    """
     url = make_url(settings.engine_url)
     if url.get_backend_name() != "sqlite" or url.database is None:
         return
-    Path(url.database).parent.mkdir(parents=True, exist_ok=True)
+    make_private(Path(url.database))
     connection = sqlite3.connect(url.database)
     try:
         connection.execute("PRAGMA journal_mode=WAL")
@@ -87,12 +92,12 @@ def prepare(settings: Settings) -> None:
 
 
 def queue_of(kind: str) -> str:
-    """Name the queue that jobs of a kind wait in."""
+    """Return the name of the queue for jobs of a kind."""
     return {PART: BATCHES, "pictures": ASIDE}.get(kind, JOBS)
 
 
 def tell(client: "DBOSClient", row: int, attempt: int, kind: str) -> None:
-    """Tell the engine of an attempt at a job; telling it again changes nothing."""
+    """Enqueue an attempt at a job in the engine; idempotent."""
     client.enqueue(
         {"queue_name": queue_of(kind), "workflow_name": WORKFLOW, "workflow_id": workflow_id(row, attempt)},
         row,
@@ -101,35 +106,35 @@ def tell(client: "DBOSClient", row: int, attempt: int, kind: str) -> None:
 
 
 def drop(client: "DBOSClient", row: int, attempt: int) -> None:
-    """Take an attempt back: it does not start any more, nor go on after the step it is in."""
+    """Cancel an attempt: it does not start any more, and stops after its current step."""
     client.cancel_workflow(workflow_id(row, attempt))
 
 
 class Engine:
-    """The engine as the service sees it: it is told of jobs, in the background, and may miss it.
+    """A client of the engine for the service: enqueues and cancels jobs in a background thread, on a best-effort basis.
 
-    Whatever goes wrong here is logged and let go: the row of the job is committed before, and a worker's watch tells
-    again what the engine does not know. So an answer to a request never waits for the engine, which on SQLite may be
-    locked for long and may not have been created yet.
+    Errors are logged and ignored: the row of the job is committed before, and the watch of a worker enqueues again jobs
+    that the engine does not know. So a response never waits for the engine, which on SQLite may be locked for long and
+    may not have been created yet.
     """
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
         self._client: DBOSClient | None = None
         self._errands: SimpleQueue[Errand | None] = SimpleQueue()
-        self._thread = Thread(target=self._run, name="engine", daemon=True)  # must not hold up the exit
+        self._thread = Thread(target=self._run, name="engine", daemon=True)  # must not delay the exit of the process
         self._thread.start()
 
     def tell(self, row: int, attempt: int, kind: str) -> None:
-        """Tell of an attempt at a job, after the commit of its row."""
+        """Enqueue an attempt at a job; call it after its row is committed."""
         self._errands.put(lambda client: tell(client, row, attempt, kind))
 
     def cancel(self, row: int, attempt: int) -> None:
-        """Drop an attempt whose job was cancelled, after the commit of that."""
+        """Cancel an attempt of a cancelled job; call it after the cancellation is committed."""
         self._errands.put(lambda client: drop(client, row, attempt))
 
     def close(self) -> None:
-        """Do the errands that can be done at once, and let go."""
+        """Process the pending calls for up to `FAREWELL_S`, then stop."""
         self._errands.put(None)
         self._thread.join(FAREWELL_S)
 
@@ -139,7 +144,7 @@ class Engine:
                 self._client = self._client or connect(self._settings)
                 errand(self._client)
             except Exception:
-                log.info("The job engine missed a message; the workers' watch makes up for it.")
+                log.info("The job engine missed a message; the workers' watch will start the job.")
                 log.debug("This is why:", exc_info=True)
         if self._client is not None:
             self._client.destroy()

@@ -1,6 +1,6 @@
-"""Whether an installation can work: its database, the job engine's, and a worker that lives.
+"""Readiness checks of an installation: its database, the job engine's database, and at least one live worker.
 
-Each is tried anew, on connections of its own and with little patience, so that the answer is of now and comes in time.
+Each check uses new connections with a short timeout, so that the result is current and arrives in time.
 """
 
 import time
@@ -14,67 +14,76 @@ from sqlalchemy.engine import make_url
 from sqlalchemy.exc import SQLAlchemyError
 
 from skills.db.base import now
-from skills.db.books import Executor
 from skills.db.models import SutureType
-from skills.db.schema import revision_of, revisions
-from skills.db.session import Database
+from skills.db.service_tables import Executor
+from skills.db.session import Database, revision_of, revisions
 from skills.errors import NotReady, SkillsError
+from skills.remedies import Action, Remedy
 from skills.settings import Settings
 
-PATIENCE_MS = 2000
-LOOK_S = 0.1
+PATIENCE_MS = 2000  # of each connection; a health check must answer soon
+LOOK_S = 0.1  # between two looks at the heartbeats
+UNUSABLE = "The database cannot be read and written; check it, its disk and its server."
 
 
 def refuse_unready(settings: Settings) -> int:
-    """Try what a request and a job need: the number of workers.
+    """Check everything that a request and a job need, and return the number of live workers.
 
     Raises:
-        NotReady: Something cannot be used; the message says what, and what to do.
+        NotReady: A part cannot be used; the message names it and the remedy.
     """
     _refuse_missing(settings.database_url, "The database")
-    with closing(Database(settings.database_url, patience_ms=PATIENCE_MS)) as database:
+    try:
+        opened = Database(settings.database_url, patience_ms=PATIENCE_MS)
+    except SkillsError as error:
+        raise NotReady(UNUSABLE) from error
+    with closing(opened) as database:
         _try_database(database)
         _try_engine(settings)
         return _workers(database, settings.lease_s)
 
 
 def refuse_left_over(settings: Settings) -> None:
-    """Refuse a job engine that remembers the jobs of another state of the database: it would mix them up.
+    """Refuse a job engine whose tables belong to another state of the database, for example from before a restore.
+
+    Its workflows refer to jobs by row numbers, which mean other jobs there.
 
     Raises:
-        NotReady: It does, or it cannot be asked.
+        NotReady: The engine has such tables, or its database cannot be read.
     """
     engine = make_url(settings.engine_url)
     if engine.get_backend_name() == "sqlite":
         if engine.database and Path(engine.database).exists():
-            raise NotReady(f"{engine.database} is the job engine's of another state of this database; move it away.")
+            raise NotReady(
+                f"{engine.database} is the job engine's database for another state of this database; move it away."
+            )
         return
     with closing(Database(settings.engine_url, patience_ms=PATIENCE_MS)) as database, database.reading() as session:
         if session.scalar(text("SELECT to_regclass('dbos.workflow_status')")) is not None:
-            raise NotReady("The schema `dbos` is the job engine's of another state of this database; drop it.")
+            raise NotReady("The schema `dbos` is the job engine's schema for another state of this database; drop it.")
 
 
 def _refuse_missing(url: str, what: str) -> None:
-    """Refuse a file that is not there, which trying to open it would make."""
+    """Refuse a SQLite file that does not exist; opening it would create it."""
     parsed = make_url(url)
     if parsed.get_backend_name() == "sqlite" and parsed.database and not Path(parsed.database).is_file():
-        raise NotReady(f"{what} is not there; `skills migrate` makes the database, a worker the job engine's.")
+        raise NotReady(f"{what} does not exist.", Remedy(Action.MIGRATE), Remedy(Action.START_WORKER))
 
 
 def _try_database(database: Database) -> None:
     try:
-        with database.writing() as session:  # a lock that can be had, on a database that can be written
+        with database.writing() as session:  # a write transaction, so that a lock or a read-only file is found
             revision = revision_of(session.connection())
             if revision == revisions()[0]:
                 session.execute(select(SutureType.slug).limit(1))
     except (SkillsError, SQLAlchemyError) as error:
-        raise NotReady("The database cannot be read and written; look at it, its disk and its server.") from error
+        raise NotReady(UNUSABLE) from error
     if revision is None:
-        raise NotReady("The database has no tables yet; run `skills migrate`.")
+        raise NotReady("The database has no tables yet.", Remedy(Action.MIGRATE))
     if revision not in revisions():
-        raise NotReady("The database was brought to a newer version; update the code of this process.")
+        raise NotReady("The database has a newer version; update the code of this process.")
     if revision != revisions()[0]:
-        raise NotReady("The database is of an older version; run `skills migrate`.")
+        raise NotReady("The database has an older version.", Remedy(Action.MIGRATE))
 
 
 def _try_engine(settings: Settings) -> None:
@@ -84,13 +93,14 @@ def _try_engine(settings: Settings) -> None:
             table = "workflow_status" if session.connection().dialect.name == "sqlite" else "dbos.workflow_status"
             session.execute(text(f"SELECT 1 FROM {table} LIMIT 1"))  # noqa: S608 - one of two names of ours
     except (SkillsError, SQLAlchemyError) as error:
-        raise NotReady("The job engine's database cannot be used; look at it, and start a worker.") from error
+        raise NotReady("The job engine's database cannot be used; check it, and start a worker.") from error
 
 
 def _workers(database: Database, lease_s: float) -> int:
-    """Count the workers that live: by the clock, and where that says none, by watching for a beat.
+    """Return the number of live workers, by the dates of their heartbeats or, if all are old, by waiting for a new one.
 
-    A clock that stepped, or another machine's, makes a live worker look dead; a beat that changes shows that it lives.
+    A clock that was adjusted, or that of another machine, makes a live worker look dead; a heartbeat that changes shows
+    that it is alive.
     """
     first = _beats(database)
     alive = sum(abs(now() - beat_at) <= timedelta(seconds=lease_s) for beat_at in first.values())
@@ -99,7 +109,7 @@ def _workers(database: Database, lease_s: float) -> int:
         time.sleep(LOOK_S)
         alive = sum(first.get(name) != beat_at for name, beat_at in _beats(database).items())
     if not alive:
-        raise NotReady("No worker has shown that it lives; start one with `skills worker`, and look at its log.")
+        raise NotReady("No worker has renewed its lease.", Remedy(Action.START_WORKER))
     return alive
 
 
@@ -108,4 +118,4 @@ def _beats(database: Database) -> Mapping[str, datetime]:
         with database.reading() as session:
             return {one.id: one.beat_at for one in session.execute(select(Executor.id, Executor.beat_at))}
     except (SkillsError, SQLAlchemyError) as error:
-        raise NotReady("The database cannot be read; look at it, its disk and its server.") from error
+        raise NotReady("The database cannot be read; check it, its disk and its server.") from error

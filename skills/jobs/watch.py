@@ -1,38 +1,87 @@
-"""What a worker does between jobs: it shows that it lives, and makes our rows and the engine's agree.
+"""The watch of a worker: leases, heartbeats, and agreement between our rows and the engine's workflows.
 
-The engine does not take over from a worker that died, does not know of a job that it was never told of, and does not
-write into our rows how a workflow ended. A round of the watch does all three. Every worker makes such rounds, so
-each change is one conditional statement, and it does not matter who makes it, nor how often.
+The engine does not take over from a dead worker, does not know jobs that were never enqueued in it, and does not write
+the outcome of a workflow into our rows. A round of the watch does all three. Every worker runs such rounds, so each
+change is one conditional, idempotent statement, and any worker may make it.
 """
 
 import logging
-from collections.abc import Callable, Collection, Iterable, Sequence
-from dataclasses import dataclass
+import time
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 
 from dbos import DBOSClient, WorkflowStatus
 from sqlalchemy import delete, select, update
 
 from skills.db.base import now
-from skills.db.books import Executor, Job
+from skills.db.service_tables import Executor, Job
 from skills.db.session import Database
 from skills.jobs.engine import JOBS, QUEUES, STEPS, drop, tell, workflow_id
-from skills.jobs.lease import Leases
-from skills.jobs.workflows import ACTIVE, fail
-from skills.library.batches import BATCH
+from skills.jobs.workflows import fail
+from skills.library.jobs import ACTIVE, BATCH
 
-AT_ONCE = 100  # rows looked at in a round: a round must stay much shorter than a lease
+LONGEST_LOOK_S = 1.0
+
+
+@dataclass
+class Leases:
+    """The time since the last heartbeat of each worker, as measured by one observer.
+
+    A heartbeat is only compared with the one seen before; its date is never compared with a clock. Time is that of this
+    process's monotonic clock, and each look adds at most `LONGEST_LOOK_S`. So a wall clock that jumps by an hour has no
+    effect, on one machine or several; nor has a pause of the observer, of the machine, or of the database, after which
+    all heartbeats are old. The cost: a worker that has just started waits for a full lease before it takes over from
+    others.
+    """
+
+    lease_s: float
+    clock: Callable[[], float] = time.monotonic
+    _looked_s: float | None = None
+    _seen: dict[str, object] = field(default_factory=dict)
+    _silent_s: dict[str, float] = field(default_factory=dict)
+
+    def look(self, beats: Mapping[str, object]) -> Mapping[str, float]:
+        """Compare the heartbeats with those of the last look, and return the seconds since the last change of each.
+
+        Args:
+            beats: The last heartbeat by executor; None for an executor that holds work but has no heartbeat.
+
+        Returns:
+            Seconds by executor; 0 where the heartbeat has changed or was not seen before.
+        """
+        now_s = self.clock()
+        passed_s = 0.0 if self._looked_s is None else min(now_s - self._looked_s, LONGEST_LOOK_S)
+        self._looked_s = now_s
+        self._silent_s = {
+            executor: self._silent_s[executor] + passed_s if self._unchanged(executor, beat) else 0.0
+            for executor, beat in beats.items()
+        }
+        self._seen = dict(beats)
+        return self._silent_s
+
+    def dead(self) -> set[str]:
+        """Return the executors whose lease has expired."""
+        return {executor for executor, silent_s in self._silent_s.items() if silent_s > self.lease_s}
+
+    def _unchanged(self, executor: str, beat: object) -> bool:
+        return executor in self._seen and self._seen[executor] == beat
+
+
+AT_ONCE = 100  # jobs compared in a round: a round must stay much shorter than a lease
 FORGOTTEN_AFTER_LEASES = 30
+ENGINE_ATTEMPTS = 10  # of one job: an engine that has failed that often will fail again
 
-# How a workflow can end without a result in our row, and what that makes of the row.
+# Statuses of a workflow that ended without a result in our row, with the state and the reason for the row.
 ENDINGS = {
     "CANCELLED": ("cancelled", "It was cancelled in the job engine."),
-    "ERROR": ("failed", "The job engine could not carry it out; ask again."),
     "MAX_RECOVERY_ATTEMPTS_EXCEEDED": (
         "failed",
-        "Its worker died every time while working on it; ask again once the worker's log has been looked at.",
+        "The worker died at each attempt at this job; check the worker's log, then request it again.",
     ),
-    "SUCCESS": ("failed", "It ended without a result, and why could not be written; ask again."),
 }
+# `workflows.perform_job` raises nothing itself. If a workflow ends with an error, or without an outcome in our row, the
+# engine's database or ours was unavailable. The job did not fail, so a new attempt is started.
+ENGINE_FAILED = ("ERROR", "SUCCESS")
 
 log = logging.getLogger(__name__)
 
@@ -48,12 +97,12 @@ class Live:
 
     @property
     def workflow(self) -> str:
-        """The name of its workflow."""
+        """The id of its workflow."""
         return workflow_id(self.row, self.attempt)
 
 
 class Watch:
-    """The rounds of one worker."""
+    """The periodic rounds of one worker."""
 
     def __init__(
         self,
@@ -64,12 +113,16 @@ class Watch:
         recover: Callable[[list[str]], object],
         doing: Collection[str] = frozenset(),
     ) -> None:
-        """Watch for one executor.
+        """Create the watch of one executor.
 
         Args:
-            recover: Hands the pending workflows of dead executors back to their queue, on the condition that they
-                are still pending and still theirs.
-            doing: The workflows that this worker is working on, as they are at any time.
+            database: Our database.
+            client: Client of the engine.
+            executor: Id of this worker in the engine and in our table of executors.
+            leases: Leases of the other workers.
+            recover: Callback that returns the pending workflows of dead executors to their queue, provided that they
+                are still pending and still assigned to those executors.
+            doing: Ids of the workflows that this worker is running; a live view, not a copy.
         """
         self._database = database
         self._client = client
@@ -80,14 +133,14 @@ class Watch:
         self._unheard = Leases(leases.lease_s, leases.clock)
 
     def beat(self) -> None:
-        """Show that this worker lives."""
+        """Write a heartbeat."""
         with self._database.writing() as session:
             mine = update(Executor).where(Executor.id == self._executor).values(beat_at=now()).returning(Executor.id)
-            if session.execute(mine).first() is None:  # the first beat, or others have forgotten us
+            if session.execute(mine).first() is None:  # the first heartbeat, or others have deleted our row
                 session.add(Executor(id=self._executor))
 
     def round(self) -> None:
-        """Beat, take over from the dead, tell what was not told, and read back what ended."""
+        """Write a heartbeat, take over from dead workers, enqueue unknown jobs, and read back outcomes."""
         self.beat()
         self._take_over()
         live = self._live()
@@ -99,22 +152,24 @@ class Watch:
             elif workflow.status in ENDINGS:
                 state, reason = ENDINGS[workflow.status]
                 fail(self._database, job.row, job.attempt, reason, state)
+            elif workflow.status in ENGINE_FAILED:
+                self._begin_again(job)
         self._remember_told([job.row for job in live if not job.told])
 
     def leave(self) -> None:
-        """Take this worker's name off the list."""
+        """Remove this worker from the table of executors."""
         with self._database.writing() as session:
             session.execute(delete(Executor).where(Executor.id == self._executor))
 
     def at_work(self, *queues: str) -> bool:
-        """Tell whether this worker still holds work, of some queues or of any."""
+        """Return whether this worker still holds workflows of some queues, by default of any."""
         return bool(self._pending(self._executor, queues or QUEUES))
 
     def _take_over(self) -> None:
-        """Give back the work of workers whose lease ran out; forget those silent for long.
+        """Return the workflows of dead workers to their queues, and forget workers that have been silent for long.
 
-        The engine's own `resume_workflow` would run cancelled work, would take work that a third worker has just
-        taken over, and would forget how often the work has killed its worker.
+        The engine's own `resume_workflow` is not used: it would run cancelled work, would take work that a third worker
+        has just taken over, and would reset the count of workers that the work has killed.
         """
         pending = self._pending()
         self._give_back({workflow.workflow_id for workflow in pending if workflow.executor_id == self._executor})
@@ -131,18 +186,23 @@ class Watch:
                 self._forget(executor, beats[executor])
 
     def _give_back(self, mine: set[str]) -> None:
-        """Give back what is this worker's and has not been begun for a lease: it was not heard that it had been taken.
+        """Return workflows to the queue that are assigned to this worker but have not been started for a full lease.
 
-        That is so where the connection breaks between a commit and its answer.
+        That happens when the connection breaks between a commit and its response: the worker never learns of the
+        assignment.
         """
         self._unheard.look(dict.fromkeys(mine.difference(self._doing)))
         for workflow in self._unheard.dead():
-            log.warning("Job %s was taken and never begun; it is given back.", workflow)
+            log.warning("Job %s was claimed and never started; it is queued again.", workflow)
             self._client._sys_db.reenqueue_for_recovery(workflow, [self._executor], JOBS)
 
     def _inherit(self, dead: list[str]) -> None:
-        """Give back what the dead were working on; start over what only workers of another version could go on with."""
-        left = self._client.list_workflows(
+        """Return the workflows of dead workers to their queues.
+
+        A workflow of another version of the steps, which only workers of that version could resume, is started again as
+        a new attempt.
+        """
+        left = self._client.list_workflows(  # without inputs and outputs, which are not needed here
             status=["PENDING", "ENQUEUED"],
             executor_id=dead,
             queue_name=list(QUEUES),
@@ -162,7 +222,10 @@ class Watch:
             session.execute(delete(Executor).where(Executor.id == executor, Executor.beat_at == beat_at))
 
     def _live(self) -> list[Live]:
-        """Read jobs that have not ended: what was never told first, then the oldest; of batches their parts alone."""
+        """Return jobs that have not ended: those never enqueued first, then the oldest.
+
+        Batches themselves are left out, because the engine runs only their parts.
+        """
         query = select(Job.row, Job.attempt, Job.told_at.is_not(None), Job.kind).where(Job.state.in_(ACTIVE))
         query = query.where(Job.kind != BATCH)
         with self._database.reading() as session:
@@ -181,9 +244,10 @@ class Watch:
         )
 
     def _start_over(self, workflow: str) -> None:
-        """Begin a new attempt: this one was begun by another sequence of steps, with which nobody here can go on.
+        """Start a new attempt at a job whose current attempt cannot be resumed.
 
-        It is told in this round or the next; a crash in between leaves an old attempt that finds itself unwanted.
+        It is enqueued in this round or the next; after a crash in between, the old attempt finds that it is no longer
+        current.
         """
         row, attempt = map(int, workflow.split("-"))
         again = {"state": "queued", "attempt": attempt + 1, "told_at": None}
@@ -191,6 +255,17 @@ class Watch:
             mine = (Job.row == row, Job.attempt == attempt, Job.state.in_(ACTIVE))
             session.execute(update(Job).where(*mine).values(**again))
         drop(self._client, row, attempt)
+
+    def _begin_again(self, job: Live) -> None:
+        """Start a new attempt at a job in which the engine failed, or fail the job after `ENGINE_ATTEMPTS`."""
+        if job.attempt < ENGINE_ATTEMPTS:
+            log.warning("The job engine failed in job %d at attempt %d; it is started again.", job.row, job.attempt)
+            self._start_over(job.workflow)
+        else:
+            reason = (
+                f"The job engine failed {job.attempt} times in this job; check the worker's log, then request it again."
+            )
+            fail(self._database, job.row, job.attempt, reason)
 
     def _remember_told(self, rows: Sequence[int]) -> None:
         if rows:

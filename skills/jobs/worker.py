@@ -1,9 +1,20 @@
-"""The worker process: it runs jobs, beside the service or on its own machine, and watches over the other workers."""
+"""The worker process: it runs jobs and watches over the other workers.
 
+It runs as a child of the service or on another machine. Each attempt at a job is logged in one line: the number of the
+attempt, the kind of the job, the outcome and the duration.
+
+The worker configures the C library not to return freed memory to the system between styles. A policy's arrays have a
+few megabytes; by default malloc returns such blocks to the system when they are freed, and the next style pays a page
+fault for every page again: a sixth of the time of a batch (`tests/bench/batches.py`).
+"""
+
+import ctypes
+import gc
 import logging
 import os
 import signal
 import sys
+import time
 import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -12,44 +23,90 @@ from threading import Event, Thread
 from types import FrameType
 
 from dbos import DBOS
+from sqlalchemy import select
 
 from skills import logs
-from skills.db.schema import refuse_other_tables
-from skills.db.session import Database
+from skills.db.service_tables import Job
+from skills.db.session import Database, refuse_other_tables
 from skills.errors import SkillsError
 from skills.jobs.engine import BATCHES, JOBS, POLLING_S, QUEUES, configuration, connect
-from skills.jobs.lease import Leases
-from skills.jobs.logged import logged
-from skills.jobs.memory import keep_freed_memory
-from skills.jobs.watch import Watch
+from skills.jobs.watch import Leases, Watch
 from skills.jobs.workflows import Perform, Work, register
+from skills.logs import job_id, told
 from skills.settings import Settings
 
+TRIM, MMAP = -1, -3  # M_TRIM_THRESHOLD and M_MMAP_THRESHOLD of malloc.h
+KEPT_BYTES = 64 << 20  # unused memory that the process may hold
+PIECE_BYTES = 32 << 20  # larger blocks are still returned at once; glibc allows no higher threshold
+
+
+def keep_freed_memory() -> bool:
+    """Configure malloc not to return up to `KEPT_BYTES` of freed memory to the system.
+
+    Returns:
+        Whether the C library supports it; glibc does.
+    """
+    try:
+        mallopt = ctypes.CDLL(None).mallopt
+    except (AttributeError, OSError):
+        return False
+    return bool(mallopt(TRIM, KEPT_BYTES) and mallopt(MMAP, PIECE_BYTES))
+
+
+def logged(perform: Perform) -> Perform:
+    """Wrap `perform` so that each attempt at a job is logged.
+
+    An exception is logged by its class name only, because its message may contain personal data.
+    """
+
+    def run(database: Database, row: int, attempt: int, settings: Settings) -> None:
+        name, kind, _ = _look(database, row)
+        token, began, outcome = job_id.set(name), time.monotonic(), ""
+        try:
+            perform(database, row, attempt, settings)
+            outcome = _look(database, row)[2]
+        except Exception as error:
+            outcome = type(error).__name__
+            raise
+        finally:
+            seconds = round(time.monotonic() - began, 3)
+            told(log, "job", kind=kind, attempt=attempt, outcome=outcome, seconds=seconds)
+            job_id.reset(token)
+
+    return run
+
+
+def _look(database: Database, row: int) -> tuple[str, str, str]:
+    with database.reading() as session:
+        found = session.execute(select(Job.id, Job.kind, Job.state).where(Job.row == row)).first()
+    return ("", "", "erased") if found is None else (found.id, found.kind, found.state)
+
+
 ROUND_S = 0.5
-MISSED_ROUNDS = 20  # in a row; where the database is away the engine waits for up to 90 s before it tries again
-DRAIN_S = 8  # what works then is cut and done again elsewhere; containers are killed after ten
+MISSED_ROUNDS = 20  # in a row; while the database is unavailable the engine's retry pauses grow up to 90 s
+DRAIN_S = 8  # jobs that run longer are aborted and run again elsewhere; container runtimes kill after 10 s
 NICENESS = 10
 
 log = logging.getLogger(__name__)
 
 
 def run_worker(settings: Settings, *, parent: int | None = None, perform: Perform | None = None) -> None:
-    """Run jobs until SIGTERM or SIGINT, or until the parent is gone; then finish what is begun, and return.
+    """Run jobs until SIGTERM or SIGINT, or until the parent has exited; then finish running jobs, and return.
 
-    To be called in the main thread of a process of its own, once: the engine
-    is one per process. The process ends here and now if its work does not end in time.
+    Call it once, in the main thread of a dedicated process: there is one engine per process. If running jobs do not end
+    within the timeout, the process exits immediately.
 
     Args:
-        parent: The id of the process without which this one has no reason to live.
-        perform: Carries a job out; `skills.library.perform_job` unless told otherwise.
+        parent: Process id of the parent; the worker stops when that process has exited. None: no such check.
+        perform: Callback that performs a job; `skills.library.perform_job` by default.
 
     Raises:
-        Conflict: The database was not migrated to this version, or to a newer one.
+        Conflict: The database has not been migrated to this version, or is of a newer one.
     """
     keep_freed_memory()
     stop = _stopped_by_signals()
     perform = logged(perform or _library())
-    executor = f"{os.getpid()}-{uuid.uuid4().hex}"  # never used again: the engine would run its work twice
+    executor = f"{os.getpid()}-{uuid.uuid4().hex}"  # unique: with a reused id the engine would run its work twice
     database = Database(settings.database_url)
     with database.reading() as session:
         refuse_other_tables(session.connection())
@@ -57,8 +114,10 @@ def run_worker(settings: Settings, *, parent: int | None = None, perform: Perfor
     work = Work(database, settings, perform)
     watch = Watch(database, client, executor, Leases(settings.lease_s), DBOS._recover_pending_workflows, work.doing)
     try:
-        watch.beat()  # before it can hold any work
+        watch.beat()  # registered before it can hold any job, so that others can take over
         with _engine(work, executor, watch):
+            gc.freeze()  # everything imported so far stays, so later collections skip it
+            gc.enable()  # the callers disable it while they import
             _go_round(watch, lambda: stop.wait(ROUND_S) or _orphaned(parent))
         _go_if_cut_short(watch)
         _survive(watch.leave)
@@ -68,9 +127,11 @@ def run_worker(settings: Settings, *, parent: int | None = None, perform: Perfor
 
 
 def _go_round(watch: Watch, over: Callable[[], bool]) -> None:
-    """Make rounds until it is over, or until the database is back after so long that a new process does better.
+    """Run rounds of the watch until `over()` is true.
 
-    Every other one is a beat alone: to look for what the engine and our rows disagree about takes ten times as long.
+    Every second round is only a heartbeat, because comparing the engine's workflows with our rows takes ten times as
+    long. The process exits if the database comes back after `MISSED_ROUNDS` or more failed rounds: the engine's retry
+    pauses have then grown so long that a new process is faster.
     """
     missed = 0
     for step in cycle((watch.round, watch.beat)):
@@ -79,7 +140,9 @@ def _go_round(watch: Watch, over: Callable[[], bool]) -> None:
         elif missed < MISSED_ROUNDS:
             missed = 0
         else:
-            log.error("The database was away for long, and the engine's pauses have grown; this worker starts anew.")
+            log.error(
+                "The database was unavailable for long, and the engine's retry pauses have grown; this worker restarts."
+            )
             logging.shutdown()
             os._exit(1)
         if over():
@@ -87,8 +150,8 @@ def _go_round(watch: Watch, over: Callable[[], bool]) -> None:
 
 
 def _library() -> Perform:
-    """Take the library's work, and warm up for it."""
-    from skills.jobs.warm import learn_once, warm_up  # late: they bring everything along
+    """Return the library's `perform_job`, and start the warm-up for it."""
+    from skills.jobs.warm_up import learn_once, warm_up  # imported late, because they import everything else
     from skills.library import perform_job
 
     warm_up(learn_once)
@@ -97,7 +160,7 @@ def _library() -> Perform:
 
 @contextmanager
 def _engine(work: Work, executor: str, watch: Watch) -> Iterator[None]:
-    """Run the engine for as long as the block, and drain it after: no new work, and time for what is begun."""
+    """Run the engine for the duration of the block, then drain it: running jobs may finish, new ones are not taken."""
     register(work)
     DBOS(config=configuration(work.settings, executor))
     DBOS.launch()
@@ -108,18 +171,25 @@ def _engine(work: Work, executor: str, watch: Watch) -> Iterator[None]:
     finally:
         drain = Thread(target=DBOS.destroy, kwargs={"workflow_completion_timeout_sec": _patience_s(watch)})
         drain.start()
-        while drain.is_alive():  # it beats while it drains, or others would take over what it finishes
+        while drain.is_alive():  # without heartbeats others would take over the jobs that are being finished
             _survive(watch.beat)
             drain.join(ROUND_S)
 
 
 def _patience_s(watch: Watch) -> int:
-    """Choose how long to drain: what is done aside is cut at once, for it may take long and nobody waits for it."""
+    """Return the timeout of draining in seconds.
+
+    It is 0 unless jobs of the queues `JOBS` or `BATCHES` run: those of `ASIDE` may take long, nobody waits for them,
+    and they are run again.
+    """
     return DRAIN_S if _at_work(watch, JOBS, BATCHES) else 0
 
 
 def _at_work(watch: Watch, *queues: str) -> bool:
-    """Tell whether this worker holds work; where the database is away it may, and its threads wait for that."""
+    """Return whether this worker holds jobs of some queues.
+
+    Where the database is unavailable it may hold some whose threads wait for the database, so True is returned.
+    """
     try:
         return watch.at_work(*queues)
     except Exception:
@@ -127,12 +197,15 @@ def _at_work(watch: Watch, *queues: str) -> bool:
 
 
 def _survive(step: Callable[[], None]) -> bool:
-    """Take a step of the watch, or miss it: a database that is locked or away for a while must not end the worker."""
+    """Run a step of the watch and return whether it succeeded.
+
+    Exceptions are only logged: a database that is locked or unavailable for a while must not end the worker.
+    """
     try:
         step()
         return True
     except Exception:
-        log.warning("The watch missed a round; the next one makes up for it.", exc_info=True)
+        log.warning("The watch missed a round; the next one does its work.", exc_info=True)
         return False
 
 
@@ -152,15 +225,15 @@ def _orphaned(parent: int | None) -> bool:
 
 
 def _go_if_cut_short(watch: Watch) -> None:
-    """End the process if a job still runs: its thread cannot be stopped, and would hold up the exit for as long."""
+    """Exit the process if a job is still running: its thread cannot be stopped, and a normal exit would wait for it."""
     if _at_work(watch):
-        log.warning("Stopped in the middle of a job; it is done again elsewhere, or after the next start.")
+        log.warning("Stopped during a job; another worker, or this one after its next start, will run it again.")
         logging.shutdown()
         os._exit(0)
 
 
 def main() -> None:
-    """Run as a child of the process whose id is the argument, out of the way of what answers requests."""
+    """Run as a child of the process whose id is the first argument, at lower priority than request handling."""
     settings = Settings()
     logs.configure(settings.log_level, as_json=settings.log_format == "json")
     os.nice(NICENESS)
@@ -170,8 +243,4 @@ def main() -> None:
         log.error("%s", refused)
         sys.exit(1)
     logging.shutdown()
-    os._exit(0)  # nobody waits for what is still being compiled
-
-
-if __name__ == "__main__":
-    main()
+    os._exit(0)  # does not wait for the warm-up thread, which may still be compiling

@@ -1,8 +1,8 @@
-"""What a worker does with one job: it tries, pauses, tries again, and in the end gives up.
+"""The workflow of one job: it tries, pauses, retries, and finally gives up.
 
-Every try is a step of the engine, so tries that were finished are not repeated when another worker takes over. No
-exception reaches the engine, which would keep its text; the outcome stands in our row, and every change of that row
-names the attempt and the states it may come from.
+Each try is a step of the engine, so finished tries are not repeated when another worker takes over. No exception
+reaches the engine, which would store its text; the outcome is stored in our row, and each update of that row names the
+attempt and the states that it may replace.
 """
 
 import logging
@@ -15,16 +15,14 @@ from dbos import DBOS
 from sqlalchemy import func, update
 
 from skills.db.base import now
-from skills.db.books import Job
+from skills.db.service_tables import LONGEST_REASON, Job
 from skills.db.session import Database
 from skills.errors import Busy, SkillsError
 from skills.jobs.engine import WORKFLOW, workflow_id
-from skills.library.batches import PART, end_part
+from skills.library.jobs import ACTIVE, PART, end_part
 from skills.settings import Settings
 
-ACTIVE = ("queued", "running")
 FIRST_PAUSE_S = 0.2
-LONGEST_REASON = 2000  # characters, as the column has it
 
 log = logging.getLogger(__name__)
 Perform = Callable[[Database, int, int, Settings], None]
@@ -32,16 +30,16 @@ Perform = Callable[[Database, int, int, Settings], None]
 
 @dataclass(frozen=True)
 class Work:
-    """How jobs are carried out in this process."""
+    """The dependencies of jobs in this process: database, settings and the callback that performs a job."""
 
     database: Database
     settings: Settings
     perform: Perform
-    doing: set[str] = field(default_factory=set)  # workflows that have been begun and have not ended
+    doing: set[str] = field(default_factory=set)  # ids of the workflows that are running in this process
 
     @contextmanager
     def begun(self, workflow: str) -> Iterator[None]:
-        """Keep a workflow among those that are being done for as long as the block."""
+        """Register a workflow as running for the duration of the block."""
         self.doing.add(workflow)
         try:
             yield
@@ -49,44 +47,48 @@ class Work:
             self.doing.discard(workflow)
 
     def try_once(self, row: int, attempt: int, tries: int) -> bool:
-        """Try to carry a job out; tell whether that settled it, for good or bad.
+        """Try to perform a job and return whether it is settled, by success or by a permanent failure.
 
-        The pause comes before the second try and grows fourfold; it is not the engine's durable sleep, which would
-        take a step of the clock for time that has passed.
+        There is a pause before each retry; it starts at `FIRST_PAUSE_S` and is multiplied by four each time. It is not
+        the engine's durable sleep, which would count a step of the wall clock as time that has passed.
         """
         time.sleep(FIRST_PAUSE_S * 4 ** (tries - 1) if tries else 0.0)
         try:
             if start(self.database, row, attempt):
                 self.perform(self.database, row, attempt, self.settings)
             return True
-        except Busy:
-            log.warning("Job %d: the database was busy at try %d.", row, tries + 1)
+        except Busy:  # temporary, so it is retried; other errors of ours would fail again
+            log.warning("Job %d: the database was busy at attempt %d.", row, tries + 1)
             return False
         except SkillsError as refused:
-            return self._end(row, attempt, str(refused))
+            return self._end(row, attempt, refused.words())
         except Exception:
-            log.exception("Job %d: try %d of %d failed.", row, tries + 1, self.settings.job_attempts)
+            log.exception("Job %d: attempt %d of %d failed.", row, tries + 1, self.settings.job_attempts)
             return False
 
     def give_up(self, row: int, attempt: int) -> bool:
-        """Say that the job failed through no fault of the request; what happened is in the worker's log."""
+        """Mark the job as failed for an internal reason and return True; the cause is in the worker's log."""
         return self._end(
             row,
             attempt,
-            f"It was tried {self.settings.job_attempts} times and failed inside the service each time; "
-            "ask again, and if it fails again show the worker's log to whoever operates it.",
+            f"All {self.settings.job_attempts} attempts failed inside the service; request it again, and if it "
+            "fails again, send the worker's log to the operator of the service.",
         )
 
     def _end(self, row: int, attempt: int, reason: str) -> bool:
         try:
             fail(self.database, row, attempt, reason)
-        except Exception:  # the watch finds a workflow that ended and a row that did not, and fails it then
+        except Exception:  # the watch finds that the workflow has ended and the row has not, and fails it then
             log.exception("Job %d: it failed, and that could not be written.", row)
         return True
 
 
 def start(database: Database, row: int, attempt: int) -> bool:
-    """Mark a job as running, or find it so after a crash; tell whether this attempt is still wanted."""
+    """Mark a job as running, also where it is already (after a crash).
+
+    Returns:
+        Whether this attempt is still current; False where the job has ended or has a newer attempt.
+    """
     changes = {"state": "running", "started_at": func.coalesce(Job.started_at, now())}
     with database.writing() as session:
         mine = (Job.row == row, Job.attempt == attempt, Job.state.in_(ACTIVE))
@@ -94,7 +96,11 @@ def start(database: Database, row: int, attempt: int) -> bool:
 
 
 def fail(database: Database, row: int, attempt: int, reason: str, state: str = "failed") -> bool:
-    """End a job without a result, unless it has ended or another attempt has it; tell whether it was so ended."""
+    """End a job without a result, unless it has ended or has a newer attempt.
+
+    Returns:
+        Whether this call ended it.
+    """
     reason = reason[:LONGEST_REASON]
     changes = {"state": state, "error": reason, "ended_at": now()}
     with database.writing() as session:
@@ -106,9 +112,9 @@ def fail(database: Database, row: int, attempt: int, reason: str, state: str = "
 
 
 def register(work: Work) -> None:
-    """Declare the workflow and its steps to the engine, before it is launched.
+    """Register the workflow and its steps with the engine, before it is launched.
 
-    Its steps are the tries and, after the last, giving up. Change `engine.STEPS` when that sequence changes.
+    The steps are the tries and, after the last, giving up. Change `engine.STEPS` when that sequence changes.
     """
     attempts = work.settings.job_attempts
 
@@ -120,7 +126,7 @@ def register(work: Work) -> None:
     def give_up(row: int, attempt: int) -> bool:
         return work.give_up(row, attempt)
 
-    # A job that kills its worker is handed on as often as one that raises is tried.
+    # A job that kills its worker is recovered as many times as one that raises is retried.
     @DBOS.workflow(name=WORKFLOW, max_recovery_attempts=attempts - 1)
     def perform_job(row: int, attempt: int) -> None:
         with work.begun(workflow_id(row, attempt)):

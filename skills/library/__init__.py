@@ -1,9 +1,63 @@
-"""The use cases, between the database and whoever asks.
+"""The use cases, between the database and its callers, and `perform_job`, which carries out any job.
 
-A function that takes a `session` joins its caller's transaction. One that takes a `database` is slow: it reads, lets
-go, computes, and writes in a short transaction of its own.
+A function that takes a `session` joins its caller's transaction. One that takes a `database` is slow: it reads in a
+transaction, closes it, computes, and writes in a short transaction at the end.
+
+`perform_job` runs a job of any kind. It is safe to retry: several workers, or several attempts of one, store the result
+once.
 """
 
-from skills.library.work import perform_job
+from collections.abc import Callable
+from typing import Any
+
+from sqlalchemy import update
+
+from skills.db.base import now
+from skills.db.service_tables import Job
+from skills.db.session import Database
+from skills.library.batch_work import retrain_part
+from skills.library.events import record
+from skills.library.jobs import PART, Store
+from skills.library.playbacks import check_playback, draw_pictures
+from skills.library.training import train_style
+from skills.settings import Settings
 
 __all__ = ["perform_job"]
+
+MAKERS: dict[str, Callable[[Database, Any, Settings], Store]] = {
+    "training": train_style,
+    PART: retrain_part,
+    "playback": check_playback,
+    "pictures": draw_pictures,
+}
+
+
+def perform_job(database: Database, row: int, attempt: int, settings: Settings) -> None:
+    """Carry out a running job; write its result and the state `succeeded` in one transaction.
+
+    Safe to call twice: the result is identified by its digest, and the state changes once.
+
+    Args:
+        database: The database with the job.
+        row: The job's row.
+        attempt: The attempt that the worker was given; a job that is at another attempt by now is left alone.
+        settings: Limits of time and memory for the computation.
+
+    Raises:
+        SkillsError: The request cannot be met; a retry would not help.
+    """
+    with database.reading() as session:
+        job = session.get(Job, row)
+        if job is None or job.state != "running" or job.attempt != attempt:
+            return  # erased, cancelled, or taken by another attempt
+        kind, request = job.kind, job.request
+    store = MAKERS[kind](database, request, settings)
+    with database.writing() as session:
+        ended = {"state": "succeeded", "progress": 1.0, "ended_at": now()}
+        mine = (Job.row == row, Job.state == "running", Job.attempt == attempt)
+        # The condition on state and attempt makes the first finished attempt the only one that stores a result.
+        if session.execute(update(Job).where(*mine).values(**ended).returning(Job.row)).first() is None:
+            return  # cancelled during the computation, or another attempt was faster
+        job = session.get_one(Job, row)
+        job.result = store(session, job.asked_by)
+        record(session, "worker", "finish", f"job-{kind}", job.id)

@@ -1,6 +1,8 @@
-"""The atlas of a suture type: how far its demonstrations are apart, what belongs together, and whose is whose.
+"""The atlas of a suture type: distances, clusters and recognition of its demonstrations.
 
-It is made of all active demonstrations whose surgeon's consent covers it.
+    Database --atlas_of--> Atlas
+
+An atlas compares all active demonstrations of the suture type whose surgeon's consent covers it.
 """
 
 from collections import Counter
@@ -13,16 +15,23 @@ import numpy as np
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
+from skills.arrays import Floats, Ints
+from skills.comparison.clusters import WORTH, Dendrogram, chart, dendrogram, how_many, silhouette
+from skills.comparison.distances import LEAST_MM, STATES, Difference, difference, in_lengths, medoid, spread
+from skills.comparison.recognition import Validated, recognise, validate
 from skills.db.models import Demonstration, Surgeon, SutureType
 from skills.db.session import Database
 from skills.errors import BadInput, BadPath, Conflict, NotFound
-from skills.library.apart import far_apart
-from skills.library.atlas_parts import (
+from skills.library.catalogue import find_suture_type
+from skills.library.consent import may, require
+from skills.library.demos import find_demo
+from skills.library.distances import far_apart
+from skills.schemas.comparison import (
     Apartness,
     Atlas,
     Cluster,
     Consistency,
-    LeftOut,
+    LeftOutOfAtlas,
     Likely,
     Merge,
     OfSurgeon,
@@ -30,37 +39,30 @@ from skills.library.atlas_parts import (
     Recognition,
     Whose,
 )
-from skills.library.catalogue import check_consent, find_suture_type
-from skills.library.demos import find_demo
-from skills.style._arrays import Floats, Ints
-from skills.style.comparing.chart import chart
-from skills.style.comparing.clusters import WORTH, Dendrogram, dendrogram, how_many, silhouette
-from skills.style.comparing.differences import Difference, difference
-from skills.style.comparing.distances import medoid, spread
-from skills.style.comparing.recognition import Validated, recognise, validate
-from skills.style.comparing.shapes import LEAST_MM, STATES, in_lengths
 
-MOST = 2000  # demonstrations: a minute of measuring on two cores, once, and an answer of 16 MB
-MOST_COMPARED = 40  # surgeons of whom all pairs are compared, in half a second
-DIGITS = 4  # of what is told: a tenth of a micrometre, far below what a recorder can tell
+MOST = 2000  # demonstrations: a minute of measuring on two cores, once, and a response of 16 MB
+MOST_COMPARED = 40  # surgeons; all pairs of them are compared, in half a second
+DIGITS = 4  # of the rounded results: a tenth of a micrometre, far below the resolution of a recorder
 UNITS = {False: "mm", True: "lengths of start to goal"}
 
 AS_ASKED = "as asked"
 BY_SILHOUETTE = f"that with the best mean silhouette, and one where even that is below {WORTH:g}"
 
-NO_DIRECTION = f"It ends within {LEAST_MM:g} mm of where it began, so it has no direction to be compared along."
+NO_DIRECTION = f"It ends within {LEAST_MM:g} mm of where it began, so it has no direction and cannot be compared."
 DISTANCE = (
     f"A distance is the total of dynamic time warping (Manhattan) of two shapes of {STATES} states, divided by "
-    f"{STATES}: about by how much two motions differ at a place. Shapes begin at one point and go in one direction."
+    f"{STATES}: about the mean difference of two motions at one place. All shapes have the same start and "
+    "direction."
 )
 CONFOUNDED = (
-    "Set-up and day go with the surgeon: who is recognised may be known by the room, the arm's place or the day's task "
-    "and not by style. So a demonstration is only ever compared with those of other sessions, and even then surgeons "
-    "who always work in a set-up of their own cannot be told from it."
+    "Set-up and day are confounded with the surgeon: a surgeon may be recognised by the room, the arm's position "
+    "or the day's task instead of the style. Therefore a demonstration is only compared with those of other "
+    "sessions, and even then a surgeon who always works in the same set-up cannot be distinguished from it."
 )
 SESSIONS = (
-    "Demonstrations with the same session name were recorded together, whoever made them; those without one count as "
-    "one session for each recording."
+    "Demonstrations with the same session name, and cuts of one recording, count as recorded together, by any "
+    "surgeon; each recording without a session name counts as a session. Cuts of one recording are not "
+    "independent."
 )
 
 
@@ -79,34 +81,36 @@ def atlas_of(
     """Compare all demonstrations of a suture type.
 
     Args:
-        database: As far as the caller may see it.
+        database: The database, restricted to the rows that the caller may see.
         suture: The suture type.
-        scaled: Whether to lay start and goal of all on each other, so that size says nothing.
-        clusters: How many; left out, as many as `skills.style.comparing.clusters` finds.
-        demo: The digest of one that is in the atlas, to be told whose style it is.
+        scaled: Scale all shapes so that start and goal coincide; sizes are then ignored.
+        clusters: The number of clusters; None: as many as `skills.comparison.clusters` finds.
+        demo: The digest of a demonstration in the atlas whose surgeon is to be recognised.
 
     Raises:
         NotFound: There is no such suture type, or nothing to compare, or no such demonstration in the atlas.
         Conflict: There are more than `MOST`; or the demonstration was withdrawn, or consent does not cover it.
-        BadInput: There are not so many demonstrations as clusters are asked for.
-        BadPath: The demonstration that is asked about has no direction.
+        BadInput: More clusters are requested than there are demonstrations.
+        BadPath: The demonstration `demo` has no direction.
     """
-    with database.reading() as session:
-        found, without_consent = _members(session, find_suture_type(session, suture).slug)
-        asked = None if demo is None else _asked(session, demo, suture)
-    if len(found) > MOST:
-        raise Conflict(
-            f"There are {len(found)} demonstrations of '{suture}', and an atlas has at most {MOST}; withdraw those "
-            "that nobody learns from.",
-            demos=len(found),
-        )
-    apart = far_apart(database, [one.row for one in found])
+    found, without_consent, asked = _found(database, suture, demo)
+    # Measuring may take a minute, outside any transaction; repeat until no member was withdrawn during it.
+    while True:
+        apart = far_apart(database, [one.row for one in found])
+        still, without_consent, asked = _found(database, suture, demo)
+        if {*found} <= {*still}:  # demonstrations added since are left to the next atlas
+            break
+        found = [one for one in found if one in still]  # consent or a demonstration was withdrawn during the measuring
     there = {*apart.rows.tolist()}
     members = [one for one in found if one.row in there]
     without_direction = [one.sha256 for one in found if one.row not in there]
     if asked in without_direction:
-        raise BadPath(f"{NO_DIRECTION} Cut the hand-off from its start to where the needle is taken.")
-    left_out = LeftOut(without_consent, without_direction, _because(without_consent, len(without_direction)))
+        raise BadPath(f"{NO_DIRECTION} Cut the hand-off from its start to the point where the needle is taken.")
+    left_out = LeftOutOfAtlas(
+        without_consent=without_consent,
+        without_direction=without_direction,
+        because=_because(without_consent, len(without_direction)),
+    )
     if not members:
         raise NotFound(" ".join([f"There is no demonstration of '{suture}' to compare.", *left_out.because]))
     if scaled:
@@ -116,8 +120,22 @@ def atlas_of(
     return _told(suture, _compare(members, shapes, far / STATES, scaled), left_out, clusters, asked)
 
 
+def _found(database: Database, suture: str, demo: str | None) -> tuple[list[_Member], int, str | None]:
+    """List the members of an atlas, count those left out for want of consent, and check the requested demonstration."""
+    with database.reading() as session:
+        found, without_consent = _members(session, find_suture_type(session, suture).slug)
+        asked = None if demo is None else _asked(session, demo, suture)
+    if len(found) > MOST:
+        raise Conflict(
+            f"There are {len(found)} demonstrations of '{suture}', and an atlas has at most {MOST}; withdraw "
+            "those that are not used for learning.",
+            demos=len(found),
+        )
+    return found, without_consent, asked
+
+
 def atlases(session: Session) -> list[tuple[SutureType, int, int]]:
-    """List the suture types that there are active demonstrations of: how many, and of how many surgeons."""
+    """List the suture types with active demonstrations: the type, and the numbers of demonstrations and surgeons."""
     of = Demonstration
     counted = select(of.suture, func.count(), func.count(of.surgeon_row.distinct())).where(of.withdrawn_at.is_(None))
     found = session.execute(counted.group_by(of.suture).order_by(of.suture)).all()
@@ -131,7 +149,7 @@ def _members(session: Session, suture: str) -> tuple[list[_Member], int]:
         Surgeon, of.surgeon_row == Surgeon.row
     )
     rows = session.execute(query.where(of.suture == suture, of.withdrawn_at.is_(None)).order_by(of.row)).all()
-    covered = {surgeon.slug: _covered(surgeon) for _, _, surgeon, _, _ in rows}
+    covered = {surgeon.slug: may(surgeon, "atlas") for _, _, surgeon, _, _ in rows}
     members = [
         _Member(row, sha256, surgeon.slug, recorded, recording)
         for row, sha256, surgeon, recorded, recording in rows
@@ -140,29 +158,21 @@ def _members(session: Session, suture: str) -> tuple[list[_Member], int]:
     return members, len(rows) - len(members)
 
 
-def _covered(surgeon: Surgeon) -> bool:
-    try:
-        check_consent(surgeon, "atlas")
-    except Conflict:
-        return False
-    return True
-
-
 def _asked(session: Session, demo: str, suture: str) -> str:
-    """Find the demonstration that is asked about, and refuse one that is not in this atlas."""
+    """Return the digest of the demonstration to be recognised; refuse one that is not in this atlas."""
     found = find_demo(session, demo)
     if found.suture != suture:
-        raise NotFound(f"This demonstration is of '{found.suture}'; ask for that atlas.")
+        raise NotFound(f"This demonstration is of '{found.suture}'; request that atlas.")
     if found.withdrawn_at is not None:
         raise Conflict("This demonstration was withdrawn, so it is not in the atlas.")
-    check_consent(found.surgeon, "atlas")
+    require(found.surgeon, "atlas")
     return found.sha256
 
 
 def _because(without_consent: int, without_direction: int) -> list[str]:
     said = []
     if without_consent:
-        said.append(f"Left out: {_count(without_consent)}, for the surgeon's consent does not cover an atlas.")
+        said.append(f"Left out: {_count(without_consent)}, because the surgeon's consent does not cover an atlas.")
     if without_direction:
         said.append(f"Left out: {_count(without_direction)}. {NO_DIRECTION}")
     return said
@@ -172,12 +182,12 @@ def _count(demos: int) -> str:
     return f"{demos} demonstration{'' if demos == 1 else 's'}"
 
 
-# ---- what is computed --------------------------------------------------------------------------------------------
+# ---- computation -------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
 class _Compared:
-    """Members with the distances between all, and whose and of which session each is, as numbers."""
+    """Members with the distances between all of them, and the surgeon and session of each as numbers."""
 
     members: Sequence[_Member]
     shapes: Floats
@@ -188,22 +198,36 @@ class _Compared:
     sessions: Ints
 
     def of(self, surgeon: int) -> Ints:
-        """Number a surgeon's demonstrations."""
+        """Return the indices of a surgeon's demonstrations."""
         return np.flatnonzero(self.whose == surgeon)
 
     def name(self, one: int) -> str:
-        """Give the digest of a demonstration."""
+        """Return the digest of a demonstration."""
         return self.members[one].sha256
 
 
 def _compare(members: Sequence[_Member], shapes: Floats, far: Floats, scaled: bool) -> _Compared:
     slugs, whose = np.unique([one.surgeon for one in members], return_inverse=True)
-    numbers: dict[object, int] = {}
-    sessions = [numbers.setdefault(one.session or one.recording_row, len(numbers)) for one in members]
-    return _Compared(members, shapes, far, scaled, slugs.tolist(), whose, np.array(sessions))
+    return _Compared(members, shapes, far, scaled, slugs.tolist(), whose, _sessions(members))
 
 
-def _told(suture: str, compared: _Compared, left_out: LeftOut, clusters: int | None, asked: str | None) -> Atlas:
+def _sessions(members: Sequence[_Member]) -> Ints:
+    """Number the sessions: demonstrations of one session name, or of one recording, were recorded together.
+
+    Cuts of one recording belong to one session even if their session names differ, or only some have one.
+    """
+    together: dict[object, set[int]] = {}
+    session = np.arange(len(members))
+    for number, one in enumerate(members):
+        for key in {one.recording_row, one.session or one.recording_row}:
+            together.setdefault(key, set()).add(number)
+    for numbers in together.values():
+        joined = np.unique(session[sorted(numbers)])
+        session[np.isin(session, joined)] = joined[0]
+    return np.unique(session, return_inverse=True)[1]
+
+
+def _told(suture: str, compared: _Compared, left_out: LeftOutOfAtlas, clusters: int | None, asked: str | None) -> Atlas:
     far, members = compared.far, compared.members
     tree = dendrogram(far)
     number = clusters or how_many(far, tree)
@@ -215,9 +239,10 @@ def _told(suture: str, compared: _Compared, left_out: LeftOut, clusters: int | N
         scaled=compared.scaled,
         unit=UNITS[compared.scaled],
         demos=[
-            Place(one.sha256, one.surgeon, one.session, cluster + 1, (x, y))
-            for one, cluster, (x, y) in zip(members, in_cluster.tolist(), places.round(DIGITS).tolist(), strict=True)
+            Place(id=one.sha256, surgeon=one.surgeon, session=one.session, cluster=cluster + 1, at=at)
+            for one, cluster, at in zip(members, in_cluster.tolist(), places.round(DIGITS).tolist(), strict=True)
         ],
+        recordings=len({one.recording_row for one in members}),
         left_out=left_out,
         distances=[far[at, :at].round(DIGITS).tolist() for at in range(len(members))],
         merges=_merges(tree),
@@ -240,29 +265,30 @@ def _merges(tree: Dendrogram) -> list[Merge]:
     merges = []
     for (one, other), height in zip(tree.joined.tolist(), tree.heights.round(DIGITS).tolist(), strict=True):
         sizes.append(sizes[one] + sizes[other])
-        merges.append(Merge(one, other, height, sizes[-1]))
+        merges.append(Merge(one=one, other=other, distance=height, demos=sizes[-1]))
     return merges
 
 
 def _cluster(compared: _Compared, cluster: int, members: Ints) -> Cluster:
     counts = Counter(compared.members[one].surgeon for one in members.tolist())
     return Cluster(
-        cluster + 1,
-        len(members),
-        compared.name(medoid(compared.far, members)),
-        _spread(compared.far, members),
-        [OfSurgeon(surgeon, demos) for surgeon, demos in counts.most_common()],
+        cluster=cluster + 1,
+        demos=len(members),
+        medoid=compared.name(medoid(compared.far, members)),
+        spread=_spread(compared.far, members),
+        surgeons=[OfSurgeon(surgeon=surgeon, demos=demos) for surgeon, demos in counts.most_common()],
     )
 
 
 def _consistency(compared: _Compared, surgeon: int) -> Consistency:
     mine = compared.of(surgeon)
     return Consistency(
-        compared.surgeons[surgeon],
-        len(mine),
-        len(np.unique(compared.sessions[mine])),
-        compared.name(medoid(compared.far, mine)),
-        _spread(compared.far, mine),
+        surgeon=compared.surgeons[surgeon],
+        demos=len(mine),
+        recordings=len({compared.members[one].recording_row for one in mine.tolist()}),
+        sessions=len(np.unique(compared.sessions[mine])),
+        medoid=compared.name(medoid(compared.far, mine)),
+        spread=_spread(compared.far, mine),
     )
 
 
@@ -271,7 +297,7 @@ def _spread(far: Floats, members: Ints) -> float | None:
 
 
 def _differences(compared: _Compared) -> list[Apartness]:
-    """Tell what sets the surgeons with the most demonstrations apart, pair by pair."""
+    """Compare the surgeons with the most demonstrations, pair by pair."""
     counts = np.bincount(compared.whose)
     most = sorted(np.argsort(-counts, kind="stable")[:MOST_COMPARED].tolist())
     medoids = {one: medoid(compared.far, compared.of(one)) for one in most}
@@ -284,39 +310,46 @@ def _apart(compared: _Compared, one: int, other: int, of_one: int, of_other: int
     (part, axis), (share, net, size) = found.where, found.most
     distance = round(found.total / STATES, DIGITS)
     return Apartness(
-        *names,
+        one=names[0],
+        other=names[1],
         distance=distance,
         part=part,
         axis=axis,
         share=round(share, DIGITS),
         offset=round(net, DIGITS),
         size=round(size, DIGITS),
-        said=_said(found, names, compared.scaled) if distance > 0 else f"Nothing sets {names[0]} and {names[1]} apart.",
+        said=_said(found, names, compared.scaled)
+        if distance > 0
+        else f"There is no difference between {names[0]} and {names[1]}.",
         shares=found.shares.round(DIGITS).tolist(),
         offsets=found.nets.round(DIGITS).tolist(),
     )
 
 
 def _said(found: Difference, names: tuple[str, str], scaled: bool) -> str:
-    """Say where most of a difference is."""
+    """Return the sentence on the part of the path and the axis with the largest difference."""
     (part, axis), (share, net, size) = found.where, found.most
-    there = f"{share:.0%} of what sets them apart is there, {axis}."
+    there = f"{share:.0%} of their difference is there, {axis}."
     if found.direction is None:
         by = _length(size, scaled)
-        return f"In the {part}, {names[0]} and {names[1]} lie {by} apart, to and fro; {there}"
-    return f"In the {part}, {names[0]} lies {_length(abs(net), scaled)} {found.direction} than {names[1]}; {there}"
+        return f"In the {part}, the paths of {names[0]} and {names[1]} are {by} apart, in both directions; {there}"
+    return (
+        f"In the {part}, the path of {names[0]} is {_length(abs(net), scaled)} {found.direction} than that of "
+        f"{names[1]}; {there}"
+    )
 
 
 def _length(length: float, scaled: bool) -> str:
-    return f"{100 * length:.1f} % of the way" if scaled else f"{length:.1f} mm"
+    return f"{100 * length:.1f} % of the length" if scaled else f"{length:.1f} mm"
 
 
 def _validated(compared: _Compared) -> tuple[Validated | None, str | None]:
-    """Validate recognition, or say why that cannot be done."""
+    """Validate recognition, or return the reason why that is not possible."""
     try:
         return validate(compared.far, compared.whose, compared.sessions), None
+    # Too few surgeons or sessions is no error of the request: the atlas is returned without recognition.
     except BadInput as error:
-        return None, str(error)
+        return None, error.words()
 
 
 def _recognition(validated: Validated) -> Recognition:
@@ -337,4 +370,8 @@ def _whose(compared: _Compared, validated: Validated, asked: str) -> Whose:
     one = [member.sha256 for member in compared.members].index(asked)
     probability = recognise(compared.far, compared.whose, compared.sessions, one, validated)
     likely = sorted(zip(probability.tolist(), compared.surgeons, strict=True), reverse=True)
-    return Whose(asked, compared.members[one].surgeon, [Likely(surgeon, p) for p, surgeon in likely])
+    return Whose(
+        demo=asked,
+        surgeon=compared.members[one].surgeon,
+        likely=[Likely(surgeon=surgeon, probability=p) for p, surgeon in likely],
+    )

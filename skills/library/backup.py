@@ -1,53 +1,118 @@
-"""Backups of an installation, and its return from one; who was erased meanwhile does not return with it."""
+"""Backups of an installation, their restoration, and the list of erasures that a restoration applies.
 
+    Database --back_up--> backup --restore, Erasures--> Database
+    Database --keep_erasures--> list of erasures, a file outside the database
+
+A backup cannot contain later changes: erasures, withdrawals, superseded releases, revoked keys, narrowed consent. The
+list contains all of them, so that a restoration applies them again. It only removes data and permissions, never adds
+them.
+"""
+
+import fcntl
 import json
 import os
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime
+from itertools import pairwise
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
-from sqlalchemy import inspect, select, update
+from sqlalchemy import Select, exists, func, inspect, select, tuple_, update
 from sqlalchemy.orm import Session
 
 from skills import __version__
 from skills.db import archive
 from skills.db.archive import Manifest
 from skills.db.base import Base, rfc3339
-from skills.db.books import Event, Job
-from skills.db.models import Demonstration, Erasure, Surgeon
+from skills.db.models import Demonstration, Erasure, PolicyVersion, Release, StoredRecording, Surgeon
+from skills.db.service_tables import Event, Job, Key
 from skills.db.session import Database
 from skills.errors import Conflict, Corrupt
-from skills.library.catalogue import salted
-from skills.library.erasure import erase_demo, erase_surgeon
+from skills.library.catalogue import put_surgeon, salted
+from skills.library.demos import withdraw_demo
+from skills.library.erasure import delete_recording, erase_demo, erase_surgeon
 from skills.library.events import record
 from skills.library.jobs import ACTIVE
+from skills.library.keys import revoke_key
+from skills.library.releases import withdraw_policies
 from skills.packing import canonical, sha256
 
-Told = Callable[[str], None]  # called with the name of what is worked on
-ERASURES = "suture-skills erasures 1"
+Told = Callable[[str], None]  # progress callback; its argument is the name of the table or step
+ERASURES = "suture-skills erasures 2"
+ERASURES_1 = "suture-skills erasures 1"  # erased surgeons and demonstrations only, as pairs; still read
+# Events that end something permanently, with the name of their list. Releases end by being superseded as well.
+ENDS = {
+    ("erase", "demonstration"): "demonstrations",
+    ("erase", "recording"): "recordings",
+    ("withdraw", "demonstration"): "withdrawn",
+    ("withdraw", "policy-version"): "releases",
+    ("revoke", "key"): "keys",
+}
+LISTED = (*ENDS, ("erase", "surgeon"), ("release", "policy-version"), ("add", "surgeon"), ("change", "surgeon"))
+
+Consent = dict[str, Any] | None
+# By the list names in `ENDS`: digests or ids, and the moment at which each last ended.
+Ended = Mapping[str, Mapping[str, datetime]]
 
 
 @dataclass(frozen=True)
 class Erasures:
-    """Who and what was erased, told so that it can be known again but not be read.
+    """The erasures, withdrawals and revocations of an installation that a restored backup must not undo.
 
-    `surgeons` holds the salt, salted digest of the pseudonym and moment of each, `demos` digest and moment.
+    It names no person. An erased surgeon is a salted digest of the pseudonym, which can be recognised but not read; a
+    surgeon with a consent is the random subject that events name as well.
+
+    Attributes:
+        surgeons: Salt, salted digest and moment of each erased surgeon.
+        ended: Demonstrations that were erased or withdrawn, recordings that were deleted and policies that are no
+            longer served, by their SHA-256, and revoked keys by their id; each with the moment at which it last ended.
+        consents: The consent of each surgeon as last stated, by subject, and the moment of the statement.
     """
 
-    surgeons: frozenset[tuple[str, str, str]] = frozenset()
-    demos: frozenset[tuple[str, str]] = frozenset()
+    surgeons: frozenset[tuple[str, str, datetime]] = frozenset()
+    ended: Ended = field(default_factory=dict)
+    consents: Mapping[str, tuple[datetime, Consent]] = field(default_factory=dict)
+
+    @property
+    def demos(self) -> frozenset[str]:
+        """The erased demonstrations."""
+        return frozenset(self.ended.get("demonstrations", ()))
 
     def __or__(self, other: "Erasures") -> "Erasures":
-        """Join two lists."""
-        return Erasures(self.surgeons | other.surgeons, self.demos | other.demos)
+        """Return the union of two lists; for an entry in both the later moment counts."""
+        kinds = [kind for kind in ENDS.values() if kind in self.ended or kind in other.ended]
+        return Erasures(
+            self.surgeons | other.surgeons,
+            {kind: _latest(self.ended.get(kind, {}), other.ended.get(kind, {})) for kind in kinds},
+            {**other.consents, **{who: said for who, said in self.consents.items() if _is_later(who, said[0], other)}},
+        )
 
-    def __sub__(self, other: "Erasures") -> "Erasures":
-        """Leave out what another list has."""
-        return Erasures(self.surgeons - other.surgeons, self.demos - other.demos)
+    def since(self, known: "Erasures") -> "Erasures":
+        """Return the entries that an installation does not know.
+
+        It knows an entry that ended there at the same moment or later, and a consent that is as recent.
+        """
+        ended = {
+            kind: {name: at for name, at in names.items() if not _knows(known.ended.get(kind, {}), name, at)}
+            for kind, names in self.ended.items()
+        }
+        consents = {who: said for who, said in self.consents.items() if _is_later(who, said[0], known)}
+        return Erasures(self.surgeons - known.surgeons, ended, consents)
+
+
+def _latest(one: Mapping[str, datetime], other: Mapping[str, datetime]) -> dict[str, datetime]:
+    return {**other, **{name: at for name, at in one.items() if not _knows(other, name, at)}}
+
+
+def _knows(known: Mapping[str, datetime], name: str, at: datetime) -> bool:
+    return name in known and known[name] >= at
+
+
+def _is_later(who: str, at: datetime, than: Erasures) -> bool:
+    return who not in than.consents or than.consents[who][0] < at
 
 
 NOTHING = Erasures()
@@ -55,31 +120,36 @@ NOTHING = Erasures()
 
 @dataclass(frozen=True)
 class Restored:
-    """What came of a backup: what it said of itself, and how many surgeons and demonstrations were erased again."""
+    """The result of a restoration: the backup's manifest, and the numbers of items ended again because of the list."""
 
     manifest: Manifest
-    surgeons_erased: int
-    demos_erased: int
+    surgeons_erased: int = 0
+    demos_erased: int = 0
+    recordings_deleted: int = 0
+    demos_withdrawn: int = 0
+    styles_stopped: int = 0  # released in the backup, and not any more
+    keys_revoked: int = 0
+    consents_narrowed: int = 0
 
 
 def back_up(database: Database, target: Path, told: Told = lambda _: None) -> Manifest:
-    """Write a backup of the present state into a new file, while others go on working.
+    """Write a backup of the present state into a new file, without blocking other users.
 
     Raises:
         Conflict: The file exists, or the tables are of another version.
     """
     if target.exists():
-        raise Conflict(f"{target} exists; a backup never overwrites anything, so give another name.")
+        raise Conflict(f"{target} exists; a backup never overwrites a file, so choose another name.")
     with _appearing(target) as file, database.reading() as session:
         return archive.write(file, session.connection(), __version__, told)
 
 
 def check_backup(source: Path) -> Manifest:
-    """Check every byte of a backup: what it says of itself.
+    """Verify every byte of a backup and return its manifest.
 
     Raises:
-        UnknownFormat: It is no backup.
-        Corrupt: It is damaged; the message says where.
+        UnknownFormat: It is not a backup.
+        Corrupt: It is damaged; the message names the place.
         Conflict: It is of a newer version.
     """
     with source.open("rb") as file:
@@ -87,49 +157,77 @@ def check_backup(source: Path) -> Manifest:
 
 
 def restore(database: Database, source: Path, erasures: Erasures = NOTHING, told: Told = lambda _: None) -> Restored:
-    """Fill a database without tables from a backup, and erase again what was erased since; all of it or nothing.
+    """Fill a database without tables from a backup and apply a list of erasures, in one transaction.
 
-    Jobs that had not ended are told to the engine again by the first worker.
+    Jobs that had not ended are submitted to the engine again by the first worker.
+
+    Args:
+        database: The target; it has no tables yet.
+        source: The backup.
+        erasures: The list to apply. Without it, everything that ended after the backup is in force again.
+        told: Progress callback, called with the name of the current table or step.
 
     Raises:
-        Conflict: The database is not empty.
-        UnknownFormat, Corrupt, Conflict: The backup is none, damaged, or newer than this version.
+        Conflict: The database is not empty, or the backup is newer than this version.
+        UnknownFormat: The file is not a backup.
+        Corrupt: The backup is damaged.
     """
     with source.open("rb") as file:
         manifest = archive.check(file)
         with database.writing() as session:
             if set(inspect(session.connection()).get_table_names()) & set(Base.metadata.tables):
-                raise Conflict("There is a database already; a backup is restored into an empty one only.")
+                raise Conflict("There is a database already; restore a backup only into an empty one.")
             archive.load(file, manifest, session.connection(), told)
             told("erasures")
-            surgeons, demos = _erase_again(session, erasures)
+            restored = _end_again(session, manifest, erasures)
             session.execute(update(Job).where(Job.state.in_(ACTIVE)).values(told_at=None))
             record(session, "local", "restore", "installation", manifest.created_at)
     database.forget()
-    return Restored(manifest, surgeons, demos)
+    return restored
 
 
 def erasures_of(database: Database) -> Erasures:
-    """List what was erased in an installation."""
+    """Return the list of erasures of an installation."""
     with database.reading() as session:
         return _listed(session)
 
 
 def keep_erasures(database: Database, target: Path) -> Erasures:
-    """Write the list of erasures, together with what the file listed before; it never gets shorter."""
-    listed = erasures_of(database) | (read_erasures(str(target)) if target.exists() else NOTHING)
-    content = {"surgeons": sorted(map(list, listed.surgeons)), "demonstrations": sorted(map(list, listed.demos))}
-    with _appearing(target) as file:
-        about = {"format": ERASURES, "erasures": content, "sha256": sha256(canonical(content))}
-        file.write(json.dumps(about, indent=1).encode() + b"\n")
+    """Write the list of erasures to a file, merged with the list already in the file, so that no entry is ever lost."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with _alone(target.parent):
+        listed = erasures_of(database) | (read_erasures(str(target)) if target.exists() else NOTHING)
+        content = {
+            "surgeons": sorted([salt, digest, rfc3339(at)] for salt, digest, at in listed.surgeons),
+            **{kind: _written(listed.ended.get(kind, {})) for kind in sorted(set(ENDS.values()))},
+            "consents": {who: [rfc3339(at), consent] for who, (at, consent) in sorted(listed.consents.items())},
+        }
+        with _appearing(target) as file:
+            about = {"format": ERASURES, "erasures": content, "sha256": sha256(canonical(content))}
+            file.write(json.dumps(about, indent=1).encode() + b"\n")
     return listed
 
 
+def keep_up_erasures(database: Database, target: Path, known: int = 0) -> int:
+    """Write the list of erasures if an event after the one of row `known` changes it.
+
+    Returns:
+        The row of the newest such event; `known` if there is none.
+    """
+    query = select(func.max(Event.row)).where(Event.row > known, tuple_(Event.action, Event.object_kind).in_(LISTED))
+    with database.reading() as session:
+        newest = session.scalar(query)
+    if newest is None:
+        return known
+    keep_erasures(database, target)
+    return newest
+
+
 def read_erasures(source: str) -> Erasures:
-    """Read a list of erasures: from a file, or by its URL from the database of an installation.
+    """Read a list of erasures from a file, or from the database of an installation if `source` is a URL.
 
     Raises:
-        Corrupt: The file is no such list, or not as it was written.
+        Corrupt: The file is not such a list, or was changed.
     """
     if "://" in source:
         database = Database(source)
@@ -139,46 +237,156 @@ def read_erasures(source: str) -> Erasures:
             database.close()
     try:
         said = json.loads(Path(source).read_bytes())
-        listed = said["erasures"]
-        if (said["format"], said["sha256"]) != (ERASURES, sha256(canonical(listed))):
+        content = said["erasures"]
+        if said["sha256"] != sha256(canonical(content)):
             raise ValueError
+        return {ERASURES: _read, ERASURES_1: _read_1}[said["format"]](content)
     except (ValueError, KeyError, TypeError) as error:
-        raise Corrupt("This is no list of erasures, or it was changed; take another copy of it.") from error
-    return Erasures(frozenset(map(tuple, listed["surgeons"])), frozenset(map(tuple, listed["demonstrations"])))
+        raise Corrupt("This is not a list of erasures, or it was changed; use another copy of it.") from error
 
 
-def _listed(session: Session) -> Erasures:
-    surgeons = {(one.salt, one.digest, rfc3339(one.erased_at) or "") for one in session.scalars(select(Erasure))}
-    erased = select(Event).where(Event.action == "erase", Event.object_kind == "demonstration")
+def _read(content: dict[str, Any]) -> Erasures:
     return Erasures(
-        frozenset(surgeons), frozenset((one.object_id, rfc3339(one.at) or "") for one in session.scalars(erased))
+        frozenset((salt, digest, datetime.fromisoformat(at)) for salt, digest, at in content["surgeons"]),
+        {kind: {name: datetime.fromisoformat(at) for name, at in content[kind].items()} for kind in ENDS.values()},
+        {who: (datetime.fromisoformat(at), consent) for who, (at, consent) in content["consents"].items()},
     )
 
 
-def _erase_again(session: Session, erasures: Erasures) -> tuple[int, int]:
-    """Erase what a list names and the backup does not know of: what it does know of may have been added anew since.
+def _read_1(content: dict[str, Any]) -> Erasures:
+    return Erasures(
+        frozenset((salt, digest, datetime.fromisoformat(at)) for salt, digest, at in content["surgeons"]),
+        {"demonstrations": {name: datetime.fromisoformat(at) for name, at in sorted(content["demonstrations"])}},
+    )
 
-    Whom the list names and nobody here is stays listed, so that nobody takes the pseudonym.
+
+def _written(ended: Mapping[str, datetime]) -> dict[str, str | None]:
+    return {name: rfc3339(at) for name, at in sorted(ended.items())}
+
+
+def _listed(session: Session) -> Erasures:
+    surgeons = {(one.salt, one.digest, one.erased_at) for one in session.scalars(select(Erasure))}
+    ended: dict[str, dict[str, datetime]] = {kind: {} for kind in ENDS.values()}
+    kind_of = tuple_(Event.action, Event.object_kind)
+    events = select(Event.action, Event.object_kind, Event.object_id, func.max(Event.at)).where(kind_of.in_(ENDS))
+    for action, kind, name, at in session.execute(events.group_by(Event.action, Event.object_kind, Event.object_id)):
+        ended[ENDS[action, kind]][name] = at
+    ended["releases"] = _latest(ended["releases"], _superseded(session))
+    return Erasures(frozenset(surgeons), ended, _consents(session))
+
+
+def _superseded(session: Session) -> dict[str, datetime]:
+    """Return, for each policy whose release was followed by another policy's, the moment when that last happened."""
+    style = (Release.surgeon_row, Release.suture)
+    query = select(*style, PolicyVersion.sha256, Release.released_at).join(
+        PolicyVersion, PolicyVersion.row == Release.policy_row
+    )
+    found: dict[str, datetime] = {}
+    for (*of, policy, _), (*of_next, next_policy, at) in pairwise(session.execute(query.order_by(*style, Release.row))):
+        if of == of_next and policy != next_policy:
+            found[policy] = max(at, found.get(policy, at))
+    return found
+
+
+def _consents(session: Session) -> dict[str, tuple[datetime, Consent]]:
+    """Return, by subject, each surgeon's last stated consent and its moment."""
+    said = select(Event.subject, func.max(Event.at)).where(Event.object_kind == "surgeon").group_by(Event.subject)
+    when: dict[str | None, datetime] = {subject: at for subject, at in session.execute(said)}  # noqa: C416 - mypy
+    surgeons = session.execute(select(Surgeon.subject, Surgeon.created_at, Surgeon.consent))
+    return {subject: (when.get(subject, created_at), consent) for subject, created_at, consent in surgeons}
+
+
+# ---- applying the list -------------------------------------------------------------------------------------------
+
+
+def _end_again(session: Session, manifest: Manifest, erasures: Erasures) -> Restored:
+    """Apply the entries of a list that the backup does not know; an entry that it knows may have been added anew since.
+
+    An erased surgeon that is not in the backup stays listed, so that nobody can take the pseudonym.
     """
-    later = erasures - _listed(session)
+    later, served = erasures.since(_listed(session)), _served(session)
     slugs = list(session.scalars(select(Surgeon.slug)))
     surgeons: set[str] = set()
     for salt, digest, erased_at in sorted(later.surgeons):
         surgeons.update(slug for slug in slugs if salted(salt, slug) == digest)
-        session.add(Erasure(salt=salt, digest=digest, erased_at=datetime.fromisoformat(erased_at)))
+        session.add(Erasure(salt=salt, digest=digest, erased_at=erased_at))
     for slug in sorted(surgeons):
         erase_surgeon(session, slug, "restore")
-    demos = {digest for digest, _ in later.demos}.intersection(session.scalars(select(Demonstration.sha256)))
-    for demo in sorted(demos):
+    demos = _here(later, "demonstrations", session, select(Demonstration.sha256))
+    for demo in demos:
         erase_demo(session, demo, "restore")
-    return len(surgeons), len(demos)
+    # A recording with demonstrations was uploaded again after its deletion, in a history that the list does not cover.
+    uncut = ~exists().where(Demonstration.recording_row == StoredRecording.row)
+    deleted = _here(later, "recordings", session, select(StoredRecording.sha256).where(uncut))
+    for recording in deleted:
+        delete_recording(session, recording, "restore", anybodys=True)
+    standing = select(Demonstration.sha256).where(Demonstration.withdrawn_at.is_(None))
+    withdrawn = _here(later, "withdrawn", session, standing)
+    for demo in withdrawn:
+        withdraw_demo(session, demo, "restore")
+    withdraw_policies(session, later.ended.get("releases", {}), "restore")
+    keys = _here(later, "keys", session, select(Key.id).where(Key.revoked_at.is_(None)))
+    for key in keys:
+        revoke_key(session, key, "restore")
+    narrowed = _narrow(session, later.consents)
+    stopped = len(served - _served(session))
+    return Restored(manifest, len(surgeons), len(demos), len(deleted), len(withdrawn), stopped, len(keys), narrowed)
+
+
+def _here(later: Erasures, kind: str, session: Session, names: Select[str]) -> list[str]:
+    """Return the names in one part of a list that are still in force in this database."""
+    return sorted({*later.ended.get(kind, ())}.intersection(session.scalars(names)))
+
+
+def _served(session: Session) -> set[tuple[int, str]]:
+    """Return the styles that have a released policy, as the surgeon's row and the suture type."""
+    standing = select(Release.surgeon_row, Release.suture).where(Release.withdrawn_at.is_(None)).distinct()
+    return {(surgeon, suture) for surgeon, suture in session.execute(standing)}
+
+
+def _narrow(session: Session, consents: Mapping[str, tuple[datetime, Consent]]) -> int:
+    """Restrict each surgeon's consent to the uses that both the backup and the consent stated since allow."""
+    changed = 0
+    for surgeon in session.scalars(select(Surgeon)).all():
+        _, stated = consents.get(surgeon.subject, (None, None))
+        both = _both(surgeon.consent, stated)
+        if both != surgeon.consent:
+            put_surgeon(session, surgeon.slug, {"consent": both}, "restore")
+            changed += 1
+    return changed
+
+
+def _both(one: Consent, other: Consent) -> Consent:
+    """Return the intersection of two consents: the uses in both, until the earlier end; None allows everything."""
+    if one is None or other is None:
+        return one or other
+    ends = [end for end in (one.get("until"), other.get("until")) if end is not None]
+    return one | {"uses": [use for use in one["uses"] if use in other["uses"]], "until": min(ends, default=None)}
+
+
+@contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """Hold an exclusive lock on a folder, so that no other process reads and rewrites a list there meanwhile."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(handle)
 
 
 @contextmanager
 def _appearing(target: Path) -> Iterator[IO[bytes]]:
-    """Write a file under another name beside its place, and let it appear there whole and durable, or not at all."""
+    """Write a file under a temporary name in its folder, and rename it once it is complete and durable.
+
+    On failure it is removed, so the target is never incomplete.
+    """
     target.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{target.name}-", dir=target.parent)  # only its owner may read it
+    try:
+        handle, name = tempfile.mkstemp(prefix=f".{target.name}-", dir=target.parent)  # only its owner may read it
+    except OSError as error:
+        error.filename = str(target)  # the path that the user gave, not the temporary name
+        raise
     try:
         with os.fdopen(handle, "w+b") as file:
             yield file

@@ -1,9 +1,9 @@
-"""Models of skill: fitted to a folder of rated trials that the laboratory has, and kept as plain numbers.
+"""Models of skill: fitted to a laboratory's folder of rated trials, and stored as plain numbers.
 
     folder in the layout of JIGSAWS --read_cohort--> Rated --calibrate_on--> about --keep--> StoredCalibration
 
-A model is kept with what it was made of: the digests of all files, the settings, the versions of the code, how it did
-on surgeons that it had not seen. The trials themselves are not kept, nor what they are called.
+A model is stored with its provenance: the digests of all files, the settings, the versions of the code, and its
+accuracy on surgeons that were left out of the fit. The trials themselves and their names are not stored.
 """
 
 import hashlib
@@ -19,30 +19,43 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from skills import __version__
+from skills.arrays import Floats
 from skills.db.models import StoredCalibration
+from skills.demonstration.demonstration import Demo, Recording, cut_demo, propose_segments
 from skills.errors import BadInput, BadRecording, BadSegment, Corrupt, NotMetres
+from skills.formats import jigsaws
+from skills.formats.jigsaws import Trial
 from skills.library.events import record
 from skills.packing import canonical, sha256
-from skills.recordings import jigsaws
-from skills.recordings.jigsaws import Trial
-from skills.style._arrays import Floats
-from skills.style.demo import Demo, Recording, cut_demo, propose_segments
-from skills.style.scoring import calibrating
-from skills.style.scoring.calibrating import NOTHING, PERMUTATIONS, Cohort, calibrate, validate
-from skills.style.scoring.figures import measure, modelled
-from skills.style.scoring.model import LEAST_RATING, LEVELS, MOST_RATING, SkillModel, as_numbers, from_numbers
+from skills.remedies import Action, Remedy
+from skills.scoring import calibration
+from skills.scoring.calibration import (
+    LEAST_RATING,
+    LEVELS,
+    MOST_RATING,
+    NOTHING,
+    PERMUTATIONS,
+    Cohort,
+    SkillModel,
+    as_numbers,
+    calibrate,
+    from_numbers,
+    validate,
+)
+from skills.scoring.features import measure, modelled
 
 Of = Literal["hand-off", "trial"]
-NAMED = 5  # trials that a refusal names
-LIBRARIES = ("scikit-learn", "scipy", "numpy")  # of which the numbers are
+NAMED = 5  # the most trials that an error names
+LIBRARIES = ("scikit-learn", "scipy", "numpy")  # the libraries that compute the numbers
 
 
 @dataclass(frozen=True)
 class Rated:
-    """A cohort, and what it was read from."""
+    """A cohort, its source, and the names of trials that were left out, by the reason."""
 
     cohort: Cohort
     data: dict[str, Any]
+    left_out: dict[str, list[str]]
 
 
 def read_cohort(
@@ -57,26 +70,29 @@ def read_cohort(
 
     Args:
         folder: The data set, or the folder of one task.
-        task: Such as "Suturing"; needed where there are several.
-        arm: Of "PSM_left" or "PSM_right" only; None of both.
-        of: What is measured of a trial: its proposed hand-offs, or all of it.
-        told: Is told how much is done, 0 to 1.
+        task: Such as "Suturing"; required if the folder has several.
+        arm: "PSM_left" or "PSM_right"; None: both.
+        of: The unit of measurement in a trial: its proposed hand-offs, or all of it.
+        told: Progress callback, called with the share that is done, 0 to 1.
 
     Raises:
-        BadInput: There is no such trial, no rating of one, or none in which there is anything to measure; or what
-            `Cohort` refuses.
-        BadRecording: A file is none; the message names it.
+        BadInput: There is no such trial, none that is rated, or none with a motion that can be measured; a rating
+            cannot be read; or an error of `Cohort`.
+        BadRecording: A file cannot be read as a recording; the message names it.
     """
     trials = _one_task(folder, task)
     ratings = _ratings(trials)
+    empty = [trial for trial in trials if trial.kinematics.stat().st_size == 0]
+    rated = [trial for trial in trials if trial.name in ratings and trial not in empty]
     measured: dict[str, list[Floats]] = {}
-    for number, trial in enumerate(trials):
+    for number, trial in enumerate(rated):
         found = [modelled(measure(demo)) for demo in _motions(trial, arm, of)]
+        # A motion without all figures of the model is left out.
         measured[trial.name] = [one for one in found if one is not None]
-        told((number + 1) / len(trials))
-    kept = [trial for trial in trials if measured[trial.name]]
+        told((number + 1) / len(rated))
+    kept = [trial for trial in rated if measured[trial.name]]
     if not kept:
-        raise BadInput(f"In none of {len(trials)} trials is there a {of} that can be measured; try --of trial.")
+        raise BadInput(f"None of {len(rated)} trials has a {of} that can be measured; try --of trial.")
     users = sorted({trial.user for trial in kept})
     counts = [len(measured[trial.name]) for trial in kept]
     cohort = Cohort(
@@ -97,26 +113,43 @@ def read_cohort(
         "levels": dict(sorted(Counter(ratings[trial.name].skill for trial in kept).items())),
         "files": sorted(map(_digest, _files(trials))),
     }
-    return Rated(cohort, data)
+    left_out = {
+        "unrated": [trial.name for trial in trials if trial.name not in ratings],
+        "empty": [trial.name for trial in empty if trial.name in ratings],
+        f"without a {of} that can be measured": [trial.name for trial in rated if not measured[trial.name]],
+    }
+    return Rated(cohort, data, {why: names for why, names in left_out.items() if names})
 
 
 def calibrate_on(
     rated: Rated, *, seed: int = 0, permutations: int = PERMUTATIONS, told: Callable[[float], None] = NOTHING
 ) -> dict[str, Any]:
-    """Fit a model, judge it on surgeons left out, and write all that there is to know of it."""
+    """Fit a model, validate it on surgeons left out, and return both with their provenance as JSON."""
     judged = validate(rated.cohort, seed=seed, permutations=permutations, told=told)
-    settings = {"ridge": calibrating.RIDGE, "logistic": calibrating.LOGISTIC, "seed": seed}
+    settings = {"ridge": calibration.RIDGE, "logistic": calibration.LOGISTIC, "seed": seed}
     return {
         "model": as_numbers(calibrate(rated.cohort)),
         "data": rated.data,
         "validated": asdict(judged),
-        "settings": settings | {"permutations": permutations, "bootstraps": calibrating.BOOTSTRAPS},
+        "settings": settings | {"permutations": permutations, "bootstraps": calibration.BOOTSTRAPS},
         "versions": {"suture-skills": __version__} | {name: version(name) for name in LIBRARIES},
     }
 
 
 def keep(session: Session, about: dict[str, Any], actor: str) -> tuple[StoredCalibration, bool]:
-    """Store a calibration, which is the one in use from then on: (the row, whether it is new)."""
+    """Store a calibration, which becomes the current one; return the row, and whether it is new.
+
+    Raises:
+        BadInput: The model is not better than chance and than the duration alone; nothing is stored.
+    """
+    refused = calibration.refusals(about["validated"])
+    if refused:
+        raise BadInput(
+            f"The model is not accepted, and nothing was stored. {' '.join(refused)} These figures are for "
+            "surgeons left out of the fit. Calibrate on more rated trials of more surgeons, on one task in one "
+            "set-up, or try --of trial.",
+            rho=about["validated"]["all_figures"]["rho"],
+        )
     digest = sha256(canonical(about))
     current = newest(session)
     if current is not None and current.sha256 == digest:
@@ -129,22 +162,22 @@ def keep(session: Session, about: dict[str, Any], actor: str) -> tuple[StoredCal
 
 
 def newest(session: Session) -> StoredCalibration | None:
-    """Find the calibration that is in use; None where there is none."""
+    """Return the current calibration; None if there is none."""
     return session.scalar(select(StoredCalibration).order_by(StoredCalibration.row.desc()).limit(1))
 
 
 def read_calibration(stored: StoredCalibration) -> SkillModel:
-    """Read the model of a calibration.
+    """Return the model of a calibration.
 
     Raises:
-        Corrupt: It is not what its digest was taken of, or no model of this version.
+        Corrupt: It does not match its digest, or is of another version.
     """
     if sha256(canonical(stored.about)) != stored.sha256:
-        raise Corrupt("A calibration is not what was calibrated; run `skills calibrate` again.")
+        raise Corrupt("The stored calibration is damaged.", Remedy(Action.CALIBRATE))
     try:
         return from_numbers(stored.about["model"])
     except (BadInput, KeyError, TypeError) as error:
-        raise Corrupt("A calibration is none that this version knows; run `skills calibrate` again.") from error
+        raise Corrupt("The stored calibration belongs to another version.", Remedy(Action.CALIBRATE)) from error
 
 
 def _one_task(folder: Path, task: str | None) -> list[Trial]:
@@ -160,27 +193,33 @@ def _one_task(folder: Path, task: str | None) -> list[Trial]:
         raise BadInput(f"The folder has trials of {', '.join(tasks)}; name one of them with --task.")
     twice = [name for name, count in Counter(trial.name for trial in found).items() if count > 1]
     if twice:
-        raise BadInput(f"The folder has {len(twice)} trials more than once, such as {twice[0]}; name one copy of it.")
+        raise BadInput(
+            f"The folder has {len(twice)} trials more than once, such as {twice[0]}; name the folder of one copy."
+        )
     return found
 
 
-def _ratings(trials: Sequence[Trial]) -> dict[str, jigsaws.Rated]:
-    """Take the rating of each trial, by its name.
+def _ratings(trials: Sequence[Trial]) -> dict[str, jigsaws.RatedTrial]:
+    """Return the rating of each trial that has one, by the trial's name.
 
     Raises:
-        BadInput: Trials and ratings do not belong together.
+        BadInput: The file of ratings is missing, has none of these trials, or has one that cannot be read.
     """
     meta = _meta(trials[0])
     if not meta.is_file():
-        raise BadInput(f"There is no {meta}; it has the ratings, a trial in a line: TASK_B001, N, 13, 3 2 1 2 2 3.")
-    rated = {trial.name: trial.rated for trial in trials if trial.rated is not None}
-    unrated = [trial.name for trial in trials if trial.name not in rated]
-    if unrated:
-        some = ", ".join(unrated[:NAMED]) + (", ..." if len(unrated) > NAMED else "")
         raise BadInput(
-            f"{meta} has no rating that can be read of {len(unrated)} of {len(trials)} trials: {some}. Names must be "
-            "those of the files, and a line has a name, N, I or E, the score, and its six parts, all whole numbers.",
-            unrated=len(unrated),
+            f"There is no {meta}; it must have the ratings, one line per trial: TASK_B001, N, 13, 3 2 1 2 2 3."
+        )
+    rated = {trial.name: trial.rated for trial in trials if trial.rated is not None}
+    listed = {line.split()[0] for line in meta.read_text(errors="replace").splitlines() if line.split()}
+    unread = [trial.name for trial in trials if trial.name not in rated and (trial.name in listed or not rated)]
+    if unread:
+        some = ", ".join(unread[:NAMED]) + (", ..." if len(unread) > NAMED else "")
+        raise BadInput(
+            f"{meta} has no readable rating for {len(unread)} of {len(trials)} trials: {some}. Names must be "
+            "those of the files, and a line has a name, N, I or E, the score, and its six parts, all whole "
+            "numbers.",
+            unrated=len(unread),
         )
     for name, one in rated.items():
         if not LEAST_RATING <= one.score <= MOST_RATING:
@@ -194,19 +233,19 @@ def _meta(trial: Trial) -> Path:
 
 
 def _files(trials: Sequence[Trial]) -> set[Path]:
-    """Name all files that a cohort was read from."""
+    """Return the paths of all files that a cohort was read from."""
     motions = {path for trial in trials for path in (trial.kinematics, trial.transcription) if path is not None}
     return motions | {_meta(trial) for trial in trials}
 
 
 def _motions(trial: Trial, arm: str | None, of: Of) -> Iterator[Demo]:
-    """Cut what is to be measured out of a trial; what is no motion of a hand is passed over."""
+    """Yield the demonstrations to measure in a trial; a stretch that cannot be cut as a demonstration is skipped."""
     try:
         with trial.kinematics.open("rb") as file:
             transcription = "" if trial.transcription is None else trial.transcription.read_text(errors="replace")
             recording = jigsaws.read_jigsaws(file, transcription)
     except BadRecording as error:
-        raise type(error)(f"{trial.kinematics}: {error}", **error.numbers) from error
+        raise type(error)(f"{trial.kinematics}: {error.message}", *error.remedies, **error.numbers) from error
     arms = recording.arms if arm is None else (arm,)
     for one in arms:
         for start_s, end_s in _spans(recording, one, of):

@@ -1,4 +1,4 @@
-"""What a policy card says in sentences: what was checked and what was not, in words that a reader can hold us to."""
+"""Sentences of a policy card: the properties that were checked, and those that were not."""
 
 from collections.abc import Sequence
 from datetime import datetime
@@ -6,30 +6,31 @@ from typing import Any
 
 from skills import __version__
 from skills.db.models import PolicyVersion
-from skills.style.domain import REACH
-from skills.style.doubt import CALIBRATED_MM, UNCALIBRATED_MM
-from skills.style.quality import times_in_words
+from skills.demonstration.quality import times_in_words
+from skills.gridworld.domain import REACH
+from skills.schemas.policies import Citation, StartCounts
+from skills.verification.monte_carlo import CALIBRATED_MM, UNCALIBRATED_MM
 
 USE = "Research use only; not a medical device. Never move an arm by it on or near a person."
 IS = [
-    "One surgeon's way to hand the needle on (the hand-off of a stitch), learnt from one recorded demonstration: for "
-    "every cell of a grid world the next of 27 moves, up to the demonstrated goal.",
-    "Certified on that grid: every greedy action was compared with exact dynamic programming, and every cell was tried "
-    "as a start. The certificate below says what was found.",
-    "An immutable value: its SHA-256 covers all of its numbers and all that is said of it here as measured.",
+    "One surgeon's needle hand-off, learnt from one recorded demonstration: for every cell of a grid world the "
+    "next of 27 moves, up to the demonstrated goal.",
+    "Certified on that grid: every greedy action was compared with exact dynamic programming, and every cell was "
+    "tried as a start. The certificate below has the results.",
+    "An immutable value: its SHA-256 covers all of its numbers and all measurements on this card.",
 ]
 IS_NOT = [
-    "A statement about accuracy: the certificate says nothing about how near a real arm comes to what it is told.",
-    "Evidence that the demonstration is a good one, clinically or technically: the policy repeats what it was shown.",
-    "A plan of motion: that stacks policies at suture points, and has a simulated playback and a verdict of its own.",
+    "A statement about accuracy: the certificate does not tell how closely a real arm follows its setpoints.",
+    "Evidence that the demonstration is a good one, clinically or technically: the policy repeats the demonstration.",
+    "A plan of motion: a plan stacks policies at suture points, and has its own simulated playback and verdict.",
     "Validated for use on people, animals or tissue.",
 ]
 NOT_CHECKED = [
-    "Tissue, thread and needle: there are none in the grid world.",
+    "Tissue, thread and needle: the grid world has none.",
     "Collisions, clearances, speeds and joint velocities: they are judged for a plan, by its playback in simulation.",
-    "The turn of the jaw at the hand-off (A2): the policy is the way of the tip; the turn is planned.",
+    "The turn of the jaw at the hand-off (A2): the policy is the path of the tip; the turn is planned.",
     "Any other arm, frame, instrument or grid than those named here.",
-    "A real robot: no figure on this card was measured on one. What the recording was made with, its protocol says.",
+    "A real robot: no figure on this card was measured on one. The study's protocol describes the recording equipment.",
 ]
 
 METRICS = (
@@ -47,65 +48,73 @@ METRICS = (
         "exact_states",
         "States reproduced",
         "of {path_states} states",
-        "Those at which the rollout is in the cell that the demonstration is in at the same step.",
+        "States at which the rollout is in the same cell as the demonstration at the same step.",
     ),
     (
         "discretisation_rmse_mm",
         "Lost to the grid",
         "mm",
-        "RMSE of the recorded samples against the centres of their cells. The other rows compare paths on the grid, "
-        "and do not see what it had lost before.",
+        "RMSE of the recorded samples against the centres of their cells. The other rows compare paths on the "
+        "grid and do not include this error.",
     ),
 )
 
 DIGESTS = {
-    "recording": "SHA-256 of the file's bytes, as they were uploaded (`sha256sum FILE`).",
+    "recording": "SHA-256 of the file's bytes as uploaded (`sha256sum FILE`).",
     "demonstration": "SHA-256 of `digest_of` as canonical JSON: it names recording, style, segment and grid.",
-    "reward map": "SHA-256 of the rewards that Algorithm 1 writes for the path; they are written again to check.",
-    "policy": "SHA-256 of `digest_of` as canonical JSON: all that is told of the policy, the demonstration's digest in "
-    "it, and the digest of its numbers.",
+    "reward map": "SHA-256 of the rewards that Algorithm 1 computes for the path; they are computed again to check.",
+    "policy": "SHA-256 of `digest_of` as canonical JSON: the description of the policy with the digest of the "
+    "demonstration, and the digest of its numbers.",
 }
 VERIFY = [
-    "All of these digests were computed again, the recording's over its bytes, before this card was written; had one "
-    "differed, there would be no card.",
-    "On the installation, `skills verify` does so for everything that is stored.",
-    "Without it: take `lineage` of the JSON card. Canonical JSON has sorted keys, no spaces and ASCII alone; Python's "
+    "All of these digests were computed again before this card was written, that of the recording over its "
+    "bytes; a difference would have prevented the card.",
+    "On the installation, `skills verify` does the same for everything that is stored.",
+    "Without the installation: take `lineage` of the JSON card. Canonical JSON has sorted keys, no spaces and ASCII "
+    "alone; Python's "
     'json.dumps(digest_of, sort_keys=True, separators=(",", ":")) writes it.',
 ]
 
 
 HOW = {
-    "medoid": "It follows the one of them that is nearest to all, as it was recorded",
-    "barycentre": "It follows the way of the least total distance to all (DTW barycentre), which none of them is",
-    "corridor": "It follows the middle of those that agree, at each place on the way, which none of them is",
+    "medoid": "It follows the demonstration that is closest to all others, as recorded",
+    "barycentre": (
+        "It follows the path with the least total distance to all (DTW barycentre), which is none of the demonstrations"
+    ),
+    "corridor": (
+        "It follows the middle of those that agree, at each place on the path, which is none of the demonstrations"
+    ),
 }
 
 
 def of_several(count: int, how: str) -> list[str]:
-    """Say what a policy is that was learnt from several demonstrations, and how."""
+    """Return the introduction of a card whose policy was learnt from several demonstrations.
+
+    Args:
+        count: The number of demonstrations.
+        how: The sentence on how they were combined, see `combined`.
+    """
     return [IS[0].replace("one recorded demonstration", f"{count} recorded demonstrations"), how, *IS[1:]]
 
 
 def combined(said: dict[str, Any], count: int) -> str:
-    """Say how several demonstrations became one way, and how far they are from it."""
+    """Return the sentences on how several demonstrations were combined, and how far each is from the combined path."""
     place = (
-        "They were shown at different places, and were turned and scaled to lie on each other. "
-        if said["moved"]
-        else ""
+        "They were recorded at different places, and were turned and scaled onto each other. " if said["moved"] else ""
     )
     wide = said["width_mm"]
     return (
         f"{HOW[said['kind']]}. {place}The {count} demonstrations are {min(said['apart_mm']):.2f} to "
-        f"{max(said['apart_mm']):.2f} mm from it at a place, on average (DTW); the majority of them pass its waypoints "
-        f"within {min(wide):.2f} to {max(wide):.2f} mm. Where this card speaks of the demonstration, it means this way."
+        f"{max(said['apart_mm']):.2f} mm from it at a place, on average (DTW); the majority of them pass its "
+        f"waypoints within {min(wide):.2f} to {max(wide):.2f} mm. On this card the demonstration means this path."
     )
 
 
 def status(version: int, served: int | None, refused: Sequence[str], was_released: bool) -> str:
-    """Say whether a version is served, and else why not."""
+    """Return the sentence on whether a version is served, and if not, why."""
     if served == version:
-        return "This is the version that is served for this style."
-    now = "nothing of this style is" if served is None else f"version {served} is"
+        return "This version is served for this style."
+    now = "no version is" if served is None else f"version {served} is"
     if refused:
         return f"It cannot be released: {'; '.join(refused)}. Of this style, {now} released now."
     before = "It was released before" if was_released else "It was never released"
@@ -113,29 +122,29 @@ def status(version: int, served: int | None, refused: Sequence[str], was_release
 
 
 def consent(given: dict[str, Any] | None) -> str:
-    """Say what a surgeon agreed to; whether it has run out depends on when that is read."""
+    """Return the sentence on a surgeon's consent; it does not say whether the consent has expired by now."""
     if given is None:
-        return "No consent is recorded here; the protocol of the study says what is allowed."
+        return "No consent is recorded here; the study's protocol states the permitted uses."
     uses = ", ".join(given["uses"]) or "nothing"
     until = given.get("until")
     return (
-        f"Covers {uses}{'' if until is None else f', until {until}'}; other uses are refused. Whether this card may be "
-        "published, the protocol says."
+        f"Covers {uses}{'' if until is None else f', until {until}'}; other uses are refused. The protocol states "
+        "whether this card may be published."
     )
 
 
 def demonstration_state(withdrawn_at: datetime | None) -> str:
-    """Say whether a demonstration stands."""
+    """Return the sentence on whether a demonstration is active or withdrawn."""
     if withdrawn_at is None:
         return "Active."
     return (
-        f"Withdrawn on {withdrawn_at:%Y-%m-%d}: its surgeon or the lab took it back. Nothing that was learnt from it "
-        "is released any more, nor can be; do not use this policy."
+        f"Withdrawn on {withdrawn_at:%Y-%m-%d} by its surgeon or the lab. No policy that was learnt from it is "
+        "or can be released; do not use this policy."
     )
 
 
 def quality(report: dict[str, Any]) -> list[str]:
-    """Say what kind of demonstration it is, and what would have made it a better one."""
+    """Return the sentences on a demonstration's quality, and the advice for recording a better one."""
     smooth, clutched = report["log_dimensionless_jerk"], report["clutch_presses"]
     size = " x ".join(f"{side:.1f}" for side in report["extent_mm"])
     said = [
@@ -150,20 +159,18 @@ def quality(report: dict[str, Any]) -> list[str]:
     ]
     if smooth is not None:
         said.append(
-            f"Smoothness (log dimensionless jerk): {smooth:.1f}; one even stroke has -5.3, a hesitant hand less."
+            f"Smoothness (log dimensionless jerk): {smooth:.1f}; one smooth stroke has -5.3, a hesitant motion less."
         )
     return said + [f"Advice to the surgeon: {one}" for one in report["advice"]]
 
 
 def lost(report: dict[str, Any]) -> str:
-    """Say what the grid took of a demonstration."""
+    """Return the sentences on the precision that a demonstration lost in the grid."""
     x, y, z = report["discretisation_rmse_mm"]
     crossings = report["revisits"]
-    crossed = (
-        "never crosses itself" if crossings == 0 else f"comes back to a state it was in {times_in_words(crossings)}"
-    )
+    crossed = "never crosses itself" if crossings == 0 else f"returns to a state {times_in_words(crossings)}"
     gaps = report["bridged_cells"]
-    bridged = "every one has a sample in it" if gaps == 0 else f"{gaps} of them were bridged, for no sample lies there"
+    bridged = "each state has a sample" if gaps == 0 else f"{gaps} of the states have no sample and were bridged"
     return (
         f"{report['discretisation_rmse_3d_mm']:.2f} mm (RMSE, 3-D; {x:.2f} in x, {y:.2f} in y, {z:.2f} in z). The path "
         f"has {report['path_states']} states and {crossed}; {bridged}."
@@ -171,61 +178,90 @@ def lost(report: dict[str, Any]) -> str:
 
 
 def learner(phases: int, settled: bool) -> str:
-    """Say what a learner's state is, and whether it came to rest."""
+    """Return the sentences on a learner's state, and on whether learning converged."""
     state = (
         "Its state is the cell and the phase (how far along the demonstration), so a path that crosses itself can be "
         "followed."
         if phases > 1
         else "Its state is the cell alone, as in the paper, so a path that crosses itself cannot be followed."
     )
-    ended = "It ended when nothing changed any more." if settled else "It ended before it had come to rest."
+    ended = "It ended when the values no longer changed." if settled else "It ended before it had converged."
     return f"{state} {ended} The same demonstration, settings, seed and learner version give the same numbers."
 
 
-def coverage(counts: dict[str, int], starts: int) -> str:
-    """Say from where the goal is reached, and how."""
-    reach = counts["follow"] + counts["reach_otherwise"]
-    if counts["follow"] == starts:
+def coverage(counts: StartCounts, starts: int) -> str:
+    """Return the sentences on how many starts reach the goal, and in which way."""
+    reach = counts.follow + counts.reach_otherwise
+    if counts.follow == starts:
         return f"All of {starts} starts join the demonstration in the fewest moves and follow it to the goal."
     return (
-        f"{reach} of {starts} starts reach the goal. {counts['follow']} join the demonstration in the fewest moves and "
-        f"follow it from there; {counts['reach_otherwise']} get there in another way."
+        f"{reach} of {starts} starts reach the goal. {counts.follow} join the demonstration in the fewest "
+        f"moves and follow it from there; {counts.reach_otherwise} reach it in another way."
     )
 
 
 def domain(phases: int) -> str:
-    """Say where the policy promises something."""
+    """Return the sentences on the certified domain of a policy."""
     if phases == 1:
-        return "Every cell of the grid, in its one phase. Outside the grid nothing is promised: a client stops."
+        return "Every cell of the grid, in its one phase. Outside the grid nothing is certified: a client must stop."
     return (
         f"Phase 0 (not joined yet) in every cell of the grid, and phase p within {REACH} cells (Chebyshev) of the "
-        "waypoints p-1 and p. Outside it the action is -2: a client stops there."
+        "waypoints p-1 and p. Outside it the action is -2: a client must stop there."
     )
 
 
-def joint_limits(frame: str, instrument: str, turned: bool, places: int, releasable: bool) -> str:
-    """Say what was checked of the arm's joints."""
+def joint_limits(manifest: dict[str, Any], turned: bool) -> str:
+    """Return the sentences on the check of the demonstrated pass against the arm's joint limits."""
+    frame, certificate = manifest["frame"], manifest["grid_certificate"]
     if not frame.endswith("_base"):
         return f"Not checked: the frame {frame} is not the base of the arm."
-    tool = "as demonstrated" if turned else "assumed to point straight down, for the wrist was not recorded"
-    found = "all are within" if releasable else "those that are outside are among the reasons against a release, if any"
+    tool = "as demonstrated" if turned else "assumed to point straight down, because the wrist was not recorded"
+    arm = f"a PSM with instrument {manifest['instrument']}, its tool {tool}"
+    if "driven" not in certificate:
+        found = (
+            "positions outside, if any, are among the reasons against a release"
+            if certificate["refused_because"]
+            else "all are within"
+        )
+        return (
+            f"The centres of the {manifest['metrics']['path_states']} cells of the demonstrated pass were checked "
+            f"in closed form against the limits of {arm}: {found}. The path that a plan fits to the recording "
+            "within these cells was not checked, nor were positions that are reached from other starts."
+        )
+    driven = certificate["driven"]
+    if driven is None:
+        return "Not checked: the demonstrated pass cannot be driven."
+    what = (
+        "the path fitted to the recording"
+        if driven["path"] == "fitted"
+        else "the path through the centres of its cells"
+    )
+    nearest, inside = driven["nearest_limit"], driven["samples"] - driven["beyond"]
+    closest = (
+        "one of them cannot be reached with any joints"
+        if nearest["margin"] is None
+        else f"the nearest limit is that of {nearest['joint']}, {nearest['margin']:.3g} {nearest['unit']} away "
+        "(negative: beyond it)"
+    )
     return (
-        f"The {places} places of the demonstrated pass were checked in closed form against the limits of a PSM with "
-        f"instrument {instrument}, its tool {tool}: {found}. Places that are reached from other starts were not."
+        f"The demonstrated pass as it is driven, {what}, was checked in closed form against the limits of {arm}: "
+        f"{inside} of {driven['samples']} positions are within them, and {closest}. Of the centres of its cells, "
+        f"which a rollout names, {driven['cell_centres_beyond']} are beyond. Positions that are reached from "
+        "other starts were not checked."
     )
 
 
 def tip_accuracy() -> str:
-    """Say how far off a real arm has to be expected."""
+    """Return the sentences on the tip error to expect of a real arm."""
     return (
-        f"Not known of your arm. A mean tip error of {CALIBRATED_MM:g} mm was measured elsewhere for a dVRK that was "
-        f"calibrated, and is what plans are judged under; one that was not may be off by {UNCALIBRATED_MM:g} mm. "
-        "docs/replay.md is the checklist before a robot moves."
+        f"Not known for your arm. A mean tip error of {CALIBRATED_MM:g} mm was measured elsewhere for a "
+        f"calibrated dVRK, and plans are judged with it; an uncalibrated one may be off by {UNCALIBRATED_MM:g} "
+        "mm. docs/replay.md has the checklist before a robot moves."
     )
 
 
 def resting(plans: int, playbacks: int, feasible_playbacks: int) -> str:
-    """Say what was made from a policy."""
+    """Return the sentence on the plans and playbacks that follow a version."""
     if plans == 0:
         return "No plan follows this version yet."
     follow = "1 plan follows" if plans == 1 else f"{plans} plans follow"
@@ -233,8 +269,8 @@ def resting(plans: int, playbacks: int, feasible_playbacks: int) -> str:
     return f"{follow} this version; in simulation, {played}."
 
 
-def citation(version: PolicyVersion) -> dict[str, str]:
-    """Write how a policy version is cited, in words and for BibTeX."""
+def citation(version: PolicyVersion) -> Citation:
+    """Return the citation of a policy version, as text and as BibTeX."""
     surgeon, suture, number, sha256 = version.surgeon.slug, version.suture, version.version, version.sha256
     title = f"Suture style of surgeon {surgeon} (a pseudonym), {suture}: policy version {number}"
     made = f"suture-skills {__version__}"
@@ -250,12 +286,12 @@ def citation(version: PolicyVersion) -> dict[str, str]:
         "note": f"Learnt from {sources}. Research use only.",
     }
     lines = [f"  {name} = {{{_for_tex(value)}}}" for name, value in fields.items()]
-    return {
-        "text": f"{title} ({version.created_at:%Y}). {made}. sha256:{sha256}.",
-        "bibtex": "\n".join([f"@misc{{{surgeon}-{suture}-v{number}-{sha256[:8]},", ",\n".join(lines), "}"]),
-    }
+    return Citation(
+        text=f"{title} ({version.created_at:%Y}). {made}. sha256:{sha256}.",
+        bibtex="\n".join([f"@misc{{{surgeon}-{suture}-v{number}-{sha256[:8]},", ",\n".join(lines), "}"]),
+    )
 
 
 def _for_tex(text: str) -> str:
-    """Write text for BibTeX: of what slugs and digests are made of, the underscore alone means something there."""
+    """Escape text for BibTeX: of the characters in slugs and digests, only the underscore is special in TeX."""
     return text.replace("_", r"\_")

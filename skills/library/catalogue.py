@@ -1,24 +1,31 @@
-"""Surgeons and suture types."""
+"""The catalogue: surgeons, by pseudonym, and suture types."""
 
 import hashlib
 import secrets
 import tomllib
 from collections.abc import Sequence
-from datetime import date
 from importlib import resources
 from typing import Any
 
-from sqlalchemy import func, or_, select
-from sqlalchemy.orm import Session
+from sqlalchemy import Select, func, or_, select
+from sqlalchemy.orm import InstrumentedAttribute, Session
 
-from skills.db.base import now
+from skills.db.base import rfc3339
+from skills.db.changes import announce
 from skills.db.models import Erasure, Surgeon, SutureType
-from skills.errors import Conflict, Erased, NotFound
+from skills.errors import Erased, NotFound
+from skills.library import releases
+from skills.library.consent import may
 from skills.library.events import record
+from skills.remedies import Action, Remedy, did_you_mean
+
+NEAR = 500  # the most names that are compared with an unknown one for "did you mean"
 
 
 def put_surgeon(session: Session, slug: str, about: dict[str, Any], actor: str) -> tuple[Surgeon, bool]:
-    """Write a surgeon whole: (the row, whether it is new).
+    """Create or replace a surgeon with all fields; return the row, and whether it is new.
+
+    If consent to training ends, or had ended and is given again, the releases of all styles are withdrawn.
 
     Raises:
         Erased: A surgeon of this pseudonym was erased.
@@ -31,35 +38,51 @@ def put_surgeon(session: Session, slug: str, about: dict[str, Any], actor: str) 
         record(session, actor, "add", "surgeon", surgeon.subject, surgeon)
         session.flush()
         return surgeon, True
+    # Before the fields are overwritten, because the decision below needs the old consent.
+    covered, before = may(surgeon, "training"), surgeon.consent
     for name, value in about.items():
         setattr(surgeon, name, value)
     record(session, actor, "change", "surgeon", surgeon.subject, surgeon)
+    if surgeon.consent != before:
+        session.flush()
+        if not (covered and may(surgeon, "training")):  # also if it had expired: serving needs a new release
+            releases.withdraw_all(session, surgeon, actor)
+        announce(session)  # every service process caches the last day of consent
     return surgeon, False
 
 
 def known_surgeon(session: Session, slug: str) -> Surgeon | None:
-    """Look for a surgeon; None where there is none of this pseudonym."""
+    """Return a surgeon, or None if there is none of this pseudonym."""
     return session.scalar(select(Surgeon).where(Surgeon.slug == slug))
 
 
 def find_surgeon(session: Session, slug: str) -> Surgeon:
-    """Find a surgeon.
+    """Return a surgeon.
 
     Raises:
         NotFound: There is none of this pseudonym.
-        Erased: There was one.
+        Erased: The surgeon of this pseudonym was erased.
     """
     surgeon = known_surgeon(session, slug)
     if surgeon is None:
         _refuse_erased(session, slug)
-        raise NotFound(f"There is no surgeon '{slug}'; add one with PUT /surgeons/{slug}.")
+        near = did_you_mean(slug, session.scalars(_near(Surgeon.slug, slug)))
+        raise NotFound(f"There is no surgeon '{slug}'.", *near, Remedy(Action.ADD_SURGEON, surgeon=slug))
     return surgeon
 
 
 def list_surgeons(
     session: Session, limit: int, after: str | None, search: str | None = None, skill_level: str | None = None
 ) -> Sequence[Surgeon]:
-    """List surgeons in the order of their pseudonyms: those in whose pseudonym `search` is, in any case."""
+    """List surgeons in the order of their pseudonyms.
+
+    Args:
+        session: The caller's transaction.
+        limit: The length of the page.
+        after: The last pseudonym of the page before.
+        search: List only pseudonyms that contain this text, ignoring case.
+        skill_level: List only surgeons of this level.
+    """
     query = select(Surgeon).where(Surgeon.slug > (after or ""))
     if search is not None:
         query = query.where(Surgeon.slug.icontains(search, autoescape=True))
@@ -68,24 +91,8 @@ def list_surgeons(
     return session.scalars(query.order_by(Surgeon.slug).limit(limit)).all()
 
 
-def check_consent(surgeon: Surgeon, use: str, today: date | None = None) -> None:
-    """Refuse a use that the surgeon's consent, where one is recorded, does not cover.
-
-    Raises:
-        Conflict: It names other uses, or has run out.
-    """
-    consent = surgeon.consent
-    if consent is None:
-        return
-    if use not in consent["uses"]:
-        raise Conflict(f"The consent of '{surgeon.slug}' does not cover {use}; it covers {', '.join(consent['uses'])}.")
-    until = consent.get("until")
-    if until is not None and not (today or now().date()) <= date.fromisoformat(until):
-        raise Conflict(f"The consent of '{surgeon.slug}' ran out on {until}.")
-
-
 def put_suture_type(session: Session, slug: str, about: dict[str, Any], actor: str) -> tuple[SutureType, bool]:
-    """Write a suture type whole: (the row, whether it is new)."""
+    """Create or replace a suture type with all fields; return the row, and whether it is new."""
     suture = known_suture_type(session, slug)
     created = suture is None
     if suture is None:
@@ -99,26 +106,34 @@ def put_suture_type(session: Session, slug: str, about: dict[str, Any], actor: s
 
 
 def known_suture_type(session: Session, slug: str) -> SutureType | None:
-    """Look for a suture type; None where the catalogue has none of this name."""
+    """Return a suture type, or None if the catalogue has none of this name."""
     return session.get(SutureType, slug)
 
 
 def find_suture_type(session: Session, slug: str) -> SutureType:
-    """Find a suture type.
+    """Return a suture type.
 
     Raises:
         NotFound: The catalogue has none of this name.
     """
     suture = known_suture_type(session, slug)
     if suture is None:
-        raise NotFound(f"There is no suture type '{slug}'; GET /suture-types lists them, PUT adds one.")
+        near = did_you_mean(slug, session.scalars(_near(SutureType.slug, slug)))
+        raise NotFound(f"There is no suture type '{slug}'.", *near, Remedy(Action.LIST_SUTURES, suture=slug))
     return suture
 
 
 def list_suture_types(
     session: Session, limit: int, after: str | None, search: str | None = None
 ) -> Sequence[SutureType]:
-    """List suture types in the order of their slugs: those in whose slug, name or family `search` is, in any case."""
+    """List suture types in the order of their slugs.
+
+    Args:
+        session: The caller's transaction.
+        limit: The length of the page.
+        after: The last slug of the page before.
+        search: List only those whose slug, name or family contains this text, ignoring case.
+    """
     query = select(SutureType).where(SutureType.slug > (after or ""))
     if search is not None:
         told = (SutureType.slug, SutureType.name, SutureType.family)
@@ -127,7 +142,7 @@ def list_suture_types(
 
 
 def seed_catalogue(session: Session) -> int:
-    """Write the catalogue of `seeds/` into an empty one: how many suture types were added."""
+    """Insert the suture types of `seeds/` into an empty catalogue; return the number of types that were added."""
     if session.scalar(select(func.count()).select_from(SutureType)):
         return 0
     text = (resources.files("skills") / "seeds" / "suture_types.toml").read_text()
@@ -137,11 +152,45 @@ def seed_catalogue(session: Session) -> int:
     return len(types)
 
 
+def _near(column: InstrumentedAttribute[str], given: str) -> Select[str]:
+    """Return a query of names similar to a misspelt one: with the same first two or last three characters.
+
+    It returns only names that the caller may see, of a similar length.
+    """
+    like = or_(column.startswith(given[:2], autoescape=True), column.endswith(given[-3:], autoescape=True))
+    long = func.length(column).between(len(given) - 3, len(given) + 3)
+    return select(column).where(like, long).limit(NEAR)
+
+
 def _refuse_erased(session: Session, slug: str) -> None:
+    # Each erasure has its own salt, so the pseudonym is digested with every one.
     if any(salted(e.salt, slug) == e.digest for e in session.scalars(select(Erasure))):
-        raise Erased("This surgeon's data was erased for good; use another pseudonym for new recordings.")
+        raise Erased("This surgeon's data was erased permanently; use another pseudonym for new recordings.")
 
 
 def salted(salt: str, slug: str) -> str:
-    """Digest a pseudonym so that it can be known again, but not be read."""
+    """Return a salted digest of a pseudonym, by which it can be recognised but not read."""
     return hashlib.sha256(f"{salt}:{slug}".encode()).hexdigest()
+
+
+def surgeon_json(row: Surgeon) -> dict[str, Any]:
+    """Return a surgeon's JSON."""
+    return {
+        "surgeon": row.slug,
+        "skill_level": row.skill_level,
+        "handedness": row.handedness,
+        "protocol": row.protocol,
+        "consent": row.consent,
+        "created_at": rfc3339(row.created_at),
+    }
+
+
+def suture_json(row: SutureType) -> dict[str, Any]:
+    """Return a suture type's JSON."""
+    return {
+        "suture": row.slug,
+        "name": row.name,
+        "also_called": row.also_called,
+        "family": row.family,
+        "description": row.description,
+    }

@@ -1,47 +1,50 @@
-"""Demonstrations: hand-offs cut out of recordings and put into their grid worlds, checked before anything is kept."""
+"""Demonstrations: hand-offs cut out of recordings and put into their grid worlds, checked before they are stored.
+
+recording, DemoIn --make_demo--> Made --upload_demo, add_demo--> Added
+"""
 
 import json
 import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from skills.db.base import now
-from skills.db.models import Demonstration, Release, StoredRecording, StoredRewardMap, Surgeon
+from skills.db.base import now, rfc3339
+from skills.db.models import Demonstration, RecordingChunk, Release, StoredRecording, StoredRewardMap, Surgeon
 from skills.db.packed import digest
-from skills.db.seen import EVERYBODYS
+from skills.db.row_visibility import EVERYBODYS
 from skills.db.session import Database
-from skills.errors import Conflict, NotFound
-from skills.library.catalogue import check_consent, find_surgeon, find_suture_type
+from skills.demonstration.demonstration import Demo, Segment, cut_demo
+from skills.demonstration.quality import describe
+from skills.demonstration.segments import TakenSegment
+from skills.errors import BadSegment, Conflict, SegmentNotNamed
+from skills.fields import as_json
+from skills.formats.reader_process import MOST, Told, read_told
+from skills.gridworld.grid import PAPER_GRID, GridPath, choose_grid, discretize
+from skills.gridworld.path_report import describe_path
+from skills.gridworld.reward import RewardMap, sparse_reward
+from skills.library import consent
+from skills.library.catalogue import find_surgeon, find_suture_type
 from skills.library.events import record
-from skills.library.recordings import Reader, Upload, find_recording, keep, read_upload, recording_bytes
+from skills.library.integrity import demo_identity, find_by_digest
+from skills.library.recordings import (
+    Teller,
+    Upload,
+    find_recording,
+    keep,
+    recording_bytes,
+    tell_upload,
+)
 from skills.library.releases import withdraw_resting_on
-from skills.library.verified import demo_identity
 from skills.packing import canonical
-from skills.recordings import read_recording
-from skills.style.demo import Demo, Recording, cut_demo
-from skills.style.grid import PAPER_GRID, GridMode, GridPath, choose_grid, discretize
-from skills.style.quality import describe, describe_path
-from skills.style.reward import RewardMap, sparse_reward
-
-
-@dataclass(frozen=True)
-class Cut:
-    """What is asked for of a recording: whose, which part, in which grid."""
-
-    surgeon: str
-    suture: str
-    arm: str | None = None
-    topic: str | None = None
-    start_s: float | None = None
-    end_s: float | None = None
-    grid: GridMode = "auto"
-    cell_mm: float | None = None
-    hysteresis: float = 0.0
-    session: str | None = None
+from skills.remedies import Action, Remedy
+from skills.schemas.base import ChosenGrid
+from skills.schemas.recordings import DemoReport
+from skills.schemas.requests import DemoIn
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,36 +55,115 @@ class Made:
     path: GridPath
     reward: RewardMap
     report: dict[str, Any]
+    taken: TakenSegment
 
 
-def make_demo(recording: Recording, cut: Cut) -> Made:
-    """Cut a hand-off out of a recording and put it into its grid world."""
-    demo = cut_demo(recording, arm=cut.arm, topic=cut.topic, start_s=cut.start_s, end_s=cut.end_s)
+class Added(NamedTuple):
+    """A stored demonstration, whether it is new, and the part of its recording that it was cut from."""
+
+    row: Demonstration
+    new: bool
+    taken: TakenSegment
+
+
+def make_demo(told: Told, cut: DemoIn) -> Made:
+    """Cut a hand-off out of a recording and put it into its grid world.
+
+    Raises:
+        SegmentNotNamed: Several hand-offs are proposed, and the request names none.
+        BadSegment: The part is named in two ways, or there is no such proposal.
+    """
+    recording = told.recording
+    part, what, because = choose_part(told, cut)
+    demo = cut_demo(recording, arm=part.arm, topic=part.topic, start_s=part.start_s, end_s=part.end_s)
     grid = choose_grid(demo.tip_mm, cut.grid, cut.cell_mm)
     path = discretize(demo.tip_mm, grid, cut.hysteresis)
     duplicates = recording.motion_of(arm=demo.arm, topic=demo.topic).duplicate_stamps
-    return Made(demo, path, sparse_reward(path), report_on(demo, path, duplicates))
+    taken = TakenSegment(what, demo.start_s, demo.end_s, because)
+    report = report_on(demo, path, duplicates) | {"segment": asdict(taken)}
+    return Made(demo, path, sparse_reward(path), report, taken)
+
+
+def choose_part(told: Told, cut: DemoIn) -> tuple[DemoIn, str, str]:
+    """Return the request with the times of the part to cut, the name of that part, and the reason for the choice.
+
+    Raises:
+        SegmentNotNamed: Several hand-offs are proposed, and the request names none.
+        BadSegment: The part is named in two ways, or there is no such proposal.
+    """
+    timed = cut.start_s is not None or cut.end_s is not None
+    if timed and cut.segment is not None:
+        raise BadSegment("Choose the part by segment, or by start_s and end_s, but not by both.")
+    if timed:
+        return cut, "the given times", "start_s or end_s was given"
+    if cut.segment == "whole":
+        return cut, "the whole recording", "segment=whole was given"
+    proposed = _proposed(told, cut)
+    if isinstance(cut.segment, int):
+        if not 1 <= cut.segment <= len(proposed):
+            raise BadSegment(f"There is no proposal {cut.segment}. {_listed(proposed)}", segments=_numbered(proposed))
+        return _proposal(cut, proposed, cut.segment)
+    if not proposed:
+        return cut, "the whole recording", "no hand-off is proposed in it; check that it holds exactly one"
+    if len(proposed) > 1:
+        raise SegmentNotNamed(_listed(proposed), Remedy(Action.NAME_SEGMENT), segments=_numbered(proposed))
+    return _proposal(cut, proposed, 1)
+
+
+def _proposed(told: Told, cut: DemoIn) -> list[Segment]:
+    """Return the proposals that match the request's arm and topic, in the order in which the recording lists them."""
+    fitting = {m.arm for m in told.recording.motions if cut.arm in (None, m.arm) and cut.topic in (None, m.topic)}
+    return [one for one in told.proposed if one.arm in fitting]
+
+
+def _proposal(cut: DemoIn, proposed: Sequence[Segment], number: int) -> tuple[DemoIn, str, str]:
+    one = proposed[number - 1]
+    part = cut.model_copy(update={"arm": one.arm, "start_s": one.start_s, "end_s": one.end_s})
+    why = "it is the only one" if cut.segment is None else f"segment={number} was given"
+    return part, f"proposal {number} of {len(proposed)}", f"{why}: {one.reason}"
+
+
+def _numbered(proposed: Sequence[Segment]) -> list[dict[str, Any]]:
+    """Return proposals with their numbers as JSON, the first `MOST`."""
+    return [
+        {"segment": number, "arm": one.arm, "start_s": one.start_s, "end_s": one.end_s, "reason": one.reason}
+        for number, one in enumerate(proposed[:MOST], 1)
+    ]
+
+
+def _listed(proposed: Sequence[Segment]) -> str:
+    """Return a sentence that lists the proposals, the first ten with their times."""
+    if not proposed:
+        return "No hand-off is proposed in this recording."
+    shown = [f"{n}: {one.arm}, {one.start_s:.2f} to {one.end_s:.2f} s" for n, one in enumerate(proposed[:10], 1)]
+    rest = "; ..." if len(proposed) > len(shown) else ""
+    are = "1 hand-off is" if len(proposed) == 1 else f"{len(proposed)} hand-offs are"
+    return f"{are} proposed in this recording ({'; '.join(shown)}{rest})."
 
 
 def report_on(demo: Demo, path: GridPath, duplicate_stamps: int) -> dict[str, Any]:
-    """Write what is measured of a demonstration and its path, and what to do about it.
+    """Return the measurements of a demonstration and its path as JSON, with advice to the surgeon.
 
     Args:
         demo: The demonstration.
-        path: It in its grid.
-        duplicate_stamps: Samples of the whole recorded motion that carried the stamp of the sample before.
+        path: Its path in the grid.
+        duplicate_stamps: Samples of the entire recorded motion that carried the stamp of the sample before.
     """
     of_motion, of_path = describe(demo), describe_path(demo, path)
-    advice = [*of_motion.advice, *_about_duplicates(duplicate_stamps), *of_path.advice]
-    grid = asdict(path.grid) | {"chosen": "paper" if path.grid == PAPER_GRID else "fit"}
-    partner = None if demo.partner is None else asdict(demo.partner) | {"approach": list(demo.partner.approach)}
-    numbers = asdict(of_motion) | asdict(of_path) | {"duplicate_stamps": duplicate_stamps}
-    written: dict[str, Any] = json.loads(canonical(numbers | {"grid": grid, "partner": partner, "advice": advice}))
-    return written  # as it is read back
+    chosen = "paper" if path.grid == PAPER_GRID else "fit"
+    more = {
+        "duplicate_stamps": duplicate_stamps,
+        "grid": ChosenGrid(**asdict(path.grid), chosen=chosen),
+        "partner": demo.partner,
+        "advice": (*of_motion.advice, *_about_duplicates(duplicate_stamps), *of_path.advice),
+    }
+    report = DemoReport(**vars(of_motion) | vars(of_path) | more)
+    written: dict[str, Any] = json.loads(canonical(as_json(report)))
+    return written  # canonical JSON and back: the same value as when it is read from the database
 
 
 def full_report(demonstration: Demonstration) -> dict[str, Any]:
-    """Measure a stored demonstration again: what was stored of an older one says less."""
+    """Measure a stored demonstration again: reports stored by older versions have fewer measurements."""
     motions = demonstration.recording.about["motions"]
     duplicates = next((m["duplicate_stamps"] for m in motions if m["topic"] == demonstration.topic), 0)
     return report_on(demonstration.demo, demonstration.path, duplicates)
@@ -91,49 +173,56 @@ def _about_duplicates(count: int) -> list[str]:
     if count == 0:
         return []
     samples = "1 sample" if count == 1 else f"{count} samples"
-    return [f"{samples} carried the stamp of the sample before and were dropped: check the recorder's clock."]
+    return [f"{samples} repeated the previous stamp and were dropped: check the recorder's clock."]
 
 
-def upload_demo(
-    database: Database, upload: Upload, cut: Cut, actor: str, read: Reader = read_recording
-) -> tuple[Demonstration, bool]:
-    """Store a recording and one demonstration of it, both or neither."""
-    with database.reading() as session:  # refused before the long work, looked up again when writing
+def upload_demo(database: Database, upload: Upload, cut: DemoIn, actor: str, read: Teller = read_told) -> Added:
+    """Store a recording and one demonstration of it, both or neither.
+
+    Args:
+        database: The database; the recording is read outside any transaction.
+        upload: The recording's bytes.
+        cut: The demonstration to cut out of it.
+        actor: The owner of the caller's key.
+        read: The reader, possibly in another process.
+
+    Raises:
+        SkillsError: As in `make_demo` and `skills.library.recordings.tell_upload`.
+    """
+    with database.reading() as session:  # fails early, before the long computation; looked up again when writing
         find_surgeon(session, cut.surgeon)
         find_suture_type(session, cut.suture)
-    recording = read_upload(upload, read)
-    made = make_demo(recording, cut)
+    told = tell_upload(upload, read)
+    made = make_demo(told, cut)
     with database.writing() as session:
-        stored, _ = keep(session, upload, recording, actor)
+        stored, _ = keep(session, upload, told, actor)
         return _store_demo(session, stored, made, cut, actor)
 
 
-def add_demo(
-    database: Database, recording_sha256: str, cut: Cut, actor: str, read: Reader = read_recording
-) -> tuple[Demonstration, bool]:
-    """Cut one more demonstration out of a stored recording."""
+def add_demo(database: Database, recording_sha256: str, cut: DemoIn, actor: str, read: Teller = read_told) -> Added:
+    """Cut another demonstration out of a stored recording; it raises the errors of `make_demo` as well."""
     with tempfile.TemporaryFile() as file:
         with database.reading() as session:
             find_surgeon(session, cut.surgeon)
             find_suture_type(session, cut.suture)
             stored = find_recording(session, recording_sha256)
             file.writelines(recording_bytes(session, stored))
-        recording = read(file, **stored.reading)
-    made = make_demo(recording, cut)
+        # Outside the transaction, because reading a recording takes long.
+        told = read(file, **stored.reading)
+    made = make_demo(told, cut)
     with database.writing() as session:
         return _store_demo(session, find_recording(session, recording_sha256), made, cut, actor)
 
 
-def _store_demo(
-    session: Session, stored: StoredRecording, made: Made, cut: Cut, actor: str
-) -> tuple[Demonstration, bool]:
+def _store_demo(session: Session, stored: StoredRecording, made: Made, cut: DemoIn, actor: str) -> Added:
     surgeon, suture = find_surgeon(session, cut.surgeon), find_suture_type(session, cut.suture)
     demo_sha256 = demo_identity(stored.sha256, surgeon.slug, suture.slug, made.demo, made.path)
     known = session.scalar(select(Demonstration).where(Demonstration.sha256 == demo_sha256))
+    # The same cut of the same recording has the same digest, so a repetition returns the stored row.
     if known is not None:
         if known.withdrawn_at is not None:
             raise Conflict("This demonstration was withdrawn; record another, or cut another part of the recording.")
-        return known, False
+        return Added(known, False, made.taken)
     demonstration = Demonstration(
         sha256=demo_sha256,
         recording=stored,
@@ -157,38 +246,46 @@ def _store_demo(
         StoredRewardMap(sha256=digest(made.reward), demonstration_row=demonstration.row, map=made.reward),
     )
     record(session, actor, "add", "demonstration", demo_sha256, surgeon)
-    return demonstration, True
+    return Added(demonstration, True, made.taken)
 
 
 def find_demo(session: Session, demo_sha256: str) -> Demonstration:
-    """Find a demonstration by its digest."""
-    demonstration = session.scalar(select(Demonstration).where(Demonstration.sha256 == demo_sha256))
-    if demonstration is None:
-        raise NotFound("There is no such demonstration; GET /demos lists them.")
-    return demonstration
+    """Return a demonstration by its digest, see `find_by_digest`."""
+    return find_by_digest(session, Demonstration, demo_sha256, "demonstration", Remedy(Action.LIST_DEMOS))
 
 
 def exported_recording(session: Session, demo_sha256: str) -> StoredRecording:
-    """Find the recording of a demonstration, for whoever takes its bytes away.
+    """Return the recording of a demonstration, for an export of its bytes.
 
     Raises:
-        Conflict: The consent of a surgeon of whom it holds a demonstration does not cover an export.
+        Conflict: The consent of a surgeon with a demonstration in this recording does not cover an export.
     """
     demo = find_demo(session, demo_sha256)
-    check_consent(demo.surgeon, "export")
+    consent.require(demo.surgeon, "export")
     also = select(Demonstration.surgeon_row).where(Demonstration.recording_row == demo.recording_row)
     others = select(Surgeon).where(Surgeon.row.in_(also), Surgeon.row != demo.surgeon_row)
-    for other in session.scalars(others, execution_options=EVERYBODYS):
-        try:
-            check_consent(other, "export")
-        except Conflict:  # whose it is, whoever asks may not be allowed to know
-            why = "Another surgeon's hand-off is in this recording, and their consent does not cover export."
-            raise Conflict(why) from None
+    if not all(consent.may(other, "export") for other in session.scalars(others, execution_options=EVERYBODYS)):
+        # The message does not name the surgeon, whom the caller may not be allowed to see.
+        raise Conflict("The recording contains the hand-off of another surgeon whose consent does not cover export.")
     return demo.recording
 
 
+def exported_chunk(database: Database, demo_sha256: str, number: int) -> bytes | None:
+    """Return one chunk of a demonstration's recording, counted from 0, in a transaction of its own.
+
+    None: there are no more chunks, or the demonstration was erased since (`exported_recording` then raises an error).
+    """
+    query = (
+        select(RecordingChunk.data)
+        .join(Demonstration, Demonstration.recording_row == RecordingChunk.recording)
+        .where(Demonstration.sha256 == demo_sha256, RecordingChunk.number == number)
+    )
+    with database.reading() as session:
+        return session.scalar(query)
+
+
 def newest_demo(session: Session, surgeon_row: int, suture: str) -> Demonstration | None:
-    """Find the newest active demonstration of a style."""
+    """Return the newest active demonstration of a style."""
     return session.scalar(
         select(Demonstration)
         .where(Demonstration.surgeon_row == surgeon_row, Demonstration.suture == suture)
@@ -207,7 +304,17 @@ def list_demos(
     recording: str | None = None,
     active: bool | None = None,
 ) -> Sequence[Demonstration]:
-    """List demonstrations, the newest first: all, or those of a surgeon, a suture type, a recording; active or not."""
+    """List demonstrations, the newest first.
+
+    Args:
+        session: The caller's transaction.
+        limit: The length of the page.
+        before: The row of the last demonstration of the page before.
+        surgeon: List only those of this surgeon.
+        suture: List only those of this suture type.
+        recording: List only those cut out of this recording, by its digest.
+        active: List only active ones, or only withdrawn ones.
+    """
     query = select(Demonstration).order_by(Demonstration.row.desc()).limit(limit)
     if before is not None:
         query = query.where(Demonstration.row < before)
@@ -223,10 +330,64 @@ def list_demos(
 
 
 def withdraw_demo(session: Session, demo_sha256: str, actor: str) -> list[Release]:
-    """Withdraw a demonstration and the releases that rest on it; withdrawing it again changes nothing."""
+    """Withdraw a demonstration and return the releases withdrawn with it; a repetition withdraws nothing more."""
     demonstration = find_demo(session, demo_sha256)
-    if demonstration.withdrawn_at is not None:
-        return []
-    demonstration.withdrawn_at = now()
-    record(session, actor, "withdraw", "demonstration", demo_sha256, demonstration.surgeon)
+    if demonstration.withdrawn_at is None:
+        demonstration.withdrawn_at = now()
+        record(session, actor, "withdraw", "demonstration", demonstration.sha256, demonstration.surgeon)
     return withdraw_resting_on(session, demonstration, actor)
+
+
+def demo_json(row: Demonstration, taken: TakenSegment | None = None) -> dict[str, Any]:
+    """Return a demonstration's JSON, with the part of the recording that was taken by this call, else as stored."""
+    report = dict(row.report)
+    stored = report.pop("segment", None)  # older rows have none
+    return {
+        "id": row.sha256,
+        "sha256": row.sha256,
+        "recording": row.recording.sha256,
+        "surgeon": row.surgeon.slug,
+        "suture": row.suture,
+        "arm": row.arm,
+        "topic": row.topic,
+        "frame": row.frame,
+        "instrument": row.instrument,
+        "start_s": row.start_s,
+        "end_s": row.end_s,
+        "segment": stored if taken is None else asdict(taken),
+        "session": row.session,
+        "hysteresis": row.hysteresis,
+        "state": "active" if row.withdrawn_at is None else "withdrawn",
+        "report": report,
+        "created_at": rfc3339(row.created_at),
+        "withdrawn_at": rfc3339(row.withdrawn_at),
+    }
+
+
+def path_json(row: Demonstration) -> dict[str, Any]:
+    """Return the JSON of a demonstration's path: its states and its recorded motion."""
+    path, recorded = row.path, row.demo
+    return {
+        "demo": row.sha256,
+        "frame": row.frame,
+        "grid": row.report["grid"],
+        "hysteresis": path.hysteresis,
+        "states": path.states.tolist(),
+        "path_mm": path.tip_mm.tolist(),
+        "stamps_s": recorded.stamps_s.tolist(),
+        "recorded_mm": recorded.tip_mm.tolist(),
+    }
+
+
+def reward_map_json(row: Demonstration, kept: StoredRewardMap) -> dict[str, Any]:
+    """Return the JSON of a reward map: the states whose reward is not `other`."""
+    rewards, levels = kept.map.rewards, kept.map.levels
+    special = np.flatnonzero(rewards != levels.other)
+    return {
+        "demo": row.sha256,
+        "sha256": kept.sha256,
+        "grid": row.report["grid"],
+        "levels": asdict(levels),
+        "states": special.tolist(),
+        "rewards": rewards[special].tolist(),
+    }

@@ -1,16 +1,18 @@
-"""The one deletion there is: a surgeon, or one demonstration, and everything derived from it.
+"""Permanent deletion: a surgeon or a demonstration with everything derived from it, or an unused recording.
 
-Recordings go too, unless a demonstration that stays shares the bytes. Events stay; those of an erased surgeon name a
-random subject that no longer belongs to anybody.
+Recordings are deleted with their surgeon or demonstration, unless a demonstration that remains was cut out of the same
+bytes or they were uploaded as another surgeon's too. A recording that was uploaded without a surgeon and never cut is
+not known to be anybody's: erasing a surgeon does not reach it, and its uploader deletes it. Events remain; those of an
+erased surgeon name a random subject that no longer belongs to anybody.
 """
 
 import secrets
 from collections.abc import Sequence
 
-from sqlalchemy import Select, delete, select
+from sqlalchemy import ColumnElement, Select, delete, func, select
 from sqlalchemy.orm import Session
 
-from skills.db.books import Job
+from skills.db.base import in_parts
 from skills.db.changes import announce
 from skills.db.models import (
     Demonstration,
@@ -20,6 +22,8 @@ from skills.db.models import (
     PolicyDemonstration,
     PolicyVersion,
     RecordingChunk,
+    RecordingSurgeon,
+    RecordingUpload,
     Release,
     StoredPictures,
     StoredPlayback,
@@ -27,84 +31,151 @@ from skills.db.models import (
     StoredRewardMap,
     Surgeon,
 )
-from skills.library.batches import BATCH, forget_styles
+from skills.db.row_visibility import EVERYBODYS
+from skills.db.service_tables import Job
+from skills.errors import Conflict, NotAllowed
 from skills.library.catalogue import find_surgeon, salted
 from skills.library.demos import find_demo
 from skills.library.events import record
+from skills.library.jobs import ACTIVE as NOT_ENDED
+from skills.library.jobs import UNSYNCHRONISED, forget_styles
+from skills.library.recordings import find_recording
+from skills.library.releases import withdraw_resting_on
+from skills.remedies import Action, Remedy
+
+ACTIVE = Job.state.in_(NOT_ENDED)
+Dropped = list[tuple[int, int]]  # rows and attempts of jobs that had not ended, so that the engine can cancel them
 
 
-def erase_surgeon(session: Session, slug: str, actor: str) -> list[Job]:
-    """Erase a surgeon for good: the pseudonym answers "erased" from now on.
+def erase_surgeon(session: Session, slug: str, actor: str) -> Dropped:
+    """Erase a surgeon permanently: from then on requests for the pseudonym are answered with `Erased`.
 
     Returns:
-        The jobs that were deleted, so that the engine can be told to drop them.
+        The jobs that were deleted before they ended.
     """
     surgeon = find_surgeon(session, slug)
+    theirs = Job.surgeon_row == surgeon.row
     of_surgeon = Demonstration.surgeon_row == surgeon.row
-    jobs = _jobs(session, surgeon)
-    demos = session.scalars(select(Demonstration).where(of_surgeon)).all()
-    _drop_jobs(session, jobs, demos)
-    _erase(session, demos)
+    dropped = [(row, at) for row, at in session.execute(select(Job.row, Job.attempt).where(theirs, ACTIVE))]
+    forget_styles(session, select(Demonstration.row).where(of_surgeon), select(Job.row).where(theirs))
+    session.execute(delete(Job).where(theirs), **UNSYNCHRONISED)
+    named = session.scalars(select(RecordingSurgeon.recording_row).where(RecordingSurgeon.surgeon_row == surgeon.row))
+    _erase(session, of_surgeon, surgeon, {*named})
     record(session, actor, "erase", "surgeon", surgeon.subject, surgeon)
+    # A salted digest recognises the pseudonym if somebody uses it again, and cannot be read back.
     salt = secrets.token_hex(32)
     session.add(Erasure(salt=salt, digest=salted(salt, slug)))
+    session.execute(delete(RecordingSurgeon).where(RecordingSurgeon.surgeon_row == surgeon.row), **UNSYNCHRONISED)
     session.execute(delete(Surgeon).where(Surgeon.row == surgeon.row))
-    return jobs
+    return dropped
 
 
-def erase_demo(session: Session, demo_sha256: str, actor: str) -> list[Job]:
-    """Erase one demonstration and what was learnt from it; the jobs that were deleted."""
+def erase_demo(session: Session, demo_sha256: str, actor: str) -> Dropped:
+    """Erase one demonstration and everything that was learnt from it.
+
+    Args:
+        session: The caller's transaction.
+        demo_sha256: Its digest, or a prefix of it.
+        actor: The owner of the key that erases it, for the event.
+
+    Returns:
+        The jobs that were deleted before they ended.
+    """
     demo = find_demo(session, demo_sha256)
-    of_demo = select(Plan.sha256).where(Plan.policy_row.in_(_resting_on([demo.row])))
-    plans = set(session.scalars(of_demo))
+    demo_sha256 = demo.sha256  # in full: the argument may be a prefix
+    withdraw_resting_on(session, demo, actor)  # otherwise the release before the served one would be served again
+    of_demo = Demonstration.row == demo.row
+    plans = set(session.scalars(select(Plan.sha256).where(Plan.policy_row.in_(_resting_on(of_demo)))))
+    theirs = select(Job.row, Job.attempt, ACTIVE, Job.request).where(Job.surgeon_row == demo.surgeon_row)
     jobs = [
-        job
-        for job in _jobs(session, demo.surgeon)
-        if demo_sha256 in job.request.get("demos", ()) or job.request.get("plan") in plans
+        (row, attempt, active)
+        for row, attempt, active, request in session.execute(theirs)
+        if demo_sha256 in request.get("demos", ()) or request.get("plan") in plans
     ]
-    _drop_jobs(session, jobs, [demo])
+    forget_styles(session, select(Demonstration.row).where(of_demo), None)
+    for some in in_parts([row for row, _, _ in jobs]):
+        forget_styles(session, None, some)
+        session.execute(delete(Job).where(Job.row.in_(some)), **UNSYNCHRONISED)
     record(session, actor, "erase", "demonstration", demo_sha256, demo.surgeon)
-    _erase(session, [demo])
-    return jobs
+    _erase(session, of_demo, demo.surgeon, set())
+    return [(row, attempt) for row, attempt, active in jobs if active]
 
 
-def _jobs(session: Session, surgeon: Surgeon) -> list[Job]:
-    return list(session.scalars(select(Job).where(Job.surgeon_row == surgeon.row)))
+def delete_recording(session: Session, recording_sha256: str, actor: str, *, anybodys: bool) -> None:
+    """Delete a recording without demonstrations; if others uploaded it too, delete only the caller's upload.
+
+    Args:
+        session: The caller's transaction.
+        recording_sha256: The SHA-256 of its bytes.
+        actor: The owner of the key that deletes it.
+        anybodys: Delete the recording even if others have uploaded it, as an admin does.
+
+    Raises:
+        NotFound: There is none.
+        NotAllowed: Only others have uploaded it.
+        Conflict: Demonstrations were cut out of it.
+    """
+    stored = find_recording(session, recording_sha256)
+    senders = set(session.scalars(select(RecordingUpload.actor).where(RecordingUpload.recording_row == stored.row)))
+    if not anybodys and actor not in senders:
+        raise NotAllowed("Another user uploaded this recording; that user or an admin can delete it.")
+    resting = select(func.count()).select_from(Demonstration).where(Demonstration.recording_row == stored.row)
+    # The count covers all surgeons: a restricted key must not delete bytes under demonstrations that it cannot see.
+    if session.scalar(resting.execution_options(**EVERYBODYS)):
+        why = "Demonstrations, active or withdrawn, depend on this recording."
+        raise Conflict(why, Remedy(Action.ERASE_DEMOS))
+    if not anybodys and senders != {actor}:
+        mine = (RecordingUpload.recording_row == stored.row, RecordingUpload.actor == actor)
+        session.execute(delete(RecordingUpload).where(*mine), **UNSYNCHRONISED)
+        return
+    record(session, actor, "erase", "recording", recording_sha256)
+    _delete_recordings(session, [stored.row])
 
 
-def _drop_jobs(session: Session, jobs: Sequence[Job], demos: Sequence[Demonstration]) -> None:
-    forget_styles(session, [demo.row for demo in demos], [job.row for job in jobs if job.kind == BATCH])
-    session.execute(delete(Job).where(Job.row.in_([job.row for job in jobs])))
-
-
-def _resting_on(demos: Sequence[int]) -> Select[int]:
-    """Write which policies were learnt from one of these demonstrations, alone or among others."""
+def _resting_on(which: ColumnElement[bool]) -> Select[int]:
+    """Return the query of the policies that were learnt from some demonstrations, alone or among others."""
+    demos = select(Demonstration.row).where(which)
     others = select(PolicyDemonstration.policy_row).where(PolicyDemonstration.demonstration_row.in_(demos))
     return select(PolicyVersion.row).where(PolicyVersion.demonstration_row.in_(demos) | PolicyVersion.row.in_(others))
 
 
-def _erase(session: Session, demos: Sequence[Demonstration]) -> None:
+def _erase(session: Session, which: ColumnElement[bool], surgeon: Surgeon, recordings: set[int]) -> None:
+    """Erase demonstrations of a surgeon with everything derived from them, and the recordings that are then unused.
+
+    Long lists of rows are not bound as parameters at once: a statement has a limited number of them.
+    """
     announce(session)
-    rows = [demo.row for demo in demos]
-    recordings = {demo.recording_row for demo in demos}
-    policies = session.scalars(_resting_on(rows)).all()
-    plans = select(Plan.row).where(Plan.policy_row.in_(policies))
-    playbacks = select(StoredPlayback.row).where(StoredPlayback.plan_row.in_(plans))
-    # In each row of the suture type may be a distance from what is erased.
-    beside = select(Demonstration.row).where(Demonstration.suture.in_({demo.suture for demo in demos}))
-    for statement in (
-        delete(MeasuredShape).where(MeasuredShape.demonstration_row.in_(beside)),
-        delete(StoredPictures).where(StoredPictures.playback_row.in_(playbacks)),
-        delete(StoredPlayback).where(StoredPlayback.plan_row.in_(plans)),
-        delete(Plan).where(Plan.policy_row.in_(policies)),
-        delete(Release).where(Release.policy_row.in_(policies)),
-        delete(PolicyDemonstration).where(PolicyDemonstration.policy_row.in_(policies)),
-        delete(PolicyVersion).where(PolicyVersion.row.in_(policies)),
-        delete(StoredRewardMap).where(StoredRewardMap.demonstration_row.in_(rows)),
-        delete(Demonstration).where(Demonstration.row.in_(rows)),
-    ):
-        session.execute(statement, execution_options={"synchronize_session": False})
-    shared = select(Demonstration.recording_row).where(Demonstration.recording_row.in_(recordings))
-    for row in recordings - set(session.scalars(shared)):
-        session.execute(delete(RecordingChunk).where(RecordingChunk.recording == row))
-        session.execute(delete(StoredRecording).where(StoredRecording.row == row))
+    recordings = recordings | {*session.scalars(select(Demonstration.recording_row).where(which))}
+    policies = session.scalars(_resting_on(which)).all()
+    demos = select(Demonstration.row).where(which)
+    # Every cached row of distances of the suture type may hold one from an erased demonstration.
+    sutures = select(Demonstration.suture).where(which)
+    beside = select(Demonstration.row).where(Demonstration.suture.in_(sutures))
+    session.execute(delete(MeasuredShape).where(MeasuredShape.demonstration_row.in_(beside)), **UNSYNCHRONISED)
+    for some in in_parts(policies):
+        plans = select(Plan.row).where(Plan.policy_row.in_(some))
+        playbacks = select(StoredPlayback.row).where(StoredPlayback.plan_row.in_(plans))
+        # From the leaves to the roots, because of the foreign keys.
+        for statement in (
+            delete(StoredPictures).where(StoredPictures.playback_row.in_(playbacks)),
+            delete(StoredPlayback).where(StoredPlayback.plan_row.in_(plans)),
+            delete(Plan).where(Plan.policy_row.in_(some)),
+            delete(Release).where(Release.policy_row.in_(some)),
+            delete(PolicyDemonstration).where(PolicyDemonstration.policy_row.in_(some)),
+            delete(PolicyVersion).where(PolicyVersion.row.in_(some)),
+        ):
+            session.execute(statement, **UNSYNCHRONISED)
+    session.execute(delete(StoredRewardMap).where(StoredRewardMap.demonstration_row.in_(demos)), **UNSYNCHRONISED)
+    session.execute(delete(Demonstration).where(which), **UNSYNCHRONISED)
+    for some in in_parts(sorted(recordings)):
+        cut = select(Demonstration.recording_row).where(Demonstration.recording_row.in_(some))
+        others = select(RecordingSurgeon.recording_row).where(
+            RecordingSurgeon.recording_row.in_(some), RecordingSurgeon.surgeon_row != surgeon.row
+        )
+        _delete_recordings(session, sorted({*some} - {*session.scalars(cut)} - {*session.scalars(others)}))
+
+
+def _delete_recordings(session: Session, rows: Sequence[int]) -> None:
+    """Delete recordings with their bytes; the records of their uploads and surgeons are deleted with them."""
+    session.execute(delete(RecordingChunk).where(RecordingChunk.recording.in_(rows)), **UNSYNCHRONISED)
+    session.execute(delete(StoredRecording).where(StoredRecording.row.in_(rows)), **UNSYNCHRONISED)

@@ -1,4 +1,4 @@
-"""The record of who did what to what, when. People appear by the random subject of their row only."""
+"""The audit log: actor, action, object and time. Surgeons appear only by the random subject of their row."""
 
 import secrets
 from collections.abc import Sequence
@@ -9,8 +9,8 @@ from sqlalchemy import Table, insert
 from sqlalchemy.orm import Session
 
 from skills.db.base import now
-from skills.db.books import Event
 from skills.db.models import Surgeon
+from skills.db.service_tables import Event
 from skills.packing import canonical, sha256
 
 _ADD = insert(cast(Table, Event.__table__))
@@ -26,9 +26,10 @@ def record(
 def record_each(
     session: Session, actor: str, action: str, object_kind: str, objects: Sequence[tuple[str, Surgeon | None]]
 ) -> None:
-    """Add an event for each of some objects of one kind to the caller's transaction, each with whose it is."""
+    """Add one event for each of several objects of one kind, each with its surgeon, to the caller's transaction."""
     if objects:
         at = now()
+        # One statement on the bare table for all of them: a batch adds many events at once.
         session.execute(_ADD, [_event(at, actor, action, object_kind, *one) for one in objects])
 
 
@@ -36,6 +37,7 @@ def _event(
     at: datetime, actor: str, action: str, object_kind: str, object_id: str, surgeon: Surgeon | None
 ) -> dict[str, Any]:
     subject = surgeon.subject if surgeon else None
+    # The random part makes the digests of two equal events at one moment different.
     identity = [at.isoformat(), actor, action, object_kind, object_id, subject, secrets.token_hex(8)]
     return {
         "sha256": sha256(canonical(identity)),

@@ -1,8 +1,10 @@
-"""Whether an installation is whole: every stored value, every digest, and what rests on what.
+"""Inspection of an installation: the schema, every stored value and digest, and the references between rows.
 
-Tables and their packed values are found among the models, so a new table is looked at without being named here. What
-a row's digest was taken of is another matter for each: `AGREES` says it. Rows are named by table and number, never by
-a pseudonym. Nothing is changed, and nothing is held for long, so that others can go on working.
+    Database --inspect_installation--> Checked, part by part
+
+Tables and their packed values are taken from the models, so a new table is checked without being named here. The input
+of a row's digest differs from table to table: `AGREES` has a check for each. Rows are named by table and number, never
+by a pseudonym. Nothing is changed, and transactions are short, so that other users are not blocked.
 """
 
 from collections import deque
@@ -14,7 +16,6 @@ from sqlalchemy import Column, Table, exists, func, select, text, tuple_
 from sqlalchemy.orm import Mapper, Session, defer, object_session
 
 from skills.db.base import Base
-from skills.db.books import Job
 from skills.db.models import (
     Demonstration,
     Plan,
@@ -27,27 +28,27 @@ from skills.db.models import (
     StoredRewardMap,
 )
 from skills.db.packed import Packed, digest
-from skills.db.schema import revision_of, revisions
-from skills.db.session import Database
+from skills.db.service_tables import Job
+from skills.db.session import Database, revision_of, revisions
 from skills.errors import Busy, SkillsError
+from skills.gridworld.reward import sparse_reward
 from skills.library.calibrations import read_calibration
 from skills.library.combined import path_of
+from skills.library.integrity import covered, demo_identity, planned, policy_identity
 from skills.library.jobs import identity_of
 from skills.library.recordings import recording_bytes
-from skills.library.verified import covered, demo_identity, planned, policy_identity
 from skills.packing import canonical, sha256
-from skills.style.reward import sparse_reward
 
 ROWS_AT_ONCE = 100
-WITH_OTHERS = {RecordingChunk}  # read where the recording that they make up is
-NAMED = 20  # orphans of one reference; their number is told in any case
+WITH_OTHERS = {RecordingChunk}  # checked with the recording that they belong to
+NAMED = 20  # orphans that are named for one reference, of all that are counted
 
 Why = Iterator[str]
 
 
 @dataclass
 class Checked:
-    """What was looked at, how many of it, and which of them are wrong and why."""
+    """The result for one part: the number of items that were checked, and the faulty ones, each with the reason."""
 
     what: str
     count: int = 0
@@ -55,7 +56,10 @@ class Checked:
 
 
 def inspect_installation(database: Database) -> Iterator[Checked]:
-    """Look at everything that is stored, part by part; each is given out as it begins, as it goes on, and at its end.
+    """Check everything that is stored, part by part.
+
+    Yields:
+        Each part at its start, during its progress, and at its end.
 
     Raises:
         Busy: The database cannot be read any more.
@@ -65,6 +69,7 @@ def inspect_installation(database: Database) -> Iterator[Checked]:
         yield from _at_once("database file", _file, database)
     yield from _at_once("references", _references, database)
     for mapper in sorted(Base.registry.mappers, key=lambda one: one.local_table.name):  # type: ignore[attr-defined]
+        # Every model that the registry knows, so that a new table cannot be forgotten.
         if mapper.class_ not in WITH_OTHERS:
             yield from _rows(database, mapper)
 
@@ -82,14 +87,14 @@ def _at_once(what: str, look: Callable[[Session, Checked], None], database: Data
     yield checked
 
 
-# ---- the whole ---------------------------------------------------------------------------------------------------
+# ---- the installation --------------------------------------------------------------------------------------------
 
 
 def _schema(session: Session, checked: Checked) -> None:
     checked.count = 1
     revision = revision_of(session.connection())
     if revision != revisions()[0]:
-        checked.wrong.append(("schema", f"it is at {revision}, this version's is {revisions()[0]}; `skills migrate`"))
+        checked.wrong.append(("schema", f"it is at {revision}, this version needs {revisions()[0]}; migrate it"))
 
 
 def _file(session: Session, checked: Checked) -> None:
@@ -99,7 +104,7 @@ def _file(session: Session, checked: Checked) -> None:
 
 
 def _references(session: Session, checked: Checked) -> None:
-    """Find rows that refer to rows that there are not."""
+    """Find rows with a foreign key to a row that does not exist."""
     for table in Base.metadata.sorted_tables:
         for key in table.foreign_keys:
             child, parent = key.parent, key.column
@@ -107,7 +112,7 @@ def _references(session: Session, checked: Checked) -> None:
             orphan = (child.is_not(None), ~exists().where(other.c[parent.name] == child))
             checked.count += session.scalar(select(func.count()).select_from(table).where(child.is_not(None))) or 0
             for row in session.execute(select(*table.primary_key).where(*orphan).limit(NAMED)):
-                checked.wrong.append((_name(table, row), f"its {child.name} is in no row of {parent.table.name}"))
+                checked.wrong.append((_name(table, row), f"its {child.name} has no row in {parent.table.name}"))
 
 
 # ---- rows --------------------------------------------------------------------------------------------------------
@@ -130,7 +135,7 @@ def _rows(database: Database, mapper: Mapper[Any]) -> Iterator[Checked]:
                     checked.wrong.append((_name(table, key), why))
         except Busy:
             raise
-        except Exception as error:  # of a file whose pages are damaged
+        except Exception as error:  # such as a damaged page of the database file
             checked.wrong.append((table.name, f"after {last}: {_in_words(error)}"))
             break
         if not page:
@@ -144,12 +149,12 @@ def _rows(database: Database, mapper: Mapper[Any]) -> Iterator[Checked]:
 def _look(
     session: Session, mapper: Mapper[Any], keys: list[Column[Any]], page: list[tuple[Any, ...]]
 ) -> Iterator[tuple[tuple[Any, ...], str]]:
-    """Look at a page of rows: the key of each that is wrong, and why."""
+    """Check a page of rows; yield the key of each faulty one, and the reason."""
     packed = packed_values(mapper)
     later = [defer(getattr(mapper.class_, name)) for name in packed]
     try:
         rows = deque(session.scalars(select(mapper.class_).options(*later).where(tuple_(*keys).in_(page))))
-    except Exception:  # one of them cannot be read: it is found by reading each alone
+    except Exception:  # one of them cannot be read; reading each alone finds which
         rows = deque()
         for key in page:
             try:
@@ -157,22 +162,22 @@ def _look(
             except Exception as error:
                 yield key, _in_words(error)
             else:
-                rows.extend([] if row is None else [row])  # None: erased meanwhile
+                rows.extend([] if row is None else [row])  # None: erased since the page was read
     while rows:
         row = rows.popleft()
         key = mapper.primary_key_from_instance(row)
         for why in _wrong_with(row, packed):
             yield tuple(key), why
-        session.expire(row, packed)  # a page of large values is too much to hold
+        session.expire(row, packed)  # frees the values: a page of large ones does not fit into memory
 
 
 def packed_values(mapper: Mapper[Any]) -> list[str]:
-    """Name the attributes of a model that hold whole values."""
+    """Return the names of a model's attributes that hold packed values."""
     return [one.key for one in mapper.column_attrs if isinstance(one.columns[0].type, Packed)]
 
 
 def _wrong_with(row: Any, packed: Sequence[str]) -> Why:
-    """Say what is wrong with a row: a value that cannot be read, else what does not agree with its digest."""
+    """Yield the faults of a row: a value that cannot be read, otherwise values that do not match the digest."""
     for name in packed:
         try:
             getattr(row, name)
@@ -190,56 +195,56 @@ def _name(table: Table, key: Sequence[Any]) -> str:
 
 
 def _in_words(error: Exception) -> str:
-    """Say what went wrong; what is not ours might repeat what was stored, and is only named."""
-    return str(error) if isinstance(error, SkillsError) else f"it cannot be read ({type(error).__name__})"
+    """Return an error as text; one that is not ours might quote stored values, so only its type is named."""
+    return error.words() if isinstance(error, SkillsError) else f"it cannot be read ({type(error).__name__})"
 
 
-# ---- what each digest was taken of, and what must agree ----------------------------------------------------------
+# ---- the input of each digest, and values that must agree --------------------------------------------------------
 
 
 def _recording(row: StoredRecording) -> Why:
     session = object_session(row)
     assert session is not None
-    size = sum(len(piece) for piece in recording_bytes(session, row))  # raises where the digest is another
+    size = sum(len(piece) for piece in recording_bytes(session, row))  # raises `Corrupt` if the digest differs
     if size != row.size_bytes:
-        yield f"it has {size} bytes where its row says {row.size_bytes}"
+        yield f"it has {size} bytes, its row has {row.size_bytes}"
 
 
 def _demonstration(row: Demonstration) -> Why:
     if demo_identity(row.recording.sha256, row.surgeon.slug, row.suture, row.demo, row.path) != row.sha256:
-        yield "it is not what its digest was taken of"
+        yield "it does not match its digest"
     if row.hysteresis != row.path.hysteresis:
-        yield "its hysteresis is not its path's"
+        yield "its hysteresis differs from that of its path"
     for name in ("arm", "topic", "frame", "instrument", "start_s", "end_s"):
         if getattr(row, name) != getattr(row.demo, name):
-            yield f"its {name} is not what was recorded"
+            yield f"its {name} differs from the recording"
 
 
 def _reward_map(row: StoredRewardMap) -> Why:
     session = object_session(row)
     assert session is not None
     if digest(row.map) != row.sha256:
-        yield "it is not what its digest was taken of"
+        yield "it does not match its digest"
     path = session.get_one(Demonstration, row.demonstration_row).path
     if digest(sparse_reward(path, row.map.levels)) != row.sha256:
-        yield "it is not what Algorithm 1 writes for its demonstration"
+        yield "it differs from the result of Algorithm 1 for its demonstration"
 
 
 def _policy(row: PolicyVersion) -> Why:
     manifest, demonstrations = row.manifest, row.demonstrations
     if policy_identity(manifest, row.learnt) != row.sha256:
-        yield "it is not what was certified"
+        yield "it differs from the certified policy"
     covered(row)
     if row.releasable != (not manifest["grid_certificate"]["refused_because"]):
-        yield "whether it may be released is not what its certificate says"
+        yield "its flag `releasable` contradicts its certificate"
     if (manifest["surgeon"], manifest["suture"]) != (row.surgeon.slug, row.suture):
-        yield "it is said to be of another style"
+        yield "its manifest names another style"
     if manifest["demos"] != [one.sha256 for one in demonstrations]:
         yield "it was learnt from another demonstration"
     if any((one.surgeon_row, one.suture) != (row.surgeon_row, row.suture) for one in demonstrations):
         yield "its demonstration is of another style"
     if digest(row.learnt.path) != digest(path_of(row)):
-        yield "its path is not its demonstration's"
+        yield "its path differs from that of its demonstration"
 
 
 def _release(row: Release) -> Why:
@@ -249,7 +254,7 @@ def _release(row: Release) -> Why:
     if not policy.releasable:
         yield "its policy did not pass the gate"
     if row.withdrawn_at is None and policy.rests_on_withdrawn:
-        yield "it stands, and its demonstration was withdrawn"
+        yield "it is not withdrawn, but its demonstration is"
 
 
 def _plan(row: Plan) -> Why:
@@ -259,9 +264,9 @@ def _plan(row: Plan) -> Why:
 
 def _playback(row: StoredPlayback) -> Why:
     if sha256(canonical([row.plan.sha256, row.report])) != row.sha256:
-        yield "it is not the verdict that was given on its plan"
+        yield "it does not match the digest of plan and verdict"
     if row.feasible != row.report.get("feasible"):
-        yield "whether it is feasible is not what its report says"
+        yield "its flag `feasible` contradicts its report"
 
 
 def _calibration(row: StoredCalibration) -> Why:
@@ -271,7 +276,7 @@ def _calibration(row: StoredCalibration) -> Why:
 
 def _job(row: Job) -> Why:
     if identity_of(row.kind, row.request) != row.identity:
-        yield "it is not what was asked for"
+        yield "its request does not match its identity"
 
 
 AGREES: dict[type, Callable[[Any], Why]] = {

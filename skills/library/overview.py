@@ -1,18 +1,28 @@
-"""What a page shows of many things at once: the styles as a matrix, one style whole, and the newest of each kind.
+"""Overviews for pages and metrics: styles as a matrix, data for 3-D views, and the figures of an installation.
 
-A *style* is a surgeon's way with one suture type. It is stored where there is an active demonstration, trained where
-there is a policy version, released where one is served.
+- The figures of an installation at this moment: its jobs, its workers, its database. They contain no names.
+- The data of a 3-D view, as plain numbers for JSON: a demonstration, the policy learnt from it, and a recording's
+  signals over time.
+- The data of pages about many items: the styles as a matrix, one style in full, and the newest items of each kind.
+
+A *style* is a surgeon's way of sewing one suture type. It is `stored` if it has an active demonstration, `trained` if
+it has a policy version, `released` if a version is served.
 """
 
-from collections import Counter
+import tempfile
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import datetime, timedelta
+from pathlib import Path
 from typing import Any, Literal
 
-from sqlalchemy import ColumnElement, func, select
+import numpy as np
+from numpy.typing import NDArray
+from sqlalchemy import ColumnElement, func, select, text
 from sqlalchemy.orm import Session
 
-from skills.db.books import Job
+from skills.db.base import now
 from skills.db.models import (
     Demonstration,
     Plan,
@@ -21,26 +31,215 @@ from skills.db.models import (
     StoredPictures,
     StoredPlayback,
     StoredRecording,
+    StoredRewardMap,
     Surgeon,
     SutureType,
 )
-from skills.library import pictures
+from skills.db.service_tables import Event, Executor, Job
+from skills.db.session import Database
+from skills.demonstration.demonstration import Demo, Recording
+from skills.demonstration.movement import smoothed_speed
+from skills.demonstration.segments import press_times
+from skills.gridworld.grid import GridPath
+from skills.gridworld.reward import RewardMap, sparse_reward
+from skills.learning.policy import Policy
+from skills.library import playbacks
 from skills.library.catalogue import find_surgeon, find_suture_type
+from skills.library.combined import learnt_from
+from skills.library.integrity import covered, learnt
+from skills.library.recordings import Reader, find_recording, recording_bytes
+from skills.library.releases import is_served, served
+
+RECENT = 500  # jobs in the quantiles of durations: enough for a meaningful 99th percentile
+QUANTILES = (0.5, 0.95, 1.0)
+
+
+@dataclass(frozen=True)
+class Condition:
+    """The figures of an installation; `seconds` are quantiles over the jobs that ended last, by kind."""
+
+    jobs: dict[tuple[str, str], int]
+    seconds: dict[str, dict[float, float]]
+    oldest_queued_s: float
+    workers: int
+    database_bytes: int
+    last_event_at: datetime | None
+
+
+def condition_of(session: Session, lease_s: float) -> Condition:
+    """Return the figures of an installation.
+
+    Args:
+        session: A transaction that sees all rows.
+        lease_s: A worker counts if its last heartbeat is at most so old, in s.
+    """
+    at, beats = now(), select(Executor.beat_at)
+    counted = session.execute(select(Job.kind, Job.state, func.count()).group_by(Job.kind, Job.state))
+    oldest = session.scalar(select(func.min(Job.created_at)).where(Job.state == "queued"))
+    return Condition(
+        jobs={(kind, state): count for kind, state, count in counted},
+        seconds=_seconds(session),
+        oldest_queued_s=0.0 if oldest is None else max(0.0, (at - oldest).total_seconds()),
+        workers=sum(abs(at - beat_at) <= timedelta(seconds=lease_s) for beat_at in session.scalars(beats)),
+        database_bytes=_size(session),
+        last_event_at=session.scalar(select(Event.at).order_by(Event.row.desc()).limit(1)),
+    )
+
+
+def _seconds(session: Session) -> dict[str, dict[float, float]]:
+    ended = select(Job.kind, Job.started_at, Job.ended_at).where(Job.started_at.is_not(None), Job.ended_at.is_not(None))
+    took: dict[str, list[float]] = defaultdict(list)
+    for kind, started_at, ended_at in session.execute(ended.order_by(Job.row.desc()).limit(RECENT)):
+        assert started_at is not None and ended_at is not None
+        took[kind].append((ended_at - started_at).total_seconds())
+    return {
+        kind: {q: sorted(seconds)[round(q * (len(seconds) - 1))] for q in QUANTILES} for kind, seconds in took.items()
+    }
+
+
+def _size(session: Session) -> int:
+    """Return the size of the database in bytes; on SQLite that of its file and its write-ahead log."""
+    connection = session.connection()
+    if connection.dialect.name != "sqlite":
+        return session.scalar(text("SELECT pg_database_size(current_database())")) or 0
+    file = Path(connection.engine.url.database or "")
+    beside = (file, file.with_name(f"{file.name}-wal"))
+    return sum(one.stat().st_size for one in beside if one.is_file())
+
+
+MOST_STARTS = 20_000  # drawn smoothly by a browser: of a larger grid every second, third, ... cell is returned
+MOST_SAMPLES = 1500  # of a line on a screen: more are not visible
+
+
+def view_of_demo(session: Session, demo: Demonstration) -> dict[str, Any]:
+    """Return a demonstration as it was recorded, as its path in the grid, and as the rewards of Algorithm 1."""
+    stored = session.scalars(select(StoredRewardMap).where(StoredRewardMap.demonstration_row == demo.row)).one()
+    return _view(demo.demo, demo.path, stored.map)
+
+
+def _view(recorded: Demo, path: GridPath, reward: RewardMap) -> dict[str, Any]:
+    rewards, levels, grid = reward.rewards, reward.levels, path.grid
+    special = np.flatnonzero(rewards != levels.other)
+    every = max(1, len(recorded.tip_mm) // MOST_SAMPLES)
+    return {
+        "frame": recorded.frame,
+        "arm": recorded.arm,
+        "grid": {"origin_mm": list(grid.origin_mm), "cell_mm": grid.cell_mm, "shape": list(grid.shape)},
+        "recorded_mm": _mm(recorded.tip_mm[::every]),
+        "path_mm": _mm(path.tip_mm),
+        "rewards": {"at_mm": _mm(grid.centres_mm(special)), "of": rewards[special].tolist(), "goal": levels.goal},
+    }
+
+
+def view_of_version(session: Session, version: PolicyVersion) -> dict[str, Any]:
+    """Return the demonstration that a version was learnt from, and for every cell the rollout that starts there."""
+    policy, coverage = learnt(version), covered(version)
+    grid = policy.path.grid
+    shown = np.arange(grid.n_states)
+    every = 1
+    # Thin along all three axes until the starts fit.
+    while len(shown) > MOST_STARTS:
+        every += 1
+        shown = np.flatnonzero((grid.cells_of(np.arange(grid.n_states)) % every == 0).all(axis=1))
+    moves = moves_to_goal(policy, coverage.reaches)
+    return _view(learnt_from(version), policy.path, sparse_reward(policy.path, policy.levels)) | {
+        "version": version.version,
+        "starts": {
+            "every": every,
+            "at_mm": _mm(grid.centres_mm(shown)),
+            "reaches": coverage.reaches[shown].tolist(),
+            "nearest": coverage.joins_nearest[shown].tolist(),
+            "moves": moves[shown].tolist(),
+        },
+    }
+
+
+def moves_to_goal(policy: Policy, reaches: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Return the number of moves from every start to the goal, shape (n_states,); -1 if the goal is not reached.
+
+    Args:
+        policy: The policy.
+        reaches: The starts that reach the goal, shape (n_states,).
+    """
+    domain, path, moves = policy.domain, policy.path, policy.moves
+    at = np.arange(path.grid.n_states)  # the rows of phase 0
+    for state in np.unique(path.states):
+        phase, done = domain.start(int(state))
+        at[state] = -1 if done else domain.rows_of(phase, path.grid.cells_of(state))
+    counted = np.where(reaches, 0, -1)
+    walking = reaches & (at >= 0) & (policy.greedy[at] >= 0)
+    while walking.any():
+        counted += walking
+        finished = moves.finishes[at]
+        at = np.where(walking, moves.row[at], at)
+        walking &= ~finished & (at >= 0) & (policy.greedy[at] >= 0)
+    return counted
+
+
+def traces_of(database: Database, recording_sha256: str, read: Reader) -> dict[str, Any]:
+    """Read a stored recording again, and return the signals of its arms, jaws and clutch over time."""
+    with tempfile.TemporaryFile() as file:
+        with database.reading() as session:
+            stored = find_recording(session, recording_sha256)
+            reading = dict(stored.reading)
+            file.writelines(recording_bytes(session, stored))
+        recording = read(file, **reading)
+    return {"duration_s": recording.duration_s, "arms": [_arm(recording, arm) for arm in recording.arms]}
+
+
+def _arm(recording: Recording, arm: str) -> dict[str, Any]:
+    motion = recording.motion_of(arm=arm)
+    seconds, speed = smoothed_speed(recording.seconds(motion.stamps_ns), motion.tip_mm)
+    every = max(1, len(seconds) // MOST_SAMPLES)
+    jaw = recording.jaw_of(arm)
+    told: dict[str, Any] = {
+        "arm": arm,
+        "topic": motion.topic,
+        "speed": {"t_s": _rounded(seconds[::every]), "mm_s": _rounded(speed[::every])},
+        "jaw": None,
+        "clutch_s": _pressed(recording),
+    }
+    if jaw is not None:
+        every = max(1, len(jaw.values) // MOST_SAMPLES)
+        told["jaw"] = {
+            "t_s": _rounded(recording.seconds(jaw.stamps_ns[::every])),
+            "rad": _rounded(jaw.values[::every]),
+        }
+    return told
+
+
+def _pressed(recording: Recording) -> list[list[float]]:
+    """Return the intervals in which the clutch was down, in s, to the end of the recording if it never went up."""
+    presses = [] if recording.clutch is None else press_times(recording.clutch)
+    last_ns = recording.origin_ns + round(recording.duration_s * 1e9)
+    spans_ns = np.array([(down, last_ns if up is None else up) for down, up in presses], np.int64).reshape(-1, 2)
+    return _rounded(recording.seconds(spans_ns))
+
+
+def _mm(points: NDArray[Any]) -> list[Any]:
+    """Return points rounded to a thousandth of a millimetre, finer than a screen can show."""
+    return _rounded(np.asarray(points, float))
+
+
+def _rounded(values: NDArray[Any]) -> list[Any]:
+    rounded: list[Any] = np.round(values, 3).tolist()
+    return rounded
+
 
 State = Literal["released", "trained", "stored", "empty"]
 STATES: tuple[State, ...] = ("released", "trained", "stored", "empty")
 MOST = 50  # rows of a list on a page
 MOST_VERSIONS = 200
 
-_Row = tuple[int, str]  # a style: its surgeon's row and its suture type's name
+_Row = tuple[int, str]  # a style: the surgeon's row and the suture type's slug
 
 
 @dataclass(frozen=True)
 class Style:
-    """What there is of one style: active demonstrations, versions, the served one and the one that is told of.
+    """The state of one style: the numbers of active demonstrations and versions, the served version and the shown one.
 
-    `shown` is what is told of the served version or, without one, of the newest; `waiting` says that the newest
-    demonstration is newer than the one that is served.
+    `shown` is the manifest of the served version or, if none is served, of the newest; `waiting` is true if the newest
+    demonstration is newer than those of the shown version.
     """
 
     suture: str
@@ -54,13 +253,13 @@ class Style:
 
 @dataclass(frozen=True)
 class Matrix:
-    """Surgeons with their styles in the order of the suture types, and the surgeon after whom the next part begins."""
+    """A page of surgeons with their styles in the order of the suture types; `next` is the cursor of the next page."""
 
     sutures: Sequence[SutureType]
     rows: Sequence[tuple[Surgeon, Sequence[Style]]]
     next: str | None
-    counts: dict[str, int]  # surgeons, suture types, demonstrations, releases; of all, whatever is asked for
-    unused: Sequence[SutureType] = ()  # suture types left out, for nothing that is shown has them
+    counts: dict[str, int]  # surgeons, suture types, demonstrations, releases: independent of the search
+    unused: Sequence[SutureType] = ()  # suture types that are left out because no shown style has them
 
 
 def matrix(
@@ -73,8 +272,16 @@ def matrix(
 ) -> Matrix:
     """Search the styles.
 
-    A word that a suture type has in its name, family or other names chooses suture types; any other must be in the
-    surgeon's pseudonym.
+    A word that occurs in a suture type's name, family or other names selects suture types; any other word must occur in
+    the surgeon's pseudonym.
+
+    Args:
+        session: The caller's transaction.
+        words: The words, separated by spaces.
+        state: Return only surgeons with a style in this state.
+        skill: Return only surgeons of this skill level.
+        after: The last pseudonym of the page before.
+        limit: The most surgeons on a page.
     """
     known = session.scalars(select(SutureType).order_by(SutureType.slug)).all()
     asked = words.lower().split()
@@ -105,28 +312,27 @@ def _said(suture: SutureType) -> str:
 
 
 def _having(state: State) -> Any:
-    """Select the surgeons of whom there is anything in this state, or on the way to it."""
+    """Return a query of the surgeons with a style in this state or beyond it."""
     if state == "released":
-        return select(Release.surgeon_row).where(Release.withdrawn_at.is_(None))
+        return select(Release.surgeon_row).where(is_served())
     if state == "trained":
         return select(PolicyVersion.surgeon_row)
     return select(Demonstration.surgeon_row).where(Demonstration.withdrawn_at.is_(None))
 
 
 def _counts(session: Session) -> dict[str, int]:
-    served = select(Release.surgeon_row, Release.suture).where(Release.withdrawn_at.is_(None)).distinct().subquery()
     active = Demonstration.withdrawn_at.is_(None)
     queries = {
         "surgeons": select(func.count()).select_from(Surgeon),
         "suture types": select(func.count()).select_from(SutureType),
         "demonstrations": select(func.count()).select_from(Demonstration).where(active),
-        "released styles": select(func.count()).select_from(served),
+        "released styles": select(func.count()).select_from(Release).where(is_served()),
     }
     return {name: session.scalar(query) or 0 for name, query in queries.items()}
 
 
 def _styles(session: Session, surgeons: Sequence[int], suture: str | None = None) -> dict[_Row, Style]:
-    """Sum up all styles of some surgeons that there is anything of."""
+    """Return the styles of some surgeons, by style; empty ones are left out."""
 
     def mine(of: Any) -> list[ColumnElement[bool]]:
         return [of.surgeon_row.in_(surgeons), *([] if suture is None else [of.suture == suture])]
@@ -141,10 +347,7 @@ def _styles(session: Session, surgeons: Sequence[int], suture: str | None = None
     learnt = select(by.surgeon_row, by.suture, func.count(), func.max(by.row)).where(*mine(by))
     for who, what, count, newest in session.execute(learnt.group_by(by.surgeon_row, by.suture)):
         versions[who, what], newest_version[who, what] = count, newest
-    standing = select(func.max(Release.row)).where(Release.withdrawn_at.is_(None), *mine(Release))
-    served = select(Release.surgeon_row, Release.suture, Release.policy_row).where(
-        Release.row.in_(standing.group_by(Release.surgeon_row, Release.suture))
-    )
+    served = select(Release.surgeon_row, Release.suture, Release.policy_row).where(*mine(Release), is_served())
     released = {(who, what): policy for who, what, policy in session.execute(served)}
     wanted = {**newest_version, **released}
     told = {one.row: one for one in session.scalars(select(by).where(by.row.in_(wanted.values())))}
@@ -179,7 +382,7 @@ def _sum_up(
 
 @dataclass(frozen=True)
 class WholeStyle:
-    """One style with its demonstrations, versions and releases, the newest first; `served` is what stands."""
+    """One style with its demonstrations, versions and releases, the newest first; `served` is the served release."""
 
     surgeon: Surgeon
     suture: SutureType
@@ -191,7 +394,7 @@ class WholeStyle:
 
 
 def whole_style(session: Session, surgeon: str, suture: str) -> WholeStyle:
-    """Look one style up with all that there is of it.
+    """Return one style with all its demonstrations, versions and releases.
 
     Raises:
         NotFound: The surgeon or the suture type is unknown.
@@ -212,25 +415,24 @@ def whole_style(session: Session, surgeon: str, suture: str) -> WholeStyle:
         demos=newest(Demonstration),
         versions=newest(PolicyVersion),
         releases=releases,
-        served=next((one for one in releases if one.withdrawn_at is None), None),
+        served=served(session, who, what.slug),
     )
 
 
 def all_surgeons(session: Session, limit: int = 1000) -> Sequence[Surgeon]:
-    """List surgeons to choose from."""
+    """List the surgeons, for a selection in a form."""
     return session.scalars(select(Surgeon).order_by(Surgeon.slug).limit(limit)).all()
 
 
 def all_suture_types(session: Session, limit: int = 1000) -> Sequence[SutureType]:
-    """List suture types to choose from."""
+    """List the suture types, for a selection in a form."""
     return session.scalars(select(SutureType).order_by(SutureType.slug).limit(limit)).all()
 
 
 def released_styles(session: Session, limit: int = 1000) -> Sequence[Release]:
-    """List what is served, by surgeon and suture type, to choose from."""
-    standing = select(func.max(Release.row)).where(Release.withdrawn_at.is_(None))
-    served = select(Release).where(Release.row.in_(standing.group_by(Release.surgeon_row, Release.suture)))
-    by_name = served.join(Surgeon, Surgeon.row == Release.surgeon_row).order_by(Surgeon.slug, Release.suture)
+    """List the served releases by surgeon and suture type, for a selection in a form."""
+    found = select(Release).where(is_served()).join(Surgeon, Surgeon.row == Release.surgeon_row)
+    by_name = found.order_by(Surgeon.slug, Release.suture)
     return session.scalars(by_name.limit(limit)).all()
 
 
@@ -250,7 +452,7 @@ def newest_recordings(
 
 
 def demos_of_recording(session: Session, recording: StoredRecording) -> Sequence[Demonstration]:
-    """List what was cut out of a recording, in order of time."""
+    """List the demonstrations cut out of a recording, in the order of their start times."""
     of = Demonstration
     return session.scalars(select(of).where(of.recording_row == recording.row).order_by(of.start_s)).all()
 
@@ -288,11 +490,11 @@ def playbacks_of(session: Session, plan: Plan) -> list[Played]:
 
 def _played(session: Session, playback: StoredPlayback) -> Played:
     drawn = session.scalar(select(StoredPictures.row).where(StoredPictures.playback_row == playback.row))
-    job = None if drawn else newest_job(session, pictures.KIND, playback=playback.sha256)
+    job = None if drawn else newest_job(session, playbacks.KIND, playback=playback.sha256)
     return Played(playback, drawn is not None, job)
 
 
 def newest_job(session: Session, kind: str, **asked: str) -> Job | None:
-    """Find the newest job of a kind that was asked for with these values."""
+    """Return the newest job of a kind whose request has these values."""
     mine = [Job.kind == kind, *(Job.request[name].as_string() == value for name, value in asked.items())]
     return session.scalar(select(Job).where(*mine).order_by(Job.row.desc()).limit(1))

@@ -1,91 +1,81 @@
-"""Plans: grid worlds stacked at suture points."""
+"""Plans: grid worlds stacked at suture points, and suture points read from a simulator's recording.
 
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+PlanIn --plan_sutures--> Plan, stored
+recording of a simulated scene --find_suture_points--> SuturePoints, not stored
+"""
+
+from dataclasses import asdict
+from functools import partial
 from typing import Any
 
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
+from skills.db.base import rfc3339
 from skills.db.models import Plan
 from skills.db.session import Database
-from skills.errors import BadPlan, NoApproach, NotFound
+from skills.demonstration.partner import Partner
+from skills.errors import BadPlan, BadSpeed, NoApproach, NoHandOff
+from skills.formats.suture_points import PARSE, SuturePoints, suture_points
+from skills.gridworld.grid import refuse_metres
+from skills.kinematics import DEFAULT_INSTRUMENT
+from skills.learning.policy import Policy
 from skills.library import policies
 from skills.library.combined import learnt_from
 from skills.library.events import record
-from skills.library.verified import learnt, plan_identity
-from skills.style.handoff import Enters, PsmM
-from skills.style.kinematics import DEFAULT_INSTRUMENT
-from skills.style.partner import Partner
-from skills.style.plan import SuturePlan, SuturePoint, pose_xyzw, rotation_of, stack
-from skills.style.timetable import seams, seconds_by_phase, transfers
-from skills.style.trajectory import Trajectory, time_parametrise
+from skills.library.integrity import find_by_digest, learnt, plan_identity, planned
+from skills.library.recordings import Reader, Upload, read_upload
+from skills.planning.handoff import PsmM
+from skills.planning.plan import SuturePlan, pose_xyzw, stack
+from skills.planning.trajectory import Trajectory, seams, seconds_by_phase, time_parametrise, transfers
+from skills.remedies import Action, Remedy
+from skills.schemas.requests import PlanIn, PsmMIn
 
 
-@dataclass(frozen=True)
-class Beside:
-    """What is asked of PSM_M, in the arm's frame; what is None is taken from the demonstration, where that has it.
+def find_suture_points(upload: Upload, arm: str | None, read: Reader) -> SuturePoints:
+    """Read the marks of a scene in a separate process, and transform them to an arm's base frame.
 
-    `source` says where the given numbers come from.
+    Args:
+        upload: An MCAP file; its `frame` names the arm's base frame.
+        arm: The arm; None if the file has the base of a single one.
+        read: The reader: `ConfinedReader` or a compatible callable.
+
+    Raises:
+        BadRecording: It cannot be used; `skills.errors` lists the kinds.
     """
-
-    approach: tuple[float, float, float] | None = None
-    base_mm: tuple[float, float, float] | None = None
-    base_xyzw: tuple[float, float, float, float] | None = None
-    instrument: str | None = None
-    enters: Enters = "after_A1"
-    source: str = "the request"
+    return suture_points(read_upload(upload, partial(read, target=PARSE)), arm=arm, frame=upload.frame)
 
 
-@dataclass(frozen=True)
-class PlanRequest:
-    """What is asked for: a style, where its passes end and start, and what the arms should be.
-
-    Without `realignment` A1 alone is planned. Without `psm_m` it is all the demonstration's, and where that does not
-    know PSM_M, A1 alone.
-    """
-
-    surgeon: str
-    suture: str
-    suture_points: Sequence[SuturePoint]
-    version: int | None = None
-    starts_mm: Sequence[Sequence[float] | None] | None = None
-    arm: str | None = None
-    frame: str | None = None
-    instrument: str | None = None
-    speed_mm_s: float = 20.0
-    rate_hz: float = 200.0
-    tip_offset_mm: float = 0.0
-    psm_m: Beside | None = None
-    realignment: bool = True
+LEAST_MM = 0.1  # ours: a speed (mm/s) or an offset below it was given in metres
 
 
-def plan_sutures(database: Database, request: PlanRequest, actor: str) -> tuple[Plan, bool]:
-    """Stack a style's policy at suture points and store the plan: (the row, whether it is new).
+def plan_sutures(database: Database, request: PlanIn, actor: str) -> tuple[Plan, bool]:
+    """Stack a style's policy at suture points and store the plan; return the row, and whether it is new.
 
     Raises:
         BadPlan: The arm, frame or instrument is not the demonstration's, or a pass is out of reach of either arm.
-        NoApproach: PSM_M is asked for, and neither request nor demonstration knows its approach.
+        Conflict: The surgeon's consent does not cover training.
+        NoApproach: A hand-off is requested, and neither request nor demonstration has PSM_M's approach.
+        NoHandOff: The plan would have no hand-off, and such a plan was not requested.
     """
     with database.reading() as session:
         policy = policies.choose(session, request.surgeon, request.suture, request.version)
         demo, followed, sha = learnt_from(policy), learnt(policy), policy.sha256
     for name in ("arm", "frame", "instrument"):
+        # The policy is certified for the demonstrated arm, frame and instrument only.
         asked, have = getattr(request, name), getattr(demo, name)
         if asked is not None and asked != have:
             raise BadPlan(
-                f"The policy was demonstrated with {name} '{have}'; a plan keeps it, so give that or leave it out."
+                f"The policy was demonstrated with {name} '{have}'; a plan must have the same, so give that value "
+                "or omit it."
             )
+    _refuse_metres(followed, request)
     plan = stack(
         followed,
-        request.suture_points,
-        arm=demo.arm,
-        frame=demo.frame,
-        instrument=demo.instrument,
-        rotation=rotation_of(demo.rotation_xyzw),
+        [point.value for point in request.suture_points],
         demo=demo,
         starts_mm=request.starts_mm,
-        psm_m=_psm_m(request.psm_m, demo.partner) if request.realignment else None,
+        psm_m=_takes_the_needle(request, demo.partner),
         speed_mm_s=request.speed_mm_s,
         rate_hz=request.rate_hz,
         tip_offset_mm=request.tip_offset_mm,
@@ -94,10 +84,12 @@ def plan_sutures(database: Database, request: PlanRequest, actor: str) -> tuple[
     identity = plan_identity(sha, plan)
     about = describe_plan(plan, trajectory)
     with database.writing() as session:
+        # Consent may have ended while the plan was computed.
+        policy = policies.followable(policies.find_by_digest(session, sha))
+        # An equal plan has the same digest, so a repeated request returns the stored row.
         known = session.scalar(select(Plan).where(Plan.sha256 == identity))
         if known is not None:
             return known, False
-        policy = policies.find_by_digest(session, sha)
         stored = Plan(sha256=identity, policy=policy, plan=plan, about=about)
         session.add(stored)
         record(session, actor, "plan", "plan", identity, policy.surgeon)
@@ -105,36 +97,83 @@ def plan_sutures(database: Database, request: PlanRequest, actor: str) -> tuple[
         return stored, True
 
 
-def _psm_m(asked: Beside | None, partner: Partner | None) -> PsmM | None:
-    """Put together what is known of PSM_M, and say of each part where it comes from: the request comes first."""
-    if asked is None and partner is None:
+def _refuse_metres(policy: Policy, request: PlanIn) -> None:
+    """Refuse lengths that can only have been meant in metres, before reach is checked.
+
+    Raises:
+        OutsideGrid: A suture point or a start lies within a millimetre of the origin, far from the motion.
+        BadSpeed: The speed is less than a tenth of a millimetre a second.
+        BadPlan: The tip's offset is shorter than a tenth of a millimetre.
+    """
+    goal_mm = policy.path.grid.centres_mm(policy.path.goal)
+    for number, point in enumerate(request.suture_points):
+        refuse_metres(f"Suture point {number}", point.position_mm, goal_mm)
+    for number, start_mm in enumerate(request.starts_mm or ()):
+        if start_mm is not None:
+            refuse_metres(f"The start of pass {number}", start_mm, goal_mm)
+    if 0 < request.speed_mm_s < LEAST_MM:
+        raise BadSpeed(
+            f"A speed of {request.speed_mm_s:g} mm/s seems to be in metres per second.",
+            f"Give {1000 * request.speed_mm_s:g} mm/s.",
+            speed_mm_s=request.speed_mm_s,
+        )
+    if 0 < request.tip_offset_mm < LEAST_MM:
+        raise BadPlan(
+            f"A tip offset of {request.tip_offset_mm:g} mm seems to be in metres.",
+            f"Give {1000 * request.tip_offset_mm:g} mm.",
+            tip_offset_mm=request.tip_offset_mm,
+        )
+
+
+def _takes_the_needle(request: PlanIn, partner: Partner | None) -> PsmM | None:
+    """Return the arm that takes the needle; None if a plan without a hand-off is requested.
+
+    Raises:
+        NoHandOff: Neither request nor demonstration has PSM_M, and a plan without it was not requested.
+        BadPlan: PSM_M is given in a request without a hand-off.
+    """
+    if request.handoff == "none" and request.psm_m is not None:
+        raise BadPlan(
+            "handoff is 'none', but the request has psm_m, the arm that takes the needle.", "Omit one of them."
+        )
+    if request.handoff == "none" or not request.realignment:
         return None
-    wanted, seen = asked or Beside(), _demonstrated(partner)
-    approach = wanted if wanted.approach is not None else seen
-    if approach.approach is None:
-        raise NoApproach("The demonstration does not say how PSM_M approaches; give psm_m.approach, or no psm_m.")
-    base = wanted if wanted.base_mm is not None else seen
+    if request.psm_m is None and partner is None:
+        raise NoHandOff(
+            "This plan would have no hand-off: neither the request nor the demonstration has the pose of PSM_M, "
+            "the arm that takes the needle.",
+            Remedy(Action.NAME_PSM_M),
+        )
+    return _psm_m(request.psm_m or PsmMIn(), partner)
+
+
+def _psm_m(asked: PsmMIn, partner: Partner | None) -> PsmM:
+    """Return PSM_M from the request, completed from the demonstration, with the source of each part."""
+    requested = "the request" if asked.source is None else f"the request: {asked.source}"
+    shown = "" if partner is None else f"the demonstration: {partner.arm} at {partner.at_s:g} s of its recording"
+    approach, approach_from = asked.approach, requested
+    if approach is None and partner is not None:
+        approach, approach_from = partner.approach, shown
+    if approach is None:
+        raise NoApproach("The demonstration has no approach direction of PSM_M.", Remedy(Action.NAME_PSM_M))
+    base_mm, base_xyzw, base_from = None, None, None
+    if asked.base is not None:
+        base_mm, base_xyzw, base_from = asked.base.position_mm, asked.base.rotation_xyzw, requested
+    elif partner is not None and partner.base_mm is not None:
+        base_mm, base_xyzw, base_from = partner.base_mm, partner.base_xyzw, shown
     return PsmM(
-        approach=approach.approach,
-        base_mm=base.base_mm,
-        base_xyzw=base.base_xyzw,
-        instrument=wanted.instrument or seen.instrument or DEFAULT_INSTRUMENT,
-        enters=wanted.enters,
-        approach_from=approach.source,
-        base_from=None if base.base_mm is None else base.source,
+        approach=approach,
+        base_mm=base_mm,
+        base_xyzw=base_xyzw,
+        instrument=asked.instrument or (partner and partner.instrument) or DEFAULT_INSTRUMENT,
+        enters=asked.enters,
+        approach_from=approach_from,
+        base_from=base_from,
     )
 
 
-def _demonstrated(partner: Partner | None) -> Beside:
-    """Write what a demonstration knows of PSM_M as if it had been asked for."""
-    if partner is None:
-        return Beside()
-    source = f"the demonstration: {partner.arm} at {partner.at_s:g} s of its recording"
-    return Beside(partner.approach, partner.base_mm, partner.base_xyzw, partner.instrument, source=source)
-
-
 def trajectory_of(plan: SuturePlan) -> Trajectory:
-    """Put a plan into time, at its own rate; the same plan gives the same bytes."""
+    """Return the trajectory of a plan, sampled at its own rate; the same plan gives the same bytes."""
     return time_parametrise(
         plan.pass_paths,
         speed_mm_s=plan.speed_mm_s,
@@ -145,7 +184,7 @@ def trajectory_of(plan: SuturePlan) -> Trajectory:
 
 
 def describe_plan(plan: SuturePlan, trajectory: Trajectory) -> dict[str, Any]:
-    """Write what a client is told of a plan, but for its digests."""
+    """Return the JSON of a plan without its digests."""
     moved = transfers(trajectory)
     return {
         "arm": plan.arm,
@@ -196,9 +235,60 @@ def _describe_psm_m(psm_m: PsmM) -> dict[str, Any]:
     }
 
 
+def hands_over(about: dict[str, Any]) -> bool:
+    """Return whether a described plan has a hand-off: A2 towards PSM_M."""
+    return about.get("psm_m") is not None
+
+
+def plan_in_words(about: dict[str, Any]) -> str:
+    """Return the sentence on the motions of a described plan, and on those that it leaves out."""
+    count = len(about["passes"])
+    moves = f"Moves {about['arm']} along {count} pass{'es' if count != 1 else ''}"
+    if not hands_over(about):
+        return f"{moves}; no hand-off: no PSM_M, no A2."
+    if not psm_m_moves(about):
+        return (
+            f"{moves} and turns its jaw to offer the needle (A2); has no motion of PSM_M, because its base is not "
+            "known, so the needle is not taken."
+        )
+    return (
+        f"{moves} and hands the needle to PSM_M at the end of each: its jaw turns (A2), PSM_M approaches and retracts."
+    )
+
+
+def psm_m_moves(about: dict[str, Any]) -> bool:
+    """Return whether a described plan moves PSM_M too; its base must be known for that."""
+    return hands_over(about) and about["trajectory"].get("psm_m_moves") is True
+
+
+def motion_of(session: Session, plan_sha256: str) -> SuturePlan:
+    """Return the motion of a stored plan, for a client that exports it to follow it.
+
+    Raises:
+        NotFound: There is no such plan.
+        Conflict: The surgeon's consent does not cover training (any more).
+        Corrupt: It does not match its digest.
+    """
+    plan = find_plan(session, plan_sha256)
+    policies.followable(plan.policy)
+    return planned(plan)
+
+
 def find_plan(session: Session, plan_sha256: str) -> Plan:
-    """Find a plan by its digest."""
-    plan = session.scalar(select(Plan).where(Plan.sha256 == plan_sha256))
-    if plan is None:
-        raise NotFound("There is no such plan; POST /plans makes one.")
-    return plan
+    """Return a plan by its digest."""
+    return find_by_digest(session, Plan, plan_sha256, "plan", Remedy(Action.MAKE_PLAN))
+
+
+def plan_json(row: Plan) -> dict[str, Any]:
+    """Return a plan's JSON."""
+    return {
+        "id": row.sha256,
+        "sha256": row.sha256,
+        "surgeon": row.policy.surgeon.slug,
+        "suture": row.policy.suture,
+        "policy": {"version": row.policy.version, "sha256": row.policy.sha256},
+        **row.about,
+        "hands_over": hands_over(row.about),
+        "in_words": plan_in_words(row.about),
+        "created_at": rfc3339(row.created_at),
+    }

@@ -1,54 +1,140 @@
-"""Playbacks: plans played in the simulator, and its verdict on the motion.
+"""Playbacks: plans played in the simulator, the verdict, its headline in words, and the film and plots.
 
-A plan may be played whatever became of its policy since: a verdict moves nothing. Whether the policy is still released
-is told with every playback, as of now, and it is the replay bag that is refused where it is not.
+    plan --check_playback--> playback --draw_pictures--> film and plots
+    plan, playback --headline--> level, text and probability
+
+The sentences about a plan and a playback are written here only, so that page, JSON, command line and bag agree. A
+headline has a level, for a colour: `good` requires that the plan hands the needle over and succeeds with enough
+certainty at the stated error of the arm. The comparisons are written so that null or NaN is never good.
+
+A plan may be played even if its policy was withdrawn since: a verdict moves no arm. Every playback is returned with the
+current state of the policy's release, and it is the replay bag that is refused for a policy that is not released.
+
+The film and plots of a playback are drawn by a worker after the verdict is stored. A client that waits for the verdict
+does not wait for them, and they are not part of it.
 """
 
 from collections.abc import Callable
 from dataclasses import asdict
 from math import isfinite
-from typing import Any
+from typing import Any, Literal
 
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from skills.db.books import Job
-from skills.db.models import StoredPlayback
+from skills.db.base import rfc3339
+from skills.db.models import StoredPictures, StoredPlayback
+from skills.db.service_tables import Job
 from skills.db.session import Database
-from skills.errors import BadPlan, NotFound
-from skills.library import jobs, pictures, releases
+from skills.errors import BadPlan, Conflict, NotDrawnYet
+from skills.library import jobs, releases
 from skills.library.events import record
-from skills.library.plans import find_plan, trajectory_of
-from skills.library.verified import planned
+from skills.library.integrity import find_by_digest, planned
+from skills.library.jobs import PicturesRequest, PlaybackRequest
+from skills.library.plans import find_plan, hands_over, plan_in_words, psm_m_moves, trajectory_of
 from skills.packing import canonical, sha256
+from skills.planning.trajectory import Trajectory
+from skills.remedies import Action, Remedy
 from skills.settings import Settings
-from skills.style.doubt import DoubtSettings, doubt
-from skills.style.trajectory import Trajectory
-from skills.style.verdict import judge
+from skills.verification.monte_carlo import DoubtSettings, doubt
+from skills.verification.playback import Pictures
+from skills.verification.verdict import judge
 
-CHECK_VERSION = 1  # to be raised with whatever changes a verdict: a plan that is asked for again is then played again
+Level = Literal["good", "caution", "bad"]
+MORE_OFTEN_NOT = 0.5  # a plan whose upper bound is below this fails more often than it succeeds
+
+
+def headline(
+    about: dict[str, Any], report: dict[str, Any], *, tip_error_mm: float, lower_bound: float
+) -> dict[str, Any]:
+    """Return the headline of a playback: level, text, and the probability at the stated error of the arm's tip.
+
+    Args:
+        about: The plan's description, as `describe_plan` writes it.
+        report: The playback's stored report.
+        tip_error_mm: The stated mean error of the arm's tip.
+        lower_bound: The value that the lower bound of the entire plan's probability has to reach for the level `good`.
+    """
+    judged = (report.get("doubt") or {}).get("under", [])
+    whole = next((under.get("plan") for under in judged if under["tip_error_mm"] == tip_error_mm), None)
+    feasible = report.get("feasible") is True
+    level = _level(about, feasible, whole, lower_bound)
+    verdict = _verdict(report, feasible, whole, tip_error_mm)
+    return {
+        "level": level,
+        "word": _word(about, feasible, level),
+        "text": f"{_word(about, feasible, level)}: {verdict} {plan_in_words(about)}",
+        "tip_error_mm": tip_error_mm,
+        "probability": whole,
+    }
+
+
+def _level(about: dict[str, Any], feasible: bool, whole: dict[str, Any] | None, lower_bound: float) -> Level:
+    if not feasible or (whole is not None and whole["upper"] is not None and whole["upper"] < MORE_OFTEN_NOT):
+        return "bad"
+    sure = whole is not None and whole["lower"] is not None and whole["lower"] >= lower_bound
+    return "good" if sure and psm_m_moves(about) else "caution"
+
+
+def _word(about: dict[str, Any], feasible: bool, level: Level) -> str:
+    """Return the level in a word or two."""
+    if not feasible:
+        return "Not feasible"
+    if level == "bad":
+        return "Likely to fail"
+    if not hands_over(about):
+        return "No hand-off"
+    if not psm_m_moves(about):
+        return "Incomplete"
+    return "Likely to succeed" if level == "good" else "Uncertain"
+
+
+def _verdict(report: dict[str, Any], feasible: bool, whole: dict[str, Any] | None, tip_error_mm: float) -> str:
+    if not feasible:
+        return report.get("failure_in_words") or "the simulator found it so."
+    exact = "feasible in an exact simulation"
+    if whole is None:
+        return f"{exact}; how often it succeeds with a tip error of {tip_error_mm:g} mm was not judged."
+    return (
+        f"{exact}; with a tip error of {tip_error_mm:g} mm the complete plan succeeds in {whole['count']} of "
+        f"{whole['of']} worlds: {_percent(whole['probability'])} ({_percent(whole['lower'])} to "
+        f"{_percent(whole['upper'])}, 95 %)."
+    )
+
+
+def _percent(part: float | None) -> str:
+    """Return a share as a percentage; a share just below 1 is not rounded to 100 %."""
+    if part is None:
+        return "unknown"
+    if 0.9995 <= part < 1:
+        return "above 99.9 %"
+    return f"{100 * part:.1f} %"
+
+
+CHECK_VERSION = 1  # part of the job's identity: raise it when verdicts change, so that plans can be played again
 
 
 def request_playback(session: Session, plan_sha256: str, actor: str, settings: Settings) -> tuple[Job, bool]:
-    """Ask for a plan to be played in the simulator: the job, and whether it is a new one.
+    """Queue the playback of a plan in the simulator; return the job, and whether it is new.
 
     Raises:
-        BadPlan: Its frame is not the arm's base, so the simulator would put it somewhere else.
+        BadPlan: Its frame is not the arm's base, so the simulator would place it wrongly.
     """
     plan = find_plan(session, plan_sha256)
     check_frame(plan.about["frame"])
     errors = sorted({*DoubtSettings().tip_errors_mm, settings.replay_tip_error_mm})
-    request = {"plan": plan.sha256, "check_version": CHECK_VERSION, "tip_errors_mm": errors}
+    request: PlaybackRequest = {"plan": plan.sha256, "check_version": CHECK_VERSION, "tip_errors_mm": errors}
     return jobs.ask(session, "playback", request, plan.policy.surgeon, actor)
 
 
 def check_playback(
-    database: Database, request: dict[str, Any], settings: Settings
+    database: Database, request: PlaybackRequest, settings: Settings
 ) -> Callable[[Session, str], dict[str, Any]]:
-    """Play a plan in the simulator, judge it, and count in how many inexact worlds it succeeds; the returned function
-    stores all of it.
+    """Play a plan in the simulator, judge it, and estimate its probability of success by Monte Carlo.
+
+    The returned function stores all of it.
     """
-    from skills.sim.player import play
+    from skills.simulation.player import play
 
     with database.reading() as session:
         stored = find_plan(session, request["plan"])
@@ -71,6 +157,7 @@ def check_playback(
     identity = sha256(canonical([request["plan"], report]))
 
     def store(session: Session, actor: str) -> dict[str, Any]:
+        # A retry of the job computes the same report and digest, and must not store it twice.
         known = session.scalar(select(StoredPlayback).where(StoredPlayback.sha256 == identity))
         if known is None:
             plan = find_plan(session, request["plan"])
@@ -80,33 +167,36 @@ def check_playback(
             session.add(known)
             record(session, actor, "play", "playback", identity, plan.policy.surgeon)
             session.flush()
-            pictures.request(session, known, actor)
+            request_pictures(session, known, actor)
         return {"playback": known.sha256, "feasible": known.feasible}
 
     return store
 
 
 def find_playback(session: Session, playback_sha256: str) -> StoredPlayback:
-    """Find a playback by its digest."""
-    playback = session.scalar(select(StoredPlayback).where(StoredPlayback.sha256 == playback_sha256))
-    if playback is None:
-        raise NotFound("There is no such playback; POST /playbacks asks for one.")
-    return playback
+    """Return a playback by its digest."""
+    return find_by_digest(session, StoredPlayback, playback_sha256, "playback", Remedy(Action.ADD_PLAYBACK))
+
+
+def headline_of(playback: StoredPlayback, settings: Settings) -> dict[str, Any]:
+    """Return the headline of a playback at the tip error and lower bound of the installation's settings."""
+    asked = {"tip_error_mm": settings.replay_tip_error_mm, "lower_bound": settings.replay_lower_bound}
+    return headline(playback.plan.about, playback.report, **asked)
 
 
 def standing_of(session: Session, playback: StoredPlayback) -> dict[str, Any]:
-    """Tell which policy version a playback's plan follows, and whether it is released now."""
+    """Return the policy version that a playback's plan follows, and whether its style serves it now."""
     policy = playback.plan.policy
-    released = releases.standing(session, policy.surgeon_row, policy.suture)
+    served = releases.served(session, policy.surgeon, policy.suture)
     return {
         "version": policy.version,
         "sha256": policy.sha256,
-        "released": any(one.policy_row == policy.row for one in released),
+        "released": served is not None and served.policy_row == policy.row,
     }
 
 
 def trajectory_digest(trajectory: Trajectory) -> str:
-    """Compute the SHA-256 of a motion: of the stamps and joints that were checked, sample by sample."""
+    """Return the SHA-256 of a motion: of the stamps and joints that were checked, sample by sample."""
     parts = [trajectory.stamps_s, trajectory.joints]
     if trajectory.psm_m is not None:
         parts += [trajectory.psm_m.base_mm, trajectory.psm_m.base_xyzw, trajectory.psm_m.joints]
@@ -117,18 +207,18 @@ def check_frame(frame: str) -> None:
     """Refuse a frame that is not an arm's base.
 
     Raises:
-        BadPlan: Joints can be solved in the arm's base alone.
+        BadPlan: Joints can be solved in the frame of the arm's base only.
     """
     if not frame.endswith("_base"):
         raise BadPlan(
-            f"The plan is in the frame '{frame}', which is not the arm's base, so nobody knows where the arm must go; "
-            "demonstrate with local/measured_cp.",
+            f"The plan is in the frame '{frame}', which is not the frame of the arm's base, so the joints cannot "
+            "be computed; demonstrate with local/measured_cp.",
             frame=frame,
         )
 
 
 def _finite(data: Any) -> Any:
-    """Write NaN and infinity, which JSON does not have, as null, and tuples as lists."""
+    """Return JSON data with null for NaN and infinity, which JSON does not have, and lists for tuples."""
     if isinstance(data, float):
         return data if isfinite(data) else None
     if isinstance(data, dict):
@@ -136,3 +226,95 @@ def _finite(data: Any) -> Any:
     if isinstance(data, list | tuple):
         return [_finite(value) for value in data]
     return data
+
+
+KIND = "pictures"
+
+
+def request_pictures(session: Session, playback: StoredPlayback, actor: str) -> tuple[Job, bool]:
+    """Queue the pictures of a stored playback; return the job, and whether it is new."""
+    return jobs.ask(session, KIND, _wanted(playback), playback.plan.policy.surgeon, actor)
+
+
+def draw_pictures(
+    database: Database, request: PicturesRequest, settings: Settings
+) -> Callable[[Session, str], dict[str, Any]]:
+    """Draw the film and plots of a playback; the returned function stores them."""
+    from skills.simulation import film, plots
+
+    with database.reading() as session:
+        playback = _playback(session, request)
+        plan, measured, report = planned(playback.plan), playback.measured, playback.report
+    trajectory = trajectory_of(plan)
+    if len(measured) != len(trajectory):
+        raise Conflict("An older version played this plan with other samples; make the plan and play it again.")
+    shot = film.shoot(trajectory, pad_top_mm=float(measured.pad_mm[2]), memory_bytes=settings.playback_memory_bytes)
+    drawn = Pictures(
+        animation_mp4=shot.mp4,
+        animation_gif=shot.gif,
+        joints_png=plots.png(plots.draw_joints(trajectory, measured, report)),
+        clearance_png=plots.png(plots.draw_clearance(trajectory, measured, report)),
+    )
+
+    def store(session: Session, actor: str) -> dict[str, Any]:
+        playback = _playback(session, request)
+        of_playback = select(StoredPictures.row).where(StoredPictures.playback_row == playback.row)
+        # A retry of the job must not store the pictures twice.
+        if session.scalar(of_playback) is None:
+            session.add(StoredPictures(playback_row=playback.row, drawn=drawn))
+            record(session, actor, "draw", KIND, playback.sha256, playback.plan.policy.surgeon)
+        return {"playback": playback.sha256}
+
+    return store
+
+
+def find_pictures(session: Session, playback: StoredPlayback) -> Pictures:
+    """Return the pictures of a playback.
+
+    Raises:
+        NotDrawnYet: They are not drawn; the message names the job that draws them, or that failed to.
+    """
+    stored = session.scalar(select(StoredPictures).where(StoredPictures.playback_row == playback.row))
+    if stored is None:
+        raise _not_drawn(playback, jobs.newest(session, KIND, _wanted(playback)))
+    return stored.drawn
+
+
+def _not_drawn(playback: StoredPlayback, job: Job | None) -> NotDrawnYet:
+    draw = Remedy(Action.DRAW, playback=playback.sha256, plan=playback.plan.sha256)
+    if job is None:
+        return NotDrawnYet("No pictures of this playback were requested.", draw)
+    see = Remedy(Action.SEE_JOB, job=job.id)
+    if job.state in jobs.ACTIVE:
+        return NotDrawnYet("The pictures of this playback are being drawn.", see, job=job.id)
+    return NotDrawnYet("The pictures of this playback were not drawn.", see, draw, job=job.id)
+
+
+def _wanted(playback: StoredPlayback) -> PicturesRequest:
+    return {"plan": playback.plan.sha256, "playback": playback.sha256}
+
+
+def _playback(session: Session, request: PicturesRequest) -> StoredPlayback:
+    return session.scalars(select(StoredPlayback).where(StoredPlayback.sha256 == request["playback"])).one()
+
+
+def playback_json(row: StoredPlayback, headline: dict[str, Any]) -> dict[str, Any]:
+    """Return a playback's JSON with its headline; all of its pictures but the first are drawn after the verdict."""
+    here = f"/playbacks/{row.sha256}"
+    return {
+        "id": row.sha256,
+        "sha256": row.sha256,
+        "plan": row.plan.sha256,
+        "feasible": row.feasible,
+        "headline": headline,
+        "report": row.report,
+        "picture": f"{here}/picture.png",
+        "pictures": {
+            "picture": f"{here}/picture.png",
+            "animation_mp4": f"{here}/animation.mp4",
+            "animation_gif": f"{here}/animation.gif",
+            "joints": f"{here}/joints.png",
+            "clearance": f"{here}/clearance.png",
+        },
+        "created_at": rfc3339(row.created_at),
+    }

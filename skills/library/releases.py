@@ -1,24 +1,140 @@
-"""What is served: a policy version is released, superseded by a later release, or withdrawn.
+"""Releases: the served version of a style, the release gate, and the results of jobs in terms of it.
 
-The newest release of a style that is not withdrawn is served. A withdrawal never lets an older release come back by
-itself: what the newest one superseded is withdrawn with it, so that nothing is served until somebody releases again.
+A policy version is released, superseded by a later release, or withdrawn. The newest release of a style that is not
+withdrawn is served, for as long as the surgeon's consent covers training. A withdrawal never lets an older release come
+back by itself: the releases that the newest one superseded are withdrawn with it, so that nothing is served until
+somebody releases again.
+
+"Not worse" compares two policies of a style on the same demonstrations, because a policy measured against its own
+demonstration alone is always near. These are all active demonstrations from which either was learnt: dynamic time
+warping of each policy's path from its demonstrated start with every demonstration's path in its grid, in mm, and the
+sum over the demonstrations.
+
+A job's row stores the effect of the job: `released` in the result of a training, `now_released` in the comparison of a
+batch's style. Another version may have been released since, or none may be served any more. So every response about a
+job takes its result from here: `released` and `now_released` are the present state, `was_released` is the effect of the
+job.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from functools import partial
+from itertools import groupby
+from math import nan
+from typing import Any
 
-from sqlalchemy import String, bindparam, select, type_coerce
-from sqlalchemy.orm import Session
+import numpy as np
+from sqlalchemy import ColumnElement, String, and_, bindparam, exists, select, type_coerce
+from sqlalchemy.orm import Session, aliased
 
-from skills.db.base import now
+from skills.arrays import Floats
+from skills.db.base import now, rfc3339
 from skills.db.changes import announce
 from skills.db.models import Demonstration, PolicyVersion, Release, Surgeon
+from skills.db.service_tables import Job, StyleToRetrain
 from skills.errors import Conflict, NotFound
+from skills.gridworld.grid import GridPath, GridWorld
+from skills.learning.evaluation import dtw
+from skills.learning.policy import Policy
+from skills.library import consent
+from skills.library.consent import refusal
 from skills.library.events import record
-from skills.library.verified import learnt
+from skills.library.integrity import learnt
+from skills.schemas.policies import FitOnTheSame
 
-# Which release a style serves, in terms that no other ever has: the number of a row that was erased is used again.
-SERVED = (
-    select(Release.row, type_coerce(Release.released_at, String).label("released_at"), PolicyVersion.sha256)
+ROUNDING_MM = 1e-6  # two sums of the same distances in different order differ by less
+
+
+@dataclass(frozen=True, eq=False)
+class Taught:
+    """A demonstration that a policy may have been learnt from: its digest, its arm and frame, and its path."""
+
+    sha256: str
+    space: tuple[str, str]  # arm and frame; paths in different ones cannot be compared
+    path: GridPath
+
+
+@dataclass(frozen=True, eq=False)
+class PolicyWay:
+    """The path of a policy from its demonstrated start, shape (T, 3) in mm, with its arm and frame."""
+
+    tip_mm: Floats
+    space: tuple[str, str]
+
+
+def not_worse(fit: FitOnTheSame) -> bool:
+    """Return whether the trained policy is at least as near as the released one; false if they cannot be compared."""
+    if fit.trained_mm is None or fit.released_mm is None:
+        return False
+    return fit.trained_mm <= fit.released_mm + ROUNDING_MM  # NaN is worse
+
+
+def shown_mm(total_mm: float | None) -> str:
+    """Return a DTW total in words."""
+    return f"{nan if total_mm is None else total_mm:g}"
+
+
+def fit_of(released: PolicyWay, trained: PolicyWay, demos: Sequence[Taught]) -> FitOnTheSame:
+    """Measure two policies against the same demonstrations.
+
+    Args:
+        released: The path of the released policy.
+        trained: The path of the new policy.
+        demos: The demonstrations; the totals are None if there are none, or arms or frames differ.
+    """
+    one_space = {released.space, trained.space, *(demo.space for demo in demos)}
+    return FitOnTheSame(
+        tuple(demo.sha256 for demo in demos),
+        *(_total_mm(way, demos) if len(one_space) == 1 and demos else None for way in (released, trained)),
+    )
+
+
+def _total_mm(way: PolicyWay, demos: Sequence[Taught]) -> float:
+    return float(sum(dtw(way.tip_mm, demo.path.tip_mm).total_mm for demo in demos))
+
+
+def way_of(manifest: Mapping[str, Any], policy: Callable[[], Policy]) -> PolicyWay:
+    """Return the path of a policy from its demonstrated start.
+
+    Args:
+        manifest: The policy's manifest.
+        policy: Loads the policy; called only if it does not reproduce its demonstration, because otherwise the manifest
+            has the path.
+    """
+    space = manifest["arm"], manifest["frame"]
+    if manifest["grid_certificate"]["demonstration_reproduced"] is not True:
+        return PolicyWay(policy().replay.tip_mm, space)
+    grid = GridWorld(
+        tuple(manifest["grid"]["origin_mm"]), manifest["grid"]["cell_mm"], tuple(manifest["grid"]["shape"])
+    )
+    return PolicyWay(grid.centres_mm(np.array(manifest["waypoints"])), space)
+
+
+def taught(session: Session, demonstrations: Collection[int]) -> dict[int, Taught]:
+    """Return the active ones of some demonstrations, by row, the oldest first."""
+    of = Demonstration
+    query = select(of.row, of.sha256, of.arm, of.frame, of.path).where(of.row.in_(demonstrations))
+    found = session.execute(query.where(of.withdrawn_at.is_(None)).order_by(of.row))
+    return {row: Taught(sha256, (arm, frame), path) for row, sha256, arm, frame, path in found}
+
+
+def fit_of_versions(session: Session, released: PolicyVersion, trained: PolicyVersion) -> FitOnTheSame:
+    """Measure two stored versions of a style against the active demonstrations from which either was learnt."""
+    rows = {one.row for version in (released, trained) for one in version.demonstrations}
+    before, after = (way_of(one.manifest, partial(learnt, one)) for one in (released, trained))
+    return fit_of(before, after, list(taught(session, rows).values()))
+
+
+# The newest release of a style that is not withdrawn, with columns that identify it for ever: row numbers are reused
+# after an erasure. It is served if the surgeon's consent, returned as text, covers training.
+STANDS = (
+    select(
+        Release.row,
+        type_coerce(Release.released_at, String).label("released_at"),
+        consent.AS_TEXT.label("consent"),
+        PolicyVersion.sha256,
+    )
     .join(Surgeon, Surgeon.row == Release.surgeon_row)
     .join(PolicyVersion, PolicyVersion.row == Release.policy_row)
     .where(Surgeon.slug == bindparam("surgeon"), Release.suture == bindparam("suture"))
@@ -26,11 +142,29 @@ SERVED = (
     .order_by(Release.row.desc())
     .limit(1)
 )
-DTW_SLACK_MM = 0.0  # ours: another learner may be released if its total DTW is no larger than the released one's
+# Remedies by words in the reason for which a version is not released; the first match counts.
+_REMEDIES = (
+    ("consent", "Record a consent of the surgeon that covers training, then request the release again."),
+    ("was released", "Request the release again if this version is to be served in its place."),
+    ("was withdrawn.", "Request the release again if this version is to be served."),
+    ("demonstration was withdrawn", "Train from a demonstration that is active, and request its release."),
+    ("worse than", "Release it by its number if it is to replace the released version anyway."),
+    ("joint limits", "Record the hand-off further inside the arm's reach, or with the arm's base elsewhere."),
+    ("not the arm's base", "Record the arm's local/measured_cp, which is in the frame of its base."),
+)
+_OTHERWISE = "Train it with other settings or another learner, or record the hand-off again."
+
+
+def remedy(reason: str) -> str:
+    """Return the remedy for a reason for which a version is not released."""
+    return next((remedy for words, remedy in _REMEDIES if words in reason), _OTHERWISE)
 
 
 def standing(session: Session, surgeon_row: int, suture: str) -> Sequence[Release]:
-    """List a style's releases that are not withdrawn, the newest (which is served) first."""
+    """List a style's releases that are not withdrawn, the newest first.
+
+    That one is served, if consent covers training.
+    """
     return session.scalars(
         select(Release)
         .where(Release.surgeon_row == surgeon_row, Release.suture == suture, Release.withdrawn_at.is_(None))
@@ -38,13 +172,35 @@ def standing(session: Session, surgeon_row: int, suture: str) -> Sequence[Releas
     ).all()
 
 
+def served(session: Session, surgeon: Surgeon, suture: str) -> Release | None:
+    """Return the release that a style serves today; None if there is none or consent does not cover training."""
+    releases = standing(session, surgeon.row, suture)
+    return releases[0] if releases and consent.may(surgeon, "training") else None
+
+
+def is_served() -> ColumnElement[bool]:
+    """Return a condition on `Release`: its style serves it today; build it anew for each query (it has the date)."""
+    later = aliased(Release)
+    superseded = exists().where(
+        later.surgeon_row == Release.surgeon_row,
+        later.suture == Release.suture,
+        later.row > Release.row,
+        later.withdrawn_at.is_(None),
+    )
+    # A scalar and not `exists`: PostgreSQL turns that into a join, and then sorts rows that an index returns in order.
+    agreed = select(consent.covered("training")).where(Surgeon.row == Release.surgeon_row).correlate(Release)
+    return and_(Release.withdrawn_at.is_(None), ~superseded.correlate(Release), agreed.scalar_subquery())
+
+
 def release(session: Session, policy: PolicyVersion, actor: str) -> Release:
-    """Release a policy version if it passes the gate; releasing what is served already changes nothing.
+    """Release a policy version if it passes the gate; releasing the served version again changes nothing.
 
     Raises:
-        Conflict: It does not pass, with the reasons; or its demonstration was withdrawn.
-        Corrupt: What is stored is not what was certified.
+        Conflict: It does not pass, with the reasons; its demonstration was withdrawn; or the surgeon's consent does not
+            cover training.
+        Corrupt: The stored policy does not match its digest.
     """
+    consent.require(policy.surgeon, "training")
     learnt(policy)
     served = standing(session, policy.surgeon_row, policy.suture)
     if served and served[0].policy_row == policy.row:
@@ -52,11 +208,15 @@ def release(session: Session, policy: PolicyVersion, actor: str) -> Release:
     reasons = list(policy.manifest["grid_certificate"]["refused_because"])
     if policy.rests_on_withdrawn:
         reasons.append("its demonstration was withdrawn")
+    # Only phased policies have to reproduce their demonstration; one of the cell state must at least not be worse.
     if policy.manifest["phases"] == 1 and served:
-        before = served[0].policy.manifest["metrics"]["dtw_total_mm"]
-        mine = policy.manifest["metrics"]["dtw_total_mm"]
-        if not mine <= before + DTW_SLACK_MM:
-            reasons.append(f"it follows the demonstration worse than the released one ({mine:g} against {before:g} mm)")
+        found = fit_of_versions(session, served[0].policy, policy)
+        if not not_worse(found):
+            trained, before = shown_mm(found.trained_mm), shown_mm(found.released_mm)
+            reasons.append(
+                "it follows the demonstrations worse than the released one "
+                f"({trained} against {before} mm on the same {len(found.demos)})"
+            )
     if reasons or not policy.releasable:
         raise Conflict(f"Version {policy.version} cannot be released: {'; '.join(reasons)}.", reasons=reasons)
     released = Release(policy=policy, surgeon_row=policy.surgeon_row, suture=policy.suture, released_by=actor)
@@ -68,21 +228,56 @@ def release(session: Session, policy: PolicyVersion, actor: str) -> Release:
 
 
 def withdraw(session: Session, surgeon: Surgeon, suture: str, actor: str) -> list[Release]:
-    """Withdraw all releases of a style: nothing is served until somebody releases again."""
+    """Withdraw all releases of a style, so that nothing is served until somebody releases again; return them.
+
+    Raises:
+        NotFound: Nothing of the style is released.
+    """
     releases = list(standing(session, surgeon.row, suture))
     if not releases:
-        raise NotFound(f"Nothing of '{surgeon.slug}' and '{suture}' is released.")
+        raise NotFound(f"No policy of '{surgeon.slug}' and '{suture}' is released.")
+    _withdraw(session, releases, actor)
+    return releases
+
+
+def withdraw_all(session: Session, surgeon: Surgeon, actor: str) -> list[Release]:
+    """Withdraw all releases of all styles of a surgeon, and return them."""
+    mine = select(Release).where(Release.surgeon_row == surgeon.row, Release.withdrawn_at.is_(None))
+    releases = list(session.scalars(mine.order_by(Release.row)))
     _withdraw(session, releases, actor)
     return releases
 
 
 def withdraw_resting_on(session: Session, demonstration: Demonstration, actor: str) -> list[Release]:
-    """Withdraw the releases that rest on a demonstration, and with the served one those that it superseded."""
+    """Withdraw the releases learnt from a demonstration; if the served one is among them, all of the style."""
     releases = standing(session, demonstration.surgeon_row, demonstration.suture)
-    resting = [r for r in releases if demonstration in r.policy.demonstrations]
-    withdrawn = list(releases) if releases and releases[0] in resting else resting
+    withdrawn = _with_superseded(releases, [r for r in releases if demonstration in r.policy.demonstrations])
     _withdraw(session, withdrawn, actor)
     return withdrawn
+
+
+def withdraw_policies(session: Session, ended: Mapping[str, datetime], actor: str) -> None:
+    """Withdraw releases of policies that ended later; if a served one is among them, all releases of its style.
+
+    Args:
+        session: The caller's transaction.
+        ended: By the policy's SHA-256, the moment of its end; a release after that moment stays.
+        actor: The actor of the events.
+    """
+    query = select(Release, PolicyVersion.sha256).join(PolicyVersion, PolicyVersion.row == Release.policy_row)
+    query = query.where(Release.withdrawn_at.is_(None))
+    query = query.order_by(Release.surgeon_row, Release.suture, Release.row.desc())
+    withdrawn: list[Release] = []
+    for _, style in groupby(session.execute(query), key=lambda one: (one[0].surgeon_row, one[0].suture)):
+        named = [(one, policy) for one, policy in style]
+        ending = [one for one, policy in named if policy in ended and one.released_at <= ended[policy]]
+        withdrawn += _with_superseded([one for one, _ in named], ending)
+    _withdraw(session, withdrawn, actor)
+
+
+def _with_superseded(releases: Sequence[Release], ending: list[Release]) -> list[Release]:
+    """Return the ending releases, or all releases of the style if the served one is among them, the newest first."""
+    return list(releases) if releases and releases[0] in ending else ending
 
 
 def _withdraw(session: Session, releases: Sequence[Release], actor: str) -> None:
@@ -91,3 +286,96 @@ def _withdraw(session: Session, releases: Sequence[Release], actor: str) -> None
         record(session, actor, "withdraw", "policy-version", one.policy.sha256, one.policy.surgeon)
     session.flush()
     announce(session)
+
+
+TRAINING = "training"
+Style = tuple[int, str]  # a surgeon's row and a suture type's slug
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The result of a job or of a style of a batch as the API returns it, and the policy version that is served now."""
+
+    served: dict[str, Any] | None
+    result: dict[str, Any] | None
+
+
+def outcomes_of(session: Session, jobs: Sequence[Job]) -> dict[int, Outcome]:
+    """Return the outcomes of jobs of any kind, by row; only trainings serve a style."""
+    trainings: dict[int, Style] = {
+        job.row: (job.surgeon_row, job.request["suture"])
+        for job in jobs
+        if job.kind == TRAINING and job.surgeon_row is not None
+    }
+    served = served_by(session, trainings.values())
+    refused = _refused(session, {surgeon for surgeon, _ in trainings.values()})
+    return {job.row: _outcome(job, trainings.get(job.row), served, refused) for job in jobs}
+
+
+def outcomes_of_styles(session: Session, styles: Sequence[StyleToRetrain]) -> dict[int, Outcome]:
+    """Return the outcomes of styles of a batch, by row: the result is the comparison with the released version."""
+    keys = {one.row: (one.demonstration.surgeon_row, one.demonstration.suture) for one in styles}
+    served = served_by(session, keys.values())
+    refused = _refused(session, {surgeon for surgeon, _ in keys.values()})
+    told = {}
+    for one in styles:
+        now, result = served.get(keys[one.row]), one.comparison
+        if result is not None and one.policy is not None:
+            was = {"was_released": result["now_released"]}
+            asked = result["now_released"] or result["not_released_because"] is not None
+            released, because = _standing(one.policy.sha256, now, refused.get(keys[one.row][0]), asked, result)
+            result = result | was | {"now_released": released} | because
+        told[one.row] = Outcome(now, result)
+    return told
+
+
+def served_by(session: Session, styles: Collection[Style]) -> dict[Style, dict[str, Any]]:
+    """Return the versions that some styles serve, with one statement; styles that serve nothing are left out."""
+    if not styles:
+        return {}
+    by = PolicyVersion
+    query = select(Release.surgeon_row, Release.suture, Release.released_at, by.version, by.sha256).join(
+        by, by.row == Release.policy_row
+    )
+    mine = Release.surgeon_row.in_({surgeon for surgeon, _ in styles}), Release.suture.in_({name for _, name in styles})
+    return {
+        (surgeon, suture): {"version": version, "sha256": sha256, "released_at": rfc3339(at)}
+        for surgeon, suture, at, version, sha256 in session.execute(query.where(*mine, is_served()))
+    }
+
+
+def _refused(session: Session, surgeons: Collection[int]) -> dict[int, str]:
+    """Return, by row, why surgeons' consent does not cover training; surgeons whose consent does are left out."""
+    if not surgeons:
+        return {}
+    found = session.scalars(select(Surgeon).where(Surgeon.row.in_(surgeons)))
+    return {one.row: str(why) for one in found if (why := refusal(one, "training")) is not None}
+
+
+def _outcome(job: Job, style: Style | None, served: dict[Style, dict[str, Any]], refused: dict[int, str]) -> Outcome:
+    if style is None:
+        return Outcome(None, job.result)
+    now, result = served.get(style), job.result
+    if result is not None:
+        was = {"was_released": result["released"]}
+        asked = job.request.get("release", False)
+        released, because = _standing(result["sha256"], now, refused.get(style[0]), asked, was | result)
+        result = result | was | {"released": released} | because
+    return Outcome(now, result)
+
+
+def _standing(
+    sha256: str, served: dict[str, Any] | None, refused: str | None, asked: bool, result: dict[str, Any]
+) -> tuple[bool, dict[str, str | None]]:
+    """Return whether a style serves a version now, and if a requested release is not in force, why and the remedy."""
+    if served is not None and served["sha256"] == sha256:
+        return True, {"not_released_because": None, "remedy": None}
+    if not asked:
+        return False, {"not_released_because": None, "remedy": None}
+    because = result["not_released_because"]
+    if because is None:
+        now = "it was withdrawn" if served is None else f"version {served['version']} was released"
+        because = f"It was released, and since then {now}."
+        if served is None and refused is not None:
+            because = f"It was released, and is no longer served. {refused}"
+    return False, {"not_released_because": because, "remedy": remedy(because)}

@@ -1,66 +1,140 @@
-"""What a lab's robot may replay: the gate, and the bag with its papers.
+"""Replay of plans on a robot: the replay gate, the replay bag, and the comparison of a recorded replay with its plan.
 
     plan --cleared--> feasible playback --replay_bag--> zip: a folder for each arm, the plan, the verdict, the policy
+    plan, recorded replay --compare_with_plan--> distances between the planned and the recorded tip path
 
-The bag holds nothing of when and where it was exported: the same plan gives the same bytes.
+The bag holds neither the time nor the place of its export: the same plan gives the same bytes.
 """
 
 import json
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
+from skills.arrays import Floats
 from skills.db.models import Plan, PolicyVersion, StoredPlayback
 from skills.db.session import Database
-from skills.errors import Conflict, Corrupt
-from skills.library import releases
-from skills.library.catalogue import check_consent
+from skills.errors import BadPlan, Conflict, Corrupt
+from skills.formats.replay_bag import (
+    JAW_CLOSED_RAD,
+    ArmMotion,
+    arm_names,
+    arms_of,
+    folder_of,
+    held_jaw_rad,
+    rows_of_pass,
+    seal,
+)
+from skills.formats.verify import PLAN, POLICY, README, VERDICT
+from skills.learning.evaluation import TIE_BREAK, dtw
+from skills.library import consent, policies, releases
 from skills.library.combined import learnt_from
-from skills.library.plans import describe_plan, find_plan, trajectory_of
+from skills.library.demos import find_demo
+from skills.library.integrity import learnt, planned
+from skills.library.plans import describe_plan, find_plan, plan_in_words, trajectory_of
 from skills.library.playbacks import trajectory_digest
-from skills.library.verified import learnt, planned
 from skills.packing import canonical, sha256
-from skills.recordings.replay import JAW_CLOSED_RAD, ArmMotion, arm_names, arms_of, folder_of, held_jaw_rad, seal
-from skills.recordings.replay_check import PLAN, POLICY, README, VERDICT
-from skills.style.trajectory import Trajectory
+from skills.planning.trajectory import Trajectory
+from skills.remedies import Action, Remedy
+
+POINTS = 1000  # ours, for either path: one every 0.25 mm of a long pass, and 24 MB to align the two
+
+
+def compare_with_plan(session: Session, plan_sha256: str, demo_sha256: str, pass_index: int = 0) -> dict[str, Any]:
+    """Align a recorded replay with a pass of its plan, and return the distances between the two tip paths, in mm.
+
+    The paths are aligned as a whole (dynamic time warping), so the two clocks need not agree; the recording has to be
+    cut to the replay itself. Each path is thinned to `POINTS` points at most, so differences below about 0.2 mm are not
+    resolved.
+
+    Args:
+        session: The caller's transaction.
+        plan_sha256: The plan's digest.
+        demo_sha256: The digest of the demonstration that was cut out of the replay's recording.
+        pass_index: The pass of the plan, counted from 0.
+
+    Raises:
+        NotFound: There is no such plan or demonstration.
+        BadPlan: The plan has no such pass, or the recording is of another arm or in another frame.
+    """
+    of_plan, of_demo = find_plan(session, plan_sha256), find_demo(session, demo_sha256)
+    plan, demo = planned(of_plan), of_demo.demo
+    if (plan.arm, plan.frame) != (demo.arm, demo.frame):
+        raise BadPlan(
+            f"The plan is for {plan.arm} in the frame {plan.frame!r}, the recording is of {demo.arm} in "
+            f"{demo.frame!r}; record the arm's local/measured_cp."
+        )
+    trajectory = trajectory_of(plan)
+    meant = trajectory.tip_mm[rows_of_pass(trajectory, pass_index)]
+    apart_mm = dtw(_thinned(demo.tip_mm), _thinned(meant)).differences_mm
+    distance_mm = np.linalg.norm(apart_mm, axis=1)
+    return {
+        "plan": of_plan.sha256,
+        "demo": of_demo.sha256,
+        "pass": pass_index,
+        "mean_mm": float(distance_mm.mean()),
+        "max_mm": float(distance_mm.max()),
+        "start_mm": float(np.linalg.norm(demo.tip_mm[0] - meant[0])),
+        "end_mm": float(np.linalg.norm(demo.tip_mm[-1] - meant[-1])),
+        "dtw_mean_mm": apart_mm.mean(axis=0).tolist(),
+        "rmse_mm": np.sqrt((apart_mm**2).mean(axis=0)).tolist(),
+        "planned_s": float(np.ptp(trajectory.stamps_s[trajectory.pass_index == pass_index])),
+        "recorded_s": float(demo.stamps_s[-1]),
+        "tie_break": TIE_BREAK,
+    }
+
+
+def _thinned(path_mm: Floats) -> Floats:
+    """Return at most `POINTS` points of a path, shape (T, 3), evenly spaced by index, its ends included."""
+    return path_mm[np.linspace(0, len(path_mm) - 1, min(len(path_mm), POINTS)).round().astype(np.int64)]
+
 
 LIMITS = (
-    "Certified on its grid alone: coverage and grid_certificate say what was checked. They say nothing of the arm's "
+    "Certified on its grid alone: coverage and grid_certificate list the checks. They do not cover the arm's "
     "accuracy, of tissue, or of another arm, frame or instrument than these."
 )
 USE = "Research use only; not a medical device. Never replay it on or near a person."
 
 
 def replay_bag(
-    database: Database, plan_sha256: str, *, tip_error_mm: float, lower_bound: float, pass_index: int | None = None
+    database: Database,
+    plan_sha256: str,
+    *,
+    tip_error_mm: float,
+    lower_bound: float,
+    pass_index: int | None = None,
+    handoff: Literal["none"] | None = None,
 ) -> bytes:
-    """Compose the bag of a plan, or of one of its passes, counted from 0: a zip archive.
+    """Return the replay bag of a plan, or of one of its passes, as the bytes of a zip archive.
 
     Args:
-        database: Where the plan is.
+        database: The database with the plan.
         plan_sha256: The plan's digest.
-        tip_error_mm: Which tip error the doubt is taken under, see `check_doubt`.
-        lower_bound: The least probability, by its lower bound, with which every pass succeeds.
-        pass_index: One pass alone; None: all of them.
+        tip_error_mm: The tip error under which the plan's probability of success is taken, see `check_doubt`.
+        lower_bound: The least probability, by its lower bound, with which every pass has to succeed.
+        pass_index: Export this pass alone, counted from 0; None: all of them.
+        handoff: "none" asks for the bag of a plan without a hand-off.
 
     Raises:
         NotFound: There is no such plan.
-        Conflict: It must not be replayed, see `cleared`; or what was played are not the samples that would be exported.
+        Conflict: The plan must not be replayed, see `cleared`; the playback checked other samples than those that would
+            be exported; or consent was withdrawn during the export.
         BadPlan: The plan has no such pass.
-        Corrupt: What is stored is not what was planned, learnt or judged.
+        Corrupt: A stored plan, policy or verdict does not match its digest.
     """
     with database.reading() as session:
         row = find_plan(session, plan_sha256)
-        verdict = cleared(session, row, tip_error_mm=tip_error_mm, lower_bound=lower_bound)
+        verdict = cleared(session, row, tip_error_mm=tip_error_mm, lower_bound=lower_bound, handoff=handoff)
         plan, demo, policy = planned(row), learnt_from(row.policy), row.policy
         learnt(policy)
         trajectory = trajectory_of(plan)
         papers = {PLAN: _plan(row, trajectory), VERDICT: _verdict(row, verdict), POLICY: _policy(policy)}
+    # The samples are computed anew; an older version may have computed and checked others.
     if trajectory_digest(trajectory) != papers[VERDICT]["report"].get("trajectory"):
         raise Conflict(
-            "The arm would move otherwise than when the plan was played, by an older version; play it again."
+            "This version computes another motion than the older version that played the plan; play it again."
         )
     arms = arms_of(
         trajectory,
@@ -73,25 +147,41 @@ def replay_bag(
     members = {name: _written(paper) for name, paper in papers.items()}
     members[README] = _readme(papers[PLAN], arms).encode()
     for arm in arms:
-        members |= folder_of(arm, plan_sha256)
-    return seal(members)
+        members |= folder_of(arm, row.sha256)
+    bag = seal(members)
+    with database.reading() as session:  # again: consent or release may have changed while the bag was composed
+        again = find_plan(session, row.sha256)
+        cleared(session, again, tip_error_mm=tip_error_mm, lower_bound=lower_bound, handoff=handoff)
+    return bag
 
 
 # ---- the gate ---------------------------------------------------------------------------------------------------
 
 
-def cleared(session: Session, plan: Plan, *, tip_error_mm: float, lower_bound: float) -> StoredPlayback:
-    """Find the playback that lets a plan be replayed: the newest of exactly this plan, feasible and certain enough.
+def cleared(
+    session: Session, plan: Plan, *, tip_error_mm: float, lower_bound: float, handoff: Literal["none"] | None = None
+) -> StoredPlayback:
+    """Return the playback that clears a plan for replay: the newest of exactly this plan, feasible and certain enough.
+
+    Args:
+        session: The caller's transaction.
+        plan: The plan.
+        tip_error_mm: The tip error that is expected of the robot, see `check_doubt`.
+        lower_bound: The least probability, by its lower bound, with which every pass has to succeed.
+        handoff: "none" accepts a plan without a hand-off.
 
     Raises:
-        Conflict: Consent does not cover an export; the demonstration was withdrawn; another policy than the plan's is
-            released, or none; the plan was not played, is not feasible, or not certain enough.
-        Corrupt: The stored verdict is not the one that was given.
+        Conflict: Consent does not cover training and export; the plan has no hand-off, and `handoff` is not "none"; the
+            demonstration was withdrawn; another policy than the plan's is released, or none; the plan was not played,
+            is not feasible, or not certain enough.
+        Corrupt: The stored verdict does not match its digest.
     """
     policy = plan.policy
-    check_consent(policy.surgeon, "export")
+    consent.require(policies.followable(policy).surgeon, "export")
+    if handoff != "none" and planned(plan).psm_m is None:
+        raise Conflict("This plan has no hand-off: no PSM_M, no A2.", Remedy(Action.EXPORT_A1_ALONE))
     if policy.rests_on_withdrawn:
-        raise Conflict("The demonstration that this plan rests on was withdrawn; plan with another policy.")
+        raise Conflict("The demonstration that this plan depends on was withdrawn; plan with another policy.")
     served = releases.standing(session, policy.surgeon_row, policy.suture)
     if not served or served[0].policy_row != policy.row:
         now = f"version {served[0].policy.version} is" if served else "none is"
@@ -103,11 +193,9 @@ def cleared(session: Session, plan: Plan, *, tip_error_mm: float, lower_bound: f
         select(StoredPlayback).where(StoredPlayback.plan_row == plan.row).order_by(StoredPlayback.row.desc()).limit(1)
     )
     if played is None:
-        raise Conflict("This plan was not played in the simulator yet; POST /playbacks asks for it.")
+        raise Conflict("This plan was not played in the simulator yet.", Remedy(Action.PLAY, plan=plan.sha256))
     if sha256(canonical([plan.sha256, played.report])) != played.sha256:
-        raise Corrupt(
-            "A stored verdict is not the one that was given; restore it from a backup or play the plan again."
-        )
+        raise Corrupt("A stored verdict does not match its digest; restore it from a backup or play the plan again.")
     if not (played.feasible and played.report["feasible"] is True):
         raise Conflict(
             f"The simulator found this plan infeasible: {played.report['failure_in_words']} Change the plan."
@@ -117,37 +205,37 @@ def cleared(session: Session, plan: Plan, *, tip_error_mm: float, lower_bound: f
 
 
 def check_doubt(report: dict[str, Any], *, tip_error_mm: float, lower_bound: float) -> None:
-    """Refuse a plan whose least certain pass may succeed less often than it should when the world is not exact.
+    """Refuse a plan whose least certain pass succeeds too rarely when the world differs from the plan.
 
     Args:
-        report: A playback's stored report; its `doubt` is a `style.doubt.Doubt` as JSON, null where that has NaN.
-        tip_error_mm: The tip error that is expected of the robot: one that was judged.
-        lower_bound: What the lower bounds of all passes have to reach.
+        report: A playback's stored report; its `doubt` is a `skills.verification.monte_carlo.Doubt` as JSON, with null
+            for NaN.
+        tip_error_mm: The tip error that is expected of the robot: one of those that were simulated.
+        lower_bound: The value that the lower bounds of all passes have to reach.
 
     Raises:
-        Conflict: One does not, or doubt was not judged under this tip error.
+        Conflict: A pass does not reach it, or the plan was not simulated under this tip error.
     """
     judged = (report.get("doubt") or {}).get("under", [])
     passes = [one for under in judged if under["tip_error_mm"] == tip_error_mm for one in under["passes"]]
     if not passes:
-        raise Conflict(
-            f"With a tip error of {tip_error_mm:g} mm this plan was not judged; play it again with POST /playbacks."
-        )
+        raise Conflict(f"This plan was not judged with a tip error of {tip_error_mm:g} mm; play it again.")
     least = float(np.min(np.array([one["succeeds"]["lower"] for one in passes], dtype=np.float64)))  # null becomes NaN
+    # NaN fails too: it is not >= any bound.
     if not least >= lower_bound:
         raise Conflict(
             f"With a tip error of {tip_error_mm:g} mm a pass of this plan may succeed with a probability of only "
-            f"{least:.3f}, and {lower_bound:g} is asked for; move its suture points, or calibrate the robot.",
+            f"{least:.3f}, and {lower_bound:g} is required; move its suture points, or calibrate the robot.",
             least=least,
             asked=lower_bound,
         )
 
 
-# ---- the papers -------------------------------------------------------------------------------------------------
+# ---- the documents in the bag -----------------------------------------------------------------------------------
 
 
 def _plan(plan: Plan, trajectory: Trajectory) -> dict[str, Any]:
-    """Write the plan as a client is told of it, from its verified value and not from what was written beside it."""
+    """Return the plan as the API describes it, from its verified value and not from the description stored with it."""
     policy = plan.policy
     return {
         "use": USE,
@@ -155,7 +243,8 @@ def _plan(plan: Plan, trajectory: Trajectory) -> dict[str, Any]:
         "surgeon": policy.surgeon.slug,
         "suture": policy.suture,
         "policy": {"version": policy.version, "sha256": policy.sha256},
-        **describe_plan(planned(plan), trajectory),
+        **(about := describe_plan(planned(plan), trajectory)),
+        "in_words": plan_in_words(about),
     }
 
 
@@ -171,7 +260,7 @@ def _verdict(plan: Plan, played: StoredPlayback) -> dict[str, Any]:
 
 
 def _policy(policy: PolicyVersion) -> dict[str, Any]:
-    """Write the policy's card: its manifest, and how far it goes."""
+    """Return the policy's manifest with the limits of its use."""
     return {
         "use": USE,
         "limits": LIMITS,
@@ -186,18 +275,22 @@ def _written(paper: dict[str, Any]) -> bytes:
 
 
 def _readme(plan: dict[str, Any], arms: tuple[ArmMotion, ...]) -> str:
-    """Say what the bag is, and of each arm what a person has to compare before it moves."""
+    """Return the text of the bag's README: its contents, and the figures of each arm to check before it moves."""
     about = [
         f"A needle hand-off for replay: plan {plan['sha256']},",
         f"surgeon {plan['surgeon']}, {plan['suture']}, policy version {plan['policy']['version']}.",
+        plan["in_words"],
         "",
         USE,
         "",
         "1. `skills verify FILE.zip` first; `sha256sum -c SHA256SUMS` in the unpacked folder checks the files alone.",
-        "2. Then docs/replay.md of suture-skills, from the top: a simulator before a robot.",
+        "2. Then follow docs/replay.md of suture-skills from its beginning: a simulator before a robot.",
     ]
     if plan["orientation"] != "demonstrated":
-        about += ["", "The demonstration had no orientation. The tool is ASSUMED to point straight down: compare it."]
+        about += [
+            "",
+            "The demonstration had no orientation. The tool is ASSUMED to point straight down: check its orientation.",
+        ]
     for arm in arms:
         about += ["", *_arm_lines(arm, plan["arm"])]
     return "\n".join([*about, ""])
@@ -207,10 +300,10 @@ def _arm_lines(arm: ArmMotion, planned_arm: str) -> list[str]:
     low, high = arm.extent_mm.tolist()
     box = [f"   {axis}:[{a:f}, {b:f}]" for axis, a, b in zip("XYZ", low, high, strict=True)]
     if arm.role == "PSM_M":
-        jaw = "stays open; nothing takes the needle until a surgeon closes it"
+        jaw = "stays open; the needle is not taken until a surgeon closes it"
         named = f"{arm.name}, PSM_M: it takes the needle."
     else:
-        jaw = "closed, and it presses" if arm.jaw_rad == JAW_CLOSED_RAD else "as demonstrated (median)"
+        jaw = "closed, with a holding force" if arm.jaw_rad == JAW_CLOSED_RAD else "as demonstrated (median)"
         known = planned_arm.upper() == arm_names(planned_arm)[0]
         assumed = "" if known else f" ASSUMED: the demonstration calls its arm {planned_arm!r}."
         named = f"{arm.name}, PSM_A: it brings the needle.{assumed}"

@@ -1,6 +1,6 @@
-"""Asking for many styles to be trained again, and looking at what became of them.
+"""Requests to train many styles again (batches), and queries of their results.
 
-What a batch is made of stands in `skills.library.batches`, how it is carried out in `skills.library.batch_work`.
+`skills.library.jobs` describes the rows of a batch, `skills.library.batch_work` trains its styles.
 """
 
 import secrets
@@ -11,67 +11,121 @@ from typing import Any
 from sqlalchemy import ColumnElement, func, insert, select
 from sqlalchemy.orm import Session
 
-from skills.db.books import Job, StyleToRetrain
+from skills.db.base import rfc3339
 from skills.db.models import Demonstration, PolicyVersion, Surgeon, SutureType
+from skills.db.service_tables import Job, StyleToRetrain
 from skills.deep.learning import require_installed
 from skills.errors import Conflict, NotFound
-from skills.library import batches, jobs
-from skills.library.batches import BATCH, PART
+from skills.learning.learners import LEARNER_VERSION, describe_learner
+from skills.learning.q_learning import PhaseQLearning
+from skills.library import jobs
 from skills.library.catalogue import find_surgeon, find_suture_type
-from skills.library.training import describe_learner
+from skills.library.combined import Recipe, newest_demos, recipes_of
+from skills.library.jobs import BATCH, PART, Asked, PartRequest, RetrainingRequest, did_nothing
+from skills.library.releases import Outcome
+from skills.library.training import GATE_VERSION
 from skills.packing import canonical, sha256
-from skills.style.learning.learners import LEARNER_VERSION, Learner
-from skills.style.learning.q_learning import PhaseQLearning
+from skills.remedies import Action, Remedy
+from skills.schemas.requests import RetrainingIn
 
-MOST_IN_A_PART = 50  # styles: the engine's cost of one, some 30 ms, is then spread over a second of work
-FEWEST_PARTS = 16  # where there are so many styles: parts are what several workers share
+MOST_IN_A_PART = 50  # styles: the engine's overhead for a part, some 30 ms, is then spread over a second of work
+FEWEST_PARTS = 16  # if there are so many styles: workers share a batch part by part
 
 
-def request_retraining(
-    session: Session,
-    actor: str,
-    *,
-    surgeon: str | None = None,
-    suture: str | None = None,
-    only_stale: bool = False,
-    learner: Learner | None = None,
-    release: bool = False,
-) -> tuple[Job, bool]:
-    """Ask for styles to be trained again, from the newest active demonstration of each: the job, and whether it is new.
+def request_retraining(session: Session, batch: RetrainingIn, actor: str) -> Asked:
+    """Queue a batch that trains styles again, each from its newest active demonstration.
 
-    Which styles these are is settled now; they and all defaults are the job's identity. With `only_stale` a style whose
-    newest version rests on that demonstration, these settings and this learner is left out; if that leaves none, the
-    job has succeeded at once.
+    A style that serves a policy of several demonstrations is learnt from the same number of its newest ones, combined
+    in the same way.
+
+    The styles are chosen now; they and all defaults are the job's identity. With `only_stale` a style is left out if
+    its newest version was learnt from that demonstration, with these settings and this learner, and was not refused by
+    an older release gate; if no style remains, the job has succeeded at once.
+
+    If an equal batch with `release` is done, and some of its styles now serve another version than when it ended, the
+    new job consists of these styles: they are learnt again, which gives the same versions, and released by the same
+    rules.
+
+    Args:
+        session: The caller's transaction.
+        batch: The request. Without `surgeon` or `suture` styles of all of them are trained, and without `learner` phase
+            Q-learning with its defaults learns.
+        actor: The owner of the caller's key.
 
     Raises:
         NotFound: The surgeon or the suture type is unknown.
         Conflict: There is no active demonstration.
-        LearnerNotInstalled: The learner needs what is not installed here.
+        LearnerNotInstalled: The learner needs a library that is not installed.
     """
-    require_installed(learner := learner or PhaseQLearning())
-    who = find_surgeon(session, surgeon) if surgeon is not None else None
-    what = find_suture_type(session, suture) if suture is not None else None
+    require_installed(learner := batch.chosen or PhaseQLearning())
+    who = None if batch.surgeon is None else find_surgeon(session, batch.surgeon)
+    what = None if batch.suture is None else find_suture_type(session, batch.suture)
     demos = _newest_demos(session, who, what)
     if not demos:
-        raise Conflict("There is no active demonstration of what was asked for; POST /demos adds one.")
-    asked: dict[str, Any] = {
-        "surgeon": surgeon,
-        "suture": suture,
-        "only_stale": only_stale,
+        add = Remedy(Action.ADD_DEMO, surgeon=batch.surgeon or "SURGEON", suture=batch.suture or "SUTURE")
+        raise Conflict("There is no active demonstration of the requested styles.", add)
+    asked: RetrainingRequest = {
+        "surgeon": batch.surgeon,
+        "suture": batch.suture,
+        "only_stale": batch.only_stale,
         "learner": describe_learner(learner),
         "learner_version": LEARNER_VERSION,
+        "gate": GATE_VERSION,
         "seed": 0,
-        "release": release,
+        "release": batch.release,
     }
     stale = _reasons(session, demos, asked, who, what)
-    chosen = [demo for demo in demos if stale[demo.row] or not only_stale]
-    asked |= {"styles": len(chosen), "demos_sha256": sha256(canonical([demo.sha256 for demo in chosen]))}
-    job, new = jobs.ask(session, BATCH, asked, who, actor)
-    if new:
-        _divide(session, job, [{"demonstration_row": demo.row, "stale": stale[demo.row]} for demo in chosen])
-        batches.settle(session, job.row)  # where there are no styles
-        session.refresh(job)
-    return job, new
+    chosen = [demo for demo in demos if stale[demo.row] or not batch.only_stale]
+    request, unsettled = _unsettled(session, asked, chosen)
+    job, new = jobs.ask(session, BATCH, request, who, actor)
+    if not new:
+        return Asked(job, False, _did_nothing(session, job))
+    # Rows are inserted only for a new job; an equal one has its own.
+    _divide(session, job, [{"demonstration_row": demo.row, "stale": stale[demo.row]} for demo in unsettled])
+    jobs.settle(session, job.row)  # a batch without styles ends here
+    session.refresh(job)
+    if job.state == "succeeded":
+        return Asked(job, True, "Nothing: no style needs training.")
+    styles = f"{len(unsettled)} {'style' if len(unsettled) == 1 else 'styles'}"
+    why = " that serve another version than when an equal batch ended" if "after" in request else ""
+    return Asked(job, True, f"A new job is queued, of {styles}{why}.")
+
+
+def _unsettled(
+    session: Session, asked: RetrainingRequest, chosen: Sequence["_Newest"]
+) -> tuple[RetrainingRequest, Sequence["_Newest"]]:
+    """Return the request to make, and its styles; if an equal batch is done, only the styles that it would now release.
+
+    `after` names that batch, so that the request differs from it, while a repetition of the request does not differ.
+    """
+    recipes = recipes_of(session, None if asked["surgeon"] is None else {demo.surgeon_row for demo in chosen})
+    while True:
+        digest = sha256(canonical([_made_of(session, demo, recipes) for demo in chosen]))
+        request: RetrainingRequest = {**asked, "styles": len(chosen), "demos_sha256": digest}
+        known = jobs.find_live(session, BATCH, request)
+        if known is None or known.state != "succeeded" or not asked["release"]:
+            return request, chosen
+        left = jobs.changed_since(session, known.row)
+        if not left:
+            return request, chosen
+        chosen = [demo for demo in chosen if demo.row in left]
+        asked = {**asked, "after": known.id}
+
+
+def _made_of(session: Session, demo: "_Newest", recipes: dict[tuple[int, str], Recipe]) -> str | list[str]:
+    """Return the digest of a style's newest demonstration, or the combination and digests of several."""
+    recipe = recipes.get((demo.surgeon_row, demo.suture))
+    if recipe is None:
+        return demo.sha256
+    newest = newest_demos(session, demo.surgeon_row, demo.suture, recipe.demos)
+    return [recipe.how.kind, *(one.sha256 for one in newest)]
+
+
+def _did_nothing(session: Session, job: Job) -> str:
+    if job.state != "succeeded" or not job.request["release"]:
+        return did_nothing(job)
+    serving, done = jobs.count_serving(session, job.row)
+    return f"Nothing: an equal batch trained {done} styles, and {serving} of them serve its version, as when it ended."
 
 
 @dataclass(frozen=True)
@@ -95,7 +149,7 @@ def _newest_demos(session: Session, surgeon: Surgeon | None, suture: SutureType 
 def _styles(
     of: type[Demonstration] | type[PolicyVersion], surgeon: Surgeon | None, suture: SutureType | None
 ) -> list[ColumnElement[bool]]:
-    """Write which rows are of the styles that were asked for."""
+    """Return the conditions that select rows of the requested styles."""
     asked = [] if surgeon is None else [of.surgeon_row == surgeon.row]
     return asked if suture is None else [*asked, of.suture == suture.slug]
 
@@ -103,16 +157,21 @@ def _styles(
 def _reasons(
     session: Session,
     demos: Sequence[_Newest],
-    asked: dict[str, Any],
+    asked: RetrainingRequest,
     surgeon: Surgeon | None,
     suture: SutureType | None,
 ) -> dict[int, list[str]]:
-    """Say of each demonstration's style why its newest version is not what this training would make of it, if so."""
+    """Return, by demonstration, why its style's newest version is stale; an empty list if it is up to date.
+
+    It is up to date if it was learnt from this demonstration with these settings and this learner, and not refused by
+    an older gate.
+    """
     of = PolicyVersion
     last = select(func.max(of.version).label("version"), of.surgeon_row, of.suture).group_by(of.surgeon_row, of.suture)
     newest = last.where(*_styles(of, surgeon, suture)).subquery()
     said = [of.manifest[name] for name in ("demos", "learner", "settings", "seed", "learner_version")]
-    query = select(of.surgeon_row, of.suture, *said).join(
+    gate = of.releasable, of.manifest["grid_certificate"]["gate"]
+    query = select(of.surgeon_row, of.suture, *said, *gate).join(
         newest,
         (of.surgeon_row == newest.c.surgeon_row) & (of.suture == newest.c.suture) & (of.version == newest.c.version),
     )
@@ -125,18 +184,19 @@ def _reasons(
         if version is None:
             reasons[demo.row] = ["never trained"]
             continue
-        rests_on, *how, learner_version = version
+        rests_on, *how, learner_version, releasable, gate = version
         found = {
             "a newer demonstration": demo.sha256 not in rests_on,
             "other settings": tuple(how) != learnt,
             "a newer learner": learner_version != asked["learner_version"],
+            "refused by an older gate": not releasable and gate != asked["gate"],
         }
         reasons[demo.row] = [reason for reason, holds in found.items() if holds]
     return reasons
 
 
 def _divide(session: Session, job: Job, styles: Sequence[dict[str, Any]]) -> None:
-    """Give every style its row, and hand them out to parts of about the same size."""
+    """Insert a row for every style, and divide the styles into parts of about the same size."""
     size = max(1, min(MOST_IN_A_PART, -(-len(styles) // FEWEST_PARTS)))
     for first in range(0, len(styles), size):
         part = Job(
@@ -149,24 +209,49 @@ def _divide(session: Session, job: Job, styles: Sequence[dict[str, Any]]) -> Non
         )
         session.add(part)
         session.flush()
-        part.request = {"retraining": job.row, "part": part.row}  # nothing personal
-        part.identity = jobs.identity_of(PART, part.request)
+        request: PartRequest = {"retraining": job.row, "part": part.row}
+        part.request, part.identity = {**request}, jobs.identity_of(PART, request)
         rows = [{"job_row": job.row, "part_row": part.row, **style} for style in styles[first : first + size]]
         session.execute(insert(StyleToRetrain), rows)
 
 
 def find_retraining(session: Session, job_id: str) -> Job:
-    """Find a batch by its job's id."""
+    """Return a batch by its job's id."""
     job = session.scalar(select(Job).where(Job.id == job_id, Job.kind == BATCH))
     if job is None:
-        raise NotFound("There is no such retraining; GET /jobs lists all jobs.")
+        raise NotFound("There is no retraining with this job id.", Remedy(Action.LIST_JOBS))
     return job
 
 
 def list_styles(
     session: Session, job: Job, limit: int, after: int | None, state: str | None
 ) -> Sequence[StyleToRetrain]:
-    """List the styles of a batch, in the order in which they were asked for."""
+    """List the styles of a batch, in the order in which they were requested.
+
+    Args:
+        session: The caller's transaction.
+        job: The batch.
+        limit: The length of the page.
+        after: The row of the last style of the page before.
+        state: List only styles in this state.
+    """
     of = StyleToRetrain
     query = select(of).where(of.job_row == job.row, of.row > (after or 0)).order_by(of.row).limit(limit)
     return session.scalars(query if state is None else query.where(of.state == state)).all()
+
+
+def retrained_json(row: StyleToRetrain, outcome: Outcome) -> dict[str, Any]:
+    """Return the JSON of one style of a batch of retrainings."""
+    return {
+        "surgeon": row.demonstration.surgeon.slug,
+        "suture": row.demonstration.suture,
+        "demo": row.demonstration.sha256,
+        "stale_because": row.stale,
+        "state": row.state,
+        "reason": row.reason,
+        "policy_version": row.policy and row.policy.version,
+        "sha256": row.policy and row.policy.sha256,
+        "comparison": outcome.result,
+        "served": outcome.served,
+        "ended_at": rfc3339(row.ended_at),
+    }

@@ -1,120 +1,244 @@
-"""Score a demonstration against a style: how far it lies from the style's own, where, and beside whom.
+"""Scores of a demonstration against a style, and its percentiles among the stored demonstrations.
 
-A score is nothing but arithmetic on what is stored, so it is worked out whenever it is asked for, and not stored: it
-takes account of what was added, withdrawn or erased since. For learning by oneself; it is no examination.
+    ScoreIn --score--> deviation from the style's reference, figures, percentiles, progress over time, skill rating
+
+Percentiles are taken among the stored demonstrations of the suture type, measured against the same reference, by the
+skill level that surgeons state; a surgeon's own demonstrations form a progress curve over time. Demonstrations of
+surgeons who did not agree to be compared are left out.
+
+A score is computed from stored values at every request and is not stored, so it follows every addition, withdrawal and
+erasure. It is meant for self-directed learning; it is not an examination.
 """
 
+import math
 import tempfile
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass
-from typing import Any
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 
+import numpy as np
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from skills.db.models import Demonstration, StoredCalibration, StoredRecording, Surgeon
-from skills.db.seen import EVERYBODYS
+from skills.arrays import Floats
+from skills.comparison.distances import VERSION, distances, shape_of
+from skills.db.models import Demonstration, MeasuredShape, StoredCalibration, StoredRecording, Surgeon
+from skills.db.row_visibility import EVERYBODYS
 from skills.db.session import Database
-from skills.errors import BadInput, Conflict, NotFound
+from skills.demonstration.demonstration import Demo, cut_demo
+from skills.errors import BadInput, BadPath, Conflict, NotFound
+from skills.learning.evaluation import TIE_BREAK
 from skills.library import calibrations, releases
-from skills.library.beside import USE, agrees, course, others_of, percentiles
-from skills.library.catalogue import check_consent, find_surgeon, find_suture_type
-from skills.library.demos import Cut, find_demo, newest_demo
+from skills.library.catalogue import find_surgeon, find_suture_type
+from skills.library.consent import may, require
+from skills.library.demos import find_demo, newest_demo
 from skills.library.recordings import Reader, find_recording, recording_bytes
-from skills.style.demo import Demo, cut_demo
-from skills.style.evaluation import TIE_BREAK
-from skills.style.scoring.deviation import Deviation, as_recorded, in_words, laid_on
-from skills.style.scoring.figures import KIND_OF, Figure, Numbers, compare, measure
-from skills.style.scoring.model import Predicted, predict
+from skills.schemas.comparison import CurvePoint, Percentiles, Reference, Score, ScoredStyle
+from skills.schemas.requests import ScoreIn
+from skills.scoring.calibration import LEVELS, Level, Skill, rate, refusals, unrated
+from skills.scoring.deviation import as_recorded, laid, laid_on
+from skills.scoring.features import KINDS, Numbers, compare, measure
 
-CREDENTIAL = "Research use only. It compares motions, says nothing about a result, and is not a credential."
+LEAST_DEMOS, LEAST_SURGEONS = 5, 2  # of a level: with fewer, a percentile is meaningless, or describes one person
+MOST_OTHERS = 1000  # the newest of a suture type; more would not change a percentile visibly
 
 
-@dataclass(frozen=True)
-class Asked:
-    """What is to be scored, a stored demonstration or a part of a stored recording, and against which style."""
+@dataclass(frozen=True, eq=False)
+class Other:
+    """A stored demonstration, measured like the scored one; `numbers` has its distance from the reference too."""
 
-    surgeon: str
-    suture: str
-    demo: str | None = None
-    recording: str | None = None
-    part: Cut | None = None
-    reference: str | None = None
+    row: Demonstration
+    numbers: Numbers
+    distance_mm: float
+
+
+@dataclass
+class _Level:
+    """The demonstrations of the surgeons of one skill level."""
+
+    name: Level
+    numbers: list[Numbers] = field(default_factory=list)
+    surgeons: set[int] = field(default_factory=set)
+
+
+def others_of(session: Session, suture: str, onto_mm: Floats) -> Iterator[Other]:
+    """Measure the newest demonstrations of a suture type against a reference's shape, where consent covers it.
+
+    Args:
+        session: The caller's transaction.
+        suture: The suture type.
+        onto_mm: The reference's shape, shape (STATES, 3).
+    """
+    query = (
+        select(Demonstration)
+        .where(Demonstration.suture == suture, Demonstration.withdrawn_at.is_(None))
+        .order_by(Demonstration.row.desc())
+        .limit(MOST_OTHERS)
+    )
+    agreed = {row.row: row for row in session.scalars(query) if may(row.surgeon, "atlas")}
+    shapes = _shapes(session, list(agreed))
+    if not shapes:
+        return
+    totals = distances(np.stack([laid(shape, onto_mm) for shape in shapes.values()]), onto_mm[None])[:, 0]
+    for (row, shape), total in zip(shapes.items(), totals.tolist(), strict=True):
+        reported = {kind.name: agreed[row].report.get(kind.name) for kind in KINDS}
+        distance_mm = total / len(onto_mm)
+        numbers = {**reported, "size_mm": float(shape[-1, 0]), "distance_mm": distance_mm}
+        yield Other(agreed[row], numbers, distance_mm)
+
+
+def _shapes(session: Session, rows: Sequence[int]) -> dict[int, Floats]:
+    """Return the shapes of demonstrations, by row: those stored for the atlas, and newly measured ones for the rest."""
+    of_these = MeasuredShape.demonstration_row.in_(rows)
+    kept = session.scalars(select(MeasuredShape).where(of_these, MeasuredShape.version == VERSION))
+    shapes = {one.demonstration_row: one.measured.shape_mm for one in kept}
+    recorded = select(Demonstration.row, Demonstration.demo).where(Demonstration.row.in_({*rows} - {*shapes}))
+    for row, demo in session.execute(recorded):
+        try:
+            shapes[row] = shape_of(demo)
+        except BadPath:  # it ends where it began, so it has no direction for a comparison
+            continue
+    return {row: shape for row, shape in shapes.items() if shape is not None}
+
+
+def percentiles(
+    others: Sequence[Other], mine: Numbers, scored: Demonstration | None, reference: Demonstration
+) -> list[Percentiles]:
+    """Return the percentiles of a motion's figures among the demonstrations of each skill level."""
+    return [_percentile(level, mine) for level in _by_level(others, scored, reference)]
+
+
+def _by_level(others: Sequence[Other], scored: Demonstration | None, reference: Demonstration) -> list[_Level]:
+    """Group demonstrations by the skill level of their surgeons, without the scored one and the reference."""
+    levels: dict[str | None, _Level] = {name: _Level(name) for name in LEVELS}
+    out = {reference.row, *([scored.row] if scored else [])}
+    for other in others:
+        level = levels.get(other.row.surgeon.skill_level)
+        if level is not None and other.row.row not in out:
+            level.numbers.append(other.numbers)
+            level.surgeons.add(other.row.surgeon_row)
+    return list(levels.values())
+
+
+def _percentile(level: _Level, mine: Numbers) -> Percentiles:
+    """Return the share of a level's demonstrations with a smaller value, for each figure; equal values count half."""
+    reason, below = None, None
+    if len(level.numbers) < LEAST_DEMOS or len(level.surgeons) < LEAST_SURGEONS:
+        reason = f"at least {LEAST_DEMOS} demonstrations of {LEAST_SURGEONS} surgeons are needed"
+    else:
+        below = {name: _share_below(mine[name], [one[name] for one in level.numbers]) for name in mine}
+    return Percentiles(
+        level=level.name, demos=len(level.numbers), surgeons=len(level.surgeons), reason=reason, below=below
+    )
+
+
+def _share_below(value: float | None, among: Sequence[float | None]) -> float | None:
+    """Return the share of values below one; None if it, or too many of the others, were not recorded."""
+    known = [one for one in among if one is not None]
+    if value is None or len(known) < LEAST_DEMOS:
+        return None
+    return sum(0.5 if math.isclose(one, value) else float(one < value) for one in known) / len(known)
+
+
+def course(others: Sequence[Other], scored: Demonstration | None) -> list[CurvePoint]:
+    """List the scored surgeon's demonstrations of the suture type up to the scored one, in the order of recording."""
+    if scored is None:
+        return []
+
+    def when(row: Demonstration) -> tuple[int, float]:
+        return row.recording_row, row.start_s
+
+    mine = [one for one in others if one.row.surgeon_row == scored.surgeon_row and when(one.row) <= when(scored)]
+    return [
+        CurvePoint(
+            demo=one.row.sha256,
+            session=one.row.session,
+            stored_at=one.row.recording.created_at,
+            distance_mm=one.distance_mm,
+            duration_s=one.numbers["duration_s"],
+            log_dimensionless_jerk=one.numbers["log_dimensionless_jerk"],
+        )
+        for one in sorted(mine, key=lambda one: when(one.row))
+    ]
+
+
+CREDENTIAL = "Research use only. It compares motions, does not judge the outcome, and is not a credential."
 
 
 @dataclass(frozen=True, eq=False)
 class _Scored:
-    """What is scored: its motion, where it comes from, and whose it is where that is known."""
+    """The scored motion, its recording, and its row if it is a stored demonstration."""
 
     demo: Demo
     recording: StoredRecording
     row: Demonstration | None = None
 
 
-def score(database: Database, asked: Asked, read: Reader) -> dict[str, Any]:
-    """Score a motion: what a client is told of it.
+def score(database: Database, asked: ScoreIn, read: Reader) -> Score:
+    """Score a motion against a style.
+
+    Args:
+        database: The database, restricted to the rows that the caller may see.
+        asked: The request.
+        read: The reader of recordings, possibly in another process.
 
     Raises:
         NotFound: There is no such surgeon, suture type, demonstration or recording, or nothing of the style.
         BadInput: The demonstration is of another suture type, or the reference of another style.
-        BadPath: One of the two ends where it began, so that it has no shape.
-        BadRecording: The part asked for is not in the recording.
-        Conflict: One of the two was withdrawn, or a consent does not cover being compared.
+        BadPath: One of the two ends where it began, so it has no shape.
+        BadRecording: The requested part is not in the recording.
+        Conflict: One of the two was withdrawn, or a consent does not cover the comparison, checked at the end too.
     """
     with database.reading() as session:
         find_suture_type(session, asked.suture)
         reference, because = _reference(session, asked)
-        check_consent(reference.surgeon, USE)
+        require(reference.surgeon, "atlas")
         scored = _stored(session, asked)
         taught = reference.demo
     if scored is None:
         scored = _of_recording(database, asked, read)
+    # No transaction is open during the computation.
     numbers, beside = measure(scored.demo), measure(taught)
     deviation = laid_on(scored.demo, taught)
-    with database.reading() as session:
-        others = list(others_of(session, asked.suture, deviation.reference_mm))
+    with database.reading() as session:  # again: consent may have ended while the two were compared
+        _agreed_still(session, [reference, scored.row], scored.recording)
+        others = list(others_of(session, asked.suture, np.array(deviation.reference_mm)))
         calibration = calibrations.newest(session)
     mine = {**numbers, "distance_mm": deviation.distance_mm}
-    where = as_recorded(scored.demo, taught)
     row = scored.row
-    return {
-        "demo": row.sha256 if row else None,
-        "recording": scored.recording.sha256,
-        "arm": scored.demo.arm,
-        "start_s": scored.demo.start_s,
-        "end_s": scored.demo.end_s,
-        "surgeon": row.surgeon.slug if row else None,
-        "style": {"surgeon": asked.surgeon, "suture": asked.suture},
-        "reference": {
-            "demo": reference.sha256,
-            "because": because,
-            "is_itself": bool(row and row.row == reference.row),
-        },
-        "figures": [_figure(one) for one in compare(numbers, beside)],
-        "deviation": _deviation(deviation),
-        "as_recorded": None if where is None else _deviation(where),
-        "tie_break": TIE_BREAK,
-        "percentiles": percentiles(others, mine, row, reference),
-        "curve": course(others, row),
-        "skill": _skill(calibration, numbers),
-        "use": CREDENTIAL,
-    }
+    return Score(
+        demo=row.sha256 if row else None,
+        recording=scored.recording.sha256,
+        arm=scored.demo.arm,
+        start_s=scored.demo.start_s,
+        end_s=scored.demo.end_s,
+        surgeon=row.surgeon.slug if row else None,
+        style=ScoredStyle(surgeon=asked.surgeon, suture=asked.suture),
+        reference=Reference(demo=reference.sha256, because=because, is_itself=bool(row and row.row == reference.row)),
+        figures=compare(numbers, beside),
+        deviation=deviation,
+        as_recorded=as_recorded(scored.demo, taught),
+        tie_break=TIE_BREAK,
+        percentiles=percentiles(others, mine, row, reference),
+        curve=course(others, row),
+        skill=_skill(calibration, numbers),
+        use=CREDENTIAL,
+    )
 
 
 def references(session: Session, suture: str) -> list[Surgeon]:
-    """List whose style a demonstration of a suture type can be scored against, experts first: who agreed to it."""
+    """List the surgeons with a demonstration of a suture type to compare with, as far as they agreed, experts first."""
     having = select(Demonstration.surgeon_row).where(
         Demonstration.suture == suture, Demonstration.withdrawn_at.is_(None)
     )
     found = session.scalars(select(Surgeon).where(Surgeon.row.in_(having)).order_by(Surgeon.slug))
-    return sorted(filter(agrees, found), key=lambda one: one.skill_level != "expert")
+    return sorted((one for one in found if may(one, "atlas")), key=lambda one: one.skill_level != "expert")
 
 
-# ---- what is compared with what -----------------------------------------------------------------------------------
+# ---- the two motions ----------------------------------------------------------------------------------------------
 
 
-def _reference(session: Session, asked: Asked) -> tuple[Demonstration, str]:
-    """Find what stands for a style, and say why."""
+def _reference(session: Session, asked: ScoreIn) -> tuple[Demonstration, str]:
+    """Return the demonstration that represents a style, and the reason for this choice."""
     surgeon = find_surgeon(session, asked.surgeon)
     if asked.reference is not None:
         named = find_demo(session, asked.reference)
@@ -122,10 +246,10 @@ def _reference(session: Session, asked: Asked) -> tuple[Demonstration, str]:
             raise BadInput("The reference is a demonstration of another style; name one of this surgeon and suture.")
         if named.withdrawn_at is not None:
             raise Conflict("The reference was withdrawn; name another, or none.")
-        return named, "it was asked for"
-    standing = releases.standing(session, surgeon.row, asked.suture)
-    if standing:
-        policy = standing[0].policy
+        return named, "it was requested"
+    served = releases.served(session, surgeon, asked.suture)
+    if served is not None:
+        policy = served.policy
         more = len(policy.manifest["demos"]) - 1
         rest = f" and {more} more" if more else ""
         return policy.demonstration, f"the released policy, version {policy.version}, was learnt from it{rest}"
@@ -135,107 +259,66 @@ def _reference(session: Session, asked: Asked) -> tuple[Demonstration, str]:
     return newest, "no policy is released, and it is the newest demonstration"
 
 
-def _stored(session: Session, asked: Asked) -> _Scored | None:
-    """Find the demonstration that is to be scored; None where it is a part of a recording."""
+def _stored(session: Session, asked: ScoreIn) -> _Scored | None:
+    """Return the stored demonstration to be scored; None if a part of a recording is to be scored."""
     if asked.demo is None:
         return None
     row = find_demo(session, asked.demo)
     if row.suture != asked.suture:
         raise BadInput("The demonstration is of another suture type than the style.")
     if row.withdrawn_at is not None:
-        raise Conflict("This demonstration was withdrawn; it is not compared any more.")
-    check_consent(row.surgeon, USE)
+        raise Conflict("This demonstration was withdrawn; it is no longer compared.")
+    require(row.surgeon, "atlas")
     return _Scored(row.demo, row.recording, row)
 
 
-def _of_recording(database: Database, asked: Asked, read: Reader) -> _Scored:
-    """Cut what is to be scored out of a stored recording, and store nothing."""
+def _of_recording(database: Database, asked: ScoreIn, read: Reader) -> _Scored:
+    """Cut the motion to be scored out of a stored recording, without storing it."""
     assert asked.recording is not None
     with tempfile.TemporaryFile() as file:
         with database.reading() as session:
             stored = find_recording(session, asked.recording)
-            also = select(Demonstration.surgeon_row).where(Demonstration.recording_row == stored.row)
-            for surgeon in session.scalars(select(Surgeon).where(Surgeon.row.in_(also)), execution_options=EVERYBODYS):
-                _refuse_unseen(surgeon)
+            _agreed_by_all(session, stored)
             file.writelines(recording_bytes(session, stored))
         recording = read(file, **stored.reading)
-    part = asked.part or Cut(asked.surgeon, asked.suture)
-    demo = cut_demo(recording, arm=part.arm, topic=part.topic, start_s=part.start_s, end_s=part.end_s)
+    demo = cut_demo(recording, arm=asked.arm, topic=asked.topic, start_s=asked.start_s, end_s=asked.end_s)
     return _Scored(demo, stored)
 
 
-def _refuse_unseen(surgeon: Surgeon) -> None:
-    """Check a consent without naming whose it is, for whoever asks may not be allowed to know."""
-    try:
-        check_consent(surgeon, USE)
-    except Conflict:
-        raise Conflict("The consent of a surgeon in this recording does not cover being compared.") from None
+def _agreed_by_all(session: Session, recording: StoredRecording) -> None:
+    """Refuse a recording without every surgeon's consent; the message names nobody the caller may not see.
+
+    Raises:
+        Conflict: The consent of a surgeon with a demonstration in this recording does not cover a comparison.
+    """
+    also = select(Demonstration.surgeon_row).where(Demonstration.recording_row == recording.row)
+    surgeons = session.scalars(select(Surgeon).where(Surgeon.row.in_(also)), execution_options=EVERYBODYS)
+    if not all(may(surgeon, "atlas") for surgeon in surgeons):
+        raise Conflict("The consent of a surgeon in this recording does not cover comparisons.")
 
 
-# ---- what is told -------------------------------------------------------------------------------------------------
+def _agreed_still(session: Session, compared: Sequence[Demonstration | None], recording: StoredRecording) -> None:
+    """Check the consents that a score needs once more.
+
+    Raises:
+        NotFound: A demonstration was erased since.
+        Conflict: A consent does not cover a comparison any more.
+    """
+    rows = [find_demo(session, one.sha256) for one in compared if one is not None]
+    for row in rows:
+        require(row.surgeon, "atlas")
+    if None in compared:
+        _agreed_by_all(session, recording)
 
 
-def _figure(figure: Figure) -> dict[str, Any]:
-    return asdict(figure.kind) | {"value": figure.value, "reference": figure.reference, "ratio": figure.ratio}
-
-
-def _deviation(found: Deviation) -> dict[str, Any]:
-    return {
-        "total_mm": found.total_mm,
-        "distance_mm": found.distance_mm,
-        "dtw_mean_mm": list(found.mean_mm),
-        "dtw_std_mm": list(found.std_mm),
-        "shares": found.difference.shares.tolist(),
-        "offsets_mm": found.difference.offsets.tolist(),
-        "words": list(in_words(found)),
-        "path_mm": found.path_mm.tolist(),
-        "reference_mm": found.reference_mm.tolist(),
-        "apart_mm": found.apart_mm.tolist(),
-    }
-
-
-def _skill(calibration: StoredCalibration | None, numbers: Numbers) -> dict[str, Any]:
-    """Say what the calibrated model makes of the figures, or why it says nothing."""
+def _skill(calibration: StoredCalibration | None, numbers: Numbers) -> Skill:
+    """Return the calibrated model's rating of the figures, or the reason why there is none."""
     if calibration is None:
-        return _uncalibrated("Not calibrated: `skills calibrate FOLDER` learns from rated trials that you have.")
+        return unrated("Not calibrated: the operator of this installation can calibrate it on rated trials.")
     model = calibrations.read_calibration(calibration)
-    predicted = predict(model, numbers)
-    if predicted is None:
-        missing = ", ".join(KIND_OF[name].label for name in model.figures if numbers[name] is None)
-        return _uncalibrated(f"Not rated: the calibrated model needs what was not recorded ({missing}).")
-    return {
-        "calibrated": True,
-        "calibration": calibration.sha256,
-        "words": list(_skill_words(calibration.about, predicted)),
-        "rating": predicted.rating,
-        "interval": list(predicted.interval),
-        "levels": dict(predicted.levels),
-        "terms": dict(predicted.terms),
-        "outside": list(predicted.outside),
-    }
-
-
-def _uncalibrated(why: str) -> dict[str, Any]:
-    nothing = dict.fromkeys(("calibration", "rating", "interval", "levels", "terms"))
-    return {"calibrated": False, "words": [why], "outside": [], **nothing}
-
-
-def _skill_words(about: dict[str, Any], predicted: Predicted) -> Iterator[str]:
-    data, judged = about["data"], about["validated"]
-    rho, chance = judged["all_figures"], judged["chance"]
-    low, high = rho["rho_interval"]
-    yield (
-        f"Calibrated on {data['trials']} rated trials ({data['task']}, each {data['of']}) of {data['surgeons']} "
-        f"surgeons. Of a surgeon whom it had not seen, it orders trials with a rank correlation of {rho['rho']:.2f} "
-        f"({low:.2f} to {high:.2f}; the duration alone: {judged['duration_only']['rho']:.2f}, chance: "
-        f"{chance['rho']:.2f}) and is right about the level in {100 * rho['accuracy']:.0f} % of them "
-        f"(chance: {100 * chance['accuracy']:.0f} %)."
-    )
-    low, high = predicted.interval
-    likely = max(predicted.levels, key=predicted.levels.__getitem__)
-    yield (
-        f"It would rate this motion {predicted.rating:.1f} of 30 (90 %: {low:.1f} to {high:.1f}), and says "
-        f"{likely} with a probability of {100 * predicted.levels[likely]:.0f} %."
-    )
-    if predicted.outside:
-        yield "This motion is unlike what it was calibrated on, so do not rely on that: " + " ".join(predicted.outside)
+    refused = refusals(calibration.about["validated"])
+    if refused:
+        why = "Not rated: the stored model belongs to an older version, is not accepted by this one and was not used."
+        again = "The operator of this installation can calibrate it again, on more rated trials."
+        return unrated(" ".join([why, *refused, again]))
+    return rate(model, numbers, calibration.sha256, calibration.about)

@@ -1,126 +1,155 @@
-"""Training a style: from its demonstration to a certified policy version, and to its release if that was asked."""
+"""Training of a style: from its demonstration to a certified policy version, and to its release if requested.
 
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+    request_training --> Job
+    Job's request --train_style--> Learnt --store_style--> PolicyVersion
+
+Learning and certifying run outside any transaction; the result is packed before the transaction that stores it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple, cast
 
 from sqlalchemy import LargeBinary, Result, Table, bindparam, func, insert, select, type_coerce, update
 from sqlalchemy.orm import Session
 
-from skills.db.books import Job
+from skills.comparison.combining import Combining, followed
 from skills.db.models import Demonstration, PolicyDemonstration, PolicyVersion, StoredRewardMap, Surgeon
 from skills.db.packed import seal, unpack_as
+from skills.db.service_tables import Job
 from skills.db.session import Database
 from skills.deep.learning import Tell, learn_policy, require_installed
-from skills.errors import BadInput, BadSettings, Conflict, NotFound, SkillsError
+from skills.demonstration.demonstration import Demo
+from skills.errors import BadInput, BadPlan, Conflict, NotFound, SkillsError
+from skills.fields import as_json
+from skills.gridworld.path_report import discretisation_rmse
+from skills.gridworld.reward import RewardMap, sparse_reward
+from skills.kinematics import instrument_of
+from skills.learning.certificate import Certificate, certify
+from skills.learning.evaluation import check_in_space, measure
+from skills.learning.learners import LEARNER_VERSION, Learner, describe_learner, learner_of, refuse_too_large
+from skills.learning.policy import Policy
+from skills.learning.q_learning import PhaseQLearning
 from skills.library import jobs, releases
-from skills.library.catalogue import check_consent, find_surgeon, find_suture_type
+from skills.library.catalogue import find_surgeon, find_suture_type
 from skills.library.combined import BEST, choose_demos, combining_of, describe_combined
+from skills.library.consent import refusal, require
 from skills.library.demos import find_demo
 from skills.library.events import record_each
-from skills.library.verified import policy_identity_of
+from skills.library.integrity import policy_identity_of
+from skills.library.jobs import QUEUED, Asked, Store, TrainingRequest, did_nothing
+from skills.library.policies import find_by_digest
 from skills.packing import canonical, sha256
+from skills.planning.plan import DrivenPass, driven_pass
+from skills.schemas.policies import Coverage, GridCertificate
+from skills.schemas.requests import TrainingIn
 from skills.settings import Settings
-from skills.style.certificate import Certificate, certify
-from skills.style.combining import Combining, followed
-from skills.style.demo import Demo
-from skills.style.evaluation import Metrics, discretisation_rmse, measure
-from skills.style.kinematics import POINTING_DOWN, reachable
-from skills.style.learning.learners import LEARNER_VERSION, LEARNERS, Learner, refuse_too_large
-from skills.style.learning.q_learning import PhaseQLearning, Training
-from skills.style.plan import rotation_of
-from skills.style.policy import Policy
-from skills.style.reward import RewardLevels, RewardMap, sparse_reward
-from skills.style.wandering import check_in_space
 
-Store = Callable[[Session, str], dict[str, Any]]
-
-# Statements that every style goes through, built once: to build one takes as long as to run it.
-_VERSIONS, _DEMOS = (cast(Table, one.__table__) for one in (PolicyVersion, Demonstration))
+# Statements executed for every style, built once: building one takes as long as executing it.
+_VERSIONS, _DEMOS, _SURGEONS = (cast(Table, one.__table__) for one in (PolicyVersion, Demonstration, Surgeon))
 _OF_STYLE = _VERSIONS.alias("of_style")
-STANDING = select(
-    _DEMOS.c.row,
-    _DEMOS.c.withdrawn_at,
-    select(func.max(_OF_STYLE.c.version))
-    .where(_OF_STYLE.c.surgeon_row == _DEMOS.c.surgeon_row, _OF_STYLE.c.suture == _DEMOS.c.suture)
-    .scalar_subquery()
-    .label("last"),
-).where(_DEMOS.c.row.in_(bindparam("demonstrations", expanding=True)))
+STANDING = (
+    select(
+        _DEMOS.c.row,
+        _DEMOS.c.withdrawn_at,
+        _SURGEONS.c.slug,
+        _SURGEONS.c.consent,
+        select(func.max(_OF_STYLE.c.version))
+        .where(_OF_STYLE.c.surgeon_row == _DEMOS.c.surgeon_row, _OF_STYLE.c.suture == _DEMOS.c.suture)
+        .scalar_subquery()
+        .label("last"),
+    )
+    .join_from(_DEMOS, _SURGEONS, _SURGEONS.c.row == _DEMOS.c.surgeon_row)
+    .where(_DEMOS.c.row.in_(bindparam("demonstrations", expanding=True)))
+)
 KNOWN = select(_VERSIONS.c.sha256, _VERSIONS.c.row, _VERSIONS.c.version).where(
     _VERSIONS.c.sha256.in_(bindparam("digests", expanding=True))
 )
 ADD = insert(_VERSIONS).returning(_VERSIONS.c.sha256, _VERSIONS.c.row, _VERSIONS.c.version)
+GATE_VERSION = 2  # part of a training's identity: raise it when the gate's result for an equal policy changes
 CERTIFICATE_NOTE = (
     "Checked on the grid: every greedy action against exact dynamic programming, and every start by following it; "
-    "the demonstrated pass against the arm's joint limits in closed form. It says nothing about the arm's accuracy. "
-    "Research use only."
+    "the demonstrated pass as it is driven (`driven.path`) against the arm's joint limits in closed form. It says "
+    "nothing about the arm's accuracy. Research use only."
 )
 
 
-def request_training(
-    session: Session,
-    surgeon: str,
-    suture: str,
-    actor: str,
-    *,
-    demos: list[str] | None = None,
-    combine: Combining | None = None,
-    learner: Learner | None = None,
-    seed: int = 0,
-    release: bool = False,
-) -> tuple[Job, bool]:
-    """Ask for a style to be trained, all defaults resolved: the job, and whether it is a new one.
+def request_training(session: Session, training: TrainingIn, actor: str) -> Asked:
+    """Queue the training of a style, with all defaults resolved.
 
-    Several demonstrations are combined, in whatever order they are named.
+    Several demonstrations are combined, independently of the order in which they are named. If an equal training with
+    `release` is done and the style now serves another version, or none, the training's version is released again if it
+    passes the gate, in the caller's transaction; the job's result contains the outcome.
+
+    Args:
+        session: The caller's transaction.
+        training: The request. Without `demos` the newest active demonstration of the style is meant, without `combine`
+            `BEST`, and without `learner` phase Q-learning with its defaults.
+        actor: The owner of the caller's key.
 
     Raises:
         NotFound: The surgeon, the suture type or a demonstration is unknown.
         Conflict: There is no active demonstration, or the surgeon's consent does not cover training.
-        BadInput: A demonstration of another style, one named twice, too many, or several that cannot be combined.
-        BadSettings: Learning it would need too much memory.
-        LearnerNotInstalled: The learner needs what is not installed here.
+        BadInput: A demonstration belongs to another style or is named twice, there are too many, or they cannot be
+            combined.
+        BadSettings: Learning would need too much memory.
+        LearnerNotInstalled: The learner needs a library that is not installed.
     """
-    require_installed(learner := learner or PhaseQLearning())
-    who, what = find_surgeon(session, surgeon), find_suture_type(session, suture)
-    check_consent(who, "training")
-    chosen = choose_demos(session, who, what.slug, demos)
+    require_installed(learner := training.chosen or PhaseQLearning())
+    who, what = find_surgeon(session, training.surgeon), find_suture_type(session, training.suture)
+    require(who, "training")
+    chosen = choose_demos(session, who, what.slug, training.demos)
+    # Before the job is queued, so that the caller sees the error at once.
     refuse_too_large(chosen[-1].path, learner)
-    request = {
+    request: TrainingRequest = {
         "surgeon": who.slug,
         "suture": what.slug,
         "demos": [demo.sha256 for demo in chosen],
         "learner": describe_learner(learner),
         "learner_version": LEARNER_VERSION,
-        "seed": seed,
-        "release": release,
+        "gate": GATE_VERSION,
+        "seed": training.seed,
+        "release": training.release,
     }
-    if len(chosen) > 1:  # of one alone it is left out, so that an equal training is still known as it always was
-        request["combine"] = {"kind": (combine or BEST).kind}
-    elif combine is not None:
-        raise BadInput("One demonstration is followed as it is; name several in `demos`, or leave `combine` out.")
-    return jobs.ask(session, "training", request, who, actor)
+    if len(chosen) > 1:  # left out for one demonstration, so that equal trainings of older versions keep their identity
+        request["combine"] = {"kind": (training.combining or BEST).kind}
+    elif training.combining is not None:
+        raise BadInput("A single demonstration is not combined; name several in `demos`, or omit `combine`.")
+    job, new = jobs.ask(session, "training", request, who, actor)
+    if new:
+        return Asked(job, True, QUEUED)
+    again = training.release and job.state == "succeeded"
+    return Asked(job, False, _release_again(session, job, actor) if again else did_nothing(job))
 
 
-def describe_learner(learner: Learner) -> dict[str, Any]:
-    """Write a learner as JSON: its kind and its settings."""
-    return {"kind": learner.kind, **asdict(learner)}
+def _release_again(session: Session, job: Job, actor: str) -> str:
+    """Release the version of a finished training unless its style serves it already; return the effect in words."""
+    assert job.result is not None, "it has succeeded"
+    version = find_by_digest(session, job.result["sha256"])
+    served = releases.served(session, version.surgeon, version.suture)
+    if served is not None and served.policy_row == version.row:
+        return f"Nothing: the style serves version {version.version} already."
+    because = _release(session, version, actor)
+    job.result = job.result | {"released": because is None, "not_released_because": because}
+    session.flush()
+    return f"Version {version.version} was released." if because is None else f"Nothing: {because}"
 
 
-def learner_of(described: dict[str, Any]) -> Learner:
-    """Read a learner back from JSON."""
-    settings = dict(described)
-    kind = settings.pop("kind", None)
-    if kind not in LEARNERS:
-        raise BadSettings(f"There is no learner of this kind; there are {', '.join(LEARNERS)}.")
-    return LEARNERS[kind](**settings)
+def _release(session: Session, version: PolicyVersion, actor: str) -> str | None:
+    """Release a version; return None, or the reason why it was refused."""
+    try:
+        releases.release(session, version, actor)
+    except Conflict as refused:
+        return refused.words()
+    return None
 
 
 @dataclass(frozen=True, eq=False)
 class Lesson:
-    """A demonstration as it is learnt from, its values still packed, and whose it is.
+    """A demonstration to learn from, its values still packed, with its surgeon.
 
-    Where several were combined it is the one whose place their way has; `others` are the rows of the rest, and
-    `combined` is what is told of it.
+    For several combined demonstrations it is the one at whose place their path lies; `others` are the rows of the rest,
+    and `combined` is the description of the combination in the manifest.
     """
 
     row: int
@@ -135,7 +164,7 @@ class Lesson:
 
 @dataclass(frozen=True, eq=False)
 class Learnt:
-    """A policy that was learnt and certified, packed already, so that no transaction has to wait for that."""
+    """A learnt and certified policy, already packed, so that no transaction has to wait for the packing."""
 
     lesson: Lesson
     training: str
@@ -146,14 +175,14 @@ class Learnt:
 
 
 class Stored(NamedTuple):
-    """Where a policy version stands."""
+    """The row and the version number of a stored policy."""
 
     row: int
     version: int
 
 
-def train_style(database: Database, request: dict[str, Any], settings: Settings) -> Store:
-    """Learn, certify and measure what was asked for; the returned function stores it."""
+def train_style(database: Database, request: TrainingRequest, settings: Settings) -> Store:
+    """Learn, certify and measure the requested style; the returned function stores the result."""
     with database.reading() as session:
         found = lessons(session, [find_demo(session, one).row for one in request["demos"]])
     lesson = combined_lesson(found, combining_of(request["combine"])) if "combine" in request else found[0]
@@ -161,39 +190,33 @@ def train_style(database: Database, request: dict[str, Any], settings: Settings)
 
     def store(session: Session, actor: str) -> dict[str, Any]:
         version = session.get_one(PolicyVersion, store_style(session, learnt).row)
-        released, kept_back = False, None
-        if request["release"]:
-            try:
-                releases.release(session, version, actor)
-                released = True
-            except Conflict as refused:
-                kept_back = str(refused)
+        because = _release(session, version, actor) if request["release"] else None
         return {
             "policy_version": version.version,
             "sha256": version.sha256,
             "releasable": version.releasable,
-            "released": released,
-            "not_released_because": kept_back,
+            "released": request["release"] and because is None,
+            "not_released_because": because,
         }
 
     return store
 
 
-def _telling(database: Database, request: dict[str, Any]) -> Tell:
-    """Write down how far a training has come; raises `Conflict` where nobody waits for it any more."""
+def _telling(database: Database, request: TrainingRequest) -> Tell:
+    """Return a callback that stores a training's progress; it raises `Conflict` once the job is no longer running."""
     mine = (Job.identity == jobs.identity_of("training", request), Job.state == "running")
 
     def tell(share: float) -> None:
         with database.writing() as session:
             running = update(Job).where(*mine).values(progress=share).returning(Job.row)
             if session.execute(running).first() is None:
-                raise Conflict("The training was cancelled while it was being learnt.")
+                raise Conflict("The training was cancelled while it ran.")
 
     return tell
 
 
 def lessons(session: Session, demonstrations: Sequence[int]) -> list[Lesson]:
-    """Read what is learnt from, in the order of the rows."""
+    """Return the lessons of some demonstrations, in the order of the rows."""
     of = Demonstration
     packed = type_coerce(of.demo, LargeBinary), type_coerce(StoredRewardMap.map, LargeBinary)
     query = (
@@ -206,11 +229,11 @@ def lessons(session: Session, demonstrations: Sequence[int]) -> list[Lesson]:
 
 
 def combined_lesson(lessons: Sequence[Lesson], how: Combining) -> Lesson:
-    """Combine lessons of one style, the oldest first, into one.
+    """Combine the lessons of one style, the oldest first, into one.
 
     Raises:
-        Corrupt: A demonstration is not what was stored.
-        BadPath: They cannot be laid on each other, or their way has no path in the grid.
+        Corrupt: A demonstration does not match its digest.
+        BadPath: They cannot be aligned, or their combined path has no path in the grid.
     """
     rewards = [unpack_as(RewardMap, lesson.reward) for lesson in lessons]
     found = followed([unpack_as(Demo, one.demo) for one in lessons], [reward.path for reward in rewards], how)
@@ -224,16 +247,22 @@ def combined_lesson(lessons: Sequence[Lesson], how: Combining) -> Lesson:
     )
 
 
-def learn_style(lesson: Lesson, request: dict[str, Any], settings: Settings, tell: Tell | None = None) -> Learnt:
-    """Learn, certify and measure a style from a demonstration, as a training asks for it; no transaction is open.
+def learn_style(lesson: Lesson, request: TrainingRequest, settings: Settings, tell: Tell | None = None) -> Learnt:
+    """Learn, certify and measure a style from a lesson, as a training requests it; no transaction is open.
+
+    Args:
+        lesson: The demonstration.
+        request: The training's request, as `request_training` writes it.
+        settings: Limits of time and memory.
+        tell: Progress callback.
 
     Raises:
-        LearningFailed: The process of a learner beyond the table crashed, or was not done within its limits.
+        LearningFailed: The process of a deep learner crashed or exceeded its limits.
         Conflict: The surgeon's consent does not cover it.
-        Corrupt: The demonstration is not what was stored.
+        Corrupt: The demonstration does not match its digest.
         BadSettings: It cannot be learnt with these settings.
     """
-    check_consent(lesson.surgeon, "training")
+    require(lesson.surgeon, "training")  # fails early; the check that counts is repeated in the transaction that stores
     demo, reward = unpack_as(Demo, lesson.demo), unpack_as(RewardMap, lesson.reward)
     policy = learn_policy(
         reward,
@@ -246,13 +275,14 @@ def learn_style(lesson: Lesson, request: dict[str, Any], settings: Settings, tel
     return certified(lesson, request, demo, policy)
 
 
-def certified(lesson: Lesson, request: dict[str, Any], demo: Demo, policy: Policy) -> Learnt:
+def certified(lesson: Lesson, request: TrainingRequest, demo: Demo, policy: Policy) -> Learnt:
     """Certify and measure a policy that was learnt from a demonstration, and pack all of it."""
     certificate, covered = certify(policy)
     numbers, coverage = seal(policy), seal(covered)
-    refused_because = refusals(policy, certificate, demo)
-    manifest = describe_policy(policy, certificate, coverage.digest, demo, request, refused_because)
-    if lesson.combined is not None:  # without it a digest is what it always was
+    driven, undriven = _driven(policy, demo)
+    refused_because = [*refusals(policy, certificate), *undriven]
+    manifest = describe_policy(policy, certificate, coverage.digest, demo, request, refused_because, driven)
+    if lesson.combined is not None:  # left out for one demonstration, so that older digests stay the same
         manifest["combined"] = lesson.combined
     return Learnt(
         lesson=lesson,
@@ -265,11 +295,11 @@ def certified(lesson: Lesson, request: dict[str, Any], demo: Demo, policy: Polic
 
 
 def store_style(session: Session, learnt: Learnt) -> Stored:
-    """Store what was learnt as the next version of its style, once.
+    """Store a learnt policy as the next version of its style; an equal one is not stored twice.
 
     Raises:
-        NotFound: A demonstration was erased meanwhile.
-        Conflict: One was withdrawn meanwhile.
+        NotFound: A demonstration was erased since.
+        Conflict: A demonstration was withdrawn since, or the surgeon's consent does not cover training any more.
     """
     (stored,) = store_styles(session, [learnt])
     if isinstance(stored, SkillsError):
@@ -278,15 +308,16 @@ def store_style(session: Session, learnt: Learnt) -> Stored:
 
 
 def store_styles(session: Session, learnt: Sequence[Learnt]) -> list[Stored | SkillsError]:
-    """Store what was learnt of several styles, no two of one style, as `store_style` does: or why one is not stored."""
+    """Store learnt policies of different styles, as `store_style` does, with a few statements for all of them.
+
+    Returns:
+        For each, in order, the stored version, or the error for which it was not stored.
+    """
     standing = {one.row: one for one in session.execute(STANDING, {"demonstrations": [o.lesson.row for o in learnt]})}
     known = _stored(session.execute(KNOWN, {"digests": [one.sha256 for one in learnt]}))
-    refused = {
-        one.sha256: _refusal(session, one.lesson, standing.get(one.lesson.row))
-        for one in learnt
-        if one.sha256 not in known
-    }
-    new = [one for one in learnt if one.sha256 in refused and refused[one.sha256] is None]
+    refused = {one.sha256: _refusal(session, one.lesson, standing.get(one.lesson.row)) for one in learnt}
+    # A version that is already stored is returned as it is, so a retry of a job stores nothing twice.
+    new = [one for one in learnt if one.sha256 not in known and refused[one.sha256] is None]
     if new:
         values = [_version(one, (standing[one.lesson.row].last or 0) + 1) for one in new]
         known |= _stored(session.execute(ADD, values))
@@ -296,7 +327,7 @@ def store_styles(session: Session, learnt: Sequence[Learnt]) -> list[Stored | Sk
     ]
     if rests_on:
         session.execute(insert(PolicyDemonstration), rests_on)
-    return [refused.get(one.sha256) or known[one.sha256] for one in learnt]
+    return [refused[one.sha256] or known[one.sha256] for one in learnt]
 
 
 def _stored(found: Result[Any]) -> dict[str, Stored]:
@@ -304,17 +335,17 @@ def _stored(found: Result[Any]) -> dict[str, Stored]:
 
 
 def _refusal(session: Session, lesson: Lesson, standing: Any) -> SkillsError | None:
-    """Say why what was learnt may not be stored: a demonstration that it rests on has gone meanwhile."""
+    """Return the error that forbids storing: the demonstration was erased or withdrawn since, or consent has ended."""
     others = [session.get(Demonstration, row) for row in lesson.others]
     if standing is None or None in others:
-        return NotFound("A demonstration was erased while it was being learnt from.")
+        return NotFound("A demonstration was erased while the training used it.")
     if any(one.withdrawn_at is not None for one in (standing, *others)):
-        return Conflict("A demonstration was withdrawn while it was being learnt from.")
-    return None
+        return Conflict("A demonstration was withdrawn while the training used it.")
+    return refusal(standing, "training")
 
 
 def _version(learnt: Learnt, version: int) -> dict[str, Any]:
-    """Write what was learnt as a row."""
+    """Return the values of a row of `PolicyVersion`."""
     return {
         "sha256": learnt.sha256,
         "training": learnt.training,
@@ -329,8 +360,8 @@ def _version(learnt: Learnt, version: int) -> dict[str, Any]:
     }
 
 
-def refusals(policy: Policy, certificate: Certificate, demo: Demo) -> list[str]:
-    """List why a policy may not be released: the gate of interface.md, written so that NaN fails."""
+def refusals(policy: Policy, certificate: Certificate) -> list[str]:
+    """Return the reasons on the grid against a release: the gate of interface.md, written so that NaN fails."""
     reasons = []
     if not certificate.every_action_optimal:
         reasons.append(f"{certificate.suboptimal} of {certificate.checked} greedy actions are not optimal")
@@ -339,15 +370,39 @@ def refusals(policy: Policy, certificate: Certificate, demo: Demo) -> list[str]:
         reasons.append(f"{missing} of {certificate.starts} starts do not reach the goal")
     if policy.learner.phased and not certificate.demonstration_reproduced:
         reasons.append("the rollout from the demonstrated start is not the demonstration")
-    if not demo.frame.endswith("_base"):
-        reasons.append(f"the frame '{demo.frame}' is not the arm's base, so its joint limits cannot be checked")
-    else:
-        rotation = rotation_of(demo.rotation_xyzw)
-        within = reachable(policy.path.tip_mm, POINTING_DOWN if rotation is None else rotation, demo.instrument)
-        if not within.all():
-            out = int((~within).sum())
-            reasons.append(f"{out} of {len(within)} places of the demonstrated pass are outside the joint limits")
     return reasons
+
+
+def _driven(policy: Policy, demo: Demo) -> tuple[DrivenPass | None, list[str]]:
+    """Solve the demonstrated pass in closed form; return the result, None if impossible, and reasons against a release.
+
+    NaN fails: a position is within the limits only if joints within the limits were found that put the tip there.
+    """
+    if not demo.frame.endswith("_base"):
+        return None, [
+            f"the frame '{demo.frame}' is not the arm's base, so its joint limits cannot be checked; demonstrate on a "
+            "topic in the frame of the arm's base, such as local/measured_cp of a dVRK"
+        ]
+    try:
+        driven = driven_pass(policy, demo)
+    except BadPlan as refused:
+        return None, [f"the demonstrated pass cannot be driven, so the joint limits were not checked: {refused}"]
+    if driven.beyond == 0:
+        return driven, []
+    nearest, arm = driven.nearest_limit, instrument_of(demo.instrument).arm.name
+    where = ", ".join(f"{value:.1f}" for value in nearest.tip_mm)
+    needs = (
+        "no joints put the tip there"
+        if nearest.value is None or nearest.margin is None
+        else f"the arm needs {nearest.joint} {nearest.value:.4f} {nearest.unit}, {-nearest.margin:.4f} {nearest.unit} "
+        f"beyond the limit {nearest.limit:.4f} of the {arm} with {demo.instrument}"
+    )
+    what = "the fitted path" if driven.path == "fitted" else "through the centres of its cells"
+    return driven, [
+        f"the demonstrated pass as it is driven ({what}) leaves the joint limits: at ({where}) mm in {demo.frame} "
+        f"{needs}, the furthest of {driven.beyond} of {driven.samples} places; demonstrate it further from that limit, "
+        "or with the arm's base elsewhere"
+    ]
 
 
 def describe_policy(
@@ -355,10 +410,21 @@ def describe_policy(
     certificate: Certificate,
     coverage_sha256: str,
     demo: Demo,
-    request: dict[str, Any],
+    request: TrainingRequest,
     refused_because: list[str],
+    driven: DrivenPass | None,
 ) -> dict[str, Any]:
-    """Write what a client is told of a policy (interface.md), but for its version, digest, release and arrays."""
+    """Return the manifest of a policy (interface.md): its JSON without version, digest, release and arrays.
+
+    Args:
+        policy: The policy.
+        certificate: The certificate of its grid.
+        coverage_sha256: The digest of its coverage.
+        demo: The demonstration that it was learnt from.
+        request: The training's request.
+        refused_because: The reasons against a release; empty if there are none.
+        driven: The demonstrated pass as the arm drives it; None if it could not be solved.
+    """
     path, grid = policy.path, policy.path.grid
     wandered = check_in_space(policy)
     lost_mm = discretisation_rmse(demo.tip_mm, grid, path.hysteresis)
@@ -376,37 +442,43 @@ def describe_policy(
         "phases": policy.domain.phases,
         "learner": policy.learner.kind,
         "learner_version": request["learner_version"],
-        "settings": _said(policy.learner),
-        "reward_levels": _said(policy.levels),
+        "settings": _settings(policy.learner),
+        "reward_levels": as_json(policy.levels),
         "seed": policy.seed,
         "demos": request["demos"],
-        "training": _said(policy.training),
-        "metrics": _said(metrics),
-        "coverage": {
-            "starts_reaching_goal": certificate.starts_reaching,
-            "starts_joining_nearest": certificate.starts_joining_nearest,
-            "n_states": certificate.starts,
-            "sha256": coverage_sha256,
-        },
-        "grid_certificate": {
-            "states_checked": certificate.checked,
-            "states_finishing": certificate.finishing,
-            "suboptimal_actions": certificate.suboptimal,
-            "demonstration_reproduced": certificate.demonstration_reproduced,
-            "refused_because": refused_because,
-            "note": CERTIFICATE_NOTE,
-        },
-        **({} if wandered is None else {"rollouts": asdict(wandered)}),  # without it a digest is what it always was
+        "training": as_json(policy.training),
+        "metrics": as_json(metrics),
+        "coverage": as_json(
+            Coverage(
+                starts_reaching_goal=certificate.starts_reaching,
+                starts_joining_nearest=certificate.starts_joining_nearest,
+                n_states=certificate.starts,
+                sha256=coverage_sha256,
+            )
+        ),
+        "grid_certificate": as_json(
+            GridCertificate(
+                states_checked=certificate.checked,
+                states_finishing=certificate.finishing,
+                suboptimal_actions=certificate.suboptimal,
+                demonstration_reproduced=certificate.demonstration_reproduced,
+                refused_because=tuple(refused_because),
+                gate=GATE_VERSION,
+                driven=driven,
+                note=CERTIFICATE_NOTE,
+            )
+        ),
+        **({} if wandered is None else {"rollouts": as_json(wandered)}),  # left out on the grid: older digests
     }
 
 
 def describe_grid(policy: Policy) -> dict[str, Any]:
-    """Write a policy's grid world."""
+    """Return the JSON of a policy's grid world."""
     grid = policy.path.grid
     return {"origin_mm": list(grid.origin_mm), "cell_mm": grid.cell_mm, "shape": list(grid.shape)}
 
 
-def _said(of: Learner | RewardLevels | Training | Metrics) -> dict[str, Any]:
-    """Write numbers by their names, tuples as lists, as they come back from the database."""
-    named = ((field.name, getattr(of, field.name)) for field in fields(of))
+def _settings(learner: Learner) -> dict[str, Any]:
+    """Return the settings of a learner as JSON, tuples as lists, equal to their value when read from the database."""
+    named = ((field.name, getattr(learner, field.name)) for field in fields(learner))
     return {name: list(value) if isinstance(value, tuple) else value for name, value in named}

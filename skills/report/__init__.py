@@ -1,10 +1,10 @@
-"""`skills report`: the paper's Figures 5 to 9 and Table I, redrawn from the pure core, and rivals beside them.
+"""`skills report`: the paper's Figures 5 to 9 and Table I, computed and drawn from the pure core, with rivals.
 
     sources  --compute-->  Numbers  --draw_all-->  PNG
                                     --tables_of-->  tables  --write_page-->  one HTML page
 
-A file for each figure (`fig_5` to `fig_9`, `table_1`, `slips`) computes its numbers; `drawings` draws them, `tables`
-and `sections` put them into words, and `page` into HTML. Nothing is asked of a server.
+`figures` and `rivals` compute the numbers of each figure, `numbers` those of Table I and all of them together;
+`drawings` draws them, `tables` formats them, and `page` adds the text and writes HTML. No server is needed.
 """
 
 import json
@@ -14,21 +14,19 @@ from pathlib import Path
 
 from skills.errors import BadInput
 from skills.report.drawings import draw_all
+from skills.report.figures import ABSENT, paper_source, sample_source
 from skills.report.numbers import Effort, compute
-from skills.report.page import Part, write_page
-from skills.report.sources import ABSENT, paper_source, sample_source
+from skills.report.page import Chapter, write_page
 from skills.report.tables import Table, printed_rmse, tables_of
 
 __all__ = ["ABSENT", "Effort", "Report", "write_report"]
 
-PRIVATE = (
-    "Some pictures show the paper's data, which was published without a licence: keep this page, and do not pass it on."
-)
+PRIVATE = "Some pictures show the paper's data, which was published without a licence: do not distribute this page."
 
 
 @dataclass(frozen=True)
 class Report:
-    """What was written: the page, the pictures beside it, the tables in it, and whether the paper's data was there."""
+    """The written files: the page, the pictures of it, the tables in it, and whether the paper's data was available."""
 
     page: Path
     numbers: Path
@@ -40,17 +38,17 @@ class Report:
 def write_report(
     to: Path, paper_data: Path | None, effort: Effort, tell: Callable[[str], None] = lambda _: None
 ) -> Report:
-    """Compute, draw and write everything into a folder; the same arguments give the same numbers.
+    """Compute, draw and write the report into a folder; the same arguments give the same numbers.
 
     Args:
-        to: The folder; it is made.
-        paper_data: Where the paper's data is; None: from the sample alone.
-        effort: How much to compute.
-        tell: Is told what is being done.
+        to: The folder, which is created.
+        paper_data: Folder of the paper's data; None: use the sample alone.
+        effort: The amount of computation.
+        tell: Callback with a line of progress.
 
     Raises:
         BadInput: `to` is a file, or `paper_data` does not hold the paper's data.
-        BadSettings: So much effort cannot be meant.
+        BadSettings: The effort is impossible, such as 0 iterations.
     """
     if to.exists() and not to.is_dir():
         raise BadInput(f"{to} is a file; name a folder to write the report to.")
@@ -60,7 +58,7 @@ def write_report(
     for source in (sample_source(), *([theirs] if theirs else [])):
         tell(f"computing and drawing: {source.title} ...")
         numbers = compute(source, effort)
-        parts.append(Part(source.title, draw_all(numbers, to), tables_of(numbers)))
+        parts.append(Chapter(source.title, draw_all(numbers, to), tables_of(numbers)))
     page, data = to / "index.html", to / "numbers.json"
     options = f"--irl-iterations {effort.irl_iterations} --seeds {effort.seeds} --runs {effort.runs}"
     page.write_text(write_page(parts, printed_rmse(), [PRIVATE if theirs else ABSENT], options))

@@ -1,4 +1,4 @@
-"""Draw the paper's Figures 5 to 9, and its rivals, from their numbers, in the colours of `skills.drawing`."""
+"""Drawings of the paper's Figures 5 to 9 and of the rivals, in the colours of `skills.drawing`."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -9,22 +9,22 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import MultipleLocator
 
-from skills.drawing import CELLS, GOAL, RECORDED, ROLLOUT
-from skills.report.fig_8 import Learnt
+from skills.arrays import Floats
+from skills.drawing import CELLS, GOAL, RECORDED, ROLLOUT, add_legend, space
+from skills.gridworld.grid import GridPath
+from skills.learning.slip import wilson
+from skills.report.figures import LearntStyle
 from skills.report.numbers import Numbers
-from skills.style._arrays import Floats
-from skills.style.disturbance import wilson
-from skills.style.grid import GridPath
 
 DPI = 110
 TICK_MM = 10.0
-BOX = (4, 4, 3)  # wide, wide, high, as in the paper: flat paths are stretched to be seen, the axes tell
+BOX = (4, 4, 3)  # width, width, height as in the paper: flat paths are stretched to be visible; the axes show the scale
 BLACK, FAILED = "#000000", "#cc79a7"
-REWARDS = "PuOr"  # orange pays less than nothing, purple more; told apart by the colour-blind
+REWARDS = "PuOr"  # orange is negative, purple positive; a palette for colour-blind readers
 NAME_ABOVE_MM = 6.0
-PASSES = ("#0072b2", "#56b4e9", "#009e73", "#e69f00", "#d55e00")  # all told apart by the colour-blind (Okabe, Ito)
+PASSES = ("#0072b2", "#56b4e9", "#009e73", "#e69f00", "#d55e00")  # a palette for colour-blind readers (Okabe, Ito)
 
-LINES = (  # of the policies and their rivals, told apart by colour, marker and dashes alike
+LINES = (  # of the policies and their rivals, distinguished by colour, marker and dashes at once
     (ROLLOUT, "o", "-"),
     ("#56b4e9", "P", "-."),
     ("#e69f00", "D", "--"),
@@ -36,7 +36,7 @@ LINES = (  # of the policies and their rivals, told apart by colour, marker and 
 
 
 def draw_all(numbers: Numbers, folder: Path) -> dict[str, Path]:
-    """Draw every figure of one source into a folder: its file by the figure's name."""
+    """Draw every figure of one source into a folder; returns the files by figure name."""
     files = {}
     for name, draw in DRAWINGS.items():
         files[name] = folder / f"{name}-{numbers.source.name}.png"
@@ -47,12 +47,12 @@ def draw_all(numbers: Numbers, folder: Path) -> dict[str, Path]:
 
 
 def draw_fig_5(numbers: Numbers) -> Figure:
-    """Draw the recovered reward (left) beside the sparse one (right); size and colour say how much a state pays."""
+    """Draw the recovered reward (left) and the sparse one (right); size and colour show the reward of a state."""
     both, path = numbers.fig_5, numbers.source.path
     figure = _figure(11.5, 5.2)
     titles = (
-        f"Maximum entropy IRL, {both.iterations} iterations\n"
-        f"{both.found} of its {both.visited} highest rewards lie on the path",
+        f"Maximum entropy IRL, {both.iterations} iterations\n{both.found} of its {both.visited} highest rewards "
+        "are on the path",
         f"Sparse reward, Algorithm 1\n10 at the goal, 1 at {both.visited - 1} visited states, 0 elsewhere",
     )
     for place, (rewards, title) in enumerate(zip((both.recovered, both.sparse), titles, strict=True), start=1):
@@ -64,11 +64,12 @@ def draw_fig_5(numbers: Numbers) -> Figure:
 
 
 def _dots(axes: Any, path: GridPath, rewards: Floats) -> Any:
-    """Draw a dot for every state, the best ones last; by the root of its reward, so that 1 is seen beside 10."""
+    """Draw a dot for every state, the largest rewards last; scaled by the root, so that 1 is visible next to 10."""
     most = np.abs(rewards).max()
     states = np.argsort(np.abs(rewards), kind="stable")
     root = np.sign(rewards) * np.sqrt(np.abs(rewards) / most)
-    sizes = (1.5 + 80 * root**2 + 40 * np.abs(root)) * np.where(root < 0, 0.3, 1.0)  # so as not to hide what pays
+    # small, so that negative rewards do not hide positive ones
+    sizes = (1.5 + 80 * root**2 + 40 * np.abs(root)) * np.where(root < 0, 0.3, 1.0)
     edges = np.where(root > 0.25, 0.6, 0.0)
     return axes.scatter(
         *path.grid.centres_mm(states).T,
@@ -92,7 +93,7 @@ def _scale(figure: Figure, axes: Any, dots: Any, rewards: Floats) -> None:
 
 
 def draw_fig_6(numbers: Numbers) -> Figure:
-    """Draw a recorded motion and its path; beside it the paper's path, whose own recording was not published."""
+    """Draw a recorded motion and its path, and the paper's path, whose own recording was not published."""
     source, told = numbers.source, numbers.fig_6
     panels = 2 if source.recorded_elsewhere else 1
     figure = _figure(6.2 * panels, 5.0)
@@ -125,7 +126,7 @@ def draw_fig_7(numbers: Numbers) -> Figure:
 
 
 def draw_fig_8(numbers: Numbers) -> Figure:
-    """Draw three policies of each learner, one learner to a row, with DTW's lines to the demonstration."""
+    """Draw three policies of each learner, one learner per row, with DTW's lines to the demonstration."""
     learners = list(dict.fromkeys(one.by for one in numbers.fig_8))
     figure = _figure(12.5, 3.9 * len(learners) + 0.9)
     for row, by in enumerate(learners):
@@ -135,24 +136,23 @@ def draw_fig_8(numbers: Numbers) -> Figure:
     return _titled(figure, f"Fig. 8: three policies of {numbers.source.title}, with DTW", legend=True)
 
 
-def _told(one: Learnt) -> str:
+def _told(one: LearntStyle) -> str:
     states, of = len(one.rollout.states), len(one.rollout.path.states)
     end = "" if one.rollout.finished else ", never arrives"
     return f"{one.by}\n{one.which}: {states} states for {of}, DTW {one.dtw_total_mm:g} mm{end}"
 
 
-def _draw_learnt(axes: Any, one: Learnt) -> None:
+def _draw_learnt(axes: Any, one: LearntStyle) -> None:
     path_mm, tip_mm = one.rollout.path.tip_mm, one.rollout.tip_mm
-    for number, (i, j) in enumerate(one.pairs.tolist()):
-        label = "DTW" if number == 0 else None
-        axes.plot(*np.stack((tip_mm[i], path_mm[j])).T, color=BLACK, linewidth=0.8, linestyle="--", label=label)
+    for i, j in one.pairs.tolist():
+        axes.plot(*np.stack((tip_mm[i], path_mm[j])).T, color=BLACK, linewidth=0.8, linestyle="--", label="DTW")
     _path(axes, one.rollout.path, width=3.6)
     axes.plot(*tip_mm.T, color=ROLLOUT, linewidth=1.6, marker="o", markersize=2.5, label="learnt")
     _mark_ends(axes, one.rollout.path)
 
 
 def draw_fig_9(numbers: Numbers) -> Figure:
-    """Draw ours from ten other starts; beside it the published policy that fails from one of its own."""
+    """Draw ours from ten other starts, and the first published policy, which fails from some of the same starts."""
     theirs = len(numbers.fig_9[0].published) > 0
     figure = _figure(6.4 * (1 + theirs), 5.2)
     arrived = sum(one.ours.finished for one in numbers.fig_9)
@@ -168,22 +168,15 @@ def draw_fig_9(numbers: Numbers) -> Figure:
 
 def _draw_starts(axes: Any, numbers: Numbers, rollouts: Sequence[Any]) -> None:
     _path(axes, numbers.source.path, width=3.2)
-    labelled: set[str] = set()
     for one in sorted(rollouts, key=lambda one: not one.finished):
         color, label = (ROLLOUT, "from other starts") if one.finished else (FAILED, "goes round, never arrives")
-        axes.plot(*one.tip_mm.T, color=color, linewidth=1.3 if one.finished else 3.0, label=_once(label, labelled))
+        axes.plot(*one.tip_mm.T, color=color, linewidth=1.3 if one.finished else 3.0, label=label)
         axes.scatter(*one.tip_mm[0], color=color, s=26 if one.finished else 70, depthshade=False)
     _mark_ends(axes, numbers.source.path)
 
 
-def _once(label: str, labelled: set[str]) -> str | None:
-    fresh = label not in labelled
-    labelled.add(label)
-    return label if fresh else None
-
-
 def draw_rivals(numbers: Numbers) -> Figure:
-    """Draw against the probability of a slip: who follows, at what cost in moves, and how far off."""
+    """Draw success, extra moves and DTW distance of policies and rivals against the probability of a slip."""
     figure = _figure(13.5, 5.0)
     follow, extra, off = figure.subplots(1, 3)
     for by, (color, marker, line) in zip(dict.fromkeys(one.by for one in numbers.disturbed), LINES, strict=True):
@@ -205,26 +198,20 @@ def draw_rivals(numbers: Numbers) -> Figure:
 
 def _against_slips(axes: Any, title: str, what: str) -> None:
     axes.set_title(title, fontsize=10)
-    axes.set_xlabel("probability of a slip in each move")
-    axes.set_ylabel(what)
-    axes.set_ylim(bottom=0)
+    axes.set(xlabel="probability of a slip in each move", ylabel=what, ylim=(0, None))
     axes.grid(alpha=0.3)
 
 
 def _figure(wide_inch: float, high_inch: float) -> Figure:
     figure = Figure((wide_inch, high_inch))
-    figure.set_layout_engine("constrained", rect=(0.01, 0, 0.96, 1))  # a z axis has its name outside its box
+    figure.set_layout_engine("constrained", rect=(0.01, 0, 0.96, 1))  # the label of a z axis is outside its box
     return figure
 
 
 def _space(figure: Figure, place: tuple[int, int, int], title: str) -> Any:
-    """Add axes in mm with a title; their limits follow what is drawn."""
-    axes: Any = figure.add_subplot(*place, projection="3d")
+    """Add 3-D axes in mm with a title; their limits follow the data."""
+    axes = space(figure, place)
     axes.set_title(title, fontsize=10)
-    axes.set_xlabel("x (mm)")
-    axes.set_ylabel("y (mm)")
-    axes.set_zlabel("z (mm)")
-    axes.tick_params(labelsize=7)
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_locator(MultipleLocator(TICK_MM))
     axes.set_box_aspect(BOX, zoom=0.95)
@@ -245,13 +232,8 @@ def _mark_ends(axes: Any, path: GridPath) -> None:
 
 def _titled(figure: Figure, title: str, *, legend: bool = False) -> Figure:
     figure.suptitle(title, fontsize=13)
-    spaces: list[Any] = [axes for axes in figure.axes if axes.name == "3d"]
-    entries: dict[str, Any] = {}
-    for axes in spaces:
-        handles, labels = axes.get_legend_handles_labels()
-        entries |= dict(zip(labels, handles, strict=True))
     if legend:
-        figure.legend(entries.values(), entries.keys(), loc="outside lower center", ncols=len(entries), frameon=False)
+        add_legend(figure)
     return figure
 
 

@@ -1,20 +1,19 @@
-"""The numbers as tables, for the page, for programs and for the terminal alike; nothing is computed here."""
+"""The report's numbers as tables, for the page, for programs and for the terminal; nothing is computed here."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
-from skills.report.numbers import Numbers
-from skills.report.table_1 import Row, Triple, as_printed
-from skills.style import paper
-from skills.style.disturbance import wilson
-from skills.style.evaluation import measure
+from skills.gridworld import paper
+from skills.learning.evaluation import measure
+from skills.learning.slip import wilson
+from skills.report.numbers import Numbers, Row, Triple, as_printed
 
 Cell = str | int | float
 
 
 @dataclass(frozen=True)
 class Table:
-    """Named columns and rows under a caption; `name` is unique on the page."""
+    """A caption, named columns, and rows; `name` is unique on the page."""
 
     name: str
     caption: str
@@ -26,7 +25,7 @@ class Table:
 
 
 def tables_of(numbers: Numbers) -> dict[str, tuple[Table, ...]]:
-    """Write all numbers of a source down: the tables of each figure."""
+    """Return all numbers of a source as tables, by figure."""
     return {figure: tuple(write(numbers) for write in writers) for figure, writers in WRITERS.items()}
 
 
@@ -133,7 +132,7 @@ def _table_1(numbers: Numbers) -> Table:
 
 
 def _ranges(numbers: Numbers) -> Table:
-    """Show what does not depend on a tie-break: how far the split over the axes may move."""
+    """Show the values that do not depend on a tie-break: the possible range of each axis's sum."""
     columns = ("trajectories", "axis", "sum (mm)", "least (mm)", "most (mm)")
     rows = (
         (_of(one), "xyz"[axis], round(one.sum_mm[axis], 3), _at(one.least_mm, axis), _at(one.most_mm, axis))
@@ -192,7 +191,7 @@ def _at(ends: Triple | None, axis: int) -> Cell:
 
 
 def printed_rmse() -> Table:
-    """Compare the printed RMSE with the one that follows from the printed Table I: no source is in it."""
+    """Compare the printed RMSE with the one that follows from the printed Table I; it does not depend on a source."""
     printed = paper.RMSE_AS_PRINTED_MM
     follows = as_printed().rmse_mm
     rows = tuple(

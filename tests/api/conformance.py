@@ -1,8 +1,9 @@
-"""Whether answers are what the OpenAPI document says: status, type, and JSON without a field that is not described."""
+"""Conformance of responses to the OpenAPI document: status, content type, and JSON without undescribed fields."""
 
 import json
 import re
 from functools import cache
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import httpx2 as httpx
@@ -15,13 +16,15 @@ PARAMETER = re.compile(r"\{\w+\}")
 
 
 @cache
-def conformance(database_url: str = "sqlite:///nowhere.sqlite") -> "Conformance":
-    """Make what every test judges by: the document is the same for all applications."""
-    return Conformance(create_app(Settings(database_url=database_url)).openapi())
+def conformance(database_url: str | None = None) -> "Conformance":
+    """Return the judge that all tests share: the OpenAPI document is the same for all applications."""
+    with TemporaryDirectory() as folder:
+        settings = Settings(database_url=database_url or f"sqlite:///{folder}/nothing.sqlite")
+        return Conformance(create_app(settings).openapi())
 
 
 class Conformance:
-    """The OpenAPI document, and its judgement of answers."""
+    """The OpenAPI document, and the check of responses against it."""
 
     def __init__(self, document: dict[str, Any]) -> None:
         self.document = document
@@ -33,7 +36,7 @@ class Conformance:
         self._validator = cache(self._make_validator)
 
     def check(self, answer: httpx.Response) -> None:
-        """Refuse an answer that is not in the document; what is no call of ours is let pass."""
+        """Refuse a response that is not in the document; requests outside of our API are not checked."""
         path = self._path_of(answer.request.url.path)
         method = answer.request.method.lower()
         if path is None or method not in self.document["paths"][path]:
@@ -55,7 +58,7 @@ class Conformance:
             self.check_json(kinds[media_type]["schema"], answer.json(), what)
 
     def check_json(self, schema: dict[str, Any], said: Any, what: str) -> None:
-        """Refuse JSON that is not of a schema of the document."""
+        """Refuse JSON that does not conform to a schema of the document."""
         wrong = next(self._validator(json.dumps(schema)).iter_errors(said), None)
         assert wrong is None, f"{what}: {wrong.message[:300]} at {wrong.instance_path}"
 
@@ -68,7 +71,7 @@ class Conformance:
 
 
 def _due(name: str, answer: httpx.Response) -> bool:
-    """Say whether a header that is documented should be there and is not; these two come with some answers only."""
+    """Return whether a documented header is missing; two of them come with some responses only."""
     return name not in ("Link", "Retry-After") and name not in answer.headers
 
 

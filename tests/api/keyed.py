@@ -1,4 +1,4 @@
-"""An installation with keys, in which two surgeons have their things; and a way to ask as somebody."""
+"""An installation with keys and the data of two surgeons, and requests under the key of one user."""
 
 import shutil
 from collections.abc import Iterator
@@ -19,7 +19,7 @@ HERON = {"surgeon": "heron", "suture": cases.SUTURE}
 
 
 def key(service: Service, owner: str, role: Any, **how: Any) -> str:
-    """Make a key, as the command line of the installation does."""
+    """Create a key, as the installation's command line does."""
     with service.database.writing() as session:
         text = create_key(session, owner, role, "local", **how)[1]
     service.app.state.access.forget()
@@ -27,7 +27,7 @@ def key(service: Service, owner: str, role: Any, **how: Any) -> str:
 
 
 class As:
-    """Somebody with a key."""
+    """A user with a key, who sends requests with it."""
 
     def __init__(self, service: Service, text: str) -> None:
         self._http = service.http
@@ -38,7 +38,7 @@ class As:
 
 
 def routes(service: Service) -> Iterator[tuple[str, str, list[Any]]]:
-    """List every route: method, path, and what it depends on."""
+    """List every route: method, path and its dependencies."""
     for route in iter_route_contexts(service.app.routes):
         for method in sorted((route.methods or set()) - {"HEAD"}):
             yield method, str(route.path), list(getattr(route, "dependencies", None) or [])
@@ -46,7 +46,7 @@ def routes(service: Service) -> Iterator[tuple[str, str, list[Any]]]:
 
 @cache
 def told_file() -> Path:
-    """Make a database in which kestrel has everything up to a playback and its pictures, and heron a demonstration."""
+    """Return a database in which kestrel has everything up to a playback with pictures, and heron a demonstration."""
     folder = backends.migrated_file().parent
     url = backends.fresh("sqlite", folder)
     with serving(url) as service:
@@ -60,7 +60,7 @@ def told_file() -> Path:
         service.work()
         client.train(**KESTREL, learner={"kind": "value-iteration"}, release=True)
         service.work()
-        plan = client.plan(**KESTREL, suture_points=[{"position_mm": GOAL_MM}])
+        plan = client.plan(**KESTREL, suture_points=[{"position_mm": GOAL_MM}], handoff="none")
         client.play(plan["sha256"])
         service.work()
     return Path(url.removeprefix("sqlite:///"))

@@ -1,4 +1,4 @@
-"""Several servers as processes of their own on one database, without workers."""
+"""Several servers in separate processes on one database, without workers."""
 
 import socket
 import subprocess
@@ -9,17 +9,17 @@ from contextlib import contextmanager
 
 import httpx2 as httpx
 
-from skills.jobs.child import environment
+from skills.serving import environment
 from skills.settings import Settings
 from tests.api.service import CSV, KESTREL, serving
 from tests.library import cases
 
-PATIENCE_S = 180.0  # where the machine is busy, a server starts slowly
+PATIENCE_S = 180.0  # a server starts slowly on a busy machine
 
 
 @contextmanager
 def servers(url: str, number: int) -> Iterator[list[httpx.Client]]:
-    """Start servers as `skills serve` does, and give a client of each once it answers."""
+    """Start servers as `skills serve` does, and yield a client of each once it responds."""
     settings = [Settings(database_url=url, port=free_port(), workers=0) for _ in range(number)]
     command = [sys.executable, "-m", "skills", "serve"]
     started = [subprocess.Popen(command, env=environment(one)) for one in settings]

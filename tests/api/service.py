@@ -1,4 +1,4 @@
-"""The application in this process, its typed client, and the hands of a worker."""
+"""The application in this process, its typed client, and a stand-in for the worker."""
 
 import shutil
 from collections.abc import Iterator
@@ -15,8 +15,8 @@ from starlette.testclient import TestClient
 from skills.api.app import create_app
 from skills.client import Client, Retrying
 from skills.db.base import Base
-from skills.db.books import Job
-from skills.library.batches import BATCH, PART
+from skills.db.service_tables import Job
+from skills.library.jobs import BATCH, PART
 from skills.settings import Settings
 from tests import backends
 from tests.api.conformance import conformance
@@ -29,19 +29,19 @@ GOAL_MM = [5.0, 55.0, -125.0]
 
 
 class AsSent(Client):
-    """The client, with the JSON that was sent as its answers, once each was read as a client reads it."""
+    """The client, which returns the JSON of a response as it was sent, after parsing it as any client does."""
 
     def _read(self, kind: type[BaseModel], said: Any) -> Any:
         kind.model_validate(said)
         return said
 
     def wait(self, job: dict[str, Any], **_how: Any) -> dict[str, Any]:
-        """Look at a job that `Service.work` has carried out: no worker is there to wait for."""
+        """Return a job that `Service.work` has carried out: there is no worker to wait for."""
         return self.job(job["id"])
 
 
 class Service:
-    """One installation: `http` asks it raw, `client` with words."""
+    """One installation: `http` sends raw requests, `client` makes typed calls."""
 
     def __init__(self, url: str, **settings: Any) -> None:
         self.url = url
@@ -52,15 +52,15 @@ class Service:
         self.client = AsSent(self.http, retrying=Retrying(attempts=1))
 
     def work(self) -> list[dict[str, Any]]:
-        """Carry all waiting jobs out, as a worker does, and look at them."""
+        """Carry out all waiting jobs as a worker does, and return them."""
         with self.database.reading() as session:
-            active = Job.state.in_(("queued", "running")), Job.kind != BATCH  # its parts are what is worked on
+            active = Job.state.in_(("queued", "running")), Job.kind != BATCH  # a batch's parts are what a worker takes
             jobs = session.scalars(select(Job).where(*active)).all()
         done = [cases.work(self.database, job) for job in jobs]
         return [self.client.job(job.id) for job in done if job.kind != PART]
 
     def train(self, **asked: Any) -> dict[str, Any]:
-        """Train kestrel's style, and give the job back."""
+        """Train kestrel's style, and return the job."""
         job = self.client.train(**KESTREL, **asked)
         self.work()
         return self.client.job(job["id"])
@@ -71,7 +71,7 @@ class Service:
             return {t: session.scalar(text(f"SELECT count(*) FROM {t}")) for t in Base.metadata.tables}
 
     def tamper(self, *statements: str, **values: Any) -> None:
-        """Change rows as somebody with the file in his hands would, past the triggers."""
+        """Change rows as somebody with write access to the file would, bypassing the triggers."""
         with self.database.writing() as session:
             names = "SELECT name FROM sqlite_master WHERE type = 'trigger'"
             for name in session.scalars(text(names)).all():
@@ -89,7 +89,7 @@ def serving(url: str, **settings: Any) -> Iterator[Service]:
 
 @cache
 def trained_file() -> Path:
-    """Make a database in which kestrel's style is learnt and released, once."""
+    """Return a database in which kestrel's style is learnt and released; it is built once."""
     folder = backends.migrated_file().parent
     url = backends.fresh("sqlite", folder)
     with serving(url) as service:
@@ -106,7 +106,7 @@ def copy_of_trained(folder: Path) -> str:
 
 
 def assert_problem(answer: httpx.Response, status: int | range, kind: str | None = None) -> dict[str, Any]:
-    """The answer is a problem of RFC 9457, with a sentence, and says nothing of our innards."""
+    """Assert that the response is an RFC 9457 problem with a sentence, without details of our implementation."""
     assert answer.status_code == status if isinstance(status, int) else answer.status_code in status, answer.text[:500]
     assert answer.headers["content-type"] == "application/problem+json", answer.text[:500]
     assert answer.headers["x-request-id"]

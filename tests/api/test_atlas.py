@@ -1,4 +1,4 @@
-"""The atlas over HTTP: typed, conditional, and of nobody whom the key does not see."""
+"""The atlas over HTTP: typed, with conditional requests, and without surgeons that the key may not see."""
 
 import re
 from collections.abc import Iterator
@@ -7,22 +7,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from skills.api.pages import atlas_drawing
+from skills.api.pages import atlas
+from skills.comparison.distances import STATES
 from skills.library.atlas import _compare, _Member, _told
-from skills.library.atlas_parts import Atlas, LeftOut
-from skills.style.comparing.shapes import STATES
+from skills.schemas.comparison import Atlas, LeftOutOfAtlas
 from tests import backends
 from tests.api.keyed import As, key
 from tests.api.service import Service, assert_problem, serving
+from tests.comparison.cohort import cohort
 from tests.library import cases, cohorts
-from tests.style.comparing.cohort import cohort
 
 ATLAS = f"/styles/{cases.SUTURE}/atlas"
 
 
 @pytest.fixture(scope="module")
 def compared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
-    """A service with two surgeons in three sessions each."""
+    """Yield a service with two surgeons in three sessions each."""
     with serving(backends.fresh("sqlite", tmp_path_factory.mktemp("atlas"))) as service:
         cohorts.add_cohort(service.database, cohort(1, surgeons=2, sessions=3))
         yield service
@@ -88,15 +88,15 @@ def test_the_page_draws_every_demonstration_and_every_distance(compared: Service
     assert len(re.findall(r'<g transform="translate\([\d. -]+\)"><title>surgeon-\d, session', said)) == 6
     assert len(re.findall(r'<rect class="s\d" [^>]*><title>', said)) == 36
     assert said.count('class="medoid"') == 2
-    assert "Set-up and day go with the surgeon" in said and "6 of 6" in said
+    assert "Set-up and day are confounded with the surgeon" in said and "6 of 6" in said
     demo = compared.client.demos()[0]["id"]
     asked = compared.http.get(f"{PAGE}?demo={demo}&clusters=2").text
     assert f"stored as {cohorts.name(1)}" in asked.replace("&#39;", "'") and 'class="asked"' in asked
-    assert re.search(r"In the (first|middle|last) third, surgeon-0 lies", asked)
+    assert re.search(r"In the (first|middle|last) third, the path of surgeon-0 is", asked)
 
 
 @pytest.mark.parametrize(
-    ("query", "said"), [("clusters=7", "1 to 6 clusters"), (f"demo={'0' * 64}", "no such demonstration")]
+    ("query", "said"), [("clusters=7", "1 to 6 clusters"), (f"demo={'0' * 64}", "no demonstration with this digest")]
 )
 def test_a_page_that_cannot_be_drawn_says_why(compared: Service, query: str, said: str):
     answer = compared.http.get(f"{PAGE}?{query}")
@@ -106,18 +106,19 @@ def test_a_page_that_cannot_be_drawn_says_why(compared: Service, query: str, sai
 def test_more_than_can_be_seen_is_drawn_in_groups_that_hold_all_of_it():
     shapes = np.random.default_rng(3).normal(0, 1, (70, 2))
     far = np.abs(shapes[:, None] - shapes[None, :]).sum(axis=2)
-    drawn = atlas_drawing.matrix(drawn_from(far))
-    assert drawn.count("<title>") == atlas_drawing.MOST_GROUPS**2
-    groups = atlas_drawing._leaves(drawn_from(far))
+    drawn = atlas.matrix(drawn_from(far))
+    assert drawn.count("<title>") == atlas.MOST_GROUPS**2
+    groups = atlas._leaves(drawn_from(far))
     assert sorted(one for group in groups for one in group.members) == list(range(70))
-    means = atlas_drawing._between(far, groups)
+    means = atlas._between(far, groups)
     np.testing.assert_allclose(means[0, 5], far[np.ix_(groups[0].members, groups[5].members)].mean())
     tree = re.search(r'class="tree" d="([^"]*)"', drawn)
-    assert tree is not None and tree[1].count("V") == atlas_drawing.MOST_GROUPS - 1
+    assert tree is not None and tree[1].count("V") == atlas.MOST_GROUPS - 1
 
 
 def drawn_from(far: np.ndarray) -> Atlas:
-    """Give an atlas in which demonstrations have distances alone."""
+    """Return an atlas in which demonstrations have nothing but distances."""
     members = [_Member(at, f"{at:064x}", f"surgeon-{at % 3}", None, at) for at in range(len(far))]
     shapes = np.zeros((len(far), STATES, 3))
-    return _told(cases.SUTURE, _compare(members, shapes, far, False), LeftOut(0, [], []), 4, None)
+    left_out = LeftOutOfAtlas(without_consent=0, without_direction=[], because=[])
+    return _told(cases.SUTURE, _compare(members, shapes, far, False), left_out, 4, None)

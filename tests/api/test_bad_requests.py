@@ -1,4 +1,4 @@
-"""Whatever is sent to any JSON route or put into any path, the answer is a 4xx in words, and never ours to blame."""
+"""Invalid requests: every JSON route and every path answers 4xx with a message, and never 5xx."""
 
 import json
 from collections.abc import Iterator
@@ -51,9 +51,9 @@ TOKENS = (
     "NaN", "Infinity", "-Infinity", "1e400", "9" * 400, "-" + "9" * 400, '"\\ud800"', '"\\u0000"', '"a\\u0000b"', "{}",
     '{"a": 1}', '[["b"]]', f'"{CANARY}"', '"' + "x" * 5000 + '"', "1.5e308", '"; DROP TABLE jobs; --"',
 )  # fmt: skip
-CACHED = {"measured_shapes": 0}  # that an atlas was asked for is seen there, and changes nothing
+CACHED = {"measured_shapes": 0}  # a request for an atlas fills this cache and changes nothing else
 FREE_TEXT = {"owner", "name", "family", "description", "also_called", "protocol", "source"}
-NUMBERS_ONLY = ("true", '"1"')  # where a number belongs
+NUMBERS_ONLY = ("true", '"1"')  # sent in place of a number
 WHOLE_ONLY = ("1.5", "true", '"1"', "1e400", "-1")
 BODIES = (
     b"", b"{", b"null", b"[]", b'"text"', b"NaN", b"1", b"\xff\xfe", b"[" * 100_000,
@@ -143,7 +143,7 @@ def test_a_value_of_the_wrong_kind_anywhere_is_refused(still: Service, untouched
     for path, leaf in leaves(SOUND[route]):
         for token in tokens_for(leaf):
             if FREE_TEXT & {*path} and token.startswith('"') and "\\u" not in token and len(token) < 200:
-                continue  # any short text is good there
+                continue  # any short text is valid there
             body = json.dumps(replaced(SOUND[route], path, "@@")).replace('"@@"', token)
             answer = still.http.request(route[0], filled(route[1]), content=body, headers=JSON)
             assert answer.status_code in range(400, 500), (path, token[:40], answer.text[:300])
@@ -163,9 +163,9 @@ def test_no_path_is_ours_to_blame(still: Service, untouched: None, segment: str)
     for method, path, _ in routes(still):
         for name in [part[1:-1] for part in path.split("/") if part.startswith("{")]:
             if segment in ("..", "%2e%2e") and path.endswith(f"{{{name}}}"):
-                continue  # the client itself takes it for the folder above
+                continue  # the client itself resolves it to the parent folder
             answer = still.http.request(method, filled(path, **{name: segment}), json=SOUND.get((method, path)))
-            fine = (200, 404) if method == "GET" and segment == "%2f" else ()  # a list, by its path with a slash
+            fine = (200, 404) if method == "GET" and segment == "%2f" else ()  # %2f addresses the list itself
             assert answer.status_code in (*fine, 404, 405, 414, 415, 422), (method, path, answer.status_code)
             assert answer.headers["x-request-id"]
 
@@ -202,7 +202,7 @@ NOT_JSON = (
 
 
 def lists(service: Service) -> list[str]:
-    """Name the lists, by what their document says of them."""
+    """Name the routes that return lists, according to their documentation."""
     found = (path for method, path, call in routes(service) if method == "GET" and "Link" in str(call["responses"]))
     return [filled(path) for path in found]
 
@@ -213,7 +213,7 @@ def test_no_limit_and_no_cursor_is_ours_to_blame(still: Service, untouched: None
         for name, values in (("limit", LIMITS), ("cursor", CURSORS)):
             for value in values:
                 answer = still.http.get(path, params={name: value.encode("utf-8", "surrogatepass")})
-                taken = answer.status_code == 200 and (name == "cursor" or value == "\u0661\u0660")  # int() reads it
+                taken = answer.status_code == 200 and (name == "cursor" or value == "\u0661\u0660")  # int() parses it
                 if not taken:
                     assert_problem(answer, range(400, 500))
                 assert "OR 1=1" not in answer.text
@@ -250,7 +250,7 @@ def test_a_parameter_that_there_is_not_or_that_comes_twice_harms_nobody(still: S
 def test_no_header_is_ours_to_blame(still: Service, untouched: None, header: dict[str, str]):
     for method, path, _ in routes(still):
         if method == "DELETE":
-            continue  # a header that means nothing keeps nobody from it
+            continue  # an unsupported header does not cause a refusal
         answer = still.http.request(method, filled(path), headers=header, json=None if method == "GET" else [])
         assert answer.status_code < 500 or path == "/readyz", (method, path, answer.text)
         if answer.status_code >= 400:
@@ -268,7 +268,7 @@ def test_json_under_another_name_or_with_a_name_twice_is_refused(
         assert CANARY not in answer.text
     twice = body[:-1] + b', "' + CANARY.encode() + b'": 2}'
     problem = assert_problem(still.http.request(route[0], filled(route[1]), content=twice, headers=JSON), 422)
-    assert problem["errors"][0]["why"] == "A name comes twice in an object."
+    assert problem["errors"][0]["why"] == "An object has the same name twice."
 
 
 def test_every_answer_has_a_request_id_of_its_own_and_forbids_guessing(still: Service):
@@ -294,7 +294,7 @@ def test_an_unexpected_failure_tells_a_case_number_and_nothing_else(trained: Ser
 
 
 def test_a_failure_in_our_code_is_500_with_a_case_number(trained: Service):
-    """A row that our own code could not have written: the JSON of a demonstration's report is cut off."""
+    """The row is one that our own code could not have written: the JSON of a demonstration's report is truncated."""
     trained.tamper("UPDATE demonstrations SET report = '{\"cut'")
     problem = assert_problem(trained.http.get("/demos"), 500, "unexpected")
     assert len(problem["case"]) == 16

@@ -1,4 +1,4 @@
-"""What cannot be a demonstration is refused in words, on both doors, and leaves no row in any table."""
+"""Uploads that cannot be a demonstration: both routes refuse them with a message and leave no row in any table."""
 
 import base64
 import gzip
@@ -12,11 +12,11 @@ import httpx2 as httpx
 import numpy as np
 import pytest
 
-from skills.recordings import topics
+from skills.formats import topics
 from tests import backends
 from tests.api.service import CSV, KESTREL, MCAP, Service, assert_problem, serving
+from tests.formats import bags, trials
 from tests.library import cases
-from tests.recordings import bags, trials
 
 TIP = cases.points_mm()
 BAG = cases.bag()
@@ -26,7 +26,7 @@ LIMIT = 200_000
 
 @dataclass
 class Bad:
-    """An upload that must be refused: what is sent, and the status and kind of the refusal."""
+    """An upload that must be refused: its content, and the status and kind of the refusal."""
 
     data: bytes
     status: int
@@ -120,7 +120,7 @@ CASES = {
     ),
     "an unknown surgeon": Bad(BAG, 404, "not-found", MCAP, {"surgeon": "nobody"}, demos_only=True),
     "an unknown suture": Bad(BAG, 404, "not-found", MCAP, {"suture": "nothing"}, demos_only=True),
-    "two arms and none named": Bad(cases.bag("PSM1", "PSM2"), 422, "no-usable-topic", MCAP, demos_only=True),
+    "two arms and none named": Bad(cases.bag("PSM1", "PSM2"), 422, "segment-not-named", MCAP, demos_only=True),
     "an arm that is not there": Bad(BAG, 422, "no-usable-topic", MCAP, {"arm": "PSM3"}, demos_only=True),
     "a segment outside": Bad(BAG, 422, "bad-segment", MCAP, {"start_s": 0.1, "end_s": 100}, demos_only=True),
     "a segment turned round": Bad(BAG, 422, "bad-segment", MCAP, {"start_s": 0.9, "end_s": 0.2}, demos_only=True),

@@ -1,4 +1,4 @@
-"""The policy card: the same facts for people and for programs, from verified values alone, and never a wrong one."""
+"""The policy card: the same facts for people and for programs, from verified values only."""
 
 import base64
 import hashlib
@@ -12,12 +12,13 @@ import numpy as np
 import pytest
 from sqlalchemy import text
 
-from skills.api.pages import coverage_drawing
-from skills.api.schemas.given import PolicyCard
+from skills.api.pages import policy_card
+from skills.api.responses import json_of
 from skills.db.session import Database
 from skills.library.cards import card_of as card_of_version
 from skills.library.policies import find_version
 from skills.packing import sha256
+from skills.schemas.given import PolicyCard
 from tests import backends
 from tests.api.service import CSV, GOAL_MM, KESTREL, POLICY, Service, assert_problem
 from tests.library import cases
@@ -29,7 +30,7 @@ NASTY = "<script>alert(1)</script>&\"'`{{ 7*7 }}"
 
 
 class Document(HTMLParser):
-    """A page's tags, attributes and text; what stands in drawings is kept apart."""
+    """A page's tags, attributes and text; the text of drawings is collected separately."""
 
     def __init__(self, html: str) -> None:
         super().__init__()
@@ -65,7 +66,7 @@ def page_of(service: Service, path: str = CARD) -> str:
 
 
 def leaves(value: object) -> Iterator[object]:
-    """Give everything that a card says, one by one."""
+    """Yield every single value of a card."""
     if isinstance(value, dict | list):
         for one in value.values() if isinstance(value, dict) else value:
             yield from leaves(one)
@@ -73,10 +74,10 @@ def leaves(value: object) -> Iterator[object]:
         yield value
 
 
-# ---- what it says -----------------------------------------------------------------------------------------------
+# ---- content ----------------------------------------------------------------------------------------------------
 
 
-def test_a_card_says_what_the_policy_its_demonstration_and_its_recording_are(still: Service):
+def test_a_card_reports_its_policy_demonstration_and_recording(still: Service):
     card = card_of(still)
     policy, demo = still.http.get(POLICY).json(), still.http.get("/demos").json()["items"][0]
     assert PolicyCard.model_validate(card).policy.sha256 == policy["sha256"]
@@ -96,7 +97,7 @@ def test_a_card_says_what_the_policy_its_demonstration_and_its_recording_are(sti
     assert card["surgeon"]["skill_level"] == "expert"
     assert card["suture_type"]["name"] == "Simple running"
     assert "not a medical device" in card["use"]
-    assert any("nothing about how near a real arm comes" in one for one in card["what_it_is_not"])
+    assert any("how closely a real arm follows" in one for one in card["what_it_is_not"])
     assert "0.65 mm" in card["limits"]["tip_accuracy"]
 
 
@@ -108,7 +109,7 @@ def test_the_card_by_digest_is_the_card_by_version(still: Service):
 
 
 def test_anybody_can_compute_the_digests_of_a_card_again(still: Service):
-    """With the recording's file and Python's own json, as `how` says, and nothing of ours."""
+    """The test uses the recording's file and Python's own json as `how` describes, and none of our code."""
     chain = {link["what"]: link for link in card_of(still)["lineage"]["chain"]}
     assert list(chain) == ["recording", "demonstration", "reward map", "policy"]
     assert chain["recording"]["sha256"] == hashlib.sha256(cases.hand_off()).hexdigest()
@@ -197,7 +198,7 @@ def test_the_page_shows_the_demonstration_and_every_layer_of_the_grid(still: Ser
     assert html.count('class="layer"') == 11
     assert html.count('class="from"') == html.count('class="to"') == 2, "one in the key, one where it is"
     assert {f"z {z} mm" for z in range(-140, -89, 5)} <= set(re.findall(r"z -\d+ mm", html))
-    for kind in coverage_drawing.KINDS:
+    for kind in policy_card.KINDS:
         assert f'<pattern id="{kind}"' in html
 
 
@@ -234,7 +235,7 @@ def test_a_card_in_another_form_or_of_no_version_is_refused(still: Service):
     assert_problem(still.http.get(f"/policy-versions/{'0' * 64}/card"), 404, "not-found")
 
 
-# ---- the state, and the tag that follows it ---------------------------------------------------------------------
+# ---- the state, and the ETag that follows it --------------------------------------------------------------------
 
 
 def tags(service: Service) -> tuple[str, str]:
@@ -265,7 +266,7 @@ def test_a_release_a_withdrawal_and_a_plan_change_the_card_and_its_tag(trained: 
     assert status["served_now"] is None
     assert status["releases"][0]["withdrawn_at"] is not None
     seen.append(tags(trained))
-    body = KESTREL | {"version": 1, "suture_points": [{"position_mm": GOAL_MM}]}
+    body = KESTREL | {"version": 1, "suture_points": [{"position_mm": GOAL_MM}], "handoff": "none"}
     assert trained.http.post("/plans", json=body).status_code == 201
     assert card_of(trained)["lineage"]["rests_on_it"]["plans"] == 1
     assert "1 plan follows" in page_of(trained)
@@ -319,7 +320,7 @@ def test_what_is_erased_is_on_no_card(trained: Service):
 
 
 def test_both_databases_write_the_same_card(tmp_path: Path):
-    """All but the moments, for the same recording, settings and seed give the same digests everywhere."""
+    """Except for times, the same recording, settings and seed give the same digests on every database."""
     cards = []
     for backend in backends.BACKENDS:
         url = backends.fresh(backend, tmp_path)
@@ -329,8 +330,8 @@ def test_both_databases_write_the_same_card(tmp_path: Path):
         cases.train(database, release=True)
         cases.add_plan(database)
         with database.reading() as session:
-            facts = card_of_version(session, find_version(session, **KESTREL, version=1)).facts
-        cards.append(re.sub(r"\d{4}-\d\d-\d\dT[0-9:.]+Z", "", json.dumps(facts)))
+            facts = card_of_version(session, find_version(session, **KESTREL, version=1)).written()
+        cards.append(re.sub(r"\d{4}-\d\d-\d\dT[0-9:.]+Z", "", json_of(facts).decode()))
         database.close()
         backends.drop(url)
     assert cards[0] == cards[1]
@@ -362,7 +363,7 @@ DAMAGE = (
 
 
 def test_a_damaged_value_gives_no_card(trained: Service):
-    """One after the other, each after a good card was given, so that nothing which was remembered hides it."""
+    """Each value is damaged after a good card was served, so that no cache may hide the damage."""
     for table, column, damage in DAMAGE:
         assert trained.http.get(CARD).status_code == 200, "all that was damaged before is whole again"
         with trained.database.reading() as session:
@@ -370,5 +371,5 @@ def test_a_damaged_value_gives_no_card(trained: Service):
         trained.tamper(f"UPDATE {table} SET {column} = {damage.format(column)}")
         for headers in ({}, PAGE):
             problem = assert_problem(trained.http.get(CARD, headers=headers), 503, "corrupt")
-            assert "restore it from a backup" in problem["detail"], (table, column)
+            assert "from a backup" in problem["detail"], (table, column)
         trained.tamper(f"UPDATE {table} SET {column} = :whole", whole=whole)

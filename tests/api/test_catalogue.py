@@ -1,4 +1,4 @@
-"""Surgeons, suture types, and the lists."""
+"""Surgeons, suture types, and their lists."""
 
 import tomllib
 from importlib import resources
@@ -144,7 +144,7 @@ def test_consent_that_does_not_cover_training_stops_it(trained: Service, kind: s
     consent = {"uses": ["export"]} if kind == "fail" else {"uses": ["training"], "until": "2020-01-01"}
     trained.client.put_surgeon("kestrel", consent=consent)
     before = trained.counts()
-    with pytest.raises(Problem, match="does not cover training" if kind == "fail" else "ran out on 2020") as refused:
+    with pytest.raises(Problem, match="does not cover training" if kind == "fail" else "expired on 2020") as refused:
         trained.client.train(**KESTREL, seed=1)
     assert (refused.value.status, refused.value.kind) == (409, "conflict")
     assert trained.counts() == before

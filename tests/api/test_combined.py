@@ -1,14 +1,14 @@
-"""Several demonstrations over HTTP: asked for, learnt, told of, fetched and checked, drawn, withdrawn."""
+"""Several demonstrations over HTTP: requested, learnt, reported, fetched, verified, drawn and withdrawn."""
 
-from typing import get_args
+from typing import get_args, get_type_hints
 
 import pytest
 
 import skills
-from skills.api.schemas.learnt import Combined
-from skills.api.schemas.sent import CombineIn
 from skills.client import Client, jobs
-from skills.style.combining import COMBININGS
+from skills.comparison.combining import COMBININGS
+from skills.schemas.policies import Combined
+from skills.schemas.requests import CombineIn
 from tests.api.service import CSV, KESTREL, POLICY, Service, assert_problem
 from tests.library import cases
 
@@ -16,7 +16,7 @@ KINDS = pytest.mark.parametrize("kind", ["medoid", "barycentre", "corridor"])
 
 
 def demos_of(service: Service) -> list[str]:
-    """Add two to the one that is there, and name all, the oldest first."""
+    """Add two demonstrations to the existing one, and return the ids of all, the oldest first."""
     for shift in ((0.0, 3.0, 0.0), (0.0, 1.5, 0.5)):
         service.client.add_demo(cases.hand_off(shift), media_type=CSV, **KESTREL)
     return [demo["id"] for demo in service.client.demos()][::-1]
@@ -31,7 +31,7 @@ def test_several_are_learnt_told_of_and_checked_by_a_client(trained: Service, ki
     said = Client(trained.http).policy(**KESTREL)
     assert (said.demos, said.combined.kind, said.combined.medoid) == (demos, kind, demos[2])
     assert len(said.combined.width_mm) == len(said.waypoints)
-    policy = Client(trained.http).learnt(**KESTREL)  # compares it with its digest
+    policy = Client(trained.http).learnt(**KESTREL)  # compares the policy with its digest
     assert skills.rollout(policy, said.start_mm).states.tolist() == said.waypoints
 
 
@@ -46,7 +46,7 @@ def test_its_view_and_its_card_show_the_way_that_is_followed(trained: Service, k
     assert card["combined"]["in_words"] in card["what_it_is"]
     page = trained.http.get(f"{POLICY}/versions/2/card", headers={"Accept": "text/html"}).text
     assert "Quality of demonstration 3" in page
-    assert page.count('<g class="corridor">') == 3  # in each view
+    assert page.count('<g class="corridor">') == 3  # one in each view
     style = trained.http.get(f"/pages/styles/kestrel/{cases.SUTURE}?version=2").text
     assert f"3 demonstrations, {kind}" in style
 
@@ -64,7 +64,8 @@ def test_withdrawing_one_of_them_takes_the_policy_away(trained: Service):
 
 
 @pytest.mark.parametrize(
-    ("combine", "why"), [({"kind": "mean"}, "kind"), ({"kind": "medoid", "rounds": 3}, "Extra"), ("medoid", "combine")]
+    ("combine", "why"),
+    [({"kind": "mean"}, "kind"), ({"kind": "medoid", "rounds": 3}, "no such field"), ("medoid", "combine")],
 )
 def test_a_way_of_combining_that_there_is_not_is_refused(trained: Service, combine, why):
     answer = trained.http.post("/trainings", json=KESTREL | {"demos": demos_of(trained), "combine": combine})
@@ -78,4 +79,4 @@ def test_one_demonstration_is_not_combined(trained: Service):
 
 def test_whoever_asks_may_choose_among_all_ways_that_there_are():
     asked = get_args(CombineIn.model_fields["kind"].annotation)
-    assert asked == get_args(jobs.Combining) == get_args(Combined.model_fields["kind"].annotation) == tuple(COMBININGS)
+    assert asked == get_args(jobs.Combining) == get_args(get_type_hints(Combined)["kind"]) == tuple(COMBININGS)

@@ -10,9 +10,9 @@ from tests.library import cases
 
 @pytest.fixture
 def addresses(still: Service) -> list[str]:
-    """What can be looked at without the simulator; the rest goes the same way."""
+    """Return the addresses that can be read without the simulator; the others behave in the same way."""
     demo = still.client.demos()[0]
-    plan = still.client.plan(**KESTREL, suture_points=[{"position_mm": GOAL_MM}])["id"]
+    plan = still.client.plan(**KESTREL, suture_points=[{"position_mm": GOAL_MM}], handoff="none")["id"]
     job = still.http.get("/jobs").json()["items"][0]["id"]
     return [
         "/surgeons", "/surgeons/kestrel", "/suture-types", f"/suture-types/{cases.SUTURE}", "/demos", "/jobs",
@@ -76,7 +76,7 @@ def test_a_release_that_was_overtaken_is_not_withdrawn_unseen(trained: Service):
 
 @pytest.fixture
 def many(trained: Service) -> Service:
-    """Five surgeons, and of kestrel three demonstrations, one of them withdrawn."""
+    """Return a service with five surgeons and three demonstrations of kestrel, one of them withdrawn."""
     for slug in ("heron", "kestrel-2", "plover", "wren"):
         trained.client.put_surgeon(slug, skill_level="novice" if slug == "wren" else "intermediate")
     for shift in (1.0, 2.0):

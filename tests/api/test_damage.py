@@ -1,11 +1,11 @@
-"""Rows changed by hand, and what erasure leaves: nothing wrong is served, and nothing of a person stays."""
+"""Rows changed by hand are not served, and erasure leaves nothing of a person in the files."""
 
 from pathlib import Path
 
 import pytest
 
-from skills.library import verified
-from skills.library.kept import Kept
+from skills.library import integrity
+from skills.library.cache import Kept
 from tests.api.service import CSV, KESTREL, POLICY, Service, assert_problem
 from tests.library import cases
 
@@ -16,14 +16,14 @@ ASKS = (
     ("GET", f"{POLICY}/versions/1", None, {}),
     ("POST", f"{POLICY}/rollouts", {"start_mm": [0.0, 55.0, -125.0]}, {}),
     ("POST", f"{POLICY}/next", {"position_mm": [0.0, 55.0, -125.0]}, {}),
-    ("POST", "/plans", KESTREL | {"suture_points": [{"position_mm": [5.0, 55.0, -125.0]}]}, {}),
+    ("POST", "/plans", KESTREL | {"suture_points": [{"position_mm": [5.0, 55.0, -125.0]}], "handoff": "none"}, {}),
 )
 
 
 @pytest.fixture(autouse=True)
 def cold(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Remember nothing of other tests, as a process that has just started."""
-    monkeypatch.setattr(verified, "_policies", Kept(32))
+    """Clear the caches that other tests filled, as in a process that has just started."""
+    monkeypatch.setattr(integrity, "_policies", Kept(32))
 
 
 def test_a_manifest_changed_after_it_was_served_is_not_served_again(trained: Service):
@@ -33,7 +33,7 @@ def test_a_manifest_changed_after_it_was_served_is_not_served_again(trained: Ser
 
 
 def assert_refused(service: Service) -> None:
-    """Whatever is asked of the policy, the answer is 503 and holds no numbers of it."""
+    """Assert that every request for the policy gets 503, without any numbers of the policy."""
     before = service.counts()
     for method, path, body, headers in ASKS:
         problem = assert_problem(service.http.request(method, path, json=body, headers=headers), 503, "corrupt")
@@ -91,7 +91,9 @@ def test_a_damaged_newest_policy_does_not_bring_an_older_one_back(trained: Servi
 
 
 def test_a_motion_of_another_plan_is_never_served(trained: Service):
-    first, second = (trained.client.plan(**KESTREL, suture_points=[{"position_mm": [x, 55, -125]}]) for x in (5, 9))
+    first, second = (
+        trained.client.plan(**KESTREL, suture_points=[{"position_mm": [x, 55, -125]}], handoff="none") for x in (5, 9)
+    )
     trained.tamper(
         "UPDATE plans SET plan = (SELECT plan FROM plans WHERE sha256 = :other) WHERE sha256 = :one",
         one=first["id"], other=second["id"],
@@ -100,8 +102,28 @@ def test_a_motion_of_another_plan_is_never_served(trained: Service):
     assert trained.http.get(f"/plans/{second['id']}/trajectory").status_code == 200
 
 
+@pytest.mark.parametrize(
+    "damage",
+    [
+        "UPDATE recording_chunks SET data = CAST(substr(data, 1, 900) || x'00' || substr(data, 902) AS BLOB)",
+        "UPDATE recording_chunks SET data = CAST(substr(data, 1, 900) AS BLOB)",
+        "DELETE FROM recording_chunks",
+        "UPDATE recording_chunks SET number = 1",
+        "UPDATE recording_chunks SET data = 'text'",
+    ],
+)
+def test_a_damaged_recording_is_refused_before_its_first_byte(trained: Service, damage: str):
+    (demo,) = trained.client.demos()
+    path = f"/demos/{demo['id']}/recording"
+    whole = trained.http.get(path)
+    assert (whole.status_code, len(whole.content)) == (200, int(whole.headers["content-length"]))
+    trained.tamper(damage)
+    problem = assert_problem(trained.http.get(path), 503, "corrupt")
+    assert "backup" in problem["detail"]
+
+
 def test_an_erased_surgeon_is_nowhere_in_the_files(service: Service):
-    """While the service goes on running: neither the pseudonym nor the recording's bytes, log included."""
+    """The service keeps running: neither the pseudonym nor the recording's bytes remain, write-ahead log included."""
     service.client.put_surgeon(CANARY)
     service.client.put_surgeon("heron")
     data = cases.bag() + b""
@@ -111,7 +133,7 @@ def test_an_erased_surgeon_is_nowhere_in_the_files(service: Service):
     service.client.add_demo(data, surgeon="heron", suture=cases.SUTURE)
     job = service.client.train(CANARY, cases.SUTURE, release=True)
     service.work()
-    service.client.plan(CANARY, cases.SUTURE, [{"position_mm": [5, 55, -125]}])
+    service.client.plan(CANARY, cases.SUTURE, [{"position_mm": [5, 55, -125]}], handoff="none")
     service.client.train(CANARY, cases.SUTURE, seed=1)
     assert CANARY.encode() in everything(service)
     assert table[1000:1064] in everything(service)
@@ -123,12 +145,12 @@ def test_an_erased_surgeon_is_nowhere_in_the_files(service: Service):
     rows = {name: count for name, count in service.counts().items() if count}
     assert rows.pop("events") > 0
     assert rows.pop("suture_types") == 11
-    shared = {"recordings": 1, "recording_chunks": 1, "recording_uploads": 1}  # heron gave the same bytes
+    shared = {"recordings": 1, "recording_chunks": 1, "recording_uploads": 1}  # heron uploaded the same bytes
     assert rows == {"surgeons": 1, "erasures": 1, "demonstrations": 1, "reward_maps": 1} | shared
     assert service.client.demo_recording(service.client.demos("heron")[0]["id"]) == data
 
 
 def everything(service: Service) -> bytes:
-    """Read the database's files, raw: the tables and the write-ahead log."""
+    """Read the database's files as bytes: the tables and the write-ahead log."""
     folder = Path(service.url.removeprefix("sqlite:///")).parent
     return b"".join(file.read_bytes() for file in folder.iterdir() if ".jobs" not in file.name)

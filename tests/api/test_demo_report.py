@@ -11,16 +11,16 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from skills.recordings import read_recording, write_mcap
+from skills.demonstration.recording import Motion, Recording
+from skills.formats import read_recording, write_mcap
+from skills.kinematics import matrix_of, quaternion_of
 from skills.seeds.recordings import sample_recordings
-from skills.style.kinematics import matrix_of, quaternion_of
-from skills.style.recording import Motion, Recording
 from tests.api.service import CSV, GOAL_MM, KESTREL, Service, assert_problem
+from tests.demonstration import sessions
 from tests.library import cases
-from tests.style import sessions
 
 PAGE = {"Accept": "text/html"}
-BASE_MM, BASE_XYZW = [160.0, 20.0, 20.0], [0.0, 0.3007057995, 0.0, 0.9537169507]  # of PSM1 in PSM2's, invented
+BASE_MM, BASE_XYZW = [160.0, 20.0, 20.0], [0.0, 0.3007057995, 0.0, 0.9537169507]  # PSM1's in PSM2's, invented
 NUMBERS = (
     "duration_s", "samples", "rate_hz", "longest_gap_s", "duplicate_stamps", "path_length_mm", "extent_mm",
     "speed_median_mm_s", "speed_peak_mm_s", "jerk_rms_mm_s3", "log_dimensionless_jerk", "spectral_arc_length",
@@ -39,14 +39,14 @@ def here(service: Service) -> Service:
 
 @pytest.fixture
 def plover(here: Service) -> dict:
-    """A hesitant demonstration with two presses of the clutch and a tremor."""
+    """Store a hesitant demonstration with two presses of the clutch and a tremor."""
     sample = next(s for s in sample_recordings() if s.surgeon == "plover")
     start_s, end_s = sample.segments[0]
     return here.client.add_demo(sample.data, **KESTREL, start_s=start_s, end_s=end_s)
 
 
 class Page(HTMLParser):
-    """What is in a page: its tags, their attributes, and its text."""
+    """The parsed content of a page: its tags, their attributes, and its text."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -73,7 +73,7 @@ def test_a_report_says_all_that_is_measured(here: Service, plover: dict):
     assert (report["clutch_presses"], report["a1_turn_negligible"]) == (2, True)
     assert report["clutched_s"] == report["undriven_s"] == pytest.approx(2.4, abs=0.01)
     said = " ".join(report["advice"])
-    for words in ("clutched twice", "starts and stops often", "Ask for hysteresis 0.25"):
+    for words in ("clutched twice", "starts and stops often", "Request hysteresis 0.25"):
         assert words in said
 
 
@@ -101,7 +101,7 @@ def test_a_page_runs_nothing_and_fetches_nothing(here: Service, plover: dict):
 
 
 def test_what_a_recording_calls_itself_is_no_mark_up(here: Service):
-    """A frame of a table may be any word of its pattern; a topic of an MCAP file is anybody's."""
+    """A table's frame may be any word of its pattern; an MCAP file's topic may be any text."""
     value, _ = sessions.session(sessions.Kind(seed=5, passes=1, both_arms=False))
     motion = value.motions[0]
     nasty = f"/{motion.arm}/<script>alert(1)</script>&\"'/measured_cp"
@@ -160,7 +160,10 @@ def test_a_demonstration_of_an_older_version_is_measured_again(here: Service):
 
 
 def test_the_clutched_samples_make_another_demonstration_than_with_them(here: Service, plover: dict):
-    """A demonstration of the same segment that was stored with them keeps its name, and is not given for this one."""
+    """A demonstration of the same segment that was stored with those samples keeps its id.
+
+    It is not returned for this one.
+    """
     path = here.client.demo_path(plover["id"])
     assert len(path["recorded_mm"]) == plover["report"]["samples"]
     assert max(np.diff(path["stamps_s"])) > 1.0, "the stamps are the recording's own"
@@ -169,7 +172,7 @@ def test_the_clutched_samples_make_another_demonstration_than_with_them(here: Se
 # ---- proposals --------------------------------------------------------------------------------------------------
 
 
-def test_a_recording_proposes_hand_offs_in_the_form_in_which_they_are_asked_for(here: Service):
+def test_proposed_hand_offs_can_be_sent_back_as_a_cut_request(here: Service):
     value, truths = sessions.session(sessions.Kind(seed=1, passes=3))
     about = here.client.add_recording(write_mcap(value))
     mine = [s for s in about["segments"] if s["arm"] == sessions.A]
@@ -187,14 +190,14 @@ def test_a_recording_proposes_hand_offs_in_the_form_in_which_they_are_asked_for(
 
 @pytest.fixture
 def two_arms(here: Service) -> dict:
-    """A policy of a demonstration in whose frame the other arm is known: its base is found in the frame of both."""
+    """Release a policy of a demonstration that knows the other arm: its base is computed from the frame of both."""
     here.client.add_demo(beside(), **KESTREL, arm="PSM2")
     here.train(release=True)
     return here.client.demos()[0]
 
 
 def beside() -> bytes:
-    """The hand-off of `cases`, with PSM1 waiting 15 mm beside its end, its approach along -x."""
+    """Return the hand-off of `cases` with PSM1 waiting 15 mm next to its end, approaching along -x."""
     tip = cases.points_mm()
     stamps_ns = cases.START_NS + np.arange(len(tip)) * (10**9 // cases.RATE_HZ)
     down = np.tile([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0], (len(tip), 1))
@@ -209,7 +212,7 @@ def beside() -> bytes:
 
 
 def with_bases() -> bytes:
-    """The same, and PSM1's pose in its own base, which stands 160 mm beside PSM2's and is tilted by 35 degrees."""
+    """Return the same with PSM1's pose in its own base, which stands 160 mm from PSM2's and is tilted by 35 degrees."""
     recording = read_recording(io.BytesIO(beside()))
     other = recording.motion_of(topic="/PSM1/measured_cp")
     base = matrix_of([BASE_XYZW])[0]
@@ -249,7 +252,7 @@ def test_a_given_approach_comes_before_the_demonstrated_one(here: Service, two_a
     assert made["id"] != plan(here)["id"]
 
 
-def test_psm_ms_base_is_the_demonstrated_one_where_both_bases_were_recorded(here: Service):
+def test_psm_ms_base_is_the_demonstrated_one_if_both_bases_were_recorded(here: Service):
     here.client.add_demo(with_bases(), **KESTREL, arm="PSM2")
     here.train(release=True)
     made = plan(here)

@@ -1,4 +1,4 @@
-"""A novice's hand is led along a style by the loop that `docs/replay.md` shows."""
+"""Guidance of a novice's hand along a style by the loop that `docs/replay.md` shows."""
 
 import re
 from pathlib import Path
@@ -21,7 +21,7 @@ def test_the_loop_of_the_page_leads_an_unsteady_hand_to_the_hand_off(still: Serv
     hand, shown = np.array(start_mm), []
 
     def show(pull_mm, target_mm):
-        """The hand follows the arrow by 2 mm, back to the path first, and trembles; at times it slips away."""
+        """Move the hand by 2 mm along the arrow, back to the path first, with tremor and occasional slips."""
         shown.append((pull_mm, target_mm))
         way = np.array(pull_mm) if pull_mm is not None else np.array(target_mm) - hand
         length = float(np.linalg.norm(way))
@@ -36,12 +36,12 @@ def test_the_loop_of_the_page_leads_an_unsteady_hand_to_the_hand_off(still: Serv
     assert any(target is not None for _, target in shown)
 
 
-def test_next_leads_back_from_outside_the_grid_and_promises_nothing_else_there(still: Service):
+def test_next_outside_the_grid_returns_only_a_correction_back_to_it(still: Service):
     outside = [-10.0, 55.0, -150.0]
     for phase, after in ((None, 0), (1, 1)):
         step = still.client.next(**KESTREL, position_mm=outside, phase=phase)
         assert (step["action"], step["next_position_mm"], step["done"], step["phase"]) == (None, None, False, after)
         assert step["correction_mm"] == [0.0, 0.0, 15.0]
-    for place in ([-0.010, 0.055, -0.135], [-10.0, 55.0, -195.0]):  # metres; too far away
+    for place in ([-0.010, 0.055, -0.135], [-10.0, 55.0, -195.0]):  # metres; and a point too far away
         refused = assert_problem(still.http.post(f"{POLICY}/next", json={"position_mm": place}), 422, "outside-grid")
         assert "millimetres" in refused["detail"]

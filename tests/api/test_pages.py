@@ -1,4 +1,4 @@
-"""The pages without a browser: what they say, what they never let through, and what their views are drawn from."""
+"""The pages without a browser: their content, the markup that they escape, and the data of their views."""
 
 import re
 import shutil
@@ -12,16 +12,14 @@ import pytest
 from sqlalchemy import select
 from starlette.testclient import TestClient
 
-from skills.api.pages.assets import PLOTLY, PLOTLY_MAP_STYLE, assets, build
-from skills.api.pages.words import number, share, size
-from skills.db.books import Job
+from skills.api.pages.page import BORROWED, PLOTLY, PLOTLY_MAP_STYLE, assets, build, number, share, size
 from skills.db.models import Demonstration, Plan, PolicyVersion, StoredRecording
-from skills.library.beside import agrees
-from skills.library.overview import matrix
+from skills.db.service_tables import Job
+from skills.learning.policy import rollout_from
+from skills.library.consent import may
+from skills.library.integrity import covered, learnt
+from skills.library.overview import matrix, moves_to_goal
 from skills.library.policies import find_version
-from skills.library.verified import covered, learnt
-from skills.library.views import moves_to_goal
-from skills.style.policy import rollout_from
 from tests.api.keyed import As, copy_of_told, key
 from tests.api.service import CSV, KESTREL, Service, assert_problem, serving
 from tests.library import cases
@@ -54,19 +52,19 @@ class Html(HTMLParser):
 
 @pytest.fixture(scope="module")
 def told(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
-    """Kestrel has everything up to a playback and its pictures, heron a demonstration."""
+    """Yield a service in which kestrel has everything up to a playback with pictures, and heron a demonstration."""
     with serving(copy_of_told(tmp_path_factory.mktemp("told"))) as service:
         yield service
 
 
 def every_page(service: Service) -> list[str]:
-    """List an address of every kind of page there is, and of each thing that there is one of."""
+    """List an address of every kind of page, and of each object that exists once."""
     with service.database.reading() as session:
         recordings = session.scalars(select(StoredRecording.sha256)).all()
         plans = session.scalars(select(Plan.sha256)).all()
         jobs = session.scalars(select(Job.id).where(Job.kind != "retraining-part")).all()
         demos = session.scalars(select(Demonstration)).all()
-        scored = [one.sha256 for one in demos if one.withdrawn_at is None and agrees(one.surgeon)]
+        scored = [one.sha256 for one in demos if one.withdrawn_at is None and may(one.surgeon, "atlas")]
         styles = {(demo.surgeon.slug, demo.suture) for demo in demos}
     return [
         *("/", "/pages/recordings", "/pages/recordings/new", "/pages/plans", "/pages/plans/new", "/pages/jobs"),
@@ -142,7 +140,7 @@ def test_an_installation_of_an_older_version_has_all_its_pages(tmp_path: Path) -
 
 
 def test_an_empty_service_says_how_to_begin(service: Service) -> None:
-    assert "Nothing is here yet" in page_of(service, "/").text
+    assert "No style yet" in page_of(service, "/").text
     for path in every_page(service):
         page_of(service, path)
 
@@ -156,7 +154,7 @@ def test_what_is_not_there_is_said_on_a_page(told: Service) -> None:
     ):
         answer = told.http.get(path)
         assert answer.status_code == 404
-        assert "That is not here" in Html(answer.text).text
+        assert "Not found" in Html(answer.text).text
 
 
 def test_an_erased_surgeon_is_gone_from_every_page(tmp_path: Path) -> None:
@@ -242,7 +240,7 @@ def test_the_time_line_has_every_arms_speed_and_the_presses(told: Service) -> No
 
 @cache
 def own() -> dict[str, bytes]:
-    return {name: asset.content for name, asset in assets().items() if name != PLOTLY}
+    return {name: asset.content for name, asset in assets().items() if name not in BORROWED}
 
 
 def test_a_file_is_kept_for_good_under_the_address_of_its_build(told: Service) -> None:

@@ -1,8 +1,8 @@
-"""Pictures over HTTP: not there yet and why, then there, each with its type and its tag."""
+"""Pictures over HTTP: first pending with a reason, then available, each with its content type and ETag."""
 
 import pytest
 
-from skills.sim import film
+from skills.simulation import film
 from tests.api.service import GOAL_MM, KESTREL, Service, assert_problem
 
 TYPES = {
@@ -15,21 +15,21 @@ TYPES = {
 BEGINS = {"image/png": b"\x89PNG\r\n\x1a\n", "image/gif": b"GIF89a"}
 
 
+@pytest.mark.needs("simulator")
 def test_pictures_are_drawn_after_the_verdict_and_erased_with_the_surgeon(
     trained: Service, monkeypatch: pytest.MonkeyPatch
 ):
-    pytest.importorskip("pybullet", reason="PYBULLET IS NOT INSTALLED: nothing is played or filmed here")
     monkeypatch.setattr(film, "FRAMES", 3)
     monkeypatch.setattr(film, "FRAMES_PER_PASS", 3)
     client = trained.client
-    plan = client.plan(**KESTREL, suture_points=[{"position_mm": GOAL_MM}])
+    plan = client.plan(**KESTREL, suture_points=[{"position_mm": GOAL_MM}], handoff="none")
     client.play(plan["id"])
     [verdict] = trained.work()
     playback = client.playback(verdict["result"]["playback"])
     links = playback["pictures"]
     assert set(links) == set(TYPES)
 
-    # the verdict is there, the pictures are not
+    # the verdict exists, the pictures do not yet
     [job] = [one for one in trained.http.get("/jobs").json()["items"] if one["state"] == "queued"]
     assert job["kind"] == "pictures"
     assert trained.http.get(links["picture"]).status_code == 200
@@ -39,7 +39,7 @@ def test_pictures_are_drawn_after_the_verdict_and_erased_with_the_surgeon(
     answer = trained.http.post(f"/playbacks/{playback['id']}/pictures")
     assert (answer.status_code, answer.json()["id"]) == (202, job["id"])
 
-    # they are
+    # the pictures exist
     [done] = trained.work()
     assert done["state"] == "succeeded", done["error"]
     assert client.draw(playback["id"])["id"] == client.wait(client.draw(playback["id"]))["id"] == job["id"]
@@ -57,7 +57,7 @@ def test_pictures_are_drawn_after_the_verdict_and_erased_with_the_surgeon(
     assert client.animation(playback["id"], "gif").startswith(b"GIF89a")
     assert client.plot(playback["id"], "joints") != client.plot(playback["id"], "clearance")
 
-    # they are gone
+    # the pictures are deleted
     client.erase_surgeon("kestrel")
     assert trained.counts()["playback_pictures"] == 0
     for link in links.values():

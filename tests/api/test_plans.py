@@ -1,16 +1,21 @@
 """Plans, their motion, and the simulator's verdict."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from tests.api.service import GOAL_MM, KESTREL, Service, assert_problem
+from tests.api.service import GOAL_MM, KESTREL, Service, assert_problem, copy_of_trained, serving
 from tests.db.test_packed import forged
 
 POINTS = [[5.0, 55.0, -125.0], [11.0, 55.0, -125.0], [17.0, 55.0, -125.0]]
-QUARTER = [0.0, 0.0, 0.7071067811865476, 0.7071067811865476]  # about z
+QUARTER = [0.0, 0.0, 0.7071067811865476, 0.7071067811865476]  # a quarter turn about z
 
 
 def plan(service: Service, *points: list[float], **asked: object) -> dict:
+    """Plan passes; unless PSM_M is given they have no hand-off."""
+    if "psm_m" not in asked:
+        asked = {"handoff": "none"} | asked
     return service.client.plan(**KESTREL, suture_points=[{"position_mm": p} for p in points], **asked)
 
 
@@ -31,13 +36,13 @@ def test_every_pass_ends_on_its_suture_point(still: Service):
 def test_a_turned_suture_point_turns_the_pass_about_it(still: Service):
     straight = plan(still, POINTS[0])["passes"][0]
     points = [{"position_mm": POINTS[0], "rotation_xyzw": QUARTER}]
-    turned = still.client.plan(**KESTREL, suture_points=points)["passes"][0]
+    turned = still.client.plan(**KESTREL, suture_points=points, handoff="none")["passes"][0]
     x, y, z = np.subtract(straight["path_mm"], POINTS[0]).T
     np.testing.assert_allclose(np.subtract(turned["path_mm"], POINTS[0]), np.stack([-y, x, z], axis=1), atol=1e-9)
 
 
 def test_the_same_plan_is_stored_once(still: Service):
-    body = KESTREL | {"suture_points": [{"position_mm": GOAL_MM}], "speed_mm_s": 12.5}
+    body = KESTREL | {"suture_points": [{"position_mm": GOAL_MM}], "speed_mm_s": 12.5, "handoff": "none"}
     first, second = (still.http.post("/plans", json=body) for _ in range(2))
     assert (first.status_code, second.status_code) == (201, 200)
     assert first.json() == second.json()
@@ -63,10 +68,57 @@ def test_the_same_plan_is_stored_once(still: Service):
 )
 def test_a_plan_that_the_arm_cannot_follow_is_refused(still: Service, asked: dict, status: int, words: str):
     before = still.counts()
-    body = KESTREL | {"suture_points": [{"position_mm": GOAL_MM}]} | asked
+    plainly = {} if "psm_m" in asked else {"handoff": "none"}
+    body = KESTREL | {"suture_points": [{"position_mm": GOAL_MM}]} | plainly | asked
     problem = assert_problem(still.http.post("/plans", json=body), status)
     assert words.lower() in problem["detail"].lower(), problem["detail"]
     assert still.counts() == before
+
+
+# ---- the hand-off, and its probability of success ---------------------------------------------------------------
+
+
+def test_a_plan_that_hands_nothing_over_is_made_on_request_alone(still: Service):
+    body = KESTREL | {"suture_points": [{"position_mm": [3.0, 55.0, -125.0]}]}
+    before = still.counts()
+    problem = assert_problem(still.http.post("/plans", json=body), 422, "no-hand-off")
+    assert "would have no hand-off" in problem["detail"]
+    assert "handoff 'none'" in problem["detail"]
+    both = body | {"handoff": "none", "psm_m": {"approach": APPROACH, "base": BASE}}
+    assert_problem(still.http.post("/plans", json=both), 422, "bad-plan")
+    assert_problem(still.http.post("/plans", json=body | {"handoff": "some"}), 422)
+    assert still.counts() == before
+    made = still.http.post("/plans", json=body | {"handoff": "none"})
+    assert made.status_code == 201
+    alone = made.json()
+    assert (alone["hands_over"], alone["psm_m"], alone["realignment"]) == (False, None, False)
+    assert alone["in_words"].endswith("along 1 pass; no hand-off: no PSM_M, no A2.")
+    whole = plan(still, [3.0, 55.0, -125.0], psm_m={"approach": APPROACH, "base": BASE})
+    assert whole["hands_over"]
+    assert "hands the needle to PSM_M" in whole["in_words"]
+
+
+def test_a_headline_is_good_only_if_the_stated_arm_error_allows_it(tmp_path: Path):
+    levels = {}
+    for tip_error_mm in (0.65, 3.0):
+        folder = tmp_path / f"{tip_error_mm}"
+        folder.mkdir()
+        with serving(copy_of_trained(folder), replay_tip_error_mm=tip_error_mm) as service:
+            made = plan(service, GOAL_MM, psm_m={"approach": APPROACH, "base": BASE})
+            service.client.play(made["id"])
+            playback = service.client.playback(service.work()[-1]["result"]["playback"])
+            headline = playback["headline"]
+            assert playback["feasible"]
+            [whole] = [
+                under["plan"] for under in playback["report"]["doubt"]["under"] if under["tip_error_mm"] == tip_error_mm
+            ]
+            assert (headline["probability"], headline["tip_error_mm"]) == (whole, tip_error_mm)
+            assert f"succeeds in {whole['count']} of {whole['of']} worlds" in headline["text"]
+            levels[tip_error_mm] = headline["level"], headline["word"]
+            page = service.http.get(f"/pages/plans/{made['id']}", headers={"Accept": "text/html"}).text
+            assert f'class="verdict {headline["level"]}"' in page
+            assert f"{headline['word']}: feasible in an exact simulation" in page
+    assert levels == {0.65: ("good", "Likely to succeed"), 3.0: ("bad", "Likely to fail")}
 
 
 # ---- PSM_M, starts and time -------------------------------------------------------------------------------------
@@ -75,7 +127,7 @@ APPROACH = [-0.94, 0.10, -0.33]
 BASE = {"position_mm": [160.0, 20.0, 20.0], "rotation_xyzw": [0.0, 0.3007057995, 0.0, 0.9537169507]}  # 35 degrees
 
 
-def test_with_psm_ms_base_it_moves_too_and_the_plan_says_where_all_of_it_comes_from(still: Service):
+def test_psm_m_moves_if_its_base_is_given_and_the_plan_names_its_sources(still: Service):
     asked = {"approach": APPROACH, "base": BASE, "source": "invented for a test"}
     made = plan(still, *POINTS, psm_m=asked)
     assert made["psm_m"] == {
@@ -137,7 +189,8 @@ def test_a_start_outside_the_grid_is_reached_by_a_transfer(still: Service):
     assert one["transfer"]["length_mm"] == pytest.approx(30.0)
     refused = still.http.post(
         "/plans",
-        json=KESTREL | {"suture_points": [{"position_mm": GOAL_MM}], "starts_mm": [[-81.0, 25.0, -120.0]]},
+        json=KESTREL
+        | {"suture_points": [{"position_mm": GOAL_MM}], "starts_mm": [[-81.0, 25.0, -120.0]], "handoff": "none"},
     )
     problem = assert_problem(refused, 422, "outside-grid")
     assert problem["numbers"] == {"pass": 0, "outside_mm": 51.0, "limit_mm": 50.0}
@@ -153,8 +206,8 @@ def test_a_suture_point_may_be_where_the_finger_tips_go(still: Service):
 @pytest.mark.parametrize(
     ("asked", "kind", "words"),
     [
-        ({"psm_m": {}}, "no-approach", "does not say how psm_m approaches"),
-        ({"psm_m": {"base": BASE}}, "no-approach", "does not say how psm_m approaches"),
+        ({"psm_m": {}}, "no-approach", "has no approach direction of psm_m"),
+        ({"psm_m": {"base": BASE}}, "no-approach", "has no approach direction of psm_m"),
         ({"psm_m": {"approach": APPROACH, "base": BASE, "instrument": "470006"}}, "invalid-request", ""),
         (
             {"psm_m": {"approach": APPROACH, "base": BASE | {"position_mm": [500.0, 0.0, 0.0]}}},
@@ -173,18 +226,19 @@ def test_a_psm_m_that_cannot_come_and_a_rate_that_no_plan_has_are_refused(
     still: Service, asked: dict, kind: str, words: str
 ):
     before = still.counts()
-    body = KESTREL | {"suture_points": [{"position_mm": GOAL_MM}]} | asked
+    plainly = {} if "psm_m" in asked else {"handoff": "none"}
+    body = KESTREL | {"suture_points": [{"position_mm": GOAL_MM}]} | plainly | asked
     problem = assert_problem(still.http.post("/plans", json=body), 422, kind)
     assert words.lower() in problem["detail"].lower(), problem["detail"]
     assert still.counts() == before
 
 
-def test_a_plan_stored_before_psm_m_moved_is_refused_and_nothing_falls_over(trained: Service):
+def test_a_plan_stored_before_psm_m_moved_is_refused_without_a_crash(trained: Service):
     made = plan(trained, GOAL_MM)
     before = {"arm": "PSM", "frame": "PSM_base", "instrument": "400006", "speed_mm_s": 20.0, "approach_m": None}
     before |= {"orientation": "assumed tool-down", "path": "fitted", "passes": {"tuple": []}}
     trained.tamper("UPDATE plans SET plan = :old", old=forged({"value": "SuturePlan", "of": before}))
-    assert trained.client.plan_of(made["id"]) == made  # what was told of it can still be looked up
+    assert trained.client.plan_of(made["id"]) == made  # its stored response can still be read
     assert_problem(trained.http.get(f"/plans/{made['id']}/trajectory"), 503, "corrupt")
     trained.client.play(made["id"])
     [job] = trained.work()
@@ -204,6 +258,11 @@ def test_a_plan_is_played_in_the_simulator_and_found_feasible(trained: Service):
     assert trained.http.post("/playbacks", json={"plan": made["id"]}).status_code == 200
     playback = trained.client.playback(job["result"]["playback"])
     assert playback["feasible"]
+    headline = playback["headline"]
+    assert (headline["level"], headline["word"]) == ("caution", "No hand-off"), (
+        "feasible, but it leaves out the hand-off"
+    )
+    assert "no hand-off: no PSM_M, no A2" in headline["text"]
     assert playback["plan"] == made["id"]
     assert playback["report"]["failure"] is None
     assert trained.client.picture(playback["id"]).startswith(b"\x89PNG\r\n\x1a\n")

@@ -1,4 +1,4 @@
-"""Training, releasing, serving, following: what a client is told of a policy, and when it is told nothing."""
+"""Training, releasing, serving and following a policy, and the requests that are refused."""
 
 import hashlib
 import io
@@ -10,7 +10,7 @@ import orjson
 import pytest
 
 from skills.client import Problem
-from skills.style.learning.q_learning import CellQLearning
+from skills.learning.q_learning import CellQLearning
 from tests import backends
 from tests.api.service import CSV, GOAL_MM, KESTREL, POLICY, Service, assert_problem, serving
 from tests.library import cases
@@ -65,7 +65,7 @@ def test_training_does_not_release_unless_asked(service: Service):
     assert (result["releasable"], result["released"], result["not_released_because"]) == (True, False, None)
     problem = assert_problem(service.http.get(POLICY), 404, "not-found")
     assert problem["numbers"]["candidates"] == [{"version": 1, "sha256": result["sha256"], "releasable": True}]
-    assert "versions/N/release" in problem["detail"]
+    assert "versions/1/release" in problem["detail"]
 
 
 def test_the_events_of_a_job_tell_its_states_to_the_end(trained: Service):
@@ -81,7 +81,7 @@ def test_the_events_of_a_job_tell_its_states_to_the_end(trained: Service):
     assert_problem(trained.http.get(f"/jobs/{'0' * 16}/events"), 404, "not-found")
 
 
-# ---- what is served
+# ---- serving
 
 
 def test_a_policy_has_every_field_of_the_interface(still: Service):
@@ -189,7 +189,7 @@ def test_what_value_iteration_finds_is_released_without_a_move_of_the_arm(traine
     assert policy["actions"] == trained.client.policy(**KESTREL, version=1)["actions"]
 
 
-def test_a_policy_for_moves_that_slip_is_released_where_it_is_exact_and_refused_where_it_was_sampled(trained: Service):
+def test_a_slip_policy_is_released_if_exact_and_refused_if_sampled(trained: Service):
     result = trained.train(learner={"kind": "value-iteration", "slip": 0.1}, release=True)["result"]
     assert result["released"]
     assert trained.client.policy(**KESTREL)["settings"] == {"gamma": 0.1, "slip": 0.1}
@@ -231,7 +231,7 @@ def test_a_learner_with_settings_that_cannot_be_meant_is_refused_at_once(still: 
     assert still.counts() == before
 
 
-def test_a_demonstration_in_another_frame_than_the_arms_base_is_not_released(service: Service):
+def test_a_demo_in_a_frame_other_than_the_arms_base_is_not_released(service: Service):
     service.client.put_surgeon("kestrel")
     service.client.add_demo(cases.hand_off(), media_type=CSV, **KESTREL, frame="ECM")
     result = service.train(release=True)["result"]

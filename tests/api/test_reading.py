@@ -1,14 +1,15 @@
-"""Uploads are read in a process of their own: what it may not have, the caller is told in words."""
+"""Reading of uploads in a separate process, and the messages for exceeded limits."""
 
 import os
 import signal
+import threading
 
 import pytest
 
 from tests import backends
 from tests.api.service import CSV, KESTREL, MCAP, assert_problem, serving
 from tests.library import cases
-from tests.sim.test_confined import alive
+from tests.waiting import alive
 
 BAG = cases.bag()
 
@@ -33,7 +34,7 @@ def test_a_recording_over_a_limit_of_the_settings_is_refused_in_words(tmp_path, 
         assert service.counts() == before
 
 
-def test_both_doors_and_stored_recordings_are_read_apart_and_a_killed_server_is_replaced(tmp_path):
+def test_files_are_read_in_another_process_and_a_killed_one_is_replaced(own_fork_server, tmp_path):
     with serving(backends.fresh("sqlite", tmp_path)) as service:
         service.client.put_surgeon("kestrel")
         server = service.app.state.reader.server
@@ -50,7 +51,25 @@ def test_both_doors_and_stored_recordings_are_read_apart_and_a_killed_server_is_
     assert not any(map(alive, pids))
 
 
-def test_a_service_that_stops_is_busy(tmp_path):
+def test_what_is_told_of_a_recording_is_found_out_where_it_is_read(tmp_path, monkeypatch):
+    """Neither an upload nor a cut searches for hand-offs in the process that answers requests."""
+    looked: list[str] = []
+
+    def look(*_: object) -> None:
+        looked.append(threading.current_thread().name)
+        raise AssertionError
+
+    with serving(backends.fresh("sqlite", tmp_path)) as service:
+        service.client.put_surgeon("kestrel")
+        monkeypatch.setattr("skills.demonstration.segments.movement_of", look)
+        recording = service.client.add_recording(BAG)
+        assert recording["segments"]
+        assert service.client.cut_demo(recording["id"], **KESTREL)["segment"]["taken"] == "proposal 1 of 1"
+        service.client.add_demo(cases.hand_off(), media_type=CSV, **KESTREL)
+    assert looked == []
+
+
+def test_a_service_that_stops_is_busy(own_fork_server, tmp_path):
     with serving(backends.fresh("sqlite", tmp_path)) as service:
         service.app.state.reader.server.close()
         answer = service.http.post("/recordings", content=BAG, headers={"Content-Type": MCAP})

@@ -1,4 +1,4 @@
-"""Batches over HTTP: one job, its styles one by one, and what is refused."""
+"""Batches over HTTP: one job, its styles one by one, and the refusals."""
 
 import pytest
 

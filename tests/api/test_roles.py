@@ -1,4 +1,4 @@
-"""Every route and every role: exactly the allowed answers; a route that declares nothing is found."""
+"""Permissions: every route with every role gets exactly the allowed status, and undeclared routes are found."""
 
 from collections.abc import Iterator
 from datetime import timedelta
@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 from fastapi import APIRouter
 
-from skills.api.access import Needs
-from skills.api.gate import is_open
+from skills.api.authentication import is_open
+from skills.api.authorisation import Needs
 from skills.db.base import now
 from skills.library.keys import LADDER, revoke_key
 from tests import backends
@@ -32,6 +32,7 @@ NEEDED = {
     "POST /recordings": UPLOADER,
     "POST /demos": UPLOADER,
     "POST /recordings/{recording}/demos": UPLOADER,
+    "DELETE /recordings/{recording}": UPLOADER,
     "POST /suture-points": UPLOADER,
     "DELETE /demos/{demo}": RELEASER,
     "POST /trainings": TRAINER,
@@ -48,7 +49,7 @@ NEEDED = {
     "GET /keys": ADMIN,
     "POST /keys": ADMIN,
     "DELETE /keys/{key}": ADMIN,
-}  # every other GET: a reader's
+}  # every other GET: reader
 SHAPES = {
     "surgeon": "nobody",
     "suture": "simple-running",
@@ -60,7 +61,7 @@ SHAPES = {
 
 
 def path_of(path: str) -> str:
-    """Fill a path with what there is not."""
+    """Fill a path with ids that do not exist."""
     for name in [part[1:-1] for part in path.split("/") if part.startswith("{")]:
         path = path.replace(f"{{{name}}}", SHAPES.get(name, "0" * 64))
     return path
@@ -68,7 +69,8 @@ def path_of(path: str) -> str:
 
 @pytest.fixture
 def service(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Service]:
-    monkeypatch.setattr("skills.api.limits.BAD_AT_ONCE", 10**6)
+    monkeypatch.setattr("skills.api.rate_limits.BAD_AT_ONCE", 10**6)
+    monkeypatch.setattr("skills.api.rate_limits.BAD_OF_ALL_AT_ONCE", 10**6)
     with serving(backends.fresh("sqlite", tmp_path), key_requests_per_s=1e6) as service:
         yield service
 
@@ -103,7 +105,7 @@ def test_every_route_answers_every_role_as_the_table_says(service: Service):
 
 
 def undeclared(service: Service) -> list[str]:
-    """Find the routes that do not say what they need, or say another thing than the gate knows."""
+    """Find the routes that declare no permission, or another one than the authorisation knows."""
     found = []
     for method, path, dependencies in routes(service):
         needs = [one.dependency for one in dependencies if isinstance(one.dependency, Needs)]
@@ -114,7 +116,7 @@ def undeclared(service: Service) -> list[str]:
     return found
 
 
-def test_every_route_declares_what_it_needs_and_one_that_does_not_is_found_and_let_nobody_in(service: Service):
+def test_every_route_declares_its_role_and_an_undeclared_one_is_refused(service: Service):
     assert undeclared(service) == []
     forgotten = APIRouter()
     forgotten.get("/forgotten")(lambda: "everything")
@@ -124,7 +126,7 @@ def test_every_route_declares_what_it_needs_and_one_that_does_not_is_found_and_l
     assert service.http.get("/forgotten").status_code == 401
 
 
-def test_releasing_with_a_training_is_for_releasers_and_erasing_a_demonstration_for_admins(service: Service):
+def test_only_releasers_train_with_release_and_only_admins_erase_a_demo(service: Service):
     asked = {"surgeon": "nobody", "suture": "simple-running"}
     trainer, releaser, admin = (As(service, key(service, role, role)) for role in ("trainer", "releaser", "admin"))
     for path, body in (("/trainings", asked), ("/retrainings", asked)):

@@ -25,7 +25,7 @@ def stored() -> dict[str, str]:
 
 @pytest.fixture(scope="module")
 def scoring(tmp_path_factory: pytest.TempPathFactory, stored: dict[str, str]) -> Iterator[Service]:
-    """Three surgeons of the samples, and a calibration."""
+    """Yield a service with three surgeons of the samples, and a calibration."""
     folder = tmp_path_factory.mktemp("scoring")
     with serving(backends.fresh("sqlite", folder)) as service:
         for surgeon, level in LEVELS.items():
@@ -49,7 +49,7 @@ def test_a_hesitant_novice_is_told_from_an_even_expert(scoring: Service, stored:
         assert figures[smoothness]["value"] < figures[smoothness]["reference"] < 0
     assert score["deviation"]["words"]
     assert score["skill"]["calibrated"] and 6 <= score["skill"]["rating"] <= 30
-    assert score["skill"]["outside"]  # a synthetic cohort is of another hand
+    assert score["skill"]["outside"]  # the motions differ from the calibration's synthetic cohort
 
 
 def test_the_same_part_of_the_recording_has_the_same_score(scoring: Service, stored: dict[str, str]) -> None:
@@ -125,7 +125,7 @@ def page(service: Service, path: str, status: int = 200) -> str:
 def test_the_page_draws_the_way_in_steps_and_says_where(scoring: Service, stored: dict[str, str]) -> None:
     score = scoring.client.score("kestrel", cases.SUTURE, demo=stored["plover"])
     text = page(scoring, f"/pages/demos/{stored['plover']}/score?surgeon=kestrel")
-    assert text.count('role="img"') == 4  # three views, and along the way; there is no earlier demonstration
+    assert text.count('role="img"') == 4  # three views and the curve along the path; no earlier demonstration
     steps = set(np.searchsorted((2.5, 5, 10, 20), score["deviation"]["apart_mm"]).tolist())
     drawn = {int(step) for step in re.findall(r'<polyline class="apart-(\d)" points="\d+\.\d,', text)}
     assert drawn == steps
@@ -146,7 +146,7 @@ def test_the_page_is_reached_from_the_style_and_the_recording(scoring: Service, 
 
 
 def test_what_cannot_be_shown_is_said_on_a_page(scoring: Service, stored: dict[str, str]) -> None:
-    assert "That is not here" in page(scoring, f"/pages/demos/{'0' * 64}/score", 404)
+    assert "Not found" in page(scoring, f"/pages/demos/{'0' * 64}/score", 404)
     assert "no surgeon" in page(scoring, f"/pages/demos/{stored['plover']}/score?surgeon=nobody", 404)
 
 
@@ -154,7 +154,7 @@ def test_without_consent_the_page_says_so(service: Service) -> None:
     service.client.put_surgeon("kestrel", consent={"uses": ["training"]})
     demo = service.client.add_demo(cases.hand_off(), media_type=CSV, **KESTREL)
     text = page(service, f"/pages/demos/{demo['id']}/score", 409)
-    assert "That cannot be shown" in text and "does not cover atlas" in text
+    assert "Cannot be shown" in text and "does not cover atlas" in text
 
 
 def test_over_time_every_demonstration_is_drawn(service: Service) -> None:
@@ -164,4 +164,4 @@ def test_over_time_every_demonstration_is_drawn(service: Service) -> None:
         demo = service.client.add_demo(cases.table(tip), media_type=CSV, **KESTREL)
     text = page(service, f"/pages/demos/{demo['id']}/score")
     assert text.count('class="before"') == 2 and text.count('class="scored"') == 1
-    assert "This is the reference itself" in text
+    assert "This demonstration is the reference itself" in text

@@ -1,4 +1,4 @@
-"""A key that is restricted to heron: whatever is kestrel's is answered as if it were not there, in every call."""
+"""A key restricted to heron: every call answers for kestrel's objects as if they did not exist."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -7,11 +7,11 @@ from typing import Any
 import pytest
 from sqlalchemy import select
 
-from skills.api.gate import is_open
+from skills.api.authentication import is_open
 from skills.db.base import Base
-from skills.db.books import Job
-from skills.db.seen import OF_NOBODY, Only
-from skills.library.batches import to_tell
+from skills.db.row_visibility import OF_NOBODY, Only
+from skills.db.service_tables import Job
+from skills.library.jobs import to_tell
 from skills.library.keys import held, list_keys
 from tests.api.keyed import HERON, As, copy_of_told, key, routes
 from tests.api.service import CSV, GOAL_MM, KESTREL, Service, serving
@@ -31,12 +31,12 @@ def admin(service: Service) -> As:
 
 @pytest.fixture
 def heron(service: Service) -> As:
-    """The highest key that can be restricted."""
+    """Return a user with the highest role that can be restricted."""
     return As(service, key(service, "of heron", "releaser", surgeons=["heron"]))
 
 
 def ids(admin: As, surgeon: str) -> dict[str, str]:
-    """Find what is a surgeon's, by the name that it has in paths."""
+    """Find a surgeon's objects, by the parameter names that they have in paths."""
     demo = admin("GET", f"/demos?surgeon={surgeon}").json()["items"][0]
     found = {"surgeon": surgeon, "suture": cases.SUTURE, "demo": demo["id"], "recording": demo["recording"]}
     jobs = admin("GET", "/jobs").json()["items"]
@@ -50,7 +50,7 @@ def ids(admin: As, surgeon: str) -> dict[str, str]:
 
 
 def filled(path: str, about: dict[str, str]) -> str | None:
-    """Fill a path with ids; None: it names nothing of a surgeon's."""
+    """Fill a path with ids; None if it names nothing that belongs to a surgeon."""
     names = [part[1:-1] for part in path.split("/") if part.startswith("{")]
     if not set(names) & set(about) - {"suture", "version"}:
         return None
@@ -59,9 +59,7 @@ def filled(path: str, about: dict[str, str]) -> str | None:
     return path
 
 
-def test_every_path_that_names_something_of_kestrels_is_404_and_all_of_it_is_there(
-    service: Service, admin: As, heron: As
-):
+def test_paths_to_kestrels_objects_are_404_for_heron_and_exist_for_admin(service: Service, admin: As, heron: As):
     kestrels, seen = ids(admin, "kestrel"), 0
     query = {"/plans/{plan}/comparison": f"?demo={kestrels['demo']}"}
     for method, path, _ in routes(service):
@@ -69,9 +67,7 @@ def test_every_path_that_names_something_of_kestrels_is_404_and_all_of_it_is_the
             continue
         where += query.get(path, "")
         answer = heron(method, where)
-        bodiless = (
-            method == "POST" and "{surgeon}" not in path
-        )  # refused for want of a body, before anything is looked for
+        bodiless = method == "POST" and "{surgeon}" not in path  # refused for the missing body, before the look-up
         refused = {403} if path == "/surgeons/{surgeon}" and method != "GET" else {404, 422} if bodiless else {404}
         assert answer.status_code in refused, (method, path, answer.status_code)
         assert "kestrel" not in answer.text, (method, path)
@@ -115,7 +111,7 @@ def test_no_body_or_query_reaches_anything_of_kestrels(service: Service, admin: 
         ("POST", "/trainings", {"json": KESTREL}),
         ("POST", "/trainings", {"json": HERON | {"demos": [kestrels["demo"]]}}),
         ("POST", "/retrainings", {"json": {"surgeon": "kestrel"}}),
-        ("POST", "/plans", {"json": KESTREL | {"suture_points": [{"position_mm": GOAL_MM}]}}),
+        ("POST", "/plans", {"json": KESTREL | {"suture_points": [{"position_mm": GOAL_MM}], "handoff": "none"}}),
         ("POST", "/playbacks", {"json": {"plan": kestrels["plan"]}}),
         ("POST", f"/recordings/{own['recording']}/demos", {"json": KESTREL}),
         ("POST", f"/recordings/{kestrels['recording']}/demos", {"json": HERON}),
@@ -145,7 +141,7 @@ def test_a_batch_for_all_is_one_for_the_surgeons_of_the_key(service: Service, ad
     with service.database.seen_by(held_by(service, "of heron")).reading() as session:
         found = session.scalar(select(Job).where(Job.id == job))
         assert found is not None
-        assert len(to_tell(session, found)) == 1  # its parts are seen too, or no engine would be told
+        assert len(to_tell(session, found)) == 1  # its parts are visible too, otherwise the engine would never get them
     assert heron("DELETE", f"/jobs/{job}").json()["state"] == "cancelled"
     assert admin("DELETE", f"/jobs/{everybodys}").json()["state"] == "cancelled"
 
@@ -155,9 +151,7 @@ def held_by(service: Service, owner: str) -> Only | None:
         return next(held(one).only for one in list_keys(session) if one.owner == owner)
 
 
-def test_who_brings_bytes_that_are_here_already_learns_nothing_from_it_and_sees_them_from_then_on(
-    service: Service, admin: As, heron: As
-):
+def test_a_duplicate_upload_reveals_nothing_and_grants_access_from_then_on(service: Service, admin: As, heron: As):
     recording = ids(admin, "kestrel")["recording"]
     assert heron("GET", f"/recordings/{recording}").status_code == 404
     sent = [heron("POST", "/recordings", content=cases.hand_off(), headers={"Content-Type": CSV}) for _ in range(2)]
@@ -171,7 +165,7 @@ def test_who_brings_bytes_that_are_here_already_learns_nothing_from_it_and_sees_
     assert other("GET", f"/recordings/{recording}").status_code == 200
 
 
-def test_an_erased_surgeon_leaves_the_key_with_nobody_and_not_with_everybody(tmp_path: Path):
+def test_a_key_whose_surgeon_is_erased_sees_nobody_rather_than_everybody(tmp_path: Path):
     with serving(copy_of_told(tmp_path)) as service:
         admin, heron = (
             As(service, key(service, "anna", "admin")),

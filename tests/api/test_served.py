@@ -1,30 +1,32 @@
-"""What is served from memory is what is released at that moment: by every process, on both databases."""
+"""The policy cache: every process serves the current release only, on both databases."""
 
 import gc
 import threading
 import time
 import weakref
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
 import httpx2 as httpx
+import numpy as np
 import pytest
 from sqlalchemy import text
 
-from skills.api.answers import JSON, NPZ, Body, negotiate
+from skills.api.responses import JSON, NPZ, Body, negotiate
 from skills.db.changes import APPLICATION, BOUND_S
 from skills.db.session import Database
 from skills.errors import UnknownFormat
-from skills.library import verified
+from skills.library import integrity
+from skills.library.cache import Kept
 from skills.library.catalogue import put_surgeon
-from skills.library.kept import Kept
 from skills.library.keys import create_key
 from tests import backends
 from tests.api.processes import learn_two_versions, servers
 from tests.api.service import CSV, KESTREL, POLICY, Service, assert_problem, serving
-from tests.jobs.house import until
 from tests.library import cases
+from tests.waiting import until
 
 RELEASE = f"{POLICY}/release"
 HAMMERED_S = 4.0
@@ -43,9 +45,9 @@ class Pair:
         return self.url.startswith("sqlite")
 
     def settle(self, version: int | None) -> float:
-        """Wait until the other server serves a version, None: nothing; tell for how long it has not, in seconds.
+        """Wait until the other server serves a version, None for no version; return how long it did not, in seconds.
 
-        On SQLite there is nothing to wait for; on PostgreSQL nothing may be waited for past the bound.
+        SQLite needs no wait; on PostgreSQL the wait must not exceed the bound.
         """
         began = time.monotonic()
         while (found := served(self.other)) != version:
@@ -55,7 +57,7 @@ class Pair:
         return time.monotonic() - began
 
     def cut(self) -> None:
-        """Cut the lines on which PostgreSQL tells the servers of changes."""
+        """Cut the connections on which PostgreSQL notifies the servers of changes."""
         database = Database(self.url)
         with database.writing() as session:
             lines = text(
@@ -76,7 +78,7 @@ def pair(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
 
 
 def served(client: httpx.Client) -> int | None:
-    """Ask which version is served; None: nothing is."""
+    """Return the version that is served, None if there is none."""
     answer = client.get(POLICY)
     assert answer.status_code in (200, 404)
     return answer.json()["version"] if answer.status_code == 200 else None
@@ -86,7 +88,7 @@ def release(client: httpx.Client, version: int) -> None:
     assert client.post(f"{POLICY}/versions/{version}/release").status_code == 200
 
 
-def test_what_one_process_withdraws_or_releases_another_no_longer_or_at_once_serves(pair: Pair):
+def test_a_release_or_withdrawal_in_one_process_takes_effect_in_another(pair: Pair):
     for version in (1, 2, 1):
         release(pair.one, version)
         pair.settle(version)
@@ -120,12 +122,12 @@ def test_also_while_the_line_that_tells_of_changes_is_cut(pair: Pair):
         cutting.join()
 
 
-# ---- hammering
+# ---- load
 
 
 @dataclass(frozen=True)
 class Told:
-    """What is served: it may be so as soon as it was asked for, and must be once it is acknowledged."""
+    """A change of the served version: possibly visible from its request on, certainly from its acknowledgement on."""
 
     version: int | None
     asked: float
@@ -134,7 +136,7 @@ class Told:
 
 @dataclass(frozen=True)
 class Seen:
-    """What a reader was given."""
+    """One response to a reader."""
 
     version: int | None
     asked: float
@@ -142,7 +144,7 @@ class Seen:
 
 
 def staleness_s(seen: Seen, told: list[Told]) -> float:
-    """Tell for how long what was given had been over when it was asked for; 0 where it may have been so meanwhile."""
+    """Return how long the response had been outdated at its request, in s; 0 if it may have been valid meanwhile."""
     late = []
     for one, following in zip(told, [*told[1:], None], strict=True):
         over = float("inf") if following is None else following.acknowledged
@@ -151,13 +153,13 @@ def staleness_s(seen: Seen, told: list[Told]) -> float:
     return min(late)
 
 
-def test_staleness_is_the_time_since_the_acknowledgement_of_what_came_after():
+def test_staleness_counts_from_the_acknowledgement_of_the_next_change():
     told = [Told(1, 0, 1), Told(None, 4, 5), Told(2, 8, 9)]
     given = [(1, 2, 3), (1, 4.9, 6), (1, 6, 7), (None, 4.5, 4.6), (None, 10, 11), (2, 8.1, 8.2), (2, 20, 21)]
     assert [staleness_s(Seen(*one), told) for one in given] == [0, 0, 1, 0, 1, 0, 0]
 
 
-def test_under_a_hail_of_requests_nothing_is_served_after_its_end_was_acknowledged(pair: Pair):
+def test_under_load_nothing_is_served_after_its_end_is_acknowledged(pair: Pair):
     release(pair.one, 1)
     pair.settle(1)
     began = time.monotonic()
@@ -195,7 +197,7 @@ def test_under_a_hail_of_requests_nothing_is_served_after_its_end_was_acknowledg
     assert late == 0 if pair.on_sqlite else late < BOUND_S
 
 
-# ---- what is in memory
+# ---- the cache
 
 
 def test_a_service_serves_what_it_has_just_released_on_postgresql_too(tmp_path: Path):
@@ -212,7 +214,7 @@ def test_a_service_serves_what_it_has_just_released_on_postgresql_too(tmp_path: 
 
 
 @pytest.mark.parametrize("backend", backends.BACKENDS)
-def test_what_is_erased_leaves_the_memory_of_every_process_though_nobody_asks(backend: str, tmp_path: Path):
+def test_erased_policies_leave_all_processes_memory_without_a_request(backend: str, tmp_path: Path):
     url = backends.fresh(backend, tmp_path)
     learn_two_versions(url)
     with serving(url) as service, serving(url) as other:
@@ -220,33 +222,33 @@ def test_what_is_erased_leaves_the_memory_of_every_process_though_nobody_asks(ba
         sha256 = service.client.policy(**KESTREL)["sha256"]
         bodies = [weakref.ref(read_and_kept(service, kind)) for kind in (JSON, NPZ)]
         assert all(body() is not None for body in bodies)
-        assert sha256 in verified.remembered()
+        assert sha256 in integrity.remembered()
         other.client.erase_surgeon("kestrel")
         assert_problem(service.http.get(f"/policy-versions/{sha256}"), 404)
         until(lambda: gc.collect() >= 0 and not any(body() for body in bodies), 20)
-        until(lambda: sha256 not in verified.remembered(), 20)
+        until(lambda: sha256 not in integrity.remembered(), 20)
         assert_problem(service.http.get(POLICY), 410)
     backends.drop(url)
 
 
 def seeing(service: Service) -> None:
-    """Wait until a service sees the changes of its database."""
+    """Wait until a service receives the changes of its database."""
     until(lambda: version(service) is not None, 20)
 
 
 def version(service: Service) -> int | None:
-    return service.http.portal.call(service.app.state.served._changes.version)
+    return service.http.portal.call(service.app.state.served.changes.version)
 
 
 def read_and_kept(service: Service, kind: str) -> Body:
-    """Ask for a policy, and look at what is then at hand."""
+    """Request a policy, and return its cached body."""
     assert service.http.get(POLICY, headers={"Accept": kind}).status_code == 200
     body = service.http.portal.call(service.app.state.served.at_hand, *KESTREL.values(), kind)
     assert body is not None
     return body
 
 
-def test_a_policy_that_is_learnt_once_more_after_an_erasure_is_told_with_its_own_dates(trained: Service):
+def test_a_policy_learnt_again_after_an_erasure_gets_its_own_dates(trained: Service):
     before = trained.client.policy(**KESTREL)
     rows = trained.counts()["releases"]
     demo = trained.client.demos()[0]["id"]
@@ -260,11 +262,11 @@ def test_a_policy_that_is_learnt_once_more_after_an_erasure_is_told_with_its_own
     assert trained.http.get(f"{POLICY}/versions/1").json()["created_at"] == after["created_at"] > before["created_at"]
 
 
-def test_what_was_verified_is_served_by_its_digest_and_what_is_damaged_is_not_read(trained: Service):
+def test_a_verified_policy_is_served_by_digest_and_a_damaged_one_refused(trained: Service):
     before = trained.http.get(POLICY)
     trained.tamper("UPDATE policy_versions SET learnt = x'00'")
     assert trained.http.get(POLICY).content == before.content
-    verified.forget(verified.remembered())
+    integrity.forget(integrity.remembered())
     with serving(trained.url) as started_later:
         assert_problem(started_later.http.get(POLICY), 503, "corrupt")
 
@@ -282,9 +284,37 @@ def test_what_is_kept_is_bounded_by_its_bytes():
     kept.forget([8, 12])
     kept.put(13, bytes(70))
     assert [key for key, _ in kept.items()] == [7, 13]
+    kept.put(13, bytes(101))
+    assert kept.get(13) is None, "an older value must not outlive one that is too heavy"
 
 
-# ---- what is asked
+def test_a_list_of_what_is_kept_marks_nothing_as_used():
+    kept: Kept[str, int] = Kept(2)
+    kept.put("first", 1)
+    kept.put("second", 2)
+    kept.get("first")
+    assert len(kept.items()) == 2
+    kept.put("third", 3)
+    assert kept.get("first") == 1 and kept.get("second") is None
+
+
+def test_threads_may_share_what_is_kept():
+    kept: Kept[int, bytes] = Kept(100, len)
+
+    def use(seed: int) -> None:
+        rng = np.random.default_rng(seed)
+        for number in rng.integers(0, 12, 3000).tolist():
+            kept.put(number, bytes(1 + number))
+            kept.get(number + 1)
+            kept.items()
+            kept.forget([number + 2])
+
+    with ThreadPoolExecutor(8) as threads:
+        list(threads.map(use, range(8)))  # raises what a thread raised
+    assert sum(len(value) for _, value in kept.items()) <= 100
+
+
+# ---- database queries
 
 
 def test_the_short_way_and_the_long_one_give_the_same_answers(trained: Service):
@@ -301,7 +331,7 @@ def test_the_short_way_and_the_long_one_give_the_same_answers(trained: Service):
     ]
     for headers in asked:
         for method in ("GET", "HEAD"):
-            cold = Service(trained.url)  # it has not started, so that it looks everything up
+            cold = Service(trained.url)  # not started, so that it queries everything
             answers = [one.http.request(method, POLICY, headers=headers) for one in (cold, trained, trained)]
             given = [(one.status_code, one.content, told(one)) for one in answers]
             assert given[0] == given[1] == given[2], headers
@@ -371,11 +401,11 @@ def test_a_served_policy_is_counted_by_its_route_however_it_was_found(trained: S
     assert counted in trained.http.get("/metrics").text
 
 
-# ---- who tells
+# ---- notifications
 
 
 def test_whatever_changes_what_is_served_is_told_on_postgresql(tmp_path: Path):
-    """Each as another process does it: a commit of this process would be seen without being told."""
+    """Each change is made as another process would: this process sees its own commits without a notification."""
     url = backends.fresh("postgresql", tmp_path)
     learn_two_versions(url)
     with serving(url) as service, serving(url) as other:

@@ -1,10 +1,10 @@
-"""Suture points out of a simulator's recording, and a plan of them."""
+"""Suture points from a simulator's recording, and a plan with them."""
 
 import numpy as np
 import pytest
 
 from tests.api.service import GOAL_MM, KESTREL, MCAP, Service, assert_problem
-from tests.recordings.test_suture_points import scene, world
+from tests.formats.test_suture_points import scene, world
 
 UNTURNED = (0.0, 0.0, 0.0, 1.0)
 MARKS = {f"{kind}{k + 1}": ((x + 0.006 * k, 0.055, -0.125), UNTURNED) for kind, x in (("Entry", 0.0), ("Exit", 0.005)) for k in range(3)}  # fmt: skip  # noqa: E501
@@ -19,7 +19,7 @@ def test_the_exits_of_a_scene_become_the_suture_points_of_a_plan(still: Service)
     goals = [one for one in found["points"] if one["is_goal"]]
     assert {one["kind"] for one in goals} == {"exit"}
     points = [{"position_mm": one["position_mm"], "rotation_xyzw": one["turn_xyzw"]} for one in goals]
-    plan = still.client.plan(**KESTREL, suture_points=points)
+    plan = still.client.plan(**KESTREL, suture_points=points, handoff="none")
     for k, one in enumerate(plan["passes"]):
         np.testing.assert_allclose(one["path_mm"][-1], np.add(GOAL_MM, [6.0 * k, 0.0, 0.0]), atol=1e-6)
 

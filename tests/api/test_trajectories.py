@@ -1,4 +1,4 @@
-"""The motion of a plan: as numbers, and as the bag that a robot replays, which is not given to everybody."""
+"""The motion of a plan: as numbers, and as the bag that a robot replays, which needs permission."""
 
 import csv
 import io
@@ -11,31 +11,35 @@ import pytest
 from sqlalchemy import select
 
 from skills.client import Problem
-from skills.db.books import Job
-from skills.recordings.replay_check import verify_bag
+from skills.db.service_tables import Job
+from skills.formats.verify import verify_bag
 from tests.api.service import GOAL_MM, KESTREL, Service, assert_problem
 from tests.library import cases
+from tests.needs import need
 
 ZIP = {"Accept": "application/zip"}
 POINTS = [[5.0, 55.0, -125.0], [11.0, 55.0, -125.0]]
 
 
 def plan(service: Service, *points: list[float], **asked: object) -> dict:
+    """Plan passes; unless PSM_M is given they have no hand-off."""
+    if "psm_m" not in asked:
+        asked = {"handoff": "none"} | asked
     return service.client.plan(**KESTREL, suture_points=[{"position_mm": p} for p in points], **asked)
 
 
 def play(service: Service, made: dict) -> dict:
-    """Play a plan in the simulator, and give the verdict."""
-    pytest.importorskip("pybullet", reason="PyBullet has no wheel here: no plan can be played, so none is replayed")
+    """Play a plan in the simulator, and return the verdict."""
+    need("simulator")
     asked = service.client.play(made["id"])["id"]
     with service.database.reading() as session:
         job = session.scalars(select(Job).where(Job.id == asked)).one()
-    done = cases.work(service.database, job)  # that one alone: pictures of it are drawn by another, and take seconds
+    done = cases.work(service.database, job)  # this job only: another one draws the pictures, which takes seconds
     assert done.state == "succeeded", done.error
     return service.client.playback(done.result["playback"])
 
 
-# ---- as numbers
+# ---- numbers
 
 
 def test_the_trajectory_is_the_same_as_json_and_as_a_table(still: Service):
@@ -63,7 +67,7 @@ def test_one_pass_alone_is_a_part_of_the_whole(still: Service):
         assert_problem(still.http.get(path, params={"pass": none}), 422, "invalid-request")
 
 
-def test_what_is_asked_for_first_is_given_and_what_is_there_already_is_not_sent_again(still: Service):
+def test_the_first_accepted_format_is_sent_and_an_unchanged_one_gives_304(still: Service):
     path = f"/plans/{plan(still, GOAL_MM)['id']}/trajectory"
     first = still.http.get(path, headers={"Accept": "image/png, text/csv;q=0.9, application/json"})
     assert first.headers["content-type"].startswith("text/csv")
@@ -76,14 +80,14 @@ def test_what_is_asked_for_first_is_given_and_what_is_there_already_is_not_sent_
         assert_problem(nowhere, 404, "not-found")
 
 
-# ---- as a bag
+# ---- the bag
 
 
-def test_a_bag_is_given_once_its_own_plan_was_played_and_for_as_long_as_all_of_it_stands(
-    trained: Service, tmp_path: Path
-):
+def test_a_bag_needs_a_playback_release_consent_and_demo_that_still_stand(trained: Service, tmp_path: Path):
     made, other = plan(trained, GOAL_MM), plan(trained, GOAL_MM, speed_mm_s=10.0)
     path = f"/plans/{made['id']}/trajectory"
+    assert "has no hand-off" in assert_problem(trained.http.get(path, headers=ZIP), 409, "conflict")["detail"]
+    path += "?handoff=none"
 
     def refused() -> str:
         return assert_problem(trained.http.get(path, headers=ZIP), 409, "conflict")["detail"]
@@ -98,21 +102,21 @@ def test_a_bag_is_given_once_its_own_plan_was_played_and_for_as_long_as_all_of_i
     assert answer.status_code == 200, answer.text
     assert answer.headers["content-type"] == "application/zip"
     assert answer.headers["content-disposition"] == f'attachment; filename="replay-{made["id"][:12]}.zip"'
-    assert answer.content == trained.client.replay_bag(made["id"])
+    assert answer.content == trained.client.replay_bag(made["id"], handoff="none")
     file = tmp_path / "bag.zip"
     file.write_bytes(answer.content)
     lines = verify_bag(file)
     assert verdict["id"][:12] in lines[1]
     with zipfile.ZipFile(file) as archive:
         assert json.loads(archive.read("verdict.json"))["report"] == verdict["report"]
-    file.write_bytes(trained.client.replay_bag(made["id"], 0))
+    file.write_bytes(trained.client.replay_bag(made["id"], 0, handoff="none"))
     assert len(verify_bag(file)) == len(lines)
 
     trained.client.withdraw(**KESTREL)
     assert "none is released" in refused()
     with pytest.raises(Problem, match="none is released"):
-        trained.client.replay_bag(made["id"])
-    assert trained.http.get(path).status_code == 200  # the numbers alone move nothing
+        trained.client.replay_bag(made["id"], handoff="none")
+    assert trained.http.get(path).status_code == 200  # the numbers alone move no robot
     trained.client.release(**KESTREL, version=1)
     assert trained.http.get(path, headers=ZIP).content == answer.content
     trained.client.put_surgeon("kestrel", consent={"uses": ["training"]})

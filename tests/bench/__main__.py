@@ -1,4 +1,4 @@
-"""`make bench [PARTS="reading learning ..."]`: how fast it is, as ratios within one run, for timings vary."""
+"""`make bench [PARTS="reading learning ..."]`: speed as ratios within one run, because absolute times vary."""
 
 import sys
 
@@ -35,7 +35,7 @@ PARTS = {
 
 
 def main() -> None:
-    """Print a table of the parts that are asked for, or of all."""
+    """Print a table of the requested parts, or of all."""
     table = Table("what", "time", "in proportion", box=None)
     for name in sys.argv[1:] or PARTS:
         PARTS[name](table)

@@ -1,4 +1,4 @@
-"""The atlas of 1000 demonstrations of 100 states: all of it from nothing, then with one more, then again."""
+"""The atlas of 1000 demonstrations of 100 states: from scratch, with one more, and unchanged."""
 
 import os
 import resource
@@ -10,31 +10,30 @@ from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
-import orjson
 from rich.table import Table
 from sqlalchemy import insert, select
 
+from skills.api.responses import json_of
+from skills.comparison.distances import THREADS, distances, shape_of
 from skills.db.base import now
 from skills.db.models import Demonstration, StoredRecording, Surgeon
 from skills.db.packed import pack
 from skills.db.session import Database
 from skills.library.atlas import atlas_of
 from skills.packing import sha256
-from skills.style.comparing.distances import THREADS, distances
-from skills.style.comparing.shapes import shape_of
 from tests import backends
+from tests.comparison.cohort import Cohort, cohort
 from tests.library import cases, cohorts
-from tests.style.comparing.cohort import Cohort, cohort
 
 T = TypeVar("T")
 
 SURGEONS, EACH = 20, 50
-WARM = 2  # demonstrations, compared before the clock runs: the loop is compiled then
-WHOLE_S, MORE_S = 60.0, 1.0  # what was asked for, on two cores
+WARM = 2  # demonstrations, compared before the measurement so that the loop is compiled
+WHOLE_S, MORE_S = 60.0, 1.0  # the required times, on two cores
 
 
 def atlas(table: Table) -> None:
-    """Measure the atlas on SQLite; behind the time stands the processor's, which what else runs does not change."""
+    """Measure the atlas on SQLite; after the time comes the processor time, which is independent of other load."""
     drawn = cohort(1, surgeons=SURGEONS, sessions=EACH)
     with tempfile.TemporaryDirectory(prefix="skills-atlas-") as folder:
         database = Database(backends.fresh("sqlite", Path(folder)))
@@ -49,7 +48,7 @@ def atlas(table: Table) -> None:
         spent, found = timed(lambda: atlas_of(database, cases.SUTURE))
         table.add_row(f"with one more, {len(found.demos)}", str(spent), spent.share_of(MORE_S))
         spent, found = timed(lambda: atlas_of(database, cases.SUTURE))
-        written, said = timed(lambda: orjson.dumps(found))
+        written, said = timed(lambda: json_of(found))
         table.add_row("again", str(spent), f"its JSON {written}, {len(said) / 1e6:.1f} MB")
         table.add_row("memory", f"{peak_mib() - before:.0f} MiB", "more than before, at the most")
         pairs(table, drawn)
@@ -57,7 +56,7 @@ def atlas(table: Table) -> None:
 
 
 def pairs(table: Table, drawn: Cohort) -> None:
-    """Measure one pair in the loop, and by the library that it is checked against."""
+    """Measure one pair in the loop, and in the library that checks it."""
     from tslearn.metrics import dtw_path_from_metric
 
     shapes = [shape_of(demo) for demo in drawn.demos[:40]]
@@ -70,7 +69,7 @@ def pairs(table: Table, drawn: Cohort) -> None:
 
 
 def fill(database: Database, drawn: Cohort, until: int) -> None:
-    """Store the first demonstrations of a cohort, those that are not there yet; past the reader, which is not meant."""
+    """Store the missing ones of a cohort's first demonstrations; without the reader, which is not measured."""
     for surgeon in range(SURGEONS):
         cases.add_surgeon(database, cohorts.name(surgeon))
     stored = cases.add_demo(database, surgeon=cohorts.name(0), session="model")
@@ -107,7 +106,7 @@ SAME = ("arm", "topic", "frame", "instrument", "start_s", "end_s", "hysteresis")
 
 @dataclass(frozen=True)
 class Spent:
-    """How long something took, and the processors with it."""
+    """The wall time and processor time of some work."""
 
     wall_s: float
     processor_s: float

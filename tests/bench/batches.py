@@ -1,7 +1,7 @@
-"""How fast a batch is trained, beside the same learning in a bare process pool, in turn, on the same cores.
+"""Speed of batch training compared with the same learning in a bare process pool, in turn, on the same cores.
 
-Besides the time that passes, what the processes that learn take of the processor: on a machine that others use too,
-only that can be compared.
+Besides wall time it reports the processor time of the learning processes: on a machine under other load, only that is
+comparable.
 """
 
 import os
@@ -23,45 +23,46 @@ import numpy as np
 from rich.table import Table
 from sqlalchemy import func, select, update
 
-from skills.db.books import Executor, Job
 from skills.db.models import Demonstration, Surgeon, SutureType
 from skills.db.packed import unpack_as
+from skills.db.service_tables import Executor, Job
 from skills.db.session import Database
 from skills.errors import BadPath
-from skills.jobs.child import environment
+from skills.gridworld.grid import PAPER_GRID, discretize
+from skills.gridworld.reward import RewardMap
 from skills.jobs.engine import Engine
-from skills.library.batches import PART, to_tell
+from skills.learning.certificate import Certificate, Coverage, certify
+from skills.learning.learners import LEARNER_VERSION, describe_learner
+from skills.learning.policy import learn_tabular
+from skills.learning.q_learning import PhaseQLearning
 from skills.library.catalogue import put_surgeon, seed_catalogue
-from skills.library.demos import Cut, upload_demo
+from skills.library.demos import upload_demo
+from skills.library.jobs import PART, to_tell
 from skills.library.retraining import request_retraining
-from skills.library.training import Lesson, describe_learner, learn_style, lessons
+from skills.library.training import Lesson, learn_style, lessons
+from skills.schemas.requests import DemoIn, RetrainingIn
+from skills.serving import environment
 from skills.settings import Settings
-from skills.style.certificate import Certificate, Coverage, certify
-from skills.style.grid import PAPER_GRID, discretize
-from skills.style.learning.learners import LEARNER_VERSION
-from skills.style.learning.q_learning import PhaseQLearning
-from skills.style.policy import learn_policy
-from skills.style.reward import RewardMap
+from tests.demonstration.synthetic import RATE_HZ, motions
 from tests.library import cases
-from tests.style.synthetic import RATE_HZ, motions
 
-STYLES = 200  # `python -m tests.bench.batches 1000 3` takes the thousand, three times
+STYLES = 200  # `python -m tests.bench.batches 1000 3` takes a thousand, three times
 ROUNDS = 2
 WORKERS = (1, 2, 4)
-FIRST = "warm-up"  # a surgeon whose style is trained before any clock runs
+FIRST = "warm-up"  # a surgeon whose style is trained before the measurement
 MOST_S = 600.0
 T = TypeVar("T")
 
 
 class Took(NamedTuple):
-    """What some work took, in s: by the clock, and of the processor by those that learn."""
+    """The cost of some work, in s: wall time, and processor time of the learning processes."""
 
     clock_s: float
     processor_s: float
 
 
 def batches(table: Table, styles: int = STYLES, rounds: int = ROUNDS) -> None:
-    """Train all styles of many synthetic surgeons with 1, 2 and 4 workers, beside a bare pool of as many processes."""
+    """Train all styles of many synthetic surgeons with 1, 2 and 4 workers, and in a bare pool of as many processes."""
     with tempfile.TemporaryDirectory(prefix="skills-batches-") as folder:
         full = Path(folder) / "full.sqlite"
         asked_of = fill(full, styles)
@@ -89,16 +90,14 @@ def batches(table: Table, styles: int = STYLES, rounds: int = ROUNDS) -> None:
 
 
 def said(took: Sequence[Took], styles: int) -> tuple[str, str]:
-    """Say how long some rounds took, and what a style did."""
+    """Format the duration of some rounds, and the time per style."""
     clock_s, processor_s = (median(times) for times in zip(*took, strict=True))
     each_ms = f"{processor_s / styles * 1e3:.1f} ms of the processor each"
     return f"{clock_s:.1f} s", f"{styles / clock_s:.0f} styles/s, {each_ms}"
 
 
 def used_s(processes: Iterable[int]) -> float:
-    """Sum what living processes have taken of the processor so far, all their threads and for all they asked of the
-    system.
-    """
+    """Return the processor time of living processes so far, with all threads, user and system time."""
     ticks = 0
     for process in processes:
         fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
@@ -107,7 +106,7 @@ def used_s(processes: Iterable[int]) -> float:
 
 
 def fill(file: Path, styles: int) -> list[tuple[RewardMap, Lesson]]:
-    """Make a database with so many styles, as many surgeons as it takes; what they are learnt from."""
+    """Create a database with a number of styles and enough surgeons; return the inputs of their training."""
     database = Database(f"sqlite:///{file}")
     database.migrate()
     with database.writing() as session:
@@ -121,7 +120,7 @@ def fill(file: Path, styles: int) -> list[tuple[RewardMap, Lesson]]:
         with database.writing() as session:
             put_surgeon(session, surgeon, {}, "bench")
         data = cases.table(tip_mm, rate_hz=RATE_HZ)
-        upload_demo(database, cases.upload(data), Cut(surgeon, suture, grid="paper"), "bench")
+        upload_demo(database, cases.upload(data), DemoIn(surgeon=surgeon, suture=suture, grid="paper"), "bench")
     with database.reading() as session:
         rows = list(session.scalars(select(Demonstration.row).order_by(Demonstration.row).offset(1)))
         stored = lessons(session, rows)
@@ -131,7 +130,7 @@ def fill(file: Path, styles: int) -> list[tuple[RewardMap, Lesson]]:
 
 
 def inside(number: int) -> Iterator[np.ndarray]:
-    """Draw motions, (T, 3) mm, that stay in the paper's grid, one of a seed."""
+    """Generate motions, (T, 3) mm, that stay in the paper's grid, from one seed."""
     seeds = count()
     for _ in range(number):
         yield next(tip for seed in seeds for tip in islice(motions(seed, PAPER_GRID, seed % 3), 1) if fits(tip))
@@ -149,7 +148,7 @@ def fits(tip_mm: np.ndarray) -> bool:
 
 
 def pool(learn: Callable[[T], object], given: Sequence[T], workers: int) -> Took:
-    """Time what is worked out of every style and nothing else, in so many processes that are warm."""
+    """Time the computation of every style and nothing else, in a number of warm processes."""
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
         list(pool.map(learn, given[:1] * workers * 4))
         processes = [child.pid for child in active_children()]
@@ -160,16 +159,16 @@ def pool(learn: Callable[[T], object], given: Sequence[T], workers: int) -> Took
 
 
 def kernel(reward: RewardMap) -> None:
-    certify(learn_policy(reward, PhaseQLearning()))
+    certify(learn_tabular(reward, PhaseQLearning()))
 
 
 def returned(reward: RewardMap) -> tuple[np.ndarray, Certificate, Coverage]:
-    policy = learn_policy(reward, PhaseQLearning())
+    policy = learn_tabular(reward, PhaseQLearning())
     return policy.q, *certify(policy)
 
 
 def worked_out(lesson: Lesson) -> None:
-    """Learn and certify, and check, measure, describe and pack it too: all that does not need the database."""
+    """Learn, certify, check, measure, describe and pack: everything that does not need the database."""
     learn_style(lesson, training_of(lesson), Settings(database_url="sqlite://"))
 
 
@@ -189,16 +188,16 @@ def training_of(lesson: Lesson) -> dict[str, object]:
 
 
 def ours(full: Path, workers: int, styles: int, *, consent: bool = True) -> Took:
-    """Time a batch in a fresh copy of the database, from its request to its end; without consent nothing is learnt."""
+    """Time a batch in a fresh copy of the database, from request to end; without consent nothing is learnt."""
     with tempfile.TemporaryDirectory(prefix="skills-batch-", dir=full.parent) as folder:
         file = Path(folder) / "skills.sqlite"
         shutil.copy(full, file)
         settings = Settings(database_url=f"sqlite:///{file}")
         database = Database(settings.database_url)
         with working(settings, workers, database) as processes, closing(Engine(settings)) as engine:
-            for number in range(2 * workers):  # everybody has learnt something
+            for number in range(2 * workers):  # until every worker has learnt something
                 other = PhaseQLearning(gamma=0.1 - number / 1000)
-                ended(database, asked(database, engine, surgeon=FIRST, learner=other))
+                ended(database, asked(database, engine, surgeon=FIRST, learner=describe_learner(other)))
             if not consent:
                 with database.writing() as session:
                     session.execute(update(Surgeon).values(consent={"uses": [], "until": None}))
@@ -211,9 +210,9 @@ def ours(full: Path, workers: int, styles: int, *, consent: bool = True) -> Took
 
 
 def asked(database: Database, engine: Engine, **what: object) -> int:
-    """Ask for a batch as the service does."""
+    """Request a batch as the service does."""
     with database.writing() as session:
-        job, _ = request_retraining(session, "bench", **what)
+        job, *_ = request_retraining(session, RetrainingIn(**what), "bench")
         told = to_tell(session, job)
     for row, attempt in told:
         engine.tell(row, attempt, PART)

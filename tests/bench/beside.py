@@ -1,7 +1,7 @@
-"""`skills serve` as it is, and beside the application constant answers, of the same server and outside of it.
+"""`skills serve` with constant responses for comparison, from the same server inside and outside of the application.
 
-`python -m tests.bench.beside BYTES ...` answers `/constant/BYTES`, in no more steps than the protocol has, and
-`/fastapi/BYTES`, by a route of FastAPI's that does nothing else. With 0 it is an empty 304.
+`python -m tests.bench.beside BYTES ...` answers `/constant/BYTES` with the least steps that the protocol needs, and
+`/fastapi/BYTES` by a minimal FastAPI route. 0 gives an empty 304.
 """
 
 import sys
@@ -18,7 +18,7 @@ create_app = serving.create_app
 
 
 def constants(sizes: list[int]) -> dict[str, tuple[dict[str, Any], dict[str, Any]]]:
-    """Write the messages of the plain ones."""
+    """Build the ASGI messages of the constant responses."""
     kept = {}
     for size in sizes:
         headers = [(b"content-length", str(size).encode()), (b"content-type", b"application/json")] if size else []
@@ -28,7 +28,7 @@ def constants(sizes: list[int]) -> dict[str, tuple[dict[str, Any], dict[str, Any
 
 
 def routes(sizes: list[int]) -> FastAPI:
-    """Make an application of constant routes."""
+    """Build an application of constant routes."""
     app = FastAPI(openapi_url=None)
     for size in sizes:
         app.get(f"/fastapi/{size}")(route(size))
@@ -45,7 +45,7 @@ def route(size: int) -> Callable[[], Awaitable[Response]]:
 
 
 class Beside:
-    """The application, and the constant answers before it."""
+    """An ASGI application that answers the constant paths itself and passes on all others."""
 
     def __init__(self, app: Any, sizes: list[int]) -> None:
         self.app, self.state = app, app.state

@@ -1,10 +1,10 @@
-"""The learners beyond the table beside those with one, and beside plain replay: what they reach, and what it costs.
+"""The deep learners compared with the tabular ones and with plain replay: their results and their cost.
 
     python -m tests.bench learners                       # small budgets: a minute each
     python -m tests.bench.beyond dqn steps=800000 seed=0 # one of them alone, as JSON
 
-Each is learnt in an interpreter of its own, so that its peak of memory is its own: that of the whole process, libraries
-included. What was learnt is packed, unpacked, compared to the last bit and followed again before it is measured.
+Each learns in a separate interpreter, so that the peak memory is its own: that of the process, libraries included. The
+learnt policy is packed, unpacked, compared bit by bit and rolled out again before it is measured.
 """
 
 import json
@@ -23,25 +23,23 @@ from rich.table import Table
 from skills import packing
 from skills.db import models  # noqa: F401 - declares what is stored
 from skills.db.packed import pack, unpack_as
-from skills.deep.learning import NEEDED
-from skills.deep.lesson import KNOWN, Lesson
-from skills.report.sources import paper_source, sample_source
+from skills.deep.learning import KNOWN, NEEDED, NetworkLesson
+from skills.gridworld.grid import GridPath, GridWorld
+from skills.gridworld.reward import RewardMap, sparse_reward
+from skills.learning import policy as table_policy
+from skills.learning.certificate import certify
+from skills.learning.deep_settings import DDPG, DQN, TRPO, network_q
+from skills.learning.evaluation import check_in_space, measure
+from skills.learning.learners import LEARNERS, Learner
+from skills.learning.policy import Policy, rollout_from
+from skills.learning.slip import replay
+from skills.report.figures import paper_source, sample_source
 from skills.settings import Settings
-from skills.style import policy as table_policy
-from skills.style.certificate import certify
-from skills.style.evaluation import measure
-from skills.style.grid import GridPath, GridWorld
-from skills.style.learning.beyond import DDPG, DQN, TRPO, network_q
-from skills.style.learning.learners import LEARNERS, Learner
-from skills.style.policy import Policy, rollout_from
-from skills.style.reward import RewardMap, sparse_reward
-from skills.style.rivals import replay
-from skills.style.wandering import check_in_space
+from tests.demonstration.synthetic import winding_path
 from tests.measured import TWO_CELLS, measured, peak_mib
-from tests.style.synthetic import winding_path
 
 SMALL = {"dqn": 60_000, "ddpg": 40_000, "trpo": 150_000}  # about a minute on one core each
-SIZES = ((11, 40), (21, 100), (51, 400), (101, 400))  # cells a side, waypoints
+SIZES = ((11, 40), (21, 100), (51, 400), (101, 400))  # cells per side, waypoints
 
 
 def learners(table: Table) -> None:
@@ -62,7 +60,7 @@ def learners(table: Table) -> None:
 
 
 def in_words(found: dict[str, Any]) -> str:
-    """Write one line of what was measured."""
+    """Format one line of measurements."""
     space = found["space"]
     wandered = f"; in the space {space['reached']} of {space['starts']}" if space else ""
     return (
@@ -72,7 +70,7 @@ def in_words(found: dict[str, Any]) -> str:
 
 
 def apart(kind: str, **settings: float) -> dict[str, Any]:
-    """Learn with one learner in an interpreter of its own."""
+    """Learn with one learner in a separate interpreter."""
     asked = [f"{name}={value}" for name, value in settings.items()]
     command = [sys.executable, "-m", "tests.bench.beyond", kind, *asked]
     done = subprocess.run(command, cwd=Path(__file__).parents[2], stdout=subprocess.PIPE, check=True)
@@ -80,10 +78,10 @@ def apart(kind: str, **settings: float) -> dict[str, Any]:
 
 
 def one(kind: str, seed: int = 0, side: int = 0, waypoints: int = 0, **settings: Any) -> dict[str, Any]:
-    """Learn with one learner here and measure what came of it; with `side` in a cube of so many cells a side."""
+    """Learn with one learner in this process and measure the result; `side` is the cells per side of a cube."""
     learner = LEARNERS[kind](**settings)
     reward = sparse_reward(demonstration(side, waypoints))
-    table_policy.learn_policy(sparse_reward(TWO_CELLS), LEARNERS["phase-q-learning"]())  # compiles
+    table_policy.learn_tabular(sparse_reward(TWO_CELLS), LEARNERS["phase-q-learning"]())  # compiles
     if isinstance(learner, DQN | DDPG | TRPO):
         import skills.deep.training  # noqa: F401 - torch is loaded before the clock starts
     wall, processor = time.perf_counter(), time.process_time()
@@ -121,21 +119,22 @@ def one(kind: str, seed: int = 0, side: int = 0, waypoints: int = 0, **settings:
 
 
 def demonstration(side: int, waypoints: int) -> GridPath:
-    """Take the paper's demonstration, or a sample's where that is not here, or a winding one in a cube."""
+    """Return the paper's demonstration, or a sample's if that is absent, or a winding one in a cube."""
     if side:
         return winding_path(0, GridWorld((0.0, 0.0, 0.0), 5.0, (side, side, side)), waypoints)
     return (paper_source(Settings().paper_data) or sample_source()).path
 
 
 def learnt(reward: RewardMap, learner: Learner, seed: int) -> Policy:
-    """Learn in this process, as the process of its own does in the service."""
+    """Learn in this process, as the service's learning process does."""
     if not isinstance(learner, DQN | DDPG | TRPO):
-        return table_policy.learn_policy(reward, learner, seed)
+        return table_policy.learn_tabular(reward, learner, seed)
     from skills.deep import training
 
-    request = BytesIO()
-    packing.write(request, Lesson(reward, learner, seed), KNOWN)
-    found = packing.read(BytesIO(training.train(request.getvalue())), KNOWN)
+    request, answer = BytesIO(), BytesIO()
+    packing.write(request, NetworkLesson(reward, learner, seed), KNOWN)
+    training.train(request, answer)
+    found = packing.read(answer, KNOWN)
     q = network_q(reward, learner, found.network)
     return Policy(reward.path, reward.levels, learner, seed, found.training, q, found.network)
 

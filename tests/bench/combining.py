@@ -1,8 +1,8 @@
-"""Which way of combining several demonstrations is nearest to one that it has not seen, leaving each out once.
+"""Ways of combining several demonstrations, compared by their distance to a left-out demonstration.
 
-Two sets: the cohort whose truth is known, with tempo and tremor, and the sample recordings' surgeons, each of whose
-hand-offs is done again with a day's differences; and the five hand-offs of one sample as they are. With an outlier, one
-of the demonstrations that are combined, the newest as likely as another, is a hand-off of quite another shape.
+Two sets: the cohort of known truth, with tempo and tremor, and the sample recordings' surgeons, each of whose hand-offs
+is repeated with day-to-day differences; and the five hand-offs of one sample unchanged. With an outlier, one of the
+combined demonstrations, the newest as likely as any other, is a hand-off of a quite different shape.
 """
 
 import io
@@ -12,19 +12,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 from rich.table import Table
 
-from skills.recordings import read_recording
+from skills.comparison.combining import COMBININGS, combine, laid, side_by_side
+from skills.comparison.distances import placed
+from skills.demonstration.demonstration import Demo, cut_demo
+from skills.formats import read_recording
+from skills.gridworld.grid import choose_grid, discretize
+from skills.learning.evaluation import dtw
 from skills.seeds.recordings import sample_recordings
-from skills.style.combining import COMBININGS, combine, side_by_side
-from skills.style.comparing.shapes import placed
-from skills.style.demo import Demo, cut_demo
-from skills.style.elsewhere import laid
-from skills.style.evaluation import dtw
-from skills.style.grid import choose_grid, discretize
-from tests.style.comparing.cohort import HUMPS, cohort, demo_of
+from tests.comparison.cohort import HUMPS, cohort, demo_of
 
-FIRST_SEED = 1000  # not one of those on which `AGREEING` was chosen
+FIRST_SEED = 1000  # none of the seeds on which `AGREEING` was chosen
 TREMOR_MM = 0.2
-OUTLIER_MM = 15.0  # size of an outlier's humps; a surgeon's own have 5
+OUTLIER_MM = 15.0  # size of an outlier's humps; a surgeon's own are 5 mm
 RESAMPLES = 2000
 NEWEST = "newest alone"
 METHODS = [NEWEST, *COMBININGS]
@@ -32,7 +31,7 @@ METHODS = [NEWEST, *COMBININGS]
 
 @dataclass(frozen=True, eq=False)
 class Errors:
-    """Mean distance at a state to the one left out, mm: of each surgeon by each method, and after the grid, (S, M)."""
+    """Mean distance to the left-out demonstration, mm per state: by surgeon and method, also after the grid, (S, M)."""
 
     ways_mm: np.ndarray
     grids_mm: np.ndarray
@@ -43,7 +42,7 @@ class Errors:
 
 
 def combining(table: Table) -> None:
-    """Print of every set how far each method's way is from the demonstration left out."""
+    """Print for every set the distance of each method's path to the left-out demonstration."""
     sets: dict[str, Callable[[], list[list[Demo]]]] = {
         "cohort, days differ by 1 mm": lambda: cohorts(1.0),
         "cohort, days differ by 3 mm": lambda: cohorts(3.0),
@@ -79,7 +78,7 @@ def _left_out(demos: list[Demo], outlier: bool, rng: np.random.Generator) -> Ite
 
 
 def _distances(held: Demo, rest: list[Demo]) -> list[tuple[float, float]]:
-    """Measure each method's way, and it in its grid, from the one left out, laid where that one is: (M, 2)."""
+    """Measure each method's path, and its grid path, against the left-out demonstration, aligned with it: (M, 2)."""
     (wanted, *_, newest), moved = side_by_side([held, *rest], 0)
     ways = [newest, *(combine(rest, how()).tip_mm for how in COMBININGS.values())]
     if moved:
@@ -93,7 +92,7 @@ def _apart(way_mm: np.ndarray, wanted_mm: np.ndarray) -> float:
 
 
 def interval(values: np.ndarray) -> str:
-    """Write a mean over surgeons and between what it lies at 95 %, drawing surgeons anew; one has no interval."""
+    """Format a mean over surgeons with its 95 % interval by resampling surgeons; one surgeon has no interval."""
     if len(values) == 1:
         return f"{values[0]:.2f}"
     drawn = np.random.default_rng(0).choice(values, (RESAMPLES, len(values))).mean(axis=1)
@@ -105,7 +104,7 @@ def interval(values: np.ndarray) -> str:
 
 
 def cohorts(day_mm: float, surgeons: int = 24, each: int = 6) -> list[list[Demo]]:
-    """Draw surgeons, so many demonstrations of each, with tremor and another tempo each time."""
+    """Draw surgeons with a number of demonstrations each, with tremor and a different tempo each time."""
     drawn = cohort(FIRST_SEED, surgeons, each, day=day_mm)
     rng = np.random.default_rng(FIRST_SEED)
     return [
@@ -115,7 +114,7 @@ def cohorts(day_mm: float, surgeons: int = 24, each: int = 6) -> list[list[Demo]
 
 
 def samples_again(day_mm: float = 1.5, each: int = 6) -> list[list[Demo]]:
-    """Take the hand-off of each sample surgeon, do it again with a day's differences, turned and at other places."""
+    """Repeat the hand-off of each sample surgeon with day-to-day differences, rotated and at other places."""
     rng = np.random.default_rng(FIRST_SEED)
     found = []
     for sample in sample_recordings():
@@ -132,12 +131,12 @@ def kestrels_five() -> list[Demo]:
 
 
 def stranger(rng: np.random.Generator) -> Demo:
-    """Draw a hand-off that is nobody's."""
+    """Draw a hand-off that belongs to no surgeon."""
     return demo_of(rng.normal(0.0, OUTLIER_MM, (HUMPS, 2)), rng.uniform(-np.pi, np.pi), rng.normal(0.0, 20.0, 3), 3.0)
 
 
 def with_tempo_and_tremor(demo: Demo, rng: np.random.Generator) -> Demo:
-    """Hurry and linger on the way, and tremble at 8 to 12 Hz."""
+    """Vary the tempo along the path, and add tremor at 8 to 12 Hz."""
     share = demo.stamps_s / demo.stamps_s[-1]
     stamps_s = demo.stamps_s[-1] * (share + rng.uniform(-0.6, 0.6) * np.sin(2 * np.pi * share) / (2 * np.pi))
     rates_hz, phases = rng.uniform(8.0, 12.0, 3), rng.uniform(0.0, 2 * np.pi, 3)

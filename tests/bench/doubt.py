@@ -1,14 +1,13 @@
-"""How long 1000 variations of a pass take, beside one closed-form inverse of the same poses."""
+"""Duration of 1000 variations of a pass, compared with one closed-form inverse of the same poses."""
 
 import numpy as np
 from rich.table import Table
 
-from skills.style.clearance import clearance_between, clearance_to_pad, links_of
-from skills.style.doubt import DoubtSettings, doubt
-from skills.style.handoff import PsmM
-from skills.style.kinematics import POINTING_DOWN, inverse, matrix_of
-from skills.style.realign import realign
-from skills.style.trajectory import PassPath, Trajectory, time_parametrise
+from skills.kinematics import POINTING_DOWN, inverse, matrix_of
+from skills.planning.handoff import PsmM, realign
+from skills.planning.trajectory import PassPath, Trajectory, time_parametrise
+from skills.verification.clearance import clearance_between, clearance_to_pad, links_of
+from skills.verification.monte_carlo import DoubtSettings, doubt
 from tests.bench.timing import best_s, in_turn
 
 ROUNDS = 3
@@ -22,7 +21,7 @@ PATH_MM = np.array([[-10, 55, -135], [-20, 60, -130], [-15, 60, -125], [-10, 55,
 
 
 def doubting(table: Table) -> None:
-    """Vary a pass, alone and with PSM_M beside it."""
+    """Vary a pass, alone and with PSM_M."""
     settings = DoubtSettings()
     for name, psm_m in (("alone", None), ("beside PSM_M", PSM_M)):
         one = _motion(psm_m)

@@ -1,8 +1,8 @@
-"""A style at other wound lines: turned, scaled and moved, beside movement primitives with another start and goal.
+"""A style at other wound lines: rotated, scaled and moved, compared with movement primitives to another start and goal.
 
-Lines are drawn in a range (`line`), for the hand-off of each sample surgeon. All methods are shown the demonstration
-without tremor, at 100 Hz. A dynamic movement primitive learns from that one. A probabilistic one needs several: it is
-shown twenty, which differ by a day, and by 5 mm in where they start and end, and is conditioned on start and goal.
+Lines are drawn from a range (`line`), for the hand-off of each sample surgeon. All methods get the demonstration
+without tremor, at 100 Hz. A dynamic movement primitive learns from that one. A probabilistic one needs several: it
+gets twenty, which differ by one day's variation and by 5 mm in start and end, and is conditioned on start and goal.
 """
 
 import io
@@ -14,33 +14,33 @@ from movement_primitives.dmp import DMP
 from movement_primitives.promp import ProMP
 from rich.table import Table
 
-from skills.recordings import read_recording
+from skills.comparison.combining import moved
+from skills.comparison.distances import TREMOR_S, placed, resampled
+from skills.demonstration.demonstration import Demo, cut_demo
+from skills.demonstration.movement import smoothed_tip
+from skills.formats import read_recording
+from skills.gridworld.grid import choose_grid, discretize
+from skills.kinematics import POINTING_DOWN, reachable
+from skills.learning.evaluation import dtw
+from skills.learning.slip import replay
+from skills.planning.path_fit import fit_to_demo, trace
 from skills.seeds.recordings import sample_recordings
-from skills.style.comparing.shapes import TREMOR_S, placed, resampled
-from skills.style.demo import Demo, cut_demo
-from skills.style.elsewhere import moved
-from skills.style.evaluation import dtw
-from skills.style.grid import choose_grid, discretize
-from skills.style.kinematics import POINTING_DOWN, reachable
-from skills.style.movement import smoothed_tip
-from skills.style.rivals import replay
-from skills.style.smooth import fit_to_demo, trace
 
 SEED = 2000
 LINES = 50  # for each sample
-GOALS_MM = ((-80.0, 80.0), (-20.0, 120.0), (-180.0, -60.0))  # the paper's grid and as much around it
+GOALS_MM = ((-80.0, 80.0), (-20.0, 120.0), (-180.0, -60.0))  # the paper's grid and the same margin around it
 SCALES, TURNS_RAD, TILTS_RAD = (0.5, 2.0), (-np.pi / 2, np.pi / 2), (-np.pi / 9, np.pi / 9)
-SHOWN = 20  # demonstrations of a probabilistic primitive
+SHOWN = 20  # demonstrations for a probabilistic primitive
 DAY_MM, ENDS_MM = 1.5, 5.0
 WEIGHTS = {"dmp": 50, "promp": 20}  # along each axis; more change little
-SURE_MM2 = 1e-6  # of a place that a probabilistic primitive is conditioned on
+SURE_MM2 = 1e-6  # variance of a position that a probabilistic primitive is conditioned on
 
 Elsewhere = Callable[[np.ndarray, np.ndarray], Demo]  # to a start and a goal
 Method = Callable[[Demo], Elsewhere]
 
 
 def geometry(table: Table, lines: int = LINES) -> None:
-    """Print how much of the shape is left, how smooth it is, and whether the arm gets there."""
+    """Print the remaining shape error, the smoothness, and whether the arm reaches the path."""
     table.add_row("[bold]at other wound lines", "shape, mm at a state: at its own, mean, worst", "jerk, ends, in reach")
     for name, method in METHODS.items():
         figures = np.array(list(measured(method, lines))).reshape(-1, lines + 1, 4)
@@ -53,7 +53,7 @@ def geometry(table: Table, lines: int = LINES) -> None:
 
 
 def measured(method: Method, lines: int) -> Iterator[tuple[float, float, float, bool]]:
-    """Move every hand-off to its own line and to others: the shape's error, jerk added, how far off ends, in reach."""
+    """Yield shape error, added jerk, end error and reachability of every hand-off, at its own and other lines."""
     for number, demo in enumerate(hand_offs()):
         elsewhere = method(demo)
         rng = np.random.default_rng([SEED, number])
@@ -68,9 +68,9 @@ def measured(method: Method, lines: int) -> Iterator[tuple[float, float, float, 
 
 
 def line(length_mm: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Draw a start and a goal: the goal in `GOALS_MM`, the way there as `SCALES`, `TURNS_RAD` and `TILTS_RAD` say.
+    """Draw a start and a goal: the goal in `GOALS_MM`, the line as `SCALES`, `TURNS_RAD` and `TILTS_RAD` say.
 
-    It is turned from the diagonal of the paper's grid, along which the samples go.
+    It is rotated from the diagonal of the paper's grid, along which the samples run.
     """
     goal_mm = rng.uniform(*np.transpose(GOALS_MM))
     turn, tilt = np.pi / 4 + rng.uniform(*TURNS_RAD), rng.uniform(*TILTS_RAD)
@@ -91,7 +91,7 @@ def hand_offs() -> list[Demo]:
 
 
 def log_jerk(demo: Demo) -> float:
-    """Measure the dimensionless jerk (Hogan and Sternad, 2009), its logarithm; neither size nor speed changes it."""
+    """Return the logarithm of the dimensionless jerk (Hogan and Sternad, 2009), independent of size and speed."""
     step_s = demo.stamps_s[1]
     speed = np.gradient(demo.tip_mm, step_s, axis=0)
     jerk = np.gradient(np.gradient(speed, step_s, axis=0), step_s, axis=0)
@@ -107,7 +107,7 @@ def ours(demo: Demo) -> Elsewhere:
 
 
 def ours_fitted(demo: Demo) -> Elsewhere:
-    """Put it into a grid of 5 mm and drive through its cells as a plan does, at an even speed, to the goal."""
+    """Discretise in a grid of 5 mm and drive through its cells as a plan does, at constant speed, to the goal."""
 
     def elsewhere(start_mm: np.ndarray, goal_mm: np.ndarray) -> Demo:
         there = moved(demo, start_mm, goal_mm)
@@ -120,7 +120,10 @@ def ours_fitted(demo: Demo) -> Elsewhere:
 
 
 def dynamic(demo: Demo) -> Elsewhere:
-    """Learn it from the demonstration; its spring is softened at the beginning, so that a far goal is no jolt."""
+    """Learn a primitive from the demonstration.
+
+    Its spring is softened at the start, so that a far goal causes no jolt.
+    """
     primitive = DMP(3, float(demo.stamps_s[-1]), float(demo.stamps_s[1]), WEIGHTS["dmp"], smooth_scaling=True)
     primitive.imitate(demo.stamps_s, demo.tip_mm)
 
@@ -134,7 +137,7 @@ def dynamic(demo: Demo) -> Elsewhere:
 
 
 def probabilistic(demo: Demo) -> Elsewhere:
-    """Learn it from demonstrations like this one, and of places around it."""
+    """Learn a primitive from demonstrations similar to this one, at places around it."""
     rng, share = np.random.default_rng(SEED), demo.stamps_s / demo.stamps_s[-1]
     waves = np.sin(np.pi * np.outer(share, [1, 2, 3]))
     ends = np.stack([1 - share, share], axis=1)

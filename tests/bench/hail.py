@@ -1,7 +1,7 @@
-"""A hail of requests, from a process of its own: one request over and over, on connections that stay open.
+"""A load generator in a separate process: one request repeated on connections that stay open.
 
-It reads orders as lines of JSON, and answers each with a line: how many requests a second, the median and the 99th
-percentile of their times in ms, and the statuses.
+It reads orders as lines of JSON and answers each with a line: requests per second, the median and the 99th percentile
+of their times in ms, and the statuses.
 """
 
 import asyncio
@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[2]
 
 @dataclass(frozen=True)
 class Hail:
-    """What came of it."""
+    """The result of one order."""
 
     rate: float
     seconds: float
@@ -30,7 +30,7 @@ class Hail:
 
 
 class Connection(asyncio.Protocol):
-    """One client: it sends the request again when it has the answer, or a pause later, until it is time to end."""
+    """One client: it repeats the request after each response, or after a pause, until the end time."""
 
     def __init__(self, request: bytes, pause_s: float, end: float, took: list[float]) -> None:
         self.request, self.pause_s, self.end, self.took = request, pause_s, end, took
@@ -48,7 +48,7 @@ class Connection(asyncio.Protocol):
 
     def data_received(self, data: bytes) -> None:
         self.had += len(data)
-        if not self.size:  # of the first answer; all that follow are as long
+        if not self.size:  # of the first response; all following ones have the same length
             self.head += data
             head, end, _ = self.head.partition(b"\r\n\r\n")
             if not end:
@@ -79,7 +79,7 @@ class Connection(asyncio.Protocol):
 async def hail(
     port: int, path: str, headers: dict[str, str], clients: int, seconds: float, pause_s: float
 ) -> dict[str, Any]:
-    """Send what is ordered, and measure."""
+    """Send the ordered requests, and measure."""
     lines = [
         f"GET {path} HTTP/1.1",
         f"Host: 127.0.0.1:{port}",
@@ -106,7 +106,7 @@ async def hail(
 
 
 class Hailing:
-    """The process that sends."""
+    """The process that sends the requests."""
 
     def __init__(self, process: subprocess.Popen[str], port: int) -> None:
         self.process, self.port = process, port
@@ -128,7 +128,7 @@ class Hailing:
 
 @contextmanager
 def hailing(port: int) -> Iterator[Hailing]:
-    """Start the process that sends."""
+    """Start the sending process."""
     command = [sys.executable, "-m", "tests.bench.hail"]
     process = subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     try:

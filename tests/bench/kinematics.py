@@ -1,23 +1,23 @@
-"""How fast joints are solved and plans put into time: a pose in batch, and a plan of twenty passes with both arms."""
+"""Speed of kinematics and time parametrisation: a pose in a batch, and a plan of twenty passes with both arms."""
 
 import numpy as np
 from rich.table import Table
 
-from skills.style.handoff import PsmM
-from skills.style.kinematics import CANNULA_MM, CLASSIC, POINTING_DOWN, angle_between, forward, inverse
-from skills.style.trajectory import PassPath, time_parametrise
+from skills.kinematics import CANNULA_MM, CLASSIC, POINTING_DOWN, angle_between, forward, inverse
+from skills.planning.handoff import PsmM
+from skills.planning.trajectory import PassPath, time_parametrise
 from tests.bench.timing import best_s
-from tests.style.motions import PSM_M, hand_off
+from tests.planning.motions import PSM_M, hand_off
 
 POSES = 12_000
 ROUNDS = 9
 TILT_RAD = np.radians(35.0)
 BESIDE = PsmM(PSM_M, (160.0, 20.0, 20.0), (0.0, float(np.sin(TILT_RAD / 2)), 0.0, float(np.cos(TILT_RAD / 2))))
-MOST_US = 2.0  # a pose, as the work on motion asks for
+MOST_US = 2.0  # per pose, as the motion specification requires
 
 
 def kinematics(table: Table) -> None:
-    """Time both directions on poses anywhere in the joints' limits, and along the paper's grid; then whole plans."""
+    """Time both directions on poses within the joint limits and on the paper's grid; then complete plans."""
     rng = np.random.default_rng(7)
     joints = rng.uniform(CLASSIC.lower, CLASSIC.upper, (POSES, 6))
     joints[:, 2] = rng.uniform(CANNULA_MM, CLASSIC.upper[2], POSES)

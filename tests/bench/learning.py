@@ -1,4 +1,4 @@
-"""How fast policies are learnt and certified, beside plain Python, plain C and what two threads can do here."""
+"""Speed of learning and certification, compared with plain Python, plain C and the gain of two threads."""
 
 import hashlib
 from io import BytesIO
@@ -6,19 +6,19 @@ from io import BytesIO
 import numpy as np
 from rich.table import Table
 
-from skills.recordings import read_recording
-from skills.report.sources import paper_source
+from skills.demonstration.demonstration import cut_demo
+from skills.formats import read_recording
+from skills.gridworld.grid import PAPER_GRID, discretize
+from skills.gridworld.reward import RewardMap, sparse_reward
+from skills.learning import _kernels
+from skills.learning.certificate import certify
+from skills.learning.evaluation import dtw
+from skills.learning.learners import Learner
+from skills.learning.policy import learn_tabular
+from skills.learning.q_learning import CellQLearning, PhaseQLearning
+from skills.report.figures import paper_source
 from skills.seeds.recordings import sample_recordings
 from skills.settings import Settings
-from skills.style.certificate import certify
-from skills.style.demo import cut_demo
-from skills.style.evaluation import dtw
-from skills.style.grid import PAPER_GRID, discretize
-from skills.style.learning import _kernels
-from skills.style.learning.learners import Learner
-from skills.style.learning.q_learning import CellQLearning, PhaseQLearning
-from skills.style.policy import learn_policy
-from skills.style.reward import RewardMap, sparse_reward
 from tests.bench.plain_c import plain_c
 from tests.bench.timing import best_s, gain, in_turn
 from tests.measured import measured
@@ -27,7 +27,7 @@ ROUNDS = 5
 
 
 def learning(table: Table) -> None:
-    """Learn the paper's demonstration, or where that is not here the loop of a sample; then larger grids."""
+    """Learn the paper's demonstration, or the loop of a sample if that is absent; then larger grids."""
     theirs = paper_source(Settings().paper_data)
     name, reward = ("the paper's user", sparse_reward(theirs.path)) if theirs else ("the loop of wren", _loop())
     learners(name, reward, table)
@@ -45,59 +45,59 @@ def _loop() -> RewardMap:
 
 
 def learners(name: str, reward: RewardMap, table: Table) -> None:
-    """Time both learners, and the certificate beside the learning."""
+    """Time both learners, and the certificate next to the learning."""
     for learner in (PhaseQLearning(), CellQLearning()):
-        policy = learn_policy(reward, learner)
-        took, both = best_s(lambda: learn_policy(reward, learner)), best_s(lambda: learn_and_certify(reward, learner))  # noqa: B023
+        policy = learn_tabular(reward, learner)
+        took, both = best_s(lambda: learn_tabular(reward, learner)), best_s(lambda: learn_and_certify(reward, learner))  # noqa: B023
         training = policy.training
         table.add_row(f"{learner.kind}, {name}", f"{took * 1e3:.1f} ms", f"{training.steps} moves")
         table.add_row("  with the certificate", f"{both * 1e3:.1f} ms", f"{both / took:.2f} x the learning alone")
 
 
 def learn_and_certify(reward: RewardMap, learner: Learner) -> None:
-    """Do what a training does."""
-    certify(learn_policy(reward, learner))
+    """Do the computation of one training."""
+    certify(learn_tabular(reward, learner))
 
 
 def compiled(reward: RewardMap, table: Table) -> None:
     """Compare the compiled kernel with the same function as plain Python."""
     learner = CellQLearning(episodes=20)
-    fast = best_s(lambda: learn_policy(reward, learner))
+    fast = best_s(lambda: learn_tabular(reward, learner))
     kept = _kernels.run_episodes_compiled
     try:
         _kernels.run_episodes_compiled = _kernels.run_episodes
-        slow = best_s(lambda: learn_policy(reward, learner), rounds=1)
+        slow = best_s(lambda: learn_tabular(reward, learner), rounds=1)
     finally:
         _kernels.run_episodes_compiled = kept
     table.add_row("plain Python, 20 episodes", f"{slow * 1e3:.1f} ms", f"{slow / fast:.0f} x the compiled one")
 
 
 def against_c(reward: RewardMap, table: Table) -> None:
-    """Compare the paper's budget of moves with a plain C scan of the 27 actions, compiled here and now; in turn."""
-    steps = learn_policy(reward, CellQLearning()).training.steps
+    """Compare the paper's budget of moves with a plain C scan of the 27 actions, compiled on the spot; in turn."""
+    steps = learn_tabular(reward, CellQLearning()).training.steps
     scan = plain_c()
     if scan is None:
         table.add_row("the paper's budget, cell state", "no C compiler here", "")
         return
-    ours, theirs = in_turn(lambda: learn_policy(reward, CellQLearning()), lambda: scan(reward), rounds=ROUNDS**2)
+    ours, theirs = in_turn(lambda: learn_tabular(reward, CellQLearning()), lambda: scan(reward), rounds=ROUNDS**2)
     table.add_row("the paper's budget, cell state", f"{ours / steps * 1e9:.1f} ns a move", f"{steps} moves")
     table.add_row("  plain C, -O3", f"{theirs / steps * 1e9:.1f} ns a move", f"ours takes {ours / theirs:.2f} of it")
 
 
 def two_threads(reward: RewardMap, table: Table) -> None:
-    """Learn the same styles on one thread and on two, in turn: the loops let go of the interpreter.
+    """Learn the same styles on one thread and on two, in turn: the loops release the interpreter lock.
 
-    Beside it what two threads of this machine can do at all, hashing: others may be using its cores.
+    For comparison, hashing shows the possible gain of two threads: other processes may use the cores.
     """
     learner, data = CellQLearning(episodes=200_000), bytes(64 << 20)
-    learning = gain(lambda: learn_policy(reward, learner), 4, ROUNDS)
+    learning = gain(lambda: learn_tabular(reward, learner), 4, ROUNDS)
     hashing = gain(lambda: hashlib.sha256(data), 4, ROUNDS)
     table.add_row("four policies, two threads", "", f"{learning:.2f} x one thread's rate")
     table.add_row("  four hashes, two threads", "", f"{hashing:.2f} x one thread's rate")
 
 
 def sizes(table: Table) -> None:
-    """Learn and certify winding paths in larger grids, each in an interpreter of its own."""
+    """Learn and certify winding paths in larger grids, each in a separate interpreter."""
     for side, waypoints in ((11, 40), (21, 100), (51, 400), (101, 400)):
         cost, path = measured(side, waypoints), f"{waypoints} waypoints"
         learning, certificate = f"peak {cost.learning_mib:.0f} MiB", f"peak {cost.certificate_mib:.0f} MiB"
@@ -106,7 +106,7 @@ def sizes(table: Table) -> None:
 
 
 def warping(table: Table) -> None:
-    """Time DTW beside the distances that it needs."""
+    """Time DTW next to the distances that it needs."""
     rng = np.random.default_rng(0)
     long = rng.normal(size=(1000, 3)), rng.normal(size=(1200, 3))
     warped, summed = best_s(lambda: dtw(*long)), best_s(lambda: np.abs(long[0][:, None] - long[1]).sum(-1))

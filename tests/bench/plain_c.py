@@ -1,4 +1,4 @@
-"""Q-learning as anybody would write it in C, to measure ours against: a scan of the 27 actions for every maximum."""
+"""Q-learning in straightforward C, as a reference for speed: a scan of the 27 actions for every maximum."""
 
 import ctypes
 import shutil
@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from skills.style.reward import RewardMap
+from skills.gridworld.reward import RewardMap
 
 SOURCE = r"""
 #include <stdint.h>
@@ -44,7 +44,7 @@ EPISODES, MAX_STEPS = 5000, 100
 
 
 def plain_c() -> Callable[[RewardMap], object] | None:
-    """Compile it: a function that learns the paper's budget once, or None where there is no C compiler."""
+    """Compile it: a function that learns the paper's budget once, or None without a C compiler."""
     if shutil.which("cc") is None:
         return None
     with tempfile.TemporaryDirectory() as folder:

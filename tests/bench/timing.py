@@ -1,4 +1,4 @@
-"""How times are taken: the best of some rounds, and of what is compared in turn, so that all see the same machine."""
+"""Timing: the best of some rounds, and comparisons in turn, so that all see the same machine."""
 
 import time
 from collections.abc import Callable
@@ -8,7 +8,7 @@ Work = Callable[[], object]
 
 
 def in_turn(*works: Work, rounds: int, clock: Callable[[], float] = time.thread_time) -> list[float]:
-    """Take the best of some rounds of each, in seconds: of this thread's processor time, or by another clock."""
+    """Return the best of some rounds of each, in seconds: of this thread's processor time, or by another clock."""
     best = [float("inf")] * len(works)
     for _ in range(rounds):
         for k, work in enumerate(works):
@@ -19,13 +19,13 @@ def in_turn(*works: Work, rounds: int, clock: Callable[[], float] = time.thread_
 
 
 def best_s(work: Work, rounds: int = 5) -> float:
-    """Take the best of some rounds, after one that only warms up."""
+    """Return the best of some rounds, after one warm-up round."""
     work()
     return in_turn(work, rounds=rounds)[0]
 
 
 def gain(work: Work, times: int, rounds: int) -> float:
-    """Do some work several times, on one thread and on two, in turn: how much faster two are at best, by the clock."""
+    """Return the best gain of two threads over one: the same work several times on each, in turn, by wall time."""
     took: dict[int, list[float]] = {1: [], 2: []}
     for threads in (1, 2) * rounds:
         began = time.perf_counter()

@@ -1,4 +1,4 @@
-"""What a client may meet: a service that does what a script says, and a clock that goes when somebody sleeps."""
+"""Stand-ins for the client's environment: a scripted service, and a clock that advances only on sleep."""
 
 import asyncio
 from collections.abc import Callable, Sequence
@@ -17,7 +17,7 @@ Outcome = httpx.Response | Exception
 
 
 class Script(httpx.BaseTransport, httpx.AsyncBaseTransport):
-    """A service whose answers are known beforehand, the last one for ever; it remembers what it was asked."""
+    """A service with scripted responses, the last of which repeats for ever; it records its requests."""
 
     def __init__(self, *outcomes: Outcome) -> None:
         self.outcomes = list(outcomes)
@@ -41,7 +41,7 @@ class Script(httpx.BaseTransport, httpx.AsyncBaseTransport):
 
 
 class Time:
-    """Seconds that pass only while somebody sleeps, or is asked."""
+    """A clock that advances only when the client sleeps or a script lets time pass."""
 
     def __init__(self) -> None:
         self.now_s = 0.0
@@ -62,7 +62,7 @@ Asked = Callable[..., Any]
 
 
 def at_once(script: Script, time: Time, **how: Any) -> Asked:
-    """Call a `Client` of a script: the name of a call and what it takes."""
+    """Return a function that calls a `Client` of a script: the name of a method and its arguments."""
 
     def ask(name: str, /, *args: Any, **kwargs: Any) -> Any:
         with Client(httpx.Client(base_url=ADDRESS, transport=script), clock=time.clock, sleep=time.sleep, **how) as one:
@@ -72,7 +72,7 @@ def at_once(script: Script, time: Time, **how: Any) -> Asked:
 
 
 def awaited(script: Script, time: Time, **how: Any) -> Asked:
-    """Call an `AsyncClient` in the same way."""
+    """Return a function that calls an `AsyncClient` in the same way."""
 
     async def ask(name: str, /, *args: Any, **kwargs: Any) -> Any:
         http = httpx.AsyncClient(base_url=ADDRESS, transport=script)

@@ -1,4 +1,4 @@
-"""What answers become: models, or why not; and both clients, which are one."""
+"""Responses as the client returns them: models, or errors; the same in both clients."""
 
 import inspect
 import re
@@ -11,14 +11,14 @@ import httpx2 as httpx
 import pytest
 
 from skills.api.app import create_app
-from skills.api.schemas.given import Policy, Surgeon
 from skills.client import AsyncClient, Client, NotUnderstood, Problem
-from skills.client.calls import call
+from skills.client.connection import call
 from skills.errors import BadSettings, SkillsError
-from skills.recordings import write_mcap
+from skills.formats import write_mcap
+from skills.schemas.given import Policy, Surgeon
 from skills.settings import Settings
 from tests.client.peers import BOTH, SURGEON, Script, Time, answer, asked, at_once
-from tests.recordings import bags
+from tests.formats import bags
 
 both = pytest.mark.parametrize("made", BOTH)
 CALLS = [name for name in dir(Client) if isinstance(inspect.getattr_static(Client, name), call)]
@@ -37,7 +37,7 @@ def test_both_clients_have_the_same_calls_with_the_same_words():
 
 
 @both
-def test_an_answer_is_a_model_and_a_field_that_is_not_known_yet_is_passed_over(made):
+def test_a_response_becomes_a_model_and_unknown_fields_are_ignored(made):
     found = made(Script(answer(SURGEON | {"favourite_needle": "CT-1"})), Time())("surgeon", "kestrel")
     assert isinstance(found, Surgeon)
     assert (found.surgeon, found.created_at) == ("kestrel", datetime(2026, 1, 2, 3, 4, 5, tzinfo=UTC))
@@ -69,10 +69,15 @@ def test_a_list_is_all_of_its_pages(made):
 def test_a_problem_tells_what_the_service_told(made):
     body = {
         **{"type": "urn:suture-skills:invalid-request", "title": "t", "status": 422, "detail": "Mend it."},
-        "errors": [{"where": "body.start_mm", "why": "Field required"}],
+        "errors": [
+            {"where": "body.start_mm.1", "why": "must be at most 5"},
+            {"where": "path.surgeon", "why": "is odd"},
+        ],
     }
     said = httpx.Response(422, json=body, headers={"content-type": "application/problem+json"})
-    with pytest.raises(Problem, match=r"Mend it. body.start_mm: Field required") as refused:
+    with pytest.raises(
+        Problem, match=r"^start_mm.1 must be at most 5\nsurgeon is odd; 'kestrel' was given$"
+    ) as refused:
         made(Script(said), Time())("rollout", "kestrel", "simple-running", (0, 0, 0))
     assert (refused.value.kind, refused.value.body) == ("invalid-request", body)
 
@@ -103,7 +108,7 @@ def test_type_checkers_know_what_both_clients_take_and_answer(tmp_path):
     file = tmp_path / "typed.py"
     file.write_text(
         "from typing import assert_type\n"
-        "from skills.api.schemas.given import Job, Policy\n"
+        "from skills.schemas.given import Job, Policy\n"
         "from skills.client import AsyncClient, Client\n"
         "def now(client: Client) -> None:\n"
         "    assert_type(client.policy('a', 'b', version=1), Policy)\n"

@@ -1,4 +1,4 @@
-"""Files in: whole and what they were said to be, or not at all. Files out, when the line breaks."""
+"""Downloads: complete and matching their digest, or not stored. Uploads: connections that break."""
 
 import hashlib
 import os
@@ -27,7 +27,7 @@ def named(content: bytes, sent: bytes | None = None, weak: bool = False) -> http
 
 @both
 @pytest.mark.parametrize("weak", [False, True])
-def test_a_file_that_is_fetched_is_told_of_as_it_comes_and_is_what_was_named(made, weak, tmp_path: Path):
+def test_a_download_reports_progress_and_matches_the_digest_in_its_etag(made, weak, tmp_path: Path):
     told: list[tuple[int, int]] = []
     to = tmp_path / "bag.zip"
     got = made(Script(named(BAG, weak=weak)), Time())(
@@ -99,7 +99,7 @@ def test_a_file_that_is_not_there_is_told_before_anything_is_sent(made, tmp_path
     assert script.asked == []
 
 
-def test_an_awaited_upload_tells_where_it_was_asked_and_not_in_another_thread(tmp_path: Path):
+def test_an_async_upload_reports_progress_in_the_calling_thread(tmp_path: Path):
     file, where = tmp_path / "table.csv", set()
     file.write_bytes(b"t_s,x_m,y_m,z_m\n" + b"0,0,0,0\n" * 300_000)
     for made in BOTH:

@@ -1,4 +1,4 @@
-"""Where a key goes, and where it never does."""
+"""Keys of the client: the requests that carry one, and those that never do."""
 
 import httpx2 as httpx
 import pytest

@@ -1,9 +1,11 @@
-"""Both clients on the real service, which is killed and started anew while they wait."""
+"""Both clients with the real service, which is killed and restarted while they wait."""
 
 import asyncio
 import hashlib
 import threading
 from pathlib import Path
+
+import pytest
 
 from skills.client import AsyncClient, Client, Retrying
 from skills.seeds.recordings import sample_recordings
@@ -12,6 +14,7 @@ from tests.e2e.conftest import running
 PATIENT = Retrying(attempts=100, longest_s=0.5, deadline_s=120)
 
 
+@pytest.mark.nightly  # 20 s; by day tests/e2e and tests/jobs kill services
 def test_from_a_file_to_a_checked_policy_while_the_service_is_killed(tmp_path: Path) -> None:
     sample = sample_recordings()[0]
     file, style = tmp_path / "sample.mcap", (sample.surgeon, sample.suture)

@@ -1,4 +1,4 @@
-"""How the client sends a recording: in pieces, with its length, its digest, and what its content says it is."""
+"""Uploads of the client: in pieces, with length, digest and a content type detected from the content."""
 
 import base64
 import hashlib
@@ -11,12 +11,12 @@ import pytest
 from skills.client import Client
 from skills.client.transport import PIECE_BYTES
 from skills.errors import UnknownFormat, UnreadableRecording
-from skills.recordings import write_mcap
-from tests.recordings import bags, others, trials
+from skills.formats import write_mcap
+from tests.formats import bags, others, trials
 
 
 class Heard(httpx.BaseTransport):
-    """A service that takes everything: what it was sent, and in how large pieces."""
+    """A service that accepts everything, and records the body and the sizes of its pieces."""
 
     def __init__(self) -> None:
         self.headers: dict[str, str] = {}
@@ -30,7 +30,7 @@ class Heard(httpx.BaseTransport):
 
 
 class Incurious(Client):
-    """A client that takes any answer."""
+    """A client that accepts any response."""
 
     def _read(self, kind, said):
         return said

@@ -1,4 +1,4 @@
-"""A policy that is fetched is put together again and compared with its digest: nothing else is ever followed."""
+"""Verification of a fetched policy: it is reassembled and compared with its digest before anything follows it."""
 
 import copy
 import io
@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 import skills
 from skills.client import Client
-from skills.client.verifying import rebuilt
+from skills.client.verification import rebuilt
 from skills.errors import BadInput, Corrupt
 from tests.api.service import KESTREL, POLICY
 from tests.library import cases
@@ -41,7 +41,7 @@ def test_it_can_be_followed_here_and_goes_where_the_service_goes(client: Client)
 
 
 def leaves(of: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
-    """Name every single number, word and truth of a document."""
+    """Yield the path of every single number, string and boolean of a document."""
     if isinstance(of, dict | list):
         for key, value in of.items() if isinstance(of, dict) else enumerate(of):
             yield from leaves(value, (*path, key))
@@ -67,7 +67,7 @@ FREE = {
     "released_at",
     "released_by",
     "arrays",
-}  # they say what was done with it, not what it is
+}  # they describe its history, not its content
 
 
 def test_nothing_that_is_said_of_it_can_be_changed(fetched: Fetched):
@@ -107,7 +107,7 @@ def test_arrays_that_are_none_are_refused_and_never_unpickled(fetched: Fetched, 
         rebuilt(fetched[0], out.getvalue(), fetched[2])
 
 
-def test_a_fitted_grid_with_hysteresis_bridges_and_another_learner_is_put_together_too(trained):
+def test_fitted_grids_with_hysteresis_and_other_learners_are_rebuilt_too(trained):
     from skills.seeds.recordings import sample_recordings
 
     plover = next(sample for sample in sample_recordings() if sample.surgeon == "plover")
@@ -126,6 +126,6 @@ def test_it_is_written_to_a_file_as_it_was_checked(client: Client, fetched: Fetc
     arrays = client.save_policy(**KESTREL, to=tmp_path / "policy.npz", version=1)
     assert json.loads(as_json.read_bytes()) == fetched[0]
     assert arrays.read_bytes() == fetched[1]
-    with pytest.raises(BadInput, match=r"\.json or \.npz"):
+    with pytest.raises(BadInput, match=r"\.json nor \.npz"):
         client.save_policy(**KESTREL, to=tmp_path / "policy.pkl")
     assert cases.SUTURE in as_json.read_text()

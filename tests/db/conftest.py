@@ -9,7 +9,7 @@ from tests import backends
 
 @pytest.fixture(params=backends.BACKENDS)
 def url(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[str]:
-    """A new migrated database, on either back end."""
+    """Yield the URL of a new migrated database, on either back end."""
     url = backends.fresh(request.param, tmp_path)
     yield url
     backends.drop(url)

@@ -1,4 +1,4 @@
-"""Moments: UTC on every database, whatever zone they were made in."""
+"""Times: UTC on every database, whatever their original time zone."""
 
 from datetime import UTC, datetime, timedelta, timezone
 
@@ -7,7 +7,7 @@ from sqlalchemy import select
 from sqlalchemy.exc import StatementError
 
 from skills.db.base import now, rfc3339
-from skills.db.books import Executor
+from skills.db.service_tables import Executor
 from skills.db.session import Database
 
 TOKYO = timezone(timedelta(hours=9))

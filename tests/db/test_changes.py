@@ -1,4 +1,4 @@
-"""Whether something has changed, told without reading a table: at once, and rather not at all than wrongly."""
+"""Detection of changes without reading a table: immediate, and better no answer than a wrong one."""
 
 import asyncio
 import os
@@ -12,11 +12,11 @@ import pytest
 from sqlalchemy import text
 
 from skills.db.base import now
-from skills.db.books import Executor
 from skills.db.changes import APPLICATION, BOUND_S, Changes, Unasked, announce, changes_of
+from skills.db.service_tables import Executor
 from skills.db.session import Database
 from skills.library.events import record
-from skills.library.releases import SERVED
+from skills.library.releases import STANDS
 from tests import backends
 
 Story = Callable[[Changes, Database], Awaitable[None]]
@@ -25,7 +25,7 @@ PATIENCE_S = 20.0
 
 
 def told(backend: str, folder: Path, story: Story) -> None:
-    """Tell a story on the event loop of a service, while another process, as it were, uses the same database."""
+    """Run a scenario on a service's event loop, with a second connection pool in place of another process."""
     url = backends.fresh(backend, folder)
     mine, another = Database(url), Database(url)
 
@@ -95,11 +95,11 @@ def test_the_version_stays_until_another_process_has_changed_something(backend: 
     told(backend, tmp_path, story)
 
 
-def test_on_sqlite_a_commit_is_seen_as_soon_as_it_is_made_and_a_heartbeat_too(tmp_path: Path):
+def test_sqlite_reports_every_commit_at_once_including_heartbeats(tmp_path: Path):
     async def story(changes: Changes, another: Database) -> None:
         for work in (change, beat) * 20:
             before = changes.version()
-            assert changes.first(SERVED, NOBODY) is None
+            assert changes.first(STANDS, NOBODY) is None
             assert changes.version() == before
             work(another)
             assert changes.version() != before
@@ -118,14 +118,14 @@ def test_a_commit_that_is_not_finished_is_not_seen(tmp_path: Path):
     told("sqlite", tmp_path, story)
 
 
-def test_on_postgresql_this_process_sees_its_own_commits_at_once_and_nobodys_heartbeats(tmp_path: Path):
+def test_postgresql_reports_own_commits_at_once_and_no_heartbeats(tmp_path: Path):
     async def story(changes: Changes, another: Database) -> None:
         before = changes.version()
         await asyncio.to_thread(beat, another)
         await asyncio.sleep(0.3)
         assert changes.version() == before
         with pytest.raises(Unasked):
-            changes.first(SERVED, NOBODY)
+            changes.first(STANDS, NOBODY)
 
     told("postgresql", tmp_path, story)
 

@@ -1,8 +1,9 @@
-"""Packed values: what comes back is what was stored, whole, or it is refused."""
+"""Packed values: unpacking returns exactly the stored value, or refuses it."""
 
 import hashlib
 import io
 import json
+import zipfile
 from collections.abc import Iterator
 from dataclasses import fields, is_dataclass, replace
 from typing import Any
@@ -13,35 +14,33 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as some
 
-from skills.db import npz, packed  # the tables declare what may be stored
+from skills.comparison.distances import STATES, Measured
+from skills.db import packed  # the tables declare the types that may be stored
 from skills.db.packed import FORMAT, Packed, digest, pack, seal, unpack
+from skills.demonstration.demonstration import Demo, Partner, Pause, cut_demo
 from skills.errors import Corrupt
-from skills.recordings import read_recording
-from skills.style.certificate import certify
-from skills.style.comparing.measured import Measured
-from skills.style.comparing.shapes import STATES
-from skills.style.demo import Demo, Partner, Pause, cut_demo
-from skills.style.grid import PAPER_GRID, GridWorld, discretize
-from skills.style.handoff import PsmM
-from skills.style.learning.beyond import DDPG, DQN, TRPO
-from skills.style.learning.irl import MaxEntIRL
-from skills.style.learning.q_learning import CellQLearning, PhaseQLearning
-from skills.style.learning.value_iteration import ValueIteration
-from skills.style.pictures import Pictures
-from skills.style.plan import SuturePoint, stack
-from skills.style.playback import Playback
-from skills.style.policy import learn_policy
-from skills.style.reward import RewardLevels, RewardMap, sparse_reward
+from skills.formats import read_recording
+from skills.gridworld.grid import PAPER_GRID, GridWorld, discretize
+from skills.gridworld.reward import RewardLevels, RewardMap, sparse_reward
+from skills.learning.certificate import certify
+from skills.learning.deep_settings import DDPG, DQN, TRPO
+from skills.learning.dynamic_programming import ValueIteration
+from skills.learning.max_ent_irl import MaxEntIRL
+from skills.learning.policy import learn_tabular
+from skills.learning.q_learning import CellQLearning, PhaseQLearning
+from skills.planning.handoff import PsmM
+from skills.planning.plan import SuturePoint, stack
+from skills.verification.playback import Pictures, Playback
 from tests.deep.networks import always
 from tests.library.cases import bag, hand_off
 
 DEMO = cut_demo(read_recording(io.BytesIO(bag())))
 PATH = discretize(DEMO.tip_mm, PAPER_GRID)
 REWARD = sparse_reward(PATH)
-POLICY = learn_policy(REWARD, CellQLearning(episodes=10), seed=3)
-PHASED = learn_policy(REWARD, PhaseQLearning(), seed=0)
+POLICY = learn_tabular(REWARD, CellQLearning(episodes=10), seed=3)
+PHASED = learn_tabular(REWARD, PhaseQLearning(), seed=0)
 SIGNED = replace(PHASED, q=np.where(PHASED.q == 0, -0.0, PHASED.q))
-VARIED = replace(PHASED, q=np.random.default_rng(0).random(PHASED.q.shape))  # more numbers than a palette has room for
+VARIED = replace(PHASED, q=np.random.default_rng(0).random(PHASED.q.shape))  # too many numbers for a palette
 PLAN = stack(
     PHASED,
     [SuturePoint((5.0, 55.0, -125.0)), SuturePoint((8.0, 55.0, -125.0), (0.0, 0.0, 0.1, 0.99498743710662))],
@@ -102,7 +101,7 @@ ARRAYS = some.arrays(
 
 
 def assert_same(one: object, other: object) -> None:
-    """Both are equal in every part: types, names, and every bit of every number."""
+    """Assert that two values are equal in every part: types, names, and every bit of every number."""
     assert type(one) is type(other)
     if isinstance(one, np.ndarray):
         assert (one.dtype, one.shape) == (other.dtype, other.shape)
@@ -139,7 +138,7 @@ def test_no_class_that_is_stored_was_left_out_above():
 
 
 def test_a_path_without_hysteresis_is_stored_as_before_there_was_any():
-    """A policy's digest is taken of its path: one that changed would be refused as damaged."""
+    """A policy's digest covers its path: if that changed, the policy would be refused as damaged."""
     assert digest(PATH) == "e8de8820d1a92553287d1df30d43004d9de384079f9365f7438e4f50a50c019c"
     assert digest(REWARD) == "23c1e05194a3b2e0a290d02a4ed1262be3bab91a17bf57f4174d72e7f0b9639c"
     assert digest(replace(PATH, hysteresis=0.25)) != digest(PATH)
@@ -168,12 +167,12 @@ def test_a_sealed_value_is_the_packed_one_with_its_digest(value: object):
 
 
 def parts_of(value: object) -> tuple[Any, dict[str, np.ndarray]]:
-    """Take a packed value apart: its tree and its arrays."""
-    arrays = npz.load(pack(value)[40:])
+    """Split a packed value into its tree and its arrays."""
+    arrays = packed.load_arrays(pack(value)[40:])
     return json.loads(arrays.pop("tree").tobytes()), arrays
 
 
-def test_the_q_values_of_a_policy_are_stored_as_their_palette_where_it_has_room():
+def test_q_values_are_stored_as_a_palette_if_they_fit_into_one():
     tree, arrays = parts_of(PHASED)
     at = tree["of"]["q"]["palette"]
     assert (arrays[f"a{at + 1}"].dtype, arrays[f"a{at + 1}"].shape) == (np.uint8, PHASED.q.shape)
@@ -182,7 +181,7 @@ def test_the_q_values_of_a_policy_are_stored_as_their_palette_where_it_has_room(
     assert digest(SIGNED) != digest(PHASED)
 
 
-def test_a_policy_is_the_same_whether_its_q_values_came_as_a_palette_or_in_full():
+def test_q_values_read_from_a_palette_or_in_full_give_the_same_policy():
     tree, arrays = parts_of(PHASED)
     at = tree["of"]["q"]["palette"]
     tree["of"]["q"] = {"array": at}
@@ -243,7 +242,7 @@ def test_a_digest_knows_every_bit_the_shape_and_the_type(array: np.ndarray, data
 def test_a_digest_is_of_the_value_and_not_of_its_compression(monkeypatch: pytest.MonkeyPatch):
     before = digest(POLICY)
     small = pack(POLICY)
-    monkeypatch.setattr(npz, "save", np.savez)
+    monkeypatch.setattr(packed, "save_arrays", np.savez)
     large = pack(POLICY)
     assert len(large) > len(small)
     assert digest(POLICY) == digest(unpack(large)) == digest(unpack(small)) == before
@@ -275,7 +274,7 @@ def test_every_cut_of_a_packed_value_is_refused():
 
 
 def forged(tree: object, **arrays: np.ndarray) -> bytes:
-    """Pack what was never a value, with a checksum that agrees."""
+    """Pack a tree that no value has, with a correct checksum."""
     out = io.BytesIO()
     np.savez(out, tree=np.frombuffer(json.dumps(tree).encode(), np.uint8), **arrays)
     return FORMAT + hashlib.sha256(out.getvalue()).digest() + out.getvalue()
@@ -316,7 +315,7 @@ def test_a_class_that_was_not_declared_is_not_stored():
         pack(recording)
 
 
-def test_a_demonstration_without_pauses_and_partner_has_the_digest_it_always_had():
+def test_a_demo_without_pauses_and_partner_keeps_its_old_digest():
     seconds = np.arange(5) / 10
     demo = Demo("PSM2", "/t", "f", 0.0, 0.4, seconds, np.stack([10 * seconds, 0 * seconds, 0 * seconds], axis=1))
     assert digest(demo) == "9e59a8556a81d3eeaac88c9548dbe6d623876a97a8bf881295446fada3e23d29"
@@ -325,7 +324,7 @@ def test_a_demonstration_without_pauses_and_partner_has_the_digest_it_always_had
     assert len({digest(demo), digest(paused), digest(partner)}) == 3
 
 
-def test_a_partner_whose_base_is_not_known_has_the_digest_it_had_before_bases_were_and_is_read_again():
+def test_a_partner_without_a_base_keeps_its_old_digest_and_can_be_read():
     seconds = np.arange(5) / 10
     partner = Partner("PSM1", 0.4, (1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 1.0))
     tip_mm = np.stack([10 * seconds, 0 * seconds, 0 * seconds], axis=1)
@@ -338,10 +337,10 @@ def test_a_partner_whose_base_is_not_known_has_the_digest_it_had_before_bases_we
     assert digest(replace(demo, partner=known)) != digest(demo)
 
 
-def test_a_plan_from_before_psm_m_moved_is_refused_and_nothing_of_it_is_used():
+def test_a_plan_from_before_psm_m_moved_is_refused_as_a_whole():
     kept = ("arm", "frame", "instrument", "speed_mm_s", "orientation", "path")
     before = {name: getattr(PLAN, name) for name in kept} | {"approach_m": None, "passes": {"tuple": []}}
-    with pytest.raises(Corrupt, match="none that this version knows"):
+    with pytest.raises(Corrupt, match="a format that this version does not know"):
         unpack(forged({"value": "SuturePlan", "of": before}))
 
 
@@ -359,3 +358,90 @@ def test_a_plan_from_before_psm_m_moved_is_refused_and_nothing_of_it_is_used():
 )
 def test_a_plans_digest_is_over_all_that_it_knows_of_psm_m_and_of_time(other):
     assert digest(replace(PLAN, **other)) != digest(PLAN)
+
+
+# ---- archives of arrays: numpy reads ours, we read numpy's, and everything else is refused ---------------------------
+
+
+ARRAYS = st.dictionaries(
+    st.text("abc_", min_size=1, max_size=5),
+    some.arrays(
+        st.sampled_from([np.float64, np.float32, np.int64, np.int8, np.uint8, np.bool_, np.complex128]),
+        some.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=40),
+    ),
+    max_size=4,
+)
+
+
+def archive_of(arrays: packed.Archive, save=packed.save_arrays) -> bytes:
+    out = io.BytesIO()
+    save(out, **arrays)
+    return out.getvalue()
+
+
+def assert_same_arrays(one: packed.Archive, other: packed.Archive) -> None:
+    assert list(one) == list(other)
+    for name, array in one.items():
+        assert (array.dtype, array.shape) == (other[name].dtype, other[name].shape)
+        assert array.tobytes() == other[name].tobytes()
+
+
+@given(ARRAYS)
+def test_numpy_reads_what_we_write_and_we_read_both(arrays: packed.Archive):
+    data = archive_of(arrays)
+    with np.load(io.BytesIO(data), allow_pickle=False) as archive:
+        assert_same_arrays(dict(archive), arrays)
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        assert archive.testzip() is None
+    for save in (packed.save_arrays, np.savez, np.savez_compressed):
+        assert_same_arrays(packed.load_arrays(archive_of(arrays, save)), arrays)
+
+
+@given(ARRAYS)
+def test_how_an_array_lies_in_memory_is_not_seen(arrays: packed.Archive):
+    turned = {name: np.asarray(array, order="F") for name, array in arrays.items()}
+    assert archive_of(turned) == archive_of(arrays)
+    assert_same_arrays(packed.load_arrays(archive_of(turned, np.savez)), arrays)
+
+
+def test_plain_arrays_are_read_without_numpy_and_without_a_copy():
+    arrays = {"a": np.arange(30.0).reshape(5, 6), "b": np.zeros((0, 3), np.int8), "c": np.array(True)}
+    for save in (packed.save_arrays, np.savez, np.savez_compressed):
+        for array in dict(packed._members(archive_of(arrays, save))).values():
+            assert not array.flags.owndata and not array.flags.writeable
+
+
+def test_large_archives_are_left_to_numpy(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(packed, "MAX_BYTES", 8)
+    arrays = {"a": np.arange(3.0)}
+    assert archive_of(arrays) == archive_of(arrays, np.savez_compressed)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_damaged_archive_is_read_as_it_was_or_refused(seed: int):
+    arrays = {"a": np.arange(50.0), "b": np.arange(9)}
+    data, rng = archive_of(arrays), np.random.default_rng(seed)
+    for bit in rng.integers(0, 8 * len(data), 200).tolist():
+        flipped = bytearray(data)
+        flipped[bit // 8] ^= 1 << bit % 8
+        try:
+            read = packed.load_arrays(bytes(flipped))
+        except Exception:
+            continue
+        for name, array in read.items():
+            if name in arrays:
+                assert array.tobytes() == arrays[name].tobytes() or array.dtype != arrays[name].dtype
+
+
+def test_an_array_of_objects_is_neither_written_nor_read():
+    objects = {"a": np.array([{}], dtype=object)}
+    with pytest.raises(TypeError):
+        archive_of(objects)
+    with pytest.raises(ValueError, match="allow_pickle=False"):
+        packed.load_arrays(archive_of(objects, np.savez))
+
+
+@pytest.mark.parametrize("data", [b"", b"PK", b"x" * 100, b"PK\5\6" + bytes(18)[:-1]])
+def test_what_is_no_archive_is_refused(data: bytes):
+    with pytest.raises(Exception):  # noqa: B017, PT011 - of any class
+        packed.load_arrays(data)["a"]

@@ -1,4 +1,4 @@
-"""What is asked often is answered by an index: the plans of the statements that the library really runs."""
+"""Query plans of the statements that the library really runs: frequent queries use an index."""
 
 import json
 from collections.abc import Callable, Iterator
@@ -10,14 +10,14 @@ from sqlalchemy import event, text
 from sqlalchemy.orm import Session
 
 from skills.db.session import Database
-from skills.jobs.lease import Leases
-from skills.jobs.watch import Watch
-from skills.library import batch_work, batches, catalogue, demos, jobs, policies, retraining, training
-from skills.library.condition import condition_of
+from skills.jobs.watch import Leases, Watch
+from skills.library import batch_work, catalogue, demos, jobs, policies, retraining, training
+from skills.library.overview import condition_of
+from skills.schemas.requests import RetrainingIn, TrainingIn
 from tests import backends
 from tests.library import hospital
 
-IN_ORDER = {"surgeons", "demonstrations", "demonstrations, further on", "what is served", "jobs"}  # nothing is sought
+IN_ORDER = {"surgeons", "demonstrations", "demonstrations, further on", "what is served", "jobs"}  # no search
 STYLE = ("surgeon-0003", "figure-of-eight")
 Plan = list[str]
 
@@ -61,8 +61,10 @@ HOT: dict[str, Callable[[Session], object]] = {
     "a style's versions": lambda s: policies.list_versions(s, *STYLE, 10, 5),
     "a version": lambda s: policies.find_version(s, *STYLE, 1),
     "a version by its digest": lambda s: policies.find_by_digest(s, policies.policy_of(s, *STYLE).policy.sha256),
-    "a training": lambda s: training.request_training(s, *STYLE, "test"),
-    "a surgeon's stale styles": lambda s: retraining.request_retraining(s, "test", surgeon=STYLE[0], only_stale=True),
+    "a training": lambda s: training.request_training(s, TrainingIn(surgeon=STYLE[0], suture=STYLE[1]), "test"),
+    "a surgeon's stale styles": lambda s: retraining.request_retraining(
+        s, RetrainingIn(surgeon=STYLE[0], only_stale=True), "test"
+    ),
     "where what was learnt stands": lambda s: s.execute(training.STANDING, {"demonstrations": [1, 2, 3]}).all(),
     "what is known already": lambda s: s.execute(training.KNOWN, {"digests": ["0" * 64, "1" * 64]}).all(),
     "what some styles serve": lambda s: s.execute(batch_work.SERVED, {"demonstrations": [1, 2, 3]}).all(),
@@ -71,7 +73,7 @@ HOT: dict[str, Callable[[Session], object]] = {
     "the newest of equal jobs": lambda s: jobs.newest(s, "pictures", {}),
     "a batch's styles": lambda s: retraining.list_styles(s, batch(s), 10, 20, None),
     "a batch's styles of a state": lambda s: retraining.list_styles(s, batch(s), 10, 20, "failed"),
-    "how far a batch is": lambda s: batches.count(s, batch(s).row),
+    "how far a batch is": lambda s: jobs.count(s, batch(s).row),
 }
 
 
@@ -105,16 +107,16 @@ def test_the_figures_are_counted_in_an_index_alone(filled: Database):
 
 def test_an_index_that_is_missing_is_noticed(filled: Database):
     with filled.reading() as session, noted(session) as asked:
-        session.execute(text("DROP INDEX ix_demonstrations_suture"))  # undone at the end of this transaction
+        session.execute(text("DROP INDEX ix_demonstrations_suture"))  # rolled back at the end of this transaction
         find = catalogue.find_suture_type(session, STYLE[1])
         asked.clear()
-        demos.list_demos(session, 10, None, None, find.slug)  # nobody has asked for the plan of just this one before
+        demos.list_demos(session, 10, None, None, find.slug)  # no plan of this query was cached before
         assert [wasteful(session, *one) for one in asked] != [[]]
 
 
 @contextmanager
 def noted(where: Session | Database) -> Iterator[list[tuple[str, Any]]]:
-    """Note the SELECT statements that are run, and their values, but for the plans of them."""
+    """Record the SELECT statements that are run, with their values, except the plan queries."""
     engine = where.engine if isinstance(where, Database) else where.get_bind().engine
     asked: list[tuple[str, Any]] = []
 
@@ -130,7 +132,7 @@ def noted(where: Session | Database) -> Iterator[list[tuple[str, Any]]]:
 
 
 def plan_of(session: Session, statement: str, values: Any) -> Any:
-    """Ask the database how it would answer; PostgreSQL without its habit of reading small tables whole."""
+    """Return the query plan; on PostgreSQL with sequential scans of small tables disabled."""
     connection = session.connection()
     if connection.dialect.name == "sqlite":
         return [row[3] for row in connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {statement}", values)]
@@ -140,11 +142,11 @@ def plan_of(session: Session, statement: str, values: Any) -> Any:
 
 
 def wasteful(session: Session, statement: str, values: Any, *, walks: bool = False, sorts: bool = False) -> list[str]:
-    """Name the steps of a plan that read a whole table, or sort for one page what an index has in order.
+    """Name the steps of a plan that scan a whole table, or sort for one page although an index has the order.
 
     Args:
-        walks: It may go along a table in the order of its key, for one page.
-        sorts: It may sort.
+        walks: The plan may walk along a table in the order of its key, for one page.
+        sorts: The plan may sort.
     """
     paged = "LIMIT" in statement
     plan = plan_of(session, statement, values)

@@ -1,4 +1,4 @@
-"""What the database itself refuses, on both back ends: changing what is append-only, and rows that rest on nothing."""
+"""Refusals by the database itself, on both back ends: changes of append-only rows, and missing references."""
 
 from collections.abc import Iterator
 
@@ -7,15 +7,20 @@ import pytest
 from sqlalchemy import inspect, text
 from sqlalchemy.exc import DatabaseError, IntegrityError
 
-from skills.db import books
+from skills.comparison.distances import STATES, Measured
+from skills.db import service_tables
 from skills.db.base import Base, now
-from skills.db.models import Erasure, MeasuredShape, StoredCalibration, StoredPictures, StoredPlayback
+from skills.db.models import (
+    Erasure,
+    MeasuredShape,
+    RecordingSurgeon,
+    StoredCalibration,
+    StoredPictures,
+    StoredPlayback,
+)
 from skills.db.session import Database
-from skills.library.keys import create_key
-from skills.library.sign_ins import Lasts, sign_in
-from skills.style.comparing.measured import Measured
-from skills.style.comparing.shapes import STATES
-from skills.style.pictures import Pictures
+from skills.library.keys import Lasts, create_key, sign_in
+from skills.verification.playback import Pictures
 from tests import backends
 from tests.db.test_packed import PLAYBACK
 from tests.library import cases
@@ -34,7 +39,7 @@ FROZEN = (
     "events",
     "erasures",
 )
-GONE_WITH_ITS_RECORDING = {"recording_uploads"}  # a note beside it, of who has sent it
+GONE_WITH_ITS_RECORDING = {"recording_uploads", "recording_surgeons"}  # who uploaded it, and for which surgeon
 WITHDRAWABLE = ("demonstrations", "releases")
 FREE = {
     "surgeons", "suture_types", "jobs", "retraining_styles", "executors", "keys", "key_surgeons", "sign_ins",
@@ -44,7 +49,7 @@ FREE = {
 
 @pytest.fixture(scope="module", params=backends.BACKENDS)
 def full(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Database]:
-    """A database with at least one row in every append-only table."""
+    """Yield a database with at least one row in every append-only table."""
     url = backends.fresh(request.param, tmp_path_factory.mktemp("full"))
     database = Database(url)
     cases.add_surgeon(database)
@@ -60,6 +65,7 @@ def full(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
         session.add(StoredPictures(playback_row=played.row, drawn=Pictures(b"mp4", b"gif", b"png", b"png")))
         session.add(StoredCalibration(sha256="0" * 64, about={}))
         session.add(Erasure(salt="0" * 64, digest="0" * 64))
+        session.add(RecordingSurgeon(recording_row=demo.recording_row, surgeon_row=demo.surgeon_row))
         shape = Measured(np.zeros((STATES, 3)), np.array([1]), np.array([0.0]), np.array([0.0]))
         session.add(MeasuredShape(demonstration_row=demo.row, version=1, measured=shape))
         key, _ = create_key(session, "ada", "reader", "test", surgeons=["kestrel"])
@@ -89,7 +95,7 @@ def test_no_column_of_an_append_only_table_can_be_updated(full: Database):
 
 
 def changed(column: str) -> str:
-    """Write SQL for another value of a column of a table that can be withdrawn: there an equal one is no change."""
+    """Return SQL for a different value of a column; in tables with withdrawal, an equal value is not a change."""
     if column.endswith("row"):
         return "row + 1000"
     if column in ("start_s", "end_s", "hysteresis"):
@@ -135,11 +141,11 @@ def test_what_something_rests_on_cannot_be_deleted(full: Database):
 
 
 def test_row_numbers_are_never_used_twice(database: Database):
-    """The engine knows a job by its row: an erased one must not come back as another's."""
+    """The engine identifies a job by its row: an erased row number must not return as another job's."""
     numbers = []
     for name in ("one", "two"):
         with database.writing() as session:
-            job = books.Job(id=name, kind="training", identity=name, request={})
+            job = service_tables.Job(id=name, kind="training", identity=name, request={})
             session.add(job)
             session.flush()
             numbers.append(job.row)
@@ -150,7 +156,7 @@ def test_row_numbers_are_never_used_twice(database: Database):
 def test_one_identity_has_one_live_job_and_any_number_of_ended_ones(database: Database):
     def add(name: str, state: str) -> None:
         with database.writing() as session:
-            session.add(books.Job(id=name, kind="training", identity="0" * 64, request={}, state=state))
+            session.add(service_tables.Job(id=name, kind="training", identity="0" * 64, request={}, state=state))
 
     for name, state in (("1", "failed"), ("2", "cancelled"), ("3", "failed"), ("4", "queued")):
         add(name, state)

@@ -1,12 +1,11 @@
-"""The environments: they pass the checkers of those who wrote the interface, and do what the grid world does."""
+"""The environments: they pass the checkers of the interface's authors, and behave as the grid world does."""
 
 import numpy as np
 import pytest
 
-from skills.style.grid import MOVES, PAPER_GRID, GridPath
-from skills.style.learning.beyond import DDPG
-from skills.style.reward import sparse_reward
-from skills.style.space import Space
+from skills.gridworld.grid import MOVES, PAPER_GRID, GridPath
+from skills.gridworld.reward import sparse_reward
+from skills.learning.deep_settings import DDPG, Space
 
 pytestmark = [pytest.mark.usefixtures("extra"), pytest.mark.filterwarnings("default")]
 PATH = GridPath(PAPER_GRID, PAPER_GRID.states_of([[1, 1, 1], [2, 1, 1], [3, 1, 1], [3, 2, 1], [3, 3, 1]]))
@@ -40,7 +39,7 @@ def test_the_same_seed_starts_in_the_same_places_and_another_elsewhere(name):
 
 
 @BOTH
-def test_no_episode_starts_at_the_goal_and_each_ends_there_or_after_100_steps(name):
+def test_episodes_start_off_the_goal_and_end_there_or_after_100_steps(name):
     world = made(name)
     space = Space(PATH, REWARD.levels)
     for seed in range(200):
@@ -53,7 +52,7 @@ def test_no_episode_starts_at_the_goal_and_each_ends_there_or_after_100_steps(na
         assert cut == (step == 100) and not ended
 
 
-def test_the_grid_pays_what_algorithm_1_says_for_every_move_from_every_cell_of_a_walk():
+def test_the_grid_pays_algorithm_1_for_every_move_of_a_random_walk():
     world = made("SutureGrid-v0")
     rng = np.random.default_rng(0)
     cell, _ = world.reset(seed=0)
@@ -69,7 +68,7 @@ def test_the_grid_pays_what_algorithm_1_says_for_every_move_from_every_cell_of_a
             cell, _ = world.reset()
 
 
-def test_the_demonstration_followed_by_hand_pays_its_waypoints_and_the_goal():
+def test_following_the_demonstration_pays_its_waypoints_and_the_goal():
     world = made("SutureGrid-v0")
     cell, _ = world.reset(options={"start_mm": PATH.tip_mm[0]})
     paid = []

@@ -1,4 +1,4 @@
-"""Learning with networks: repeatable, in a process of its own, ended at once, and told how far it is."""
+"""Learning with networks: repeatable, in a separate process, cancelled at once, with progress reports."""
 
 import numpy as np
 import pytest
@@ -6,14 +6,14 @@ import pytest
 import skills
 from skills.db.models import PolicyVersion
 from skills.deep import learning
-from skills.deep.lesson import Lesson
+from skills.deep.learning import NetworkLesson
 from skills.errors import Conflict, LearningFailed
-from skills.library.verified import learnt
-from skills.style.certificate import certify
-from skills.style.grid import GridPath, GridWorld
-from skills.style.learning.beyond import DDPG, DQN, TRPO
-from skills.style.policy import rollout
-from skills.style.reward import sparse_reward
+from skills.gridworld.grid import GridPath, GridWorld
+from skills.gridworld.reward import sparse_reward
+from skills.learning.certificate import certify
+from skills.learning.deep_settings import DDPG, DQN, TRPO
+from skills.learning.policy import rollout
+from skills.library.integrity import learnt
 from tests.api.conftest import service, trained  # noqa: F401 - fixtures
 from tests.api.service import KESTREL, POLICY, Service
 
@@ -29,7 +29,7 @@ EACH = pytest.mark.parametrize("learner", QUICK, ids=lambda one: one.kind)
 
 
 @EACH
-def test_the_same_seed_learns_the_same_bytes_another_seed_others_and_what_it_took_is_counted(learner):
+def test_the_seed_determines_the_learnt_bytes_and_the_training_is_counted(learner):
     first, second, other = (skills.learn_policy(REWARD, learner, seed) for seed in (5, 5, 6))
     assert first.network == second.network and first.q.tobytes() == second.q.tobytes()
     assert first.network != other.network
@@ -51,7 +51,7 @@ def test_numpy_answers_what_torch_answered(learner):
     kept = training._network
     training._network = lambda one, model: found.append(model) or kept(one, model)
     try:
-        network = training.learn(Lesson(REWARD, learner, 1)).network
+        network = training.learn(NetworkLesson(REWARD, learner, 1)).network
     finally:
         training._network = kept
     (model,) = found
@@ -69,7 +69,7 @@ def test_numpy_answers_what_torch_answered(learner):
     assert ours == pytest.approx(theirs, abs=1e-5)
 
 
-def test_deep_q_learning_learns_a_small_grid_so_well_that_it_passes_the_gate():
+def test_deep_q_learning_learns_a_small_grid_and_passes_the_gate():
     policy = skills.learn_policy(REWARD, DQN(steps=20_000, width=64, batch=128, gamma=0.6))
     certificate, _ = certify(policy)
     assert certificate.starts_reaching == 27
@@ -90,7 +90,7 @@ def test_how_far_it_is_is_told_and_whoever_raises_there_ends_it():
 
 
 def test_a_learner_that_takes_too_long_or_too_much_is_ended_with_advice():
-    with pytest.raises(LearningFailed, match=r"did not finish within 3 s; ask for fewer steps"):
+    with pytest.raises(LearningFailed, match=r"did not finish within 3 s; request fewer steps"):
         skills.learn_policy(REWARD, DQN(steps=10_000_000), timeout_s=3.0)
     with pytest.raises(LearningFailed) as failed:
         skills.learn_policy(REWARD, DQN(steps=1000), memory_bytes=512 << 20)

@@ -1,6 +1,6 @@
-"""A policy with a network is stored, certified, released, served, planned, played and checked as any other.
+"""A policy with a network is stored, certified, released, served, planned, played and checked like any other.
 
-The networks here are written by hand, so no torch is needed: neither to learn them nor, and that is the point, after.
+The networks here are written by hand. So the tests show that torch is needed neither here nor after training.
 """
 
 import io
@@ -12,22 +12,22 @@ import pytest
 from skills.client import Client
 from skills.db.models import PolicyVersion
 from skills.db.packed import unpack_as
+from skills.demonstration.demonstration import Demo
 from skills.errors import Conflict
+from skills.gridworld.domain import Domain
+from skills.gridworld.reward import RewardMap
+from skills.learning.deep_settings import DDPG, DQN, Deep, network_q
+from skills.learning.dynamic_programming import Mdp, exact_q
+from skills.learning.evaluation import SpaceRollouts
+from skills.learning.learners import LEARNER_VERSION, describe_learner
+from skills.learning.network import Network
+from skills.learning.policy import Policy, rollout
+from skills.learning.q_learning import Training
 from skills.library import releases
 from skills.library.demos import find_demo
 from skills.library.inspection import inspect_installation
-from skills.library.training import certified, describe_learner, lessons, store_style
-from skills.library.verified import learnt
-from skills.style.demo import Demo
-from skills.style.domain import Domain
-from skills.style.exact import Mdp, exact_q
-from skills.style.learning.beyond import DDPG, DQN, Deep, network_q
-from skills.style.learning.learners import LEARNER_VERSION
-from skills.style.learning.q_learning import Training
-from skills.style.network import Network
-from skills.style.policy import Policy, rollout
-from skills.style.reward import RewardMap
-from skills.style.wandering import Rollouts
+from skills.library.integrity import learnt
+from skills.library.training import certified, lessons, store_style
 from tests.api.conftest import service  # noqa: F401 - a fixture
 from tests.api.service import CSV, GOAL_MM, KESTREL, POLICY, Service
 from tests.deep.networks import always, table_as_network
@@ -37,13 +37,13 @@ DEEP_RUNS = Training(1000, 250, 20, 15, 5, 0, settled=False)
 
 
 def exact_network(reward: RewardMap) -> Network:
-    """Write what DQN would learn if it learnt all there is to learn."""
+    """Return the network that DQN would learn in the limit."""
     mdp = Mdp(Domain(reward.path, phased=False), reward, DQN().gamma)
     return table_as_network(reward.path.grid, exact_q(mdp))
 
 
 def store(service: Service, learner: Deep, network: Network | None = None) -> PolicyVersion:  # noqa: F811
-    """Store what a learner might have left behind, as a training does."""
+    """Store a possible result of a learner, as a training does."""
     demo = service.client.add_demo(cases.hand_off(), media_type=CSV, **KESTREL)
     request = {
         **KESTREL, "demos": [demo["sha256"]], "learner": describe_learner(learner),
@@ -98,15 +98,15 @@ def test_its_network_is_among_the_arrays_and_whoever_fetches_it_can_run_it(serve
     assert rollout(fetched, start_mm).states.tolist() == client.rollout(**KESTREL, start_mm=start_mm).states
 
 
-def test_an_installation_with_it_is_found_whole_and_one_with_a_changed_network_is_not(served: Service):
+def test_inspection_accepts_the_installation_and_finds_a_changed_network(served: Service):
     assert [wrong for checked in inspect_installation(served.database) for wrong in checked.wrong] == []
     served.tamper("UPDATE policy_versions SET learnt = (SELECT map FROM reward_maps LIMIT 1)")
     assert [wrong for checked in inspect_installation(served.database) for wrong in checked.wrong]
 
 
+@pytest.mark.needs("simulator")
 def test_its_plan_is_played_in_the_simulator(served: Service):
-    pytest.importorskip("pybullet", reason="PyBullet has no wheel here: no plan of a deep policy was played")
-    plan = served.client.plan(**KESTREL, suture_points=[{"position_mm": GOAL_MM}])
+    plan = served.client.plan(**KESTREL, suture_points=[{"position_mm": GOAL_MM}], handoff="none")
     asked = served.client.play(plan["id"])
     served.work()
     played = served.client.job(asked["id"])
@@ -114,11 +114,11 @@ def test_its_plan_is_played_in_the_simulator(served: Service):
     assert served.client.playback(played["result"]["playback"])["feasible"]
 
 
-def test_one_that_was_learnt_in_the_space_says_how_it_fares_there_and_is_refused_for_its_actions(service: Service):  # noqa: F811
+def test_a_continuous_policy_reports_its_rollouts_and_is_not_released(service: Service):  # noqa: F811
     service.client.put_surgeon("kestrel")
     version = store(service, DDPG(), always((0.0, 0.0, 0.0)))
     told = service.http.get(f"{POLICY}/versions/1").json()
-    assert Rollouts(**told["rollouts"]).reached < 20
+    assert SpaceRollouts(**told["rollouts"]).reached < 20
     assert told["rollouts"]["starts"] == 1000 and not told["rollouts"]["demonstrated_start_reached"]
     assert "greedy actions are not optimal" in told["grid_certificate"]["refused_because"][0]
     with service.database.writing() as session, pytest.raises(Conflict, match="not optimal"):

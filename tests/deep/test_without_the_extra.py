@@ -1,18 +1,26 @@
-"""Without the extra: no torch comes along, everything else works, and a deep learner says what to install."""
+"""Without the extra: torch is not imported, everything else works, and a deep learner names the missing packages."""
 
 import re
 import subprocess
 import sys
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
+import skills
 from skills.cli import app
+from skills.deep import learning
 from skills.deep.learning import NEEDED
+from skills.errors import LearningFailed
+from skills.gridworld.grid import GridPath, GridWorld
+from skills.gridworld.reward import sparse_reward
+from skills.learning.deep_settings import DDPG
+from skills.learning.policy import Policy
 from tests.api.conftest import service, still, trained  # noqa: F401 - fixtures
 from tests.api.service import KESTREL, Service, assert_problem
+from tests.deep.networks import towards
 
 PROJECT = Path(__file__).parents[2]
 HEAVY = re.compile(r"^(torch|triton|nvidia-|cuda-|stable-baselines3|sb3-contrib|gymnasium)")
@@ -25,6 +33,40 @@ def absent(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     for name in NEEDED:
         monkeypatch.setitem(sys.modules, name, None)
     return
+
+
+@pytest.fixture
+def trained_by(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Policy]:
+    """Return a function that learns with another training process, given as `module:function`."""
+    monkeypatch.setattr(learning, "require_installed", lambda learner: None)
+    path = GridPath(GridWorld((0.0, 0.0, 0.0), 5.0, (3, 3, 3)), [0, 1, 2])
+
+    def learn(target: str) -> Policy:
+        monkeypatch.setattr(learning, "TARGET", target)
+        return skills.learn_policy(sparse_reward(path), DDPG(steps=800, width=32, batch=32), 7)
+
+    return learn
+
+
+def test_a_lesson_goes_to_the_training_process_and_a_network_comes_back(trained_by):
+    policy = trained_by("tests.deep.networks:train")
+    assert policy.network == towards((0.5, 0.0, 0.0))
+    assert policy.training.steps == policy.seed == 7
+
+
+@pytest.mark.parametrize(
+    ("fault", "cause", "advice"),
+    [
+        ("crash", "crashed", "SIGSEGV; train again"),
+        ("fail", "failed", "code 1; its last output is in the log"),
+        ("garbage", "nonsense", "returned unreadable data; train again"),
+        ("a_number", "nonsense", "returned unreadable data; train again"),
+    ],
+)
+def test_a_training_process_without_a_network_fails_with_advice(trained_by, fault, cause, advice):
+    with pytest.raises(LearningFailed, match=f"^The learning process .*{advice}") as caught:
+        trained_by(f"tests.sandbox.faults:{fault}")
+    assert caught.value.numbers == {"cause": cause}
 
 
 def names_in(lock: str) -> list[str]:
@@ -41,7 +83,7 @@ def test_what_is_installed_by_default_has_no_torch_in_it():
     }  # fmt: skip
 
 
-def test_the_lock_of_the_extra_adds_to_the_other_and_contradicts_it_nowhere():
+def test_the_lock_of_the_extra_only_adds_to_the_base_lock():
     pinned = re.compile(r"^([\w.-]+==\S+)", re.MULTILINE)
     base, extra = (
         pinned.findall((PROJECT / name).read_text()) for name in ("requirements.lock", "requirements-deep.lock")
@@ -49,10 +91,10 @@ def test_the_lock_of_the_extra_adds_to_the_other_and_contradicts_it_nowhere():
     added = {one.split("==")[0] for one in {*extra} - {*base}}
     assert added >= {"stable-baselines3", "sb3-contrib", "gymnasium"}
     assert added.isdisjoint(one.split("==")[0] for one in base)
-    assert "torch" not in added  # its builds have other hashes: the Makefile says how it is taken
+    assert "torch" not in added  # its builds have other hashes: the Makefile describes its installation
 
 
-def test_a_fresh_process_learns_with_the_table_and_says_what_a_network_needs():
+def test_without_the_extra_tables_are_learnt_and_networks_name_their_needs():
     code = WITHOUT + (
         "import skills\n"
         "path = skills.GridPath(skills.GridWorld((0.0, 0.0, 0.0), 5.0, (3, 3, 3)), [0, 1, 2])\n"

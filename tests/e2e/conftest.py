@@ -1,4 +1,4 @@
-"""The real service: a server and its worker as processes of their own, on loopback, with a database in a folder."""
+"""The real service: a server and its worker as separate processes on loopback, with a database in a folder."""
 
 import os
 import signal
@@ -6,19 +6,29 @@ import socket
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
+import httpx2 as httpx
 import pytest
 
 from skills.client import Client
-from skills.demo import wait_until_ready
+from tests.waiting import END_S, until
 
-WORKER, FORK_SERVER = "skills.jobs.worker", "skills.confined.fork_server"
+WORKER, FORK_SERVER = "skills.jobs.worker", "skills.sandbox.fork_server"
+REPLACED = 2  # workers that may die while a service starts, as where its database is not yet reachable
+
+
+def answers(client: Client) -> bool:
+    """Return whether a starting service is ready."""
+    try:
+        return client.http.get("/readyz").is_success
+    except httpx.TransportError:
+        return False
 
 
 class Service:
-    """A service that can be killed and started again on the same database."""
+    """A service that can be killed and restarted on the same database."""
 
     def __init__(self, folder: Path, **settings: object) -> None:
         with socket.socket() as free:
@@ -40,37 +50,45 @@ class Service:
 
     def start(self) -> None:
         self.launch()
+        workers: set[int] = set()
+
+        def ready() -> bool:
+            with suppress(OSError):  # a thread or a child may end while it is looked at
+                workers.update(self.children(WORKER))
+            assert len(workers) <= int(self.environment["SKILLS_WORKERS"]) + REPLACED, "its workers die at their start"
+            return answers(client)
+
         with Client(self.url) as client:
-            wait_until_ready(client, self.process)
+            until(ready, by=[self.process])
 
     def child(self, word: str) -> int:
-        """Find the child process that has a word on its command line: its worker, or its fork server."""
+        """Return the child process with a word on its command line: its worker, or its fork server."""
         (child,) = self.children(word)
         return child
 
     def children(self, word: str) -> list[int]:
-        """Find the child processes that have a word on their command lines."""
+        """Return the child processes with a word on their command lines."""
         assert self.process is not None
-        tasks = Path(f"/proc/{self.process.pid}/task")  # it may be any of its threads that started it
+        tasks = Path(f"/proc/{self.process.pid}/task")  # any of its threads may have started the child
         children = [pid for task in tasks.iterdir() for pid in (task / "children").read_text().split()]
         return [int(pid) for pid in children if word in Path(f"/proc/{pid}/cmdline").read_text()]
 
     def kill(self) -> None:
         assert self.process is not None
         self.process.send_signal(signal.SIGKILL)
-        self.process.wait(30)
+        self.process.wait(END_S)
 
     def stop(self) -> int:
         assert self.process is not None
         self.process.terminate()
-        return self.process.wait(30)
+        return self.process.wait(END_S)
 
 
 @contextmanager
 def running(folder: Path, **settings: object) -> Iterator[Service]:
     service = Service(folder, **settings)
     try:
-        service.start()  # in here, so that one that does not get ready in time is stopped too
+        service.start()  # inside `try`, so that a service that is not ready in time is stopped too
         yield service
     finally:
         if service.process is not None and service.process.poll() is None:

@@ -1,16 +1,17 @@
-"""A rollout written from the text of interface.md alone, on the JSON that the service sends, against the library's."""
+"""A rollout written from the text of interface.md alone, on the service's JSON, compared with the library's."""
 
 from itertools import product
 from typing import Any
 
 import numpy as np
+import pytest
 
 from skills.client import Client
 from skills.seeds.recordings import sample_recordings
 
 
 def rolled_out(policy: dict[str, Any], start: int) -> tuple[list[int], bool]:
-    """Follow the policy from a state. Nothing of ours is used: only the JSON and the rules of interface.md."""
+    """Follow the policy from a state, with nothing but the JSON and the rules of interface.md."""
     nx, ny, nz = policy["grid"]["shape"]
     waypoints, actions = policy["waypoints"], policy["actions"]
     last = len(waypoints) - 1
@@ -41,7 +42,8 @@ def rolled_out(policy: dict[str, Any], start: int) -> tuple[list[int], bool]:
     return states, False
 
 
-def test_a_client_that_knows_only_the_interface_goes_where_the_library_goes_from_every_start(client: Client) -> None:
+@pytest.mark.nightly  # every start, by a client that shares no code with ours
+def test_a_client_of_the_interface_alone_rolls_out_like_the_library(client: Client) -> None:
     sample = next(s for s in sample_recordings() if s.surgeon == "wren")  # its path crosses itself
     client.put_surgeon(sample.surgeon)
     client.add_demo(sample.data, surgeon=sample.surgeon, suture=sample.suture)

@@ -1,4 +1,4 @@
-"""`make demo`, as a newcomer would see it."""
+"""`make demo`, as a new user runs it."""
 
 import os
 import re
@@ -9,20 +9,26 @@ from pathlib import Path
 import pytest
 
 
-def test_the_demo_does_the_main_job_and_exits_with_0(tmp_path: Path) -> None:
-    pytest.importorskip("pybullet", reason="PyBullet has no wheel here: the demo's playback cannot run")
-    environment = os.environ | {"COLUMNS": "160"}
+@pytest.mark.needs("simulator")
+@pytest.mark.parametrize(
+    "real", [False, pytest.param(True, marks=[pytest.mark.nightly, pytest.mark.needs("recordings")])]
+)
+def test_the_demo_does_the_main_job_and_exits_with_0(tmp_path: Path, real: bool) -> None:
+    environment = (
+        os.environ | {"COLUMNS": "160", "SKILLS_WORKERS": "1"} | ({} if real else {"SKILLS_SAMPLE_RECORDINGS": ""})
+    )
     ended = subprocess.run([sys.executable, "-m", "skills.demo"], env=environment, cwd=tmp_path, capture_output=True)
     printed = ended.stdout.decode()
     assert ended.returncode == 0, printed + ended.stderr.decode()
-    styles = re.findall(r"^ (\w+) [a-z-]+ +(\d+)/(\d+) +0 +1331/1331 +feasible ", printed, re.MULTILINE)
+    styles = re.findall(
+        r"^ (\w+) [a-z-]+ +(\d+)/(\d+) +0 +1331/1331 +feasible, \d+ of 1000 worlds ", printed, re.MULTILINE
+    )
     assert {surgeon for surgeon, _, _ in styles} == {"kestrel", "heron", "wren", "plover"}
     assert all(exact == states for _, exact, states in styles)
     pictures = tmp_path / "build" / "demo"
-    real = bool(os.environ.get("SKILLS_SAMPLE_RECORDINGS"))
     learnt = "333 of 333 states, DTW 0 mm, 9570 of 9570 starts reach the goal; released."
     assert (learnt if real else "No real recording:") in printed
-    assert ("Played back at its own place: feasible" in printed) == real
+    assert ("Played back at its own place: No hand-off: feasible in an exact simulation" in printed) == real
     assert len(list(pictures.glob("*-playback.png"))) >= len(styles)
     begins = {".png": b"\x89PNG", ".gif": b"GIF89a", ".mp4": b"\0\0\0"}
     assert all(picture.read_bytes().startswith(begins[picture.suffix]) for picture in pictures.iterdir())

@@ -1,4 +1,4 @@
-"""Hostile files through the real service: every one is refused in words or taken as it is, and nothing else is hurt."""
+"""Hostile files sent to the real service: each is refused with a message or accepted, and nothing else suffers."""
 
 import os
 import signal
@@ -18,12 +18,13 @@ import pytest
 from skills.client import Client
 from tests.api.service import KESTREL, MCAP, assert_problem
 from tests.e2e.conftest import FORK_SERVER, Service, running
+from tests.formats import hostile
 from tests.library import cases
 from tests.measured import peak_mib
-from tests.recordings import hostile
+from tests.waiting import END_S, crowded
 
 BAG = cases.bag()
-BOMB_S = 5.0  # of processor time, so that it does not matter what else goes on
+BOMB_S = 5.0  # of processor time, so that other load does not matter
 OTHERS_S = 0.25
 GROWTH_MIB = 64
 QUICK_BOMBS = [
@@ -44,7 +45,7 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
 
 @pytest.fixture(scope="module")
 def http(service: Service) -> Iterator[httpx.Client]:
-    with httpx.Client(base_url=service.url, timeout=60.0) as http:
+    with httpx.Client(base_url=service.url, timeout=END_S) as http:
         yield http
 
 
@@ -54,7 +55,7 @@ def send(http: httpx.Client, data: bytes, path: str = "/recordings") -> httpx.Re
 
 
 def rows(service: Service) -> dict[str, int]:
-    """Count the rows of every table but the workers' own."""
+    """Count the rows of every table except the workers' own."""
     connection = sqlite3.connect(service.database)
     tables = [name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")]
     tables.remove("executors")
@@ -64,7 +65,7 @@ def rows(service: Service) -> dict[str, int]:
 
 
 def reading_s(service: Service) -> float:
-    """Read the processor time of all forks so far."""
+    """Return the processor time of all forks so far."""
     fields = Path(f"/proc/{service.child(FORK_SERVER)}/stat").read_text().rpartition(")")[2].split()
     return sum(map(int, fields[13:15])) / os.sysconf("SC_CLK_TCK")  # cutime and cstime of proc(5)
 
@@ -76,7 +77,7 @@ def recorded(http: httpx.Client, demo: dict[str, Any]) -> tuple[Any, Any]:
 
 @contextmanager
 def others_are_served(http: httpx.Client) -> Iterator[None]:
-    """Ask for the catalogue all the while: 19 of 20 answers come in time, though other tests share the machine."""
+    """Request the catalogue continuously: 19 of 20 responses arrive in time, although other tests share the machine."""
     over, took = Event(), []
 
     def ask() -> None:
@@ -93,11 +94,11 @@ def others_are_served(http: httpx.Client) -> Iterator[None]:
         finally:
             over.set()
             asking.result()
-    assert float(np.quantile(took, 0.95)) < OTHERS_S
+    assert float(np.quantile(took, 0.95)) < OTHERS_S * crowded()
 
 
 def sweep(service: Service, http: httpx.Client, files: Iterable[bytes]) -> int:
-    """Send files, and count the accepted: all others are problems of the caller, and leave no row."""
+    """Send files, and count the accepted ones: all others give 4xx and leave no row."""
     before, accepted = rows(service), set()
     for data in files:
         answer = send(http, data)
@@ -121,7 +122,7 @@ def same_or_refused(http: httpx.Client, files: Iterable[bytes]) -> None:
 
 
 def defuse(service: Service, http: httpx.Client, names: Iterable[str]) -> list[float]:
-    """Send bombs, while others are served and memory is watched: the seconds that each took."""
+    """Send bombs while others are served and memory is watched; return the seconds that each took."""
     assert send(http, BAG).status_code in (200, 201)
     processes = [service.process.pid, service.child(FORK_SERVER)]
     before, peaks, took, bombs = rows(service), [peak_mib(pid) for pid in processes], [], hostile.bombs()

@@ -1,10 +1,9 @@
-"""The service as processes: killed and started again, stopped, refused."""
+"""The service as processes: killed and restarted, stopped, refused."""
 
 import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -12,11 +11,12 @@ import pytest
 from skills.client import Client
 from skills.seeds.recordings import sample_recordings
 from tests.e2e.conftest import FORK_SERVER, WORKER, running
-from tests.sim.test_confined import alive, waited
+from tests.waiting import END_S, alive, until
 
 SLOW_LEARNER = {"kind": "cell-q-learning", "episodes": 300_000}  # a few seconds of work
 
 
+@pytest.mark.nightly  # 20 s; by day tests/jobs kill workers
 def test_what_was_acknowledged_survives_a_kill_and_the_training_goes_on(tmp_path: Path) -> None:
     sample = sample_recordings()[0]
     style = (sample.surgeon, sample.suture)
@@ -24,21 +24,19 @@ def test_what_was_acknowledged_survives_a_kill_and_the_training_goes_on(tmp_path
         client.put_surgeon(sample.surgeon)
         demo = client.add_demo(sample.data, surgeon=sample.surgeon, suture=sample.suture)
         job = client.train(*style, learner=SLOW_LEARNER)
-        deadline = time.monotonic() + 30
-        while client.job(job.id).state == "queued" and time.monotonic() < deadline:
-            time.sleep(0.02)
+        until(lambda: client.job(job.id).state != "queued")
         assert client.job(job.id).state == "running"
         service.kill()
         service.start()
         assert client.demo(demo.id).state == "active"
         assert client.demo_recording(demo.id) == sample.data
-        done = client.wait(client.job(job.id), timeout_s=60)
+        done = client.wait(client.job(job.id), timeout_s=END_S)
         assert done.state == "succeeded"
         assert [v.version for v in client.versions(*style)] == [1]
         assert client.train(*style, learner=SLOW_LEARNER).id == job.id
 
 
-def test_the_recording_comes_back_exactly_and_two_segments_are_two_demonstrations(client: Client) -> None:
+def test_a_recording_is_returned_exactly_and_two_segments_give_two_demos(client: Client) -> None:
     sample = next(s for s in sample_recordings() if len(s.segments) > 1)
     client.put_surgeon(sample.surgeon)
     first, again = client.add_recording(sample.data), client.add_recording(sample.data)
@@ -55,19 +53,20 @@ def test_the_recording_comes_back_exactly_and_two_segments_are_two_demonstration
 
 def test_a_stopped_service_exits_with_0_and_takes_its_children_along(tmp_path: Path) -> None:
     with running(tmp_path, workers=2) as service:
-        waited(lambda: len(service.children(WORKER)) == 2)
+        until(lambda: len(service.children(WORKER)) == 2)
         children = [*service.children(WORKER), service.child(FORK_SERVER)]
         assert service.stop() == 0
-    waited(lambda: not any(map(alive, children)))
+    until(lambda: not any(map(alive, children)))
 
 
+@pytest.mark.nightly  # by day tests/jobs kill workers
 def test_a_worker_that_dies_is_replaced_and_its_job_done(tmp_path: Path) -> None:
     sample = sample_recordings()[0]
     with running(tmp_path) as service, Client(service.url) as client:
         client.put_surgeon(sample.surgeon)
         client.add_demo(sample.data, surgeon=sample.surgeon, suture=sample.suture)
         os.kill(service.child(WORKER), signal.SIGKILL)
-        done = client.wait(client.train(sample.surgeon, sample.suture, release=True), timeout_s=60)
+        done = client.wait(client.train(sample.surgeon, sample.suture, release=True), timeout_s=END_S)
         assert done.result["released"]
 
 

@@ -9,7 +9,7 @@ from tests.jobs.house import House
 
 @pytest.fixture(scope="module", params=BACKENDS)
 def house(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[House]:
-    """An installation with one worker, on either database."""
+    """Yield an installation with one worker, on either database."""
     folder = tmp_path_factory.mktemp("house")
     url = blank(request.param, folder)
     yield from _lived_in(url, folder)
@@ -18,7 +18,7 @@ def house(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
 
 @pytest.fixture
 def empty_house(tmp_path: Path) -> Iterator[House]:
-    """An installation without workers, on SQLite."""
+    """Yield an installation without workers, on SQLite."""
     house = House(f"sqlite:///{tmp_path / 'skills.sqlite'}", tmp_path)
     yield house
     house.close()

@@ -1,28 +1,27 @@
-"""A database, the service's side of the engine, and workers as processes of their own; and the whole service."""
+"""An installation for the job tests: a database, the service's engine client, and workers in separate processes."""
 
 import subprocess
 import sys
-import time
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import httpx2 as httpx
 from sqlalchemy import ColumnElement, func, select, text
 
-from skills.db.books import Executor, Job
+from skills.db.service_tables import Executor, Job
 from skills.db.session import Database
-from skills.jobs.child import environment
 from skills.jobs.engine import Engine
 from skills.library.inspection import inspect_installation
+from skills.serving import environment
 from skills.settings import Settings
 from tests.backends import blank, drop
 from tests.e2e.conftest import Service, running
 from tests.library import cases
+from tests.waiting import END_S, until
 
 ROOT = Path(__file__).parents[2]
-START_S = 180.0  # on a crowded machine; it takes three on one of its own
 Worker = subprocess.Popen[bytes]
 
 
@@ -41,12 +40,12 @@ class House:
         self.engine.close()
         self.database.close()
 
-    def ask(self, kind: str = "quick", state: str = "queued", **request: object) -> int:
-        """Commit a job as the library does; nobody is told of it."""
+    def ask(self, kind: str = "quick", state: str = "queued", attempt: int = 1, **request: object) -> int:
+        """Commit a job as the library does, without notifying the engine."""
         name = uuid.uuid4().hex
         asked = {"journal": str(self.journal), **request}
         with self.database.writing() as session:
-            job = Job(id=name, kind=kind, identity=name * 2, request=asked, state=state)
+            job = Job(id=name, kind=kind, identity=name * 2, request=asked, state=state, attempt=attempt)
             session.add(job)
         return job.row
 
@@ -54,31 +53,31 @@ class House:
         with self.database.reading() as session:
             return session.get_one(Job, row)
 
-    def ended(self, row: int, within_s: float = 10.0) -> Job:
-        """Wait for a job's end."""
+    def ended(self, row: int, within_s: float = END_S) -> Job:
+        """Wait for a job's end, and return the job."""
         until(lambda: self.job(row).state not in ("queued", "running"), within_s)
         return self.job(row)
 
-    def begun(self, row: int, within_s: float = 10.0) -> int:
-        """Wait until somebody works on a job, and tell who."""
+    def begun(self, row: int, within_s: float = END_S) -> int:
+        """Wait until a worker runs a job, and return the worker's process id."""
         until(lambda: self.noted("begins", row), within_s)
         return self.noted("begins", row)[-1]
 
     def noted(self, word: str, row: int) -> list[int]:
-        """List the processes that noted a word about a job."""
+        """List the processes that wrote a word about a job into the journal."""
         lines = (line.split() for line in self.journal.read_text().splitlines())
         return [int(pid) for said, about, pid in lines if (said, int(about)) == (word, row)]
 
     @contextmanager
     def workers(self, number: int) -> Iterator[dict[int, Worker]]:
-        """Start workers side by side, wait until they work, and see that they are gone in the end."""
+        """Start several workers, wait until they run, and make sure that they have stopped at the end."""
         started = [
             subprocess.Popen([sys.executable, "-m", "tests.jobs.standin"], cwd=ROOT, env=environment(self.settings))
             for _ in range(number)
         ]
         try:
-            until(lambda: len(self.executors()) == number, START_S)
-            self.ended(self.ask(), START_S)
+            until(lambda: len(self.executors()) == number, by=started)
+            self.ended(self.ask())
             yield {worker.pid: worker for worker in started}
         finally:
             for worker in started:
@@ -90,17 +89,8 @@ class House:
             return list(session.scalars(select(Executor.id)))
 
 
-def until(what: Callable[[], object], within_s: float) -> float:
-    """Wait for something; tell how long it took, in seconds."""
-    began = time.monotonic()
-    while not what():
-        assert time.monotonic() - began < within_s, f"it did not happen within {within_s} s"
-        time.sleep(0.02)
-    return time.monotonic() - began
-
-
 class Records:
-    """What the tables of an installation say, and those of its engine."""
+    """The contents of an installation's tables, and of its engine's tables."""
 
     def __init__(self, url: str) -> None:
         self.database = Database(url)
@@ -112,11 +102,11 @@ class Records:
         self.engine.close()
 
     def held(self) -> dict[str, int]:
-        """Tell which process holds which job, by the names of its workflows."""
+        """Return which process holds which job, by the names of its workflows."""
         return self._holders("status = 'PENDING'")
 
     def begun_since(self, moment: float) -> set[int]:
-        """Tell which processes have begun a job since then, in seconds of the clock."""
+        """Return the processes that have begun a job since a moment, in seconds of the clock."""
         return set(self._holders(f"started_at_epoch_ms > {moment * 1000:.0f}").values())
 
     def count(self, table: type, *where: ColumnElement[bool]) -> int:
@@ -131,7 +121,7 @@ class Records:
             return session.get_one(Job, row).state
 
     def wrong(self) -> list[tuple[str, str]]:
-        """Look at everything that is stored, as `skills verify` does: what is wrong."""
+        """Inspect everything that is stored, as `skills verify` does, and return the faults."""
         parts = {part.what: part for part in inspect_installation(self.database)}
         return [wrong for part in parts.values() for wrong in part.wrong]
 
@@ -142,15 +132,15 @@ class Records:
 
 
 def add_demonstration(url: str) -> None:
-    """Add a surgeon and a small hand-off of his to a service."""
-    with httpx.Client(base_url=url, timeout=60.0) as http:
+    """Add a surgeon and a small hand-off to a service."""
+    with httpx.Client(base_url=url, timeout=END_S) as http:
         http.put("/surgeons/kestrel", json={}).raise_for_status()
         query, as_table = {"surgeon": "kestrel", "suture": cases.SUTURE}, {"Content-Type": "text/csv"}
         http.post("/demos", params=query, content=cases.hand_off(), headers=as_table).raise_for_status()
 
 
 class Site(Records):
-    """The real service with its workers, and its records."""
+    """The real service with its workers, and its tables."""
 
     def __init__(self, service: Service, url: str) -> None:
         super().__init__(url)
@@ -168,7 +158,7 @@ def site(backend: str, folder: Path, **settings: object) -> Iterator[Site]:
 
 @contextmanager
 def site_at(url: str, folder: Path, **settings: object) -> Iterator[Site]:
-    """Start the service on a database; it is ready, and it is gone in the end."""
+    """Start the service on a database, yield it once it is ready, and stop it at the end."""
     with running(folder, database_url=url, **settings) as service:
         place = Site(service, url)
         try:

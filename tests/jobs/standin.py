@@ -1,4 +1,4 @@
-"""A worker with a stand-in for the library: what a job does is its kind, and it keeps a journal."""
+"""A worker with a stand-in for the library: a job's kind is its behaviour, and a journal records its steps."""
 
 import os
 import time
@@ -6,7 +6,7 @@ from pathlib import Path
 
 from sqlalchemy import update
 
-from skills.db.books import Job
+from skills.db.service_tables import Job
 from skills.db.session import Database
 from skills.errors import BadInput
 from skills.jobs.worker import run_worker

@@ -1,4 +1,4 @@
-from skills.jobs.child import environment
+from skills.serving import environment
 from skills.settings import Settings
 
 

@@ -1,4 +1,4 @@
-"""A worker stopped past its lease and continued: another has done its training, and its own result changes nothing."""
+"""A worker that is stopped past its lease and continued: another has done its training, and its result is discarded."""
 
 import signal
 import subprocess
@@ -12,22 +12,23 @@ from typing import Any
 import pytest
 from sqlalchemy import select, text
 
-from skills.db.books import Event, Executor, Job
 from skills.db.models import PolicyVersion
-from skills.jobs.child import environment
+from skills.db.service_tables import Event, Executor, Job
 from skills.jobs.engine import workflow_id
+from skills.learning.q_learning import CellQLearning
+from skills.serving import environment
 from skills.settings import Settings
-from skills.style.learning.q_learning import CellQLearning
 from tests import backends
-from tests.jobs.house import ROOT, Records, Worker, until
-from tests.jobs.test_batches import can_write, stop_between_transactions
+from tests.jobs.house import ROOT, Records, Worker
+from tests.jobs.test_batches import stop_between_transactions
 from tests.library import cases
+from tests.waiting import END_S, until
 
-SLOW = CellQLearning(episodes=800_000)  # about a second of learning, so that there is a middle
-PATIENCE_S = 300.0
+SLOW = CellQLearning(episodes=800_000)  # about a second of learning, so that a test can act midway
+PATIENCE_S = END_S
 
 
-@pytest.fixture(params=backends.BACKENDS)
+@pytest.fixture(params=backends.POSTGRESQL_NIGHTLY)
 def records(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Records]:
     url = backends.fresh(request.param, tmp_path)
     records = Records(url)
@@ -38,7 +39,7 @@ def records(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Records]
 
 @contextmanager
 def workers(records: Records, folder: Path) -> Iterator[dict[int, Worker]]:
-    """Two real workers, ready, by their processes; each tells of its every try in a log of its own."""
+    """Yield two real workers, ready, by process id; each logs its every attempt into a separate file."""
     how = environment(Settings(database_url=records.database.url, log_level="info"))
     started: dict[int, Worker] = {}
     for number in range(2):
@@ -46,7 +47,7 @@ def workers(records: Records, folder: Path) -> Iterator[dict[int, Worker]]:
             worker = subprocess.Popen([sys.executable, "-m", "skills", "worker"], cwd=ROOT, env=how, stderr=log)
             started[worker.pid] = worker
     try:
-        until(lambda: records.count(Executor) == 2, PATIENCE_S)
+        until(lambda: records.count(Executor) == 2, PATIENCE_S, by=started.values())
         yield started
     finally:
         for worker in started.values():
@@ -55,20 +56,17 @@ def workers(records: Records, folder: Path) -> Iterator[dict[int, Worker]]:
 
 
 def stop(records: Records, worker: Worker) -> None:
-    """Stop a worker where it holds the one write lock neither of our database nor of the engine's."""
+    """Stop a worker while it holds the write lock of neither our database nor the engine's."""
     stop_between_transactions(records.database, worker)
-    while records.engine.engine.dialect.name == "sqlite" and not can_write(records.engine):
-        worker.send_signal(signal.SIGCONT)
-        stop_between_transactions(records.database, worker)
 
 
 def told(folder: Path, job: Job) -> int:
-    """Count the tries at a job that the workers' logs tell of."""
+    """Count the attempts at a job in the workers' logs."""
     return sum(f"job_id={job.id}" in line for log in folder.glob("*.log") for line in log.read_text().splitlines())
 
 
 def everything(records: Records) -> list[tuple[Any, ...]]:
-    """Read what trainings write: every job, policy version and event."""
+    """Return the rows that trainings write: every job, policy version and event."""
     with records.database.reading() as session:
         jobs = select(Job.row, Job.state, Job.attempt, Job.result, Job.error, Job.progress, Job.ended_at)
         policies = select(PolicyVersion.row, PolicyVersion.sha256, PolicyVersion.version)
@@ -104,7 +102,7 @@ def test_the_late_result_of_a_stopped_worker_changes_nothing(records: Records, t
 
 
 def stopped_in_the_middle(records: Records, started: dict[int, Worker], job: Job) -> Worker | None:
-    """Stop the worker that works on a job; None where it was too fast."""
+    """Stop the worker that works on a job, and return it; None if it was too fast."""
     until(lambda: records.state(job.row) != "queued", PATIENCE_S)
     worker = started.get(records.held().get(workflow_id(job.row, job.attempt), 0))
     if worker is None:

@@ -1,10 +1,10 @@
-"""Silence is measured by the onlooker's own time, in looks."""
+"""Leases: the observer measures silence with its own clock, from observation to observation."""
 
-from skills.jobs.lease import Leases
+from skills.jobs.watch import Leases
 
 
 def leases(*looks: tuple[float, dict[str, object]]) -> Leases:
-    """Look at these moments (in seconds of the onlooker) at these beats."""
+    """Return leases that observed these heartbeats at these moments (in seconds of the observer)."""
     clock = iter(at_s for at_s, _ in looks)
     onlooker = Leases(2.0, clock=lambda: next(clock))
     for _, beats in looks:
@@ -12,7 +12,7 @@ def leases(*looks: tuple[float, dict[str, object]]) -> Leases:
     return onlooker
 
 
-def test_a_worker_is_dead_once_its_beat_has_not_changed_for_longer_than_the_lease():
+def test_a_worker_is_dead_if_its_heartbeat_is_unchanged_beyond_the_lease():
     still = [(at_s, {"a": 1, "b": at_s}) for at_s in (0.0, 0.8, 1.6, 2.0)]
     assert leases(*still).dead() == set()
     assert leases(*still, (2.1, {"a": 1, "b": 2.1})).dead() == {"a"}

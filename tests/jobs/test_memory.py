@@ -1,4 +1,4 @@
-"""What is freed stays with the process, so that the next style finds it."""
+"""Memory of workers: freed memory stays with the process, so that the next style can use it."""
 
 import resource
 import subprocess
@@ -9,7 +9,7 @@ import pytest
 CODE = """
 import resource, sys
 import numpy as np
-from skills.jobs.memory import keep_freed_memory
+from skills.jobs.worker import keep_freed_memory
 kept = keep_freed_memory()
 def work():
     for _ in range(50):

@@ -1,10 +1,11 @@
-"""A person who waits comes before a batch, and what nobody waits for is done aside."""
+"""Queues: interactive requests overtake batches, and pictures are drawn one at a time without delaying other jobs."""
 
 from itertools import pairwise
 
 from skills.jobs.engine import JOBS, QUEUES
-from skills.library.batches import PART
-from tests.jobs.house import House, until
+from skills.library.jobs import PART
+from tests.jobs.house import House
+from tests.waiting import until
 
 GRACE_S = 5.0
 
@@ -51,4 +52,4 @@ def test_a_worker_that_is_told_to_go_does_not_stay_for_pictures(empty_house: Hou
         worker.terminate()
         took_s = until(lambda: worker.poll() is not None, GRACE_S)
         print(f"told to go, to gone: {took_s:.2f} s")
-    assert house.job(row).state == "running"  # and taken over from, as from any that died
+    assert house.job(row).state == "running"  # and taken over, as from any dead worker

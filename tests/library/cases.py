@@ -1,4 +1,4 @@
-"""Small hand-offs as tables and bags, and the line from one of them to a playback, called as the service calls it."""
+"""Small hand-offs as tables and bags, and their way to a playback, with the library calls that the service makes."""
 
 import io
 from itertools import pairwise
@@ -6,22 +6,23 @@ from typing import Any
 
 import numpy as np
 
-from skills.db.books import Job
 from skills.db.models import Demonstration, Plan, PolicyVersion
+from skills.db.service_tables import Job
 from skills.db.session import Database
+from skills.demonstration.recording import Motion, Recording
+from skills.formats import write_mcap
 from skills.jobs.workflows import Work
+from skills.learning.learners import describe_learner
+from skills.learning.q_learning import CellQLearning
 from skills.library import perform_job
 from skills.library.catalogue import put_surgeon, seed_catalogue
-from skills.library.demos import Cut, upload_demo
-from skills.library.plans import PlanRequest, plan_sutures
+from skills.library.demos import upload_demo
+from skills.library.plans import plan_sutures
 from skills.library.recordings import Upload
 from skills.library.training import request_training
 from skills.packing import sha256
-from skills.recordings import write_mcap
+from skills.schemas.requests import DemoIn, PlanIn, TrainingIn
 from skills.settings import Settings
-from skills.style.learning.q_learning import CellQLearning
-from skills.style.plan import SuturePoint
-from skills.style.recording import Motion, Recording
 
 SUTURE = "simple-running"
 PUBLISHED = CellQLearning.published()
@@ -31,7 +32,7 @@ CORNERS_MM = np.array([[-10, 55, -135], [-20, 60, -130], [-10, 55, -120], [5, 55
 
 
 def points_mm(shift_mm: tuple[float, float, float] = (0.0, 0.0, 0.0), samples: int = 20) -> np.ndarray:
-    """Walk around three corners inside the paper's grid, seven cells in all; shape (3 samples, 3)."""
+    """Return a path around three corners inside the paper's grid, seven cells in all; shape (3 samples, 3)."""
     legs = [np.linspace(a, b, samples) for a, b in pairwise(CORNERS_MM)]
     return np.concatenate(legs) + np.asarray(shift_mm)
 
@@ -44,7 +45,7 @@ def table(tip: np.ndarray, *, unit: str = "mm", rate_hz: float = RATE_HZ, stamps
 
 
 def hand_off(shift_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> bytes:
-    """Give one hand-off as a table; another shift is another recording and another path."""
+    """Return one hand-off as a table; another shift gives another recording and another path."""
     return table(points_mm(shift_mm))
 
 
@@ -68,17 +69,26 @@ def add_surgeon(database: Database, slug: str = "kestrel", **about: Any) -> None
 
 
 def add_demo(database: Database, data: bytes | None = None, surgeon: str = "kestrel", **cut: Any) -> Demonstration:
-    """Store one demonstration: its row."""
-    return upload_demo(database, upload(data or hand_off()), Cut(surgeon, SUTURE, **cut), "test")[0]
+    """Store one demonstration, and return its row."""
+    return store(database, upload(data or hand_off()), surgeon, **cut)
+
+
+def store(database: Database, sent: Upload, surgeon: str = "kestrel", **cut: Any) -> Demonstration:
+    """Store one demonstration of an upload, and return its row."""
+    return upload_demo(database, sent, DemoIn(surgeon=surgeon, suture=SUTURE, **cut), "test").row
 
 
 def ask_training(database: Database, surgeon: str = "kestrel", **asked: Any) -> Job:
     with database.writing() as session:
-        return request_training(session, surgeon, SUTURE, "test", **asked)[0]
+        if "learner" in asked:
+            asked["learner"] = describe_learner(asked["learner"])
+        if asked.get("combine"):
+            asked["combine"] = {"kind": asked["combine"].kind}
+        return request_training(session, TrainingIn(surgeon=surgeon, suture=SUTURE, **asked), "test")[0]
 
 
 def work(database: Database, job: Job) -> Job:
-    """Carry a job out as a worker does: mark it running, perform it, or say why it failed."""
+    """Carry out a job as a worker does: mark it running, perform it, or record why it failed."""
     settled = Work(database, Settings(database_url=database.url), perform_job).try_once(job.row, job.attempt, 0)
     assert settled, "the job failed inside the service"
     with database.reading() as session:
@@ -86,7 +96,7 @@ def work(database: Database, job: Job) -> Job:
 
 
 def train(database: Database, surgeon: str = "kestrel", **asked: Any) -> PolicyVersion:
-    """Train, and give the version that came of it."""
+    """Train, and return the resulting version."""
     job = work(database, ask_training(database, surgeon, **asked))
     assert job.state == "succeeded", job.error
     with database.reading() as session:
@@ -94,5 +104,11 @@ def train(database: Database, surgeon: str = "kestrel", **asked: Any) -> PolicyV
 
 
 def add_plan(database: Database, surgeon: str = "kestrel", **asked: Any) -> Plan:
-    point = SuturePoint((5.0, 55.0, -125.0))
-    return plan_sutures(database, PlanRequest(surgeon, SUTURE, [point], **asked), "test")[0]
+    """Plan one pass; unless PSM_M is given it has no hand-off."""
+    if "psm_m" not in asked:
+        asked = {"handoff": "none"} | asked
+    return plan_sutures(
+        database,
+        PlanIn(surgeon=surgeon, suture=SUTURE, suture_points=[{"position_mm": (5.0, 55.0, -125.0)}], **asked),
+        "test",
+    )[0]

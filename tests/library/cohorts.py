@@ -1,12 +1,12 @@
-"""A cohort whose truth is known, stored as recordings of surgeons in sessions."""
+"""A cohort of known truth, stored as recordings of surgeons in sessions."""
 
 import numpy as np
 
 from skills.db.session import Database
+from tests.comparison.cohort import Cohort, cohort
 from tests.library import cases
-from tests.style.comparing.cohort import Cohort, cohort
 
-EVERY = 4  # of the samples: 25 Hz, which is quicker to store and shows the same
+EVERY = 4  # every fourth sample: 25 Hz, which is quicker to store and shows the same
 
 
 def name(surgeon: int) -> str:
@@ -22,7 +22,7 @@ def hand_off(drawn: Cohort, one: int) -> bytes:
 def add_cohort(
     database: Database, drawn: Cohort | None = None, whose: np.ndarray | None = None, sessions: bool = True
 ) -> list[str]:
-    """Store a cohort, eight surgeons in five sessions: the digests of its demonstrations."""
+    """Store a cohort of eight surgeons in five sessions, and return the digests of its demonstrations."""
     drawn = drawn or cohort(1)
     whose = drawn.surgeons if whose is None else whose
     for surgeon in np.unique(whose):
@@ -32,7 +32,7 @@ def add_cohort(
             database,
             hand_off(drawn, one),
             name(surgeon),
-            session=f"session {drawn.sessions[one]}" if sessions else None,
+            session=f"session-{drawn.sessions[one]}" if sessions else None,
             grid="fit",
         ).sha256
         for one, surgeon in enumerate(whose.tolist())

@@ -1,7 +1,7 @@
-"""A hospital in a moment: any number of surgeons, with a learnt, released and retrained style of each suture type.
+"""A large hospital, quickly: any number of surgeons, with a learnt, released and retrained style of each suture type.
 
-One style is really demonstrated, learnt and released; all others are rows with its numbers and names of their own.
-Their digests are those that such styles would have, so whatever is read back is verified as always.
+One style is really demonstrated, learnt and released; all others are rows with its numbers and different names. Their
+digests are those that such styles would have, so everything that is read back is verified as usual.
 """
 
 import secrets
@@ -13,7 +13,6 @@ from sqlalchemy import LargeBinary, Table, insert, select, type_coerce
 from sqlalchemy.orm import Session
 
 from skills.db.base import now
-from skills.db.books import Event, Job, StyleToRetrain
 from skills.db.models import (
     Demonstration,
     PolicyVersion,
@@ -25,18 +24,18 @@ from skills.db.models import (
     SutureType,
 )
 from skills.db.packed import Packed, digest
+from skills.db.service_tables import Event, Job, StyleToRetrain
 from skills.db.session import Database
-from skills.library.batches import BATCH, PART
 from skills.library.catalogue import put_suture_type
-from skills.library.jobs import identity_of
+from skills.library.integrity import demo_identity
+from skills.library.jobs import BATCH, PART, identity_of
 from skills.library.retraining import MOST_IN_A_PART
-from skills.library.verified import demo_identity
 from skills.packing import canonical, sha256
 from tests.library import cases
 
 FIRST = "kestrel"
 SUTURES = 12  # the catalogue's eleven, and one of the hospital's own
-WAITING = 30  # jobs that have not ended, in a hospital of any size
+WAITING = 30  # unfinished jobs, in a hospital of any size
 ROWS_AT_ONCE = 1000
 
 Row = dict[str, Any]
@@ -44,7 +43,7 @@ Style = tuple[str, str]
 
 
 def fill(database: Database, surgeons: int) -> list[Style]:
-    """Fill a migrated database with so many surgeons: their styles, surgeon by surgeon."""
+    """Fill a migrated database with a number of surgeons; return their styles, surgeon by surgeon."""
     cases.add_surgeon(database, FIRST)
     cases.add_demo(database)
     cases.train(database, release=True)
@@ -66,7 +65,7 @@ def fill(database: Database, surgeons: int) -> list[Style]:
 
 
 def _add_surgeons(session: Session, slugs: list[str]) -> None:
-    """Add surgeons, each with a recording of his own: the bytes of the first one's, and his name behind them."""
+    """Add surgeons, each with a recording: the bytes of the first one's, followed by the surgeon's name."""
     one, recording, chunk = (_first(session, model) for model in (Surgeon, StoredRecording, RecordingChunk))
     _add(session, Surgeon, (one | {"slug": slug, "subject": secrets.token_hex(16)} for slug in slugs))
     files = {sha256(data): data for data in (chunk["data"] + slug.encode() for slug in slugs)}
@@ -77,7 +76,7 @@ def _add_surgeons(session: Session, slugs: list[str]) -> None:
 
 
 def _add_styles(session: Session, styles: list[Style]) -> None:
-    """Add of each style a demonstration, its reward map, a policy version and its release."""
+    """Add a demonstration, its reward map, a policy version and its release for each style."""
     real, version = session.scalars(select(Demonstration)).one(), session.scalars(select(PolicyVersion)).one()
     first, reward, policy, released = (
         _first(session, model) for model in (Demonstration, StoredRewardMap, PolicyVersion, Release)
@@ -109,7 +108,7 @@ def _add_styles(session: Session, styles: list[Style]) -> None:
 
 
 def _add_jobs(session: Session, styles: list[Style]) -> None:
-    """Add the training of each style, some jobs that wait, and last a batch of all styles, which is done."""
+    """Add the training of each style, some waiting jobs, and last a finished batch of all styles."""
     training = _first(session, Job)
 
     def job(kind: str, request: Row, **state: object) -> Row:
@@ -160,7 +159,7 @@ def _table(model: type) -> Table:
 
 
 def _first(session: Session, model: type) -> Row:
-    """Read the first row of a table without its number, values packed as they are stored."""
+    """Read the first row of a table without its number, with packed values as stored."""
     table = _table(model)
     columns = [column for column in table.columns if column.name != "row"]
     as_stored = (type_coerce(c, LargeBinary).label(c.name) if isinstance(c.type, Packed) else c for c in columns)

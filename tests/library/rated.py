@@ -1,7 +1,7 @@
-"""A cohort of rated trials in the layout of JIGSAWS, made up from beginning to end, whose truth is known.
+"""A cohort of rated trials in the layout of JIGSAWS, entirely synthetic, of known truth.
 
-Every surgeon has a skill from 0 to 1. The less of it, the more a hand-off hesitates, swerves and turns, and the more
-time it takes; the ratings follow the skill but for a point or two. None of it is of the data set.
+Every surgeon has a skill from 0 to 1. The lower it is, the more a hand-off hesitates, swerves and turns, and the more
+time it takes; the ratings follow the skill within a point or two. Nothing is taken from the data set.
 """
 
 from collections.abc import Iterator
@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from skills.recordings.jigsaws import Rated, Skill, meta_line
-from tests.recordings.trials import RATE_HZ, text, turning
+from skills.formats.jigsaws import RatedTrial, Skill, meta_line
+from tests.formats.trials import RATE_HZ, text, turning
 
 SURGEONS = "BCDEFGHI"
 REST_S = 1.0
@@ -32,7 +32,7 @@ def surgeons(count: int = 8) -> list[Surgeon]:
 
 
 def folder(root: Path, seed: int = 0, count: int = 8, trials: int = 5, task: str = "Suturing") -> Path:
-    """Write trials of so many surgeons, their gestures and their ratings; gives back the root."""
+    """Write trials of a number of surgeons, their gestures and their ratings; return the root."""
     rng = np.random.default_rng(seed)
     home, lines = root / task, []
     for inside in ("kinematics/AllGestures", "transcriptions"):
@@ -48,14 +48,14 @@ def folder(root: Path, seed: int = 0, count: int = 8, trials: int = 5, task: str
     return root
 
 
-def rated(name: str, surgeon: Surgeon, rng: np.random.Generator) -> Rated:
-    """Rate a trial: six parts of one to five points, near four times the skill and one."""
+def rated(name: str, surgeon: Surgeon, rng: np.random.Generator) -> RatedTrial:
+    """Rate a trial: six parts of one to five points, near four times the skill plus one."""
     parts = np.rint(1.0 + 4.0 * surgeon.skill + rng.normal(0.0, 0.4, 6)).clip(1, 5).astype(int).tolist()
-    return Rated(name, surgeon.level, sum(parts), tuple(parts))
+    return RatedTrial(name, surgeon.level, sum(parts), tuple(parts))
 
 
 def trial(skill: float, rng: np.random.Generator) -> tuple[np.ndarray, str]:
-    """Make one trial: its 76 columns, and the gestures of its one hand-off, by the right instrument."""
+    """Return one trial: its 76 columns, and the gestures of its one hand-off, by the right instrument."""
     clumsy = float(np.clip(1.0 - skill, 0.0, 1.0))
     strokes = 1 + round(4 * clumsy + rng.normal(0.0, 0.4))
     seconds = float(np.clip(4.0 + 3.0 * clumsy + rng.normal(0.0, 1.2), 2.5, None))
@@ -74,7 +74,7 @@ def trial(skill: float, rng: np.random.Generator) -> tuple[np.ndarray, str]:
 
 
 def strokes_of(count: int, seconds: float) -> Iterator[np.ndarray]:
-    """Divide the way from 0 to 1 into minimum-jerk strokes, each from rest to rest."""
+    """Divide the path from 0 to 1 into minimum-jerk strokes, each from rest to rest."""
     samples = round(seconds * RATE_HZ / count)
     u = np.arange(1, samples + 1) / samples
     for number in range(count):
@@ -82,5 +82,5 @@ def strokes_of(count: int, seconds: float) -> Iterator[np.ndarray]:
 
 
 def arm(tip_m: np.ndarray, turns: np.ndarray) -> np.ndarray:
-    """Write an arm's 19 columns; velocities are not used, and the gripper holds on."""
+    """Write an arm's 19 columns; velocities are not used, and the gripper stays closed."""
     return np.hstack([tip_m, turns, np.zeros((len(tip_m), 6)), np.full((len(tip_m), 1), -0.5)])

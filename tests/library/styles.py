@@ -4,23 +4,25 @@ from itertools import count, islice
 
 from sqlalchemy import func, select, text
 
-from skills.db.books import Job, StyleToRetrain
 from skills.db.models import PolicyVersion, SutureType
+from skills.db.service_tables import Job, StyleToRetrain
 from skills.db.session import Database
+from skills.formats.reader_process import read_told
+from skills.learning.learners import describe_learner
 from skills.library import demos
-from skills.library.batches import PART
 from skills.library.catalogue import put_surgeon, seed_catalogue
-from skills.library.demos import Cut, Made, make_demo
+from skills.library.demos import Made, make_demo
+from skills.library.jobs import PART
 from skills.library.recordings import find_recording, keep
 from skills.library.retraining import request_retraining
-from skills.recordings import read_recording
+from skills.schemas.requests import DemoIn, RetrainingIn
 from tests.library import cases
 
 NO_CONSENT = {"consent": {"uses": ["atlas"], "until": None}}
 
 
 def add_styles(database: Database, number: int) -> list[tuple[str, str]]:
-    """Add so many styles, twelve of a surgeon: their surgeons and suture types."""
+    """Add a number of styles, twelve per surgeon; return their surgeons and suture types."""
     with database.writing() as session:
         seed_catalogue(session)
     with database.reading() as session:
@@ -33,21 +35,23 @@ def add_styles(database: Database, number: int) -> list[tuple[str, str]]:
             put_surgeon(session, surgeon, {}, "test")
         stored = find_recording(session, sha256)
         for surgeon, suture in styles:
-            demos._store_demo(session, stored, made, Cut(surgeon, suture), "test")
+            demos._store_demo(session, stored, made, DemoIn(surgeon=surgeon, suture=suture), "test")
     return styles
 
 
 def made_once(database: Database) -> tuple[Made, str]:
     upload = cases.upload(cases.hand_off())
-    recording = read_recording(upload.file)
+    told = read_told(upload.file)
     with database.writing() as session:
-        keep(session, upload, recording, "test")
-    return make_demo(recording, Cut("anybody", cases.SUTURE)), upload.sha256
+        keep(session, upload, told, "test")
+    return make_demo(told, DemoIn(surgeon="anybody", suture=cases.SUTURE)), upload.sha256
 
 
 def ask_retraining(database: Database, **asked: object) -> Job:
     with database.writing() as session:
-        return request_retraining(session, "test", **asked)[0]
+        if "learner" in asked:
+            asked["learner"] = describe_learner(asked["learner"])
+        return request_retraining(session, RetrainingIn(**asked), "test")[0]
 
 
 def parts_of(database: Database, job: Job) -> list[Job]:
@@ -72,7 +76,7 @@ def states_of(database: Database, job: Job) -> list[str]:
 
 
 def retrain(database: Database, **asked: object) -> Job:
-    """Ask for a batch and carry all of its parts out, as a worker does."""
+    """Request a batch and carry out all of its parts, as a worker does."""
     job = ask_retraining(database, **asked)
     for part in parts_of(database, job):
         cases.work(database, part)
@@ -80,7 +84,7 @@ def retrain(database: Database, **asked: object) -> Job:
 
 
 def damage(database: Database, demonstration: int) -> None:
-    """Change a byte of a stored reward map, as somebody with the database in his hands would."""
+    """Change a byte of a stored reward map, as somebody with write access to the database would."""
     on_sqlite = database.engine.dialect.name == "sqlite"
     before = "DROP TRIGGER reward_maps_append_only" + ("" if on_sqlite else " ON reward_maps")
     broken = "CAST('broken' AS BLOB)" if on_sqlite else "'broken'::bytea"
@@ -92,7 +96,7 @@ def damage(database: Database, demonstration: int) -> None:
 
 
 def versions(database: Database) -> int:
-    """Count the policy versions that there are."""
+    """Count the policy versions."""
     return counted(database, PolicyVersion)
 
 

@@ -1,4 +1,4 @@
-"""The atlas on both back ends: a cohort whose truth is known, what is kept of it, and what must not be."""
+"""The atlas on both back ends: a cohort of known truth, its cache, and data that must not be cached."""
 
 from collections.abc import Iterator
 from itertools import pairwise
@@ -11,18 +11,18 @@ from sqlalchemy import select, text
 
 from skills.db.models import Demonstration, MeasuredShape, Surgeon
 from skills.db.packed import digest
-from skills.db.seen import Only
+from skills.db.row_visibility import Only
 from skills.db.session import Database
 from skills.errors import BadInput, BadPath, Conflict, NotFound
-from skills.library import apart, atlas
+from skills.learning.evaluation import dtw
+from skills.library import atlas, distances
 from skills.library.atlas import atlas_of
 from skills.library.catalogue import put_surgeon
 from skills.library.demos import withdraw_demo
 from skills.library.erasure import erase_demo, erase_surgeon
-from skills.style.evaluation import dtw
 from tests import backends
+from tests.comparison.cohort import cohort
 from tests.library import cases, cohorts
-from tests.style.comparing.cohort import cohort
 
 SUTURE = cases.SUTURE
 AROUND_MM = np.array([[-10, 55, -135], [-20, 60, -130], [-10.2, 55, -135]], dtype=float)
@@ -39,20 +39,20 @@ def database(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Databas
 
 @pytest.fixture
 def measured(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """How many pairs were measured by each call."""
+    """Return a list that records how many pairs each call measures."""
     counted: list[int] = []
-    really = apart.distances_of
+    really = distances.distances_of
 
     def count(shapes, pairs):
         counted.append(len(pairs))
         return really(shapes, pairs)
 
-    monkeypatch.setattr(apart, "distances_of", count)
+    monkeypatch.setattr(distances, "distances_of", count)
     return counted
 
 
 def small(database: Database, **how) -> list[str]:
-    """Two surgeons in two sessions each."""
+    """Store two surgeons in two sessions each."""
     return cohorts.add_cohort(database, cohort(1, surgeons=2, sessions=2), **how)
 
 
@@ -100,22 +100,22 @@ def test_with_labels_shuffled_recognition_falls_to_chance(database: Database):
     assert seen is not None
     print(f"{seen.right} of {seen.tested}, {seen.interval}, log loss {seen.log_loss:.2f} nat")
     chance = 40 * 0.125
-    assert abs(seen.right - chance) < 4 * np.sqrt(chance * (1 - 0.125))  # of one shuffle; many are in tests/style
-    assert seen.log_loss > 0.9 * seen.log_loss_of_guessing  # and it does not claim to know
+    assert abs(seen.right - chance) < 4 * np.sqrt(chance * (1 - 0.125))  # of one shuffle; for many see tests/comparison
+    assert seen.log_loss > 0.9 * seen.log_loss_of_guessing  # and its confidence is not above chance
 
 
-def test_its_numbers_are_those_of_the_paper_s_measure_and_scaling_takes_size_out(database: Database):
+def test_the_atlas_uses_the_papers_measure_and_scaling_removes_size(database: Database):
     small(database)
     plain, scaled = atlas_of(database, SUTURE), atlas_of(database, SUTURE, scaled=True)
     rows = select(Demonstration).order_by(Demonstration.row)
     with database.reading() as session:
-        shapes = [apart.shape_of(one.demo) for one in session.scalars(rows)]
+        shapes = [distances.shape_of(one.demo) for one in session.scalars(rows)]
     np.testing.assert_allclose(far(plain)[0, 3], dtw(shapes[0], shapes[3]).total_mm / 100, atol=1e-4)
     one, other = (shape / shape[-1, 0] for shape in (shapes[0], shapes[3]))
     np.testing.assert_allclose(far(scaled)[0, 3], dtw(one, other).total_mm / 100, atol=1e-4)
     assert (plain.unit, scaled.unit) == ("mm", "lengths of start to goal")
     (apart_by,) = plain.differences
-    assert apart_by.said.startswith(f"In the {apart_by.part}, surgeon-0 lies ")
+    assert apart_by.said.startswith(f"In the {apart_by.part}, the path of surgeon-0 is ")
     assert np.sum(apart_by.shares) == pytest.approx(1.0, abs=1e-3)
 
 
@@ -147,7 +147,7 @@ def test_a_new_demonstration_costs_one_row_of_distances(database: Database, meas
     assert kept(database).items() > before.items() and len(kept(database)) == 5
 
 
-def test_what_is_kept_may_be_dropped_and_what_another_version_kept_is_not_used(
+def test_the_shape_cache_may_be_dropped_and_other_versions_are_ignored(
     database: Database, measured: list[int], monkeypatch: pytest.MonkeyPatch
 ):
     small(database)
@@ -155,7 +155,7 @@ def test_what_is_kept_may_be_dropped_and_what_another_version_kept_is_not_used(
     with database.writing() as session:
         session.execute(text("DELETE FROM measured_shapes"))
     assert atlas_of(database, SUTURE) == first
-    monkeypatch.setattr(apart, "VERSION", 2)
+    monkeypatch.setattr(distances, "VERSION", 2)
     assert atlas_of(database, SUTURE) == first
     assert measured == [6, 6] * 3
     with database.reading() as session:
@@ -170,8 +170,8 @@ def test_it_is_measured_in_blocks_and_kept_block_by_block(
     with database.writing() as session:
         session.execute(text("DELETE FROM measured_shapes"))
     measured.clear()
-    monkeypatch.setattr(apart, "PAIRS_AT_ONCE", 10)
-    monkeypatch.setattr(apart, "DEMOS_AT_ONCE", 2)
+    monkeypatch.setattr(distances, "PAIRS_AT_ONCE", 10)
+    monkeypatch.setattr(distances, "DEMOS_AT_ONCE", 2)
     assert atlas_of(database, SUTURE) == whole
     assert sum(measured) == 2 * 36 and len(measured) > 4
 
@@ -195,14 +195,14 @@ def test_consent_is_asked_and_who_is_left_out_is_counted_and_not_named(database:
     found = atlas_of(database, SUTURE)
     assert [one.id for one in found.demos] == names[:2]
     assert found.left_out.without_consent == 2
-    assert "Left out: 2 demonstrations, for the surgeon's consent does not cover an atlas." in found.notes
+    assert "Left out: 2 demonstrations, because the surgeon's consent does not cover an atlas." in found.notes
     assert cohorts.name(1) not in repr(found)
     with pytest.raises(Conflict, match="does not cover atlas"):
         atlas_of(database, SUTURE, demo=names[2])
     with database.writing() as session:
         put_surgeon(session, cohorts.name(1), {"consent": {"uses": ["atlas"], "until": "2020-01-01"}}, "test")
         put_surgeon(session, cohorts.name(0), {"consent": {"uses": ["training"], "until": None}}, "test")
-    with pytest.raises(NotFound, match="4 demonstrations, for the surgeon's consent"):
+    with pytest.raises(NotFound, match="4 demonstrations, because the surgeon's consent"):
         atlas_of(database, SUTURE)
 
 
@@ -237,6 +237,27 @@ def test_sessions_that_nobody_named_are_one_for_each_recording(database: Databas
     assert seen.recognition is not None and seen.recognition.tested == 4
 
 
+def test_a_cut_is_not_recognised_by_another_cut_of_its_recording(database: Database):
+    """This includes cuts with separate session names, and cuts of which only one has a name."""
+    for surgeon, shift in (("kestrel", 0.0), ("plover", 2.5)):
+        cases.add_surgeon(database, surgeon)
+        for number, session in enumerate(("morning", "noon", None)):
+            data = cases.hand_off((shift, 0.0, 0.0))
+            cases.add_demo(
+                database, data, surgeon, end_s=0.9 + 0.1 * number, session=session and f"{surgeon}-{session}"
+            )
+    found = atlas_of(database, SUTURE)
+    assert (len(found.demos), found.recordings) == (6, 2)
+    assert [(one.demos, one.recordings, one.sessions) for one in found.surgeons] == [(3, 1, 1), (3, 1, 1)]
+    assert found.recognition is None and "two sessions each" in (found.no_recognition_because or "")
+    for surgeon, shift in (("kestrel", 0.5), ("plover", 3.0)):
+        cases.add_demo(database, cases.hand_off((shift, 0.0, 0.0)), surgeon, session=f"{surgeon}-noon")
+        cases.add_demo(database, cases.hand_off((shift + 0.5, 0.0, 0.0)), surgeon, session=f"{surgeon}-evening")
+    found = atlas_of(database, SUTURE)
+    assert [(one.demos, one.recordings, one.sessions) for one in found.surgeons] == [(5, 3, 2), (5, 3, 2)]
+    assert found.recognition is not None and found.recognition.tested == 10
+
+
 def test_one_without_a_direction_is_left_out_by_name(database: Database, measured: list[int]):
     small(database)
     around = np.concatenate([np.linspace(a, b, 20) for a, b in pairwise(AROUND_MM)])
@@ -260,13 +281,13 @@ def test_erasure_leaves_nothing(database: Database, whole: bool):
             erase_surgeon(session, cohorts.name(0), "test")
         else:
             erase_demo(session, names[0], "test")
-    assert kept(database) == {}  # in a row of those that stay there was a distance from what is gone
+    assert kept(database) == {}  # a remaining demonstration's row had a distance to the erased one
     assert [one.id for one in atlas_of(database, SUTURE).demos] == names[2:] if whole else names[1:]
 
 
 def test_what_is_erased_while_it_is_measured_is_not_kept(database: Database, monkeypatch: pytest.MonkeyPatch):
     names = small(database)
-    really = apart.distances_of
+    really = distances.distances_of
 
     def erase_first(shapes, pairs):
         with database.writing() as session:
@@ -274,14 +295,16 @@ def test_what_is_erased_while_it_is_measured_is_not_kept(database: Database, mon
                 erase_surgeon(session, cohorts.name(0), "test")
         return really(shapes, pairs)
 
-    monkeypatch.setattr(apart, "distances_of", erase_first)
-    atlas_of(database, SUTURE)
-    assert kept(database) == {}
+    monkeypatch.setattr(distances, "distances_of", erase_first)
     assert [one.id for one in atlas_of(database, SUTURE).demos] == names[2:]
-    assert len(kept(database)) == 2
+    with database.reading() as session:
+        there = {*session.scalars(select(Demonstration.row))}
+        measured = session.scalars(select(MeasuredShape)).all()
+    assert {one.demonstration_row for one in measured} == there
+    assert all({*one.measured.others.tolist()} <= there for one in measured)
 
 
-def test_who_may_see_some_surgeons_sees_an_atlas_of_theirs_and_spoils_nothing(database: Database, measured: list[int]):
+def test_a_restricted_atlas_holds_permitted_surgeons_and_leaves_the_cache(database: Database, measured: list[int]):
     names = small(database)
     with database.reading() as session:
         mine = session.scalars(select(Surgeon.row).where(Surgeon.slug == cohorts.name(1))).one()
@@ -311,7 +334,7 @@ def test_one_alone_has_an_atlas_and_nothing_has_none(database: Database):
     assert [one.spread for one in found.surgeons] == [None]
     with pytest.raises(NotFound):
         atlas_of(database, SUTURE, demo="0" * 64)
-    with pytest.raises(NotFound, match="ask for that atlas"):
+    with pytest.raises(NotFound, match="request that atlas"):
         atlas_of(database, "simple-interrupted", demo=demo.sha256)
 
 

@@ -1,7 +1,8 @@
-"""Backups: under traffic, between the back ends, damaged, of other versions; and who was erased stays erased."""
+"""Backups: during writes, between the back ends, damaged, of other versions; and erasures persist."""
 
 import threading
 from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +11,9 @@ from sqlalchemy import inspect, select, text
 
 from skills.db import archive
 from skills.db.base import Base
-from skills.db.books import Executor, Job
 from skills.db.models import Demonstration, Erasure, Surgeon
-from skills.db.schema import alembic_config, revisions
-from skills.db.session import Database
+from skills.db.service_tables import Executor, Job
+from skills.db.session import Database, alembic_config, revisions
 from skills.errors import Conflict, Corrupt, Erased
 from skills.library.backup import (
     Erasures,
@@ -38,7 +38,7 @@ OTHER = {"sqlite": "postgresql", "postgresql": "sqlite"}
 
 @pytest.fixture
 def empty(tmp_path: Path) -> Iterator[Callable[[str], Database]]:
-    """Make databases without tables."""
+    """Yield a function that creates databases without tables."""
     made: list[Database] = []
 
     def make(backend: str) -> Database:
@@ -52,7 +52,7 @@ def empty(tmp_path: Path) -> Iterator[Callable[[str], Database]]:
 
 
 def rows(database: Database) -> dict[str, list[tuple[Any, ...]]]:
-    """Read everything that is backed up, as it is stored, but for the events of restoring."""
+    """Read everything that is backed up, as stored, except the events of restoring."""
     found = {}
     with database.reading() as session:
         for table in archive.tables():
@@ -70,7 +70,7 @@ def wrong(database: Database) -> list[tuple[str, str]]:
 
 
 def etags(database: Database) -> dict[str, str]:
-    """Ask the service for every policy that it serves."""
+    """Request every served policy from the service, and return its ETag."""
     service = Service(database.url)
     with service.http as http:
         served = http.get("/policies").json()["items"]
@@ -79,7 +79,7 @@ def etags(database: Database) -> dict[str, str]:
         return {path: http.get(path).headers["etag"] for path in paths}
 
 
-def test_a_backup_under_traffic_is_one_state_and_comes_back_on_either_database(
+def test_a_backup_under_writes_is_one_state_and_restores_on_both_databases(
     database: Database, empty: Callable[[str], Database], tmp_path: Path
 ):
     acknowledged = [cases.add_demo(database).sha256]
@@ -167,7 +167,7 @@ def test_jobs_that_had_not_ended_are_told_again_and_done(
 
 
 def test_a_worker_of_the_restored_installation_carries_on(tmp_path: Path):
-    """Of a database whose engine knew the jobs, with an engine that has never heard of them."""
+    """The database's engine knew the jobs; the restored one has a new engine that does not."""
     before = House(backends.fresh("sqlite", tmp_path), tmp_path)
     row, begun = before.ask(), before.ask(state="running")
     with before.database.writing() as session:
@@ -219,7 +219,7 @@ def test_a_backup_of_an_older_schema_is_migrated(
         connection.commit()
     with pytest.raises(Conflict, match="of another version"):
         back_up(old, tmp_path / "refused.zip")
-    # What the first version's code would have written: its tables, read from the database itself.
+    # The backup of the first version's code: its tables, read from the database itself.
     first = [t for t in archive.tables() if t.name in inspect(old.engine).get_table_names()]
     monkeypatch.setattr(archive, "tables", lambda: [as_it_is(old, t) for t in first])
     monkeypatch.setattr(archive, "revisions", lambda: (revision,))
@@ -233,7 +233,7 @@ def test_a_backup_of_an_older_schema_is_migrated(
 
 
 def as_it_is(database: Database, table: Any) -> Any:
-    """A table with only those of its columns that the database has."""
+    """Return a table with only those of its columns that the database has."""
     there = {column["name"] for column in inspect(database.engine).get_columns(table.name)}
     copy = table.to_metadata(Base.metadata.__class__())
     for column in list(copy.columns):
@@ -263,7 +263,7 @@ def test_who_was_erased_after_the_backup_does_not_come_back(
         withdraw_demo(session, gone, "test")
         erase_demo(session, gone, "test")
     listed = keep_erasures(database, tmp_path / "erasures.json")
-    assert (len(listed.surgeons), {digest for digest, _ in listed.demos}) == (2, {gone})
+    assert (len(listed.surgeons), listed.demos) == (2, {gone})
     assert canary not in (tmp_path / "erasures.json").read_text()
     for source, backend in ((str(tmp_path / "erasures.json"), "sqlite"), (database.url, "postgresql")):
         restored = empty(backend)
@@ -276,7 +276,7 @@ def test_who_was_erased_after_the_backup_does_not_come_back(
                 with pytest.raises(Erased):
                     put_surgeon(session, slug, {}, "test")
         assert wrong(restored) == []
-        assert {digest for digest, _ in erasures_of(restored).demos} == {gone}
+        assert erasures_of(restored).demos == {gone}
         if backend == "sqlite":
             file = Path(restored.url.removeprefix("sqlite:///"))
             left = b"".join(one.read_bytes() for one in file.parent.glob(f"{file.name}*"))
@@ -288,7 +288,7 @@ def test_who_was_erased_after_the_backup_does_not_come_back(
         assert policy_of(session, canary, cases.SUTURE).policy.releasable
 
 
-def test_what_was_erased_and_added_anew_before_the_backup_is_not_erased_again(
+def test_a_demo_erased_and_added_again_before_the_backup_is_not_erased(
     database: Database, empty: Callable[[str], Database], tmp_path: Path
 ):
     demo = cases.add_demo(database).sha256
@@ -307,12 +307,11 @@ def test_what_was_erased_and_added_anew_before_the_backup_is_not_erased_again(
     assert restore(again, tmp_path / "b.zip", read_erasures(str(tmp_path / "list.json"))).demos_erased == 1
 
 
-def test_a_list_of_erasures_never_gets_shorter_and_is_refused_when_it_was_changed(database: Database, tmp_path: Path):
+def test_a_list_of_erasures_never_shrinks_and_is_refused_if_altered(database: Database, tmp_path: Path):
     kept = tmp_path / "erasures.json"
-    earlier = Erasures(
-        frozenset({("00", "11" * 32, "2026-01-01T00:00:00Z")}), frozenset({("ab" * 32, "2026-01-01T00:00:00Z")})
-    )
-    assert keep_erasures(database, kept) == Erasures()
+    at = datetime(2026, 1, 1, tzinfo=UTC)
+    earlier = Erasures(frozenset({("00", "11" * 32, at)}), {"demonstrations": {"ab" * 32: at}})
+    assert keep_erasures(database, kept).surgeons == set()
     with database.writing() as session:
         erase_surgeon(session, "kestrel", "test")
     now_listed = keep_erasures(database, kept)
@@ -322,7 +321,7 @@ def test_a_list_of_erasures_never_gets_shorter_and_is_refused_when_it_was_change
     assert len((now_listed | earlier).surgeons) == 2
     for damaged in (kept.read_bytes()[:-20], kept.read_bytes().replace(b"surgeons", b"surgeans"), b"[]", b"\xff"):
         (tmp_path / "damaged.json").write_bytes(damaged)
-        with pytest.raises(Corrupt, match="no list of erasures"):
+        with pytest.raises(Corrupt, match="not a list of erasures"):
             read_erasures(str(tmp_path / "damaged.json"))
 
 

@@ -1,4 +1,4 @@
-"""Carrying out parts of batches: each style for itself, nothing twice, whoever else is at work on it."""
+"""Parts of batches: each style is trained independently and once, even if several workers work on it."""
 
 import time
 from threading import Thread
@@ -6,7 +6,7 @@ from threading import Thread
 import pytest
 from sqlalchemy import func, select
 
-from skills.db.books import Event
+from skills.db.service_tables import Event
 from skills.db.session import Database
 from skills.jobs.workflows import Work, fail, start
 from skills.library import batch_work, perform_job, retraining
@@ -30,7 +30,7 @@ from tests.library.styles import (
 # ---- one bad style
 
 
-def test_of_eight_styles_with_one_poisoned_seven_are_done_and_one_failed_with_its_reason(database: Database):
+def test_one_bad_style_of_eight_fails_with_its_reason_and_seven_are_done(database: Database):
     add_styles(database, 8)
     job = ask_retraining(database)
     damage(database, styles_of(database, job)[3].demonstration_row)
@@ -38,7 +38,7 @@ def test_of_eight_styles_with_one_poisoned_seven_are_done_and_one_failed_with_it
         assert cases.work(database, part).state == "succeeded"
     assert states_of(database, job) == ["done"] * 3 + ["failed"] + ["done"] * 4
     bad = styles_of(database, job)[3]
-    assert "not what was stored" in bad.reason
+    assert "does not match its checksum" in bad.reason
     assert (bad.policy_row, bad.comparison, bad.ended_at is None) == (None, None, False)
     batch = look(database, job)
     assert (batch.state, batch.progress) == ("failed", 1.0)
@@ -47,7 +47,7 @@ def test_of_eight_styles_with_one_poisoned_seven_are_done_and_one_failed_with_it
     assert versions(database) == 7
 
 
-def test_a_style_without_consent_or_whose_demonstration_was_withdrawn_fails_and_the_others_go_on(database: Database):
+def test_styles_without_consent_or_valid_demo_fail_and_the_others_continue(database: Database):
     add_styles(database, 2)
     demo = cases.add_demo(database)
     cases.add_surgeon(database, "heron")
@@ -67,7 +67,7 @@ def test_a_style_without_consent_or_whose_demonstration_was_withdrawn_fails_and_
     assert demo.sha256 not in str(reasons)
 
 
-def test_what_fails_inside_the_service_is_tried_again_and_then_given_up_alone(
+def test_an_internal_failure_is_retried_and_then_only_its_style_gives_up(
     database: Database, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(retraining, "FEWEST_PARTS", 1)
@@ -107,7 +107,7 @@ def test_a_style_at_which_its_worker_died_comes_last_the_next_time(database: Dat
     deadly = styles_of(database, job)[1].demonstration_row
 
     class Death(BaseException):
-        """What no worker survives."""
+        """An error that kills the worker."""
 
     def learn(lesson, request, settings):
         if lesson.row == deadly:
@@ -116,20 +116,18 @@ def test_a_style_at_which_its_worker_died_comes_last_the_next_time(database: Dat
 
     monkeypatch.setattr(batch_work, "learn_style", learn)
     monkeypatch.setattr(batch_work, "TOGETHER_S", 60.0)  # on a slow machine too
-    for done in (0, 1, 3):  # at first it took the others of its transaction along
+    for done in (0, 1, 3):  # at first it rolled back the others in its transaction
         assert start(database, part.row, 1)
         with pytest.raises(Death):
             perform_job(database, part.row, 1, Settings(database_url=database.url))
         assert states_of(database, job).count("done") == done
     assert [style.tries for style in styles_of(database, job)] == [2, 3, 2, 2]
-    assert fail(database, part.row, 1, "Its worker died every time while working on it.")
+    assert fail(database, part.row, 1, "The worker died at each attempt at this job.")
     assert states_of(database, job) == ["done", "failed", "done", "done"]
     assert look(database, job).state == "failed"
 
 
-def test_a_style_refused_at_the_last_moment_takes_none_of_its_transaction_along(
-    database: Database, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_style_refused_at_commit_does_not_roll_back_the_others(database: Database, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(retraining, "FEWEST_PARTS", 1)
     add_styles(database, 3)
     job = ask_retraining(database)
@@ -145,7 +143,7 @@ def test_a_style_refused_at_the_last_moment_takes_none_of_its_transaction_along(
     monkeypatch.setattr(batch_work, "learn_style", learn)
     cases.work(database, part)
     assert states_of(database, job) == ["done", "failed", "done"]
-    assert "withdrawn while it was being learnt" in styles_of(database, job)[1].reason
+    assert "withdrawn while the training used it" in styles_of(database, job)[1].reason
     assert versions(database) == 2
 
 
@@ -178,7 +176,7 @@ def test_a_worker_that_was_handed_two_parts_learns_one_after_the_other(
 
     def learn(lesson, request, settings):
         learnt.append(parts[lesson.row])
-        time.sleep(0.02)  # long enough for the other thread to come in between
+        time.sleep(0.02)  # long enough for the other thread to intervene
         return learn_style(lesson, request, settings)
 
     monkeypatch.setattr(batch_work, "learn_style", learn)
@@ -191,10 +189,10 @@ def test_a_worker_that_was_handed_two_parts_learns_one_after_the_other(
     assert learnt in (sorted(learnt), sorted(learnt, reverse=True))
 
 
-# ---- two workers at the same part
+# ---- two workers on the same part
 
 
-def test_a_late_result_changes_nothing_and_its_worker_goes_on_with_what_is_left(
+def test_a_late_result_changes_nothing_and_its_worker_does_what_is_left(
     database: Database, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(retraining, "FEWEST_PARTS", 1)
@@ -204,7 +202,7 @@ def test_a_late_result_changes_nothing_and_its_worker_goes_on_with_what_is_left(
     others, ended = [], []
 
     def learn(lesson, request, settings):
-        if not others:  # meanwhile another worker has taken the part over, and ends it
+        if not others:  # meanwhile another worker takes the part over, and finishes it
             others.append(lesson.row)
             with monkeypatch.context() as meanwhile:
                 meanwhile.setattr(batch_work, "learn_style", learn_style)

@@ -1,6 +1,8 @@
-"""Calibrating on a folder in the layout of JIGSAWS: a cohort whose truth is known, and folders that are wrong."""
+"""Calibration on a folder in the layout of JIGSAWS: a cohort of known truth, and invalid folders."""
 
+import copy
 import json
+import math
 import shutil
 from pathlib import Path
 from typing import Any
@@ -15,18 +17,17 @@ from skills.db.session import Database
 from skills.errors import BadInput, Corrupt, NotAQuaternion, NotFinite, UnreadableRecording
 from skills.library.calibrations import Rated, calibrate_on, keep, newest, read_calibration, read_cohort
 from skills.library.inspection import inspect_installation
-from skills.style.scoring.calibrating import held_out, shuffled, spearman
-from skills.style.scoring.model import as_numbers
+from skills.scoring.calibration import as_numbers, held_out, refusals, shuffled, spearman
+from tests.formats.trials import kinematics
+from tests.formats.trials import text as as_text
 from tests.library import rated
-from tests.recordings.trials import kinematics
-from tests.recordings.trials import text as as_text
 
 META = "meta_file_Suturing.txt"
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Eight surgeons with five trials each."""
+    """Return eight surgeons with five trials each."""
     return rated.folder(tmp_path_factory.mktemp("rated"))
 
 
@@ -42,7 +43,7 @@ def about(read: Rated) -> dict[str, Any]:
 
 @pytest.fixture
 def copied(folder: Path, tmp_path: Path) -> Path:
-    """The folder, to be spoilt."""
+    """Return a copy of the folder, to be damaged."""
     return Path(shutil.copytree(folder, tmp_path / "copied"))
 
 
@@ -80,7 +81,7 @@ def test_with_labels_shuffled_many_times(read: Rated) -> None:
 
 @pytest.mark.nightly
 def test_other_cohorts_are_rated_as_well(tmp_path: Path) -> None:
-    """The same surgeons in nine other cohorts: what is learnt is not of one draw."""
+    """The same surgeons in nine other cohorts are rated equally well, so the result does not depend on one draw."""
     rhos = []
     for seed in range(1, 10):
         drawn = read_cohort(rated.folder(tmp_path / str(seed), seed)).cohort
@@ -101,7 +102,7 @@ def test_what_is_kept_is_plain_and_names_nobody(read: Rated, about: dict[str, An
     assert "Suturing_" not in written and ".txt" not in written
     assert len(about["data"]["files"]) == 81 and all(len(digest) == 64 for digest in about["data"]["files"])
     assert set(about["versions"]) == {"suture-skills", "scikit-learn", "scipy", "numpy"}
-    assert calibrate_on(read, permutations=20) == about  # the same to the last bit
+    assert calibrate_on(read, permutations=20) == about  # identical to the last bit
 
 
 def test_the_newest_is_used_and_an_equal_one_is_not_kept_again(database: Database, about: dict[str, Any]) -> None:
@@ -128,7 +129,7 @@ def test_a_calibration_cannot_be_changed_and_damage_is_found(database: Database,
         session.execute(text("UPDATE calibrations SET sha256 = '0'"))
     with database.writing() as session:
         session.add(StoredCalibration(sha256="0" * 64, about=about))
-    with database.reading() as session, pytest.raises(Corrupt, match="skills calibrate"):
+    with database.reading() as session, pytest.raises(Corrupt, match="calibrate it on rated trials"):
         read_calibration(newest(session))
     assert wrong(database)
 
@@ -138,7 +139,7 @@ def wrong(database: Database) -> list[tuple[str, str]]:
     return [one for part in parts.values() for one in part.wrong]
 
 
-# ---- folders that are wrong --------------------------------------------------------------------------------------
+# ---- invalid folders ---------------------------------------------------------------------------------------------
 
 
 def test_an_empty_folder_says_what_is_expected(tmp_path: Path) -> None:
@@ -170,7 +171,11 @@ def test_a_missing_meta_file_is_named(copied: Path) -> None:
 def test_names_that_do_not_match_are_named(copied: Path) -> None:
     meta = copied / "Suturing" / META
     meta.write_text(meta.read_text().replace("Suturing_B001", "Suturing_B901"))
-    with pytest.raises(BadInput, match="1 of 40 trials: Suturing_B001"):
+    found = read_cohort(copied)
+    assert found.left_out == {"unrated": ["Suturing_B001"]}
+    assert (found.data["trials"], found.data["left_out"]) == (39, 1)
+    meta.write_text("")
+    with pytest.raises(BadInput, match="40 of 40 trials: Suturing_B001"):
         read_cohort(copied)
 
 
@@ -220,8 +225,70 @@ def test_a_trial_that_is_cut_off_is_named(copied: Path) -> None:
         read_cohort(copied)
 
 
+def test_an_empty_trial_is_left_out_and_named(copied: Path) -> None:
+    (copied / "Suturing/kinematics/AllGestures/Suturing_C002.txt").write_bytes(b"")
+    found = read_cohort(copied)
+    assert found.left_out == {"empty": ["Suturing_C002"]}
+    assert (found.data["trials"], found.data["left_out"]) == (39, 1)
+
+
+# ---- accepted models ---------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def unknowable(read: Rated) -> dict[str, Any]:
+    """Return a model of ratings that were shuffled among the surgeons."""
+    return calibrate_on(Rated(shuffled(read.cohort, np.random.default_rng(1)), read.data, {}), permutations=20)
+
+
+def test_a_model_of_what_cannot_be_known_is_refused_and_nothing_is_stored(
+    database: Database, unknowable: dict[str, Any]
+) -> None:
+    assert unknowable["validated"]["all_figures"]["rho"] < 0.5
+    refused = pytest.raises(BadInput, match=r"not accepted, and nothing was stored\. .*p = .*--of trial")
+    with refused, database.writing() as session:
+        keep(session, unknowable, "test")
+    with database.reading() as session:
+        assert newest(session) is None
+
+
+@pytest.mark.parametrize(
+    ("part", "field", "wrong", "said"),
+    [
+        ("all_figures", "rho_interval", [-0.1, 0.9], "may be 0 or less"),
+        ("all_figures", "rho_interval", [math.nan, math.nan], "may be 0 or less"),
+        ("chance", "rho_p", 0.051, "A random order does as well"),
+        ("chance", "rho_p", math.nan, "A random order does as well"),
+        ("chance", "accuracy_p", 0.2, "right as often"),
+        ("chance", "accuracy_p", math.nan, "right as often"),
+        ("all_figures", "accuracy", 0.0, "in 0 % of the trials"),
+        ("all_figures", "accuracy", math.nan, "in nan % of the trials"),
+        ("duration_only", "accuracy", 0.99, "the duration alone in 99 %"),
+        (None, "over_duration", [0.0, 0.4], "no better than the duration alone"),
+        (None, "over_duration", [math.nan, 0.4], "no better than the duration alone"),
+        (None, "over_duration", None, "no better than the duration alone"),
+    ],
+)
+def test_each_comparison_can_refuse_and_nan_does(
+    part: str | None, field: str, wrong: Any, said: str, about: dict[str, Any]
+) -> None:
+    judged = copy.deepcopy(about["validated"])
+    assert refusals(judged) == []
+    of = judged if part is None else judged[part]
+    if wrong is None:  # as an older version stored it
+        del of[field]
+    else:
+        of[field] = wrong
+    why = refusals(judged)
+    assert len(why) == 1 and said in why[0]
+
+
+def test_a_model_without_any_figure_is_refused_in_words() -> None:
+    assert len(refusals({"all_figures": {}, "duration_only": {}, "chance": {}})) == 5
+
+
 def test_trials_without_a_hand_off_are_left_out_and_counted(copied: Path) -> None:
-    """An arm that stands still, in one trial and then in all of them."""
+    """An arm stands still, in one trial and then in all of them."""
     names = sorted((copied / "Suturing/kinematics/AllGestures").iterdir())
     still = as_text(np.tile(kinematics(90)[0], (90, 1)))
     names[0].write_bytes(still)
@@ -231,5 +298,5 @@ def test_trials_without_a_hand_off_are_left_out_and_counted(copied: Path) -> Non
     for name in names:
         name.write_bytes(still)
         (copied / "Suturing/transcriptions" / name.name).unlink(missing_ok=True)
-    with pytest.raises(BadInput, match="In none of 40 trials"):
+    with pytest.raises(BadInput, match="None of 40 trials"):
         read_cohort(copied)

@@ -1,4 +1,4 @@
-"""A policy learnt from several demonstrations: what it rests on, and what becomes of it when one of them goes."""
+"""A policy learnt from several demonstrations: its dependencies, and the effect of removing one of them."""
 
 from pathlib import Path
 
@@ -6,30 +6,31 @@ import numpy as np
 import pytest
 from sqlalchemy import func, select
 
+from skills.comparison.combining import COMBININGS, Barycentre, Corridor, Medoid
 from skills.db.models import Demonstration, PolicyDemonstration, PolicyVersion, Release
 from skills.db.packed import digest
 from skills.db.session import Database
 from skills.errors import BadInput, Conflict, NotFound
+from skills.learning.evaluation import dtw
 from skills.library import training
 from skills.library.backup import back_up, restore
 from skills.library.cards import card_of
 from skills.library.combined import learnt_from, path_of
-from skills.library.demos import Cut, upload_demo, withdraw_demo
+from skills.library.demos import upload_demo, withdraw_demo
 from skills.library.erasure import erase_demo, erase_surgeon
 from skills.library.inspection import inspect_installation
+from skills.library.integrity import learnt
 from skills.library.overview import matrix
 from skills.library.policies import find_by_digest
 from skills.library.releases import release, standing
-from skills.library.verified import learnt
+from skills.schemas.requests import DemoIn
 from skills.settings import Settings
-from skills.style.combining import COMBININGS, Barycentre, Corridor, Medoid
-from skills.style.evaluation import dtw
 from tests import backends
 from tests.library import cases
 from tests.library.styles import retrain
 
 SHIFTS_MM = ((0.0, 0.0, 0.0), (0.0, 3.0, 0.0), (0.0, 1.5, 0.5))
-GONE = pytest.mark.parametrize(  # of each the one that the policy's row names, and another
+GONE = pytest.mark.parametrize(  # the demonstration that the policy's row names, and another one
     ("how", "gone"), [(Medoid(), 2), (Medoid(), 0), (Corridor(), 2), (Corridor(), 1)], ids=str
 )
 HOWS = pytest.mark.parametrize("how", [one() for one in COMBININGS.values()], ids=lambda how: how.kind)
@@ -75,7 +76,7 @@ def test_it_names_all_of_them_passes_the_gate_and_is_verified(database: Database
     assert len(said["apart_mm"]) == 3
 
 
-def test_left_to_the_service_they_are_combined_as_a_corridor_in_whatever_order_they_are_named(database: Database):
+def test_demos_are_combined_as_a_corridor_by_default_in_any_order(database: Database):
     demos = add_three(database)
     job = cases.ask_training(database, demos=[demo.sha256 for demo in demos])
     again = cases.ask_training(database, demos=[demo.sha256 for demo in demos[::-1]], combine=Corridor())
@@ -103,7 +104,7 @@ def test_the_middle_lies_between_the_demonstrations(database: Database):
 
 
 @GONE
-def test_withdrawing_any_of_them_withdraws_the_release_and_lets_none_be_made_again(database: Database, how, gone):
+def test_withdrawing_any_of_the_demos_withdraws_and_blocks_the_release(database: Database, how, gone):
     demos = add_three(database)
     version = train(database, demos, combine=how, release=True)
     with database.writing() as session:
@@ -120,7 +121,7 @@ def test_erasing_any_of_them_erases_the_policy(database: Database, how, gone):
     train(database, demos, combine=how, release=True)
     cases.add_plan(database)
     with database.writing() as session:
-        assert erase_demo(session, demos[gone].sha256, "test")
+        assert erase_demo(session, demos[gone].sha256, "test") == []  # no unfinished job depends on it
     assert [rows(database, table) for table in (PolicyVersion, PolicyDemonstration, Release)] == [0, 0, 0]
     assert rows(database, Demonstration) == 2
     assert wrong(database) == []
@@ -129,8 +130,8 @@ def test_erasing_any_of_them_erases_the_policy(database: Database, how, gone):
 @pytest.mark.parametrize(
     ("leave", "why"),
     [
-        (withdraw_demo, "A demonstration was withdrawn while it was being learnt from."),
-        (erase_demo, "A demonstration was erased while it was being learnt from."),
+        (withdraw_demo, "A demonstration was withdrawn while the training used it."),
+        (erase_demo, "A demonstration was erased while the training used it."),
     ],
 )
 def test_one_that_leaves_while_it_is_learnt_from_leaves_no_policy(database: Database, leave, why):
@@ -176,14 +177,14 @@ def test_a_plan_follows_it_and_a_card_tells_of_it(database: Database, how):
         followed, card = learnt_from(stored), card_of(session, stored)
         assert np.abs(plan.plan.passes[0].tip_mm[-1] - [5.0, 55.0, -125.0]).max() < 1e-9
         assert dtw(plan.plan.passes[0].tip_mm, followed.tip_mm).differences_mm.sum(axis=1).mean() < 5.0
-    assert "3 recorded demonstrations" in card.facts["what_it_is"][0]
-    assert card.facts["combined"]["kind"] == how.kind
-    links = [(link["what"], link["sha256"]) for link in card.facts["lineage"]["chain"]]
+    assert "3 recorded demonstrations" in card.facts.what_it_is[0]
+    assert card.facts.combined.kind == how.kind
+    links = [(link.what, link.sha256) for link in card.facts.lineage.chain]
     assert [sha256 for what, sha256 in links if what == "demonstration"] == version.manifest["demos"]
     assert links[-1] == ("policy", version.sha256)
 
 
-def test_a_style_that_rests_on_its_newest_demonstration_among_others_is_not_stale(database: Database):
+def test_a_style_that_used_its_newest_demo_among_others_is_not_stale(database: Database):
     demos = add_three(database)
     train(database, demos, combine=Medoid())
     assert retrain(database, only_stale=True).request["styles"] == 0
@@ -194,14 +195,14 @@ def test_a_style_that_rests_on_its_newest_demonstration_among_others_is_not_stal
 def test_what_cannot_be_combined_is_refused_before_a_job_is_made(database: Database):
     one, two, _ = add_three(database)
     bag = cases.upload(cases.bag("PSM1"), "application/vnd.mcap")
-    other_arm, _ = upload_demo(database, bag, Cut("kestrel", cases.SUTURE), "test")
+    other_arm = upload_demo(database, bag, DemoIn(surgeon="kestrel", suture=cases.SUTURE), "test").row
     cases.add_surgeon(database, "heron")
     herons = cases.add_demo(database, surgeon="heron")
     for demos, how, why in (
         ([one, one], None, "named twice"),
         ([one, other_arm], None, "one arm"),
         ([one, herons], None, "another style"),
-        ([one], Medoid(), "as it is"),
+        ([one], Medoid(), "is not combined"),
         ([one, two] * 26, None, "At most 50"),
     ):
         with pytest.raises(BadInput, match=why):
@@ -227,11 +228,11 @@ def test_others_than_its_own_demonstrations_are_found(database: Database):
         session.add(PolicyDemonstration(policy_row=version.row, demonstration_row=demos[2].row))
     assert [why for _, why in wrong(database)] == [
         "it was learnt from another demonstration",
-        "its path is not its demonstration's",
+        "its path differs from that of its demonstration",
     ]
 
 
-def test_a_backup_brings_it_back_on_the_other_back_end_with_all_that_it_rests_on(database: Database, tmp_path: Path):
+def test_a_combined_policy_is_restored_with_its_demos_on_another_back_end(database: Database, tmp_path: Path):
     demos = add_three(database)
     train(database, demos, release=True)
     back_up(database, tmp_path / "all.zip")

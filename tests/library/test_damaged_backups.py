@@ -1,4 +1,4 @@
-"""Backups that are damaged, none, of another version or not for here: refused by name, and nothing is written."""
+"""Invalid backups, damaged, of another version or for another place: refused by name, and nothing is written."""
 
 import io
 import json
@@ -22,7 +22,7 @@ from tests.library import cases
 
 @pytest.fixture(scope="module")
 def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A backup with one row in most tables, to be damaged."""
+    """Return a backup with one row in most tables, to be damaged."""
     folder = tmp_path_factory.mktemp("small")
     database = Database(backends.fresh("sqlite", folder))
     cases.add_surgeon(database)
@@ -49,13 +49,13 @@ def test_a_backup_is_a_zip_file_that_others_can_look_into(small: Path):
 
 def test_it_is_restored_into_an_empty_database_only(database: Database, small: Path):
     before = how_many(database)
-    with pytest.raises(Conflict, match="into an empty one only"):
+    with pytest.raises(Conflict, match="only into an empty one"):
         restore(database, small)
     assert how_many(database) == before
 
 
 def refused(data: bytes, folder: Path, expected: type[SkillsError] | tuple[type[SkillsError], ...] = Corrupt) -> str:
-    """Restore bytes, which must be refused before anything is written: the words."""
+    """Restore bytes, which must be refused before anything is written; return the message."""
     (folder / "damaged.zip").write_bytes(data)
     database = Database(f"sqlite:///{folder / 'restored.sqlite'}")
     with pytest.raises(expected) as caught:
@@ -87,7 +87,7 @@ def test_what_is_damaged_is_named(small: Path, tmp_path: Path):
         damaged = whole[:at] + bytes([whole[at] ^ 4]) + whole[at + 1 :]
         assert f"{name} is " in refused(damaged, tmp_path), name
     assert "its last bytes" in refused(whole[:-1], tmp_path)
-    assert "cut off" in refused(whole[: len(whole) // 2], tmp_path)
+    assert "truncated file" in refused(whole[: len(whole) // 2], tmp_path)
     assert "its directory" in refused(whole[:10] + b"\x7f" + whole[11:], tmp_path)
 
 
@@ -102,7 +102,7 @@ def test_a_missing_part_is_named(small: Path, tmp_path: Path):
 
 
 def resealed(small: Path, **changes: Any) -> bytes:
-    """A backup that says something else of itself, and is otherwise whole."""
+    """Return a backup with a changed manifest that is otherwise complete."""
     out = io.BytesIO()
     with zipfile.ZipFile(small) as old, zipfile.ZipFile(out, "w") as new:
         for info in old.infolist():
@@ -116,9 +116,9 @@ def resealed(small: Path, **changes: Any) -> bytes:
 
 
 def test_what_is_no_backup_or_of_another_version_is_refused(small: Path, tmp_path: Path):
-    assert "no backup" in refused(b"", tmp_path, UnknownFormat)
-    assert "no backup" in refused(b"SQLite format 3\x00" * 100, tmp_path, UnknownFormat)
-    assert "that this version reads" in refused(
+    assert "not a backup" in refused(b"", tmp_path, UnknownFormat)
+    assert "not a backup" in refused(b"SQLite format 3\x00" * 100, tmp_path, UnknownFormat)
+    assert "that this version can read" in refused(
         resealed(small, format="suture-skills backup 2"), tmp_path, UnknownFormat
     )
     assert "newer version" in refused(resealed(small, schema="9999"), tmp_path, Conflict)

@@ -1,4 +1,4 @@
-"""`skills verify` of an installation: what is whole is said to be, and whatever was changed is named."""
+"""`skills verify` of an installation: intact data are reported as such, and every change is named."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -7,12 +7,12 @@ import pytest
 from sqlalchemy import select, text
 
 from skills.db.base import Base
-from skills.db.books import Event
 from skills.db.models import Demonstration, RecordingChunk
 from skills.db.packed import Packed
+from skills.db.service_tables import Event
 from skills.db.session import Database
 from skills.library import inspection
-from skills.library.apart import far_apart
+from skills.library.distances import far_apart
 from skills.library.inspection import AGREES, WITH_OTHERS, inspect_installation, packed_values
 from tests import backends
 from tests.library import cases
@@ -21,14 +21,14 @@ MAPPERS = sorted(Base.registry.mappers, key=lambda one: one.local_table.name)
 
 
 def looked_at(database: Database) -> tuple[dict[str, int], list[tuple[str, str]]]:
-    """What was checked and how many of it, and what is wrong."""
+    """Return the number of checked rows by kind, and the faults."""
     parts = {id(part): part for part in list(inspect_installation(database))}.values()
     return {part.what: part.count for part in parts}, [one for part in parts for one in part.wrong]
 
 
 @pytest.fixture(scope="module")
 def filled(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A database with two styles, a release that was withdrawn and a plan."""
+    """Return a database with two styles, a withdrawn release and a plan."""
     folder = tmp_path_factory.mktemp("filled")
     database = Database(backends.fresh("sqlite", folder))
     for slug, shift in (("kestrel", 0.0), ("heron", 2.5)):
@@ -43,7 +43,7 @@ def filled(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def damaged(filled: Path, tmp_path: Path) -> Iterator[Database]:
-    """A copy of it, to be changed."""
+    """Yield a copy of it, to be changed."""
     copy = tmp_path / "damaged.sqlite"
     copy.write_bytes(filled.read_bytes())
     database = Database(f"sqlite:///{copy}")
@@ -52,7 +52,7 @@ def damaged(filled: Path, tmp_path: Path) -> Iterator[Database]:
 
 
 def tamper(database: Database, *statements: str) -> None:
-    """Change rows as somebody with the file in his hands would, past triggers and references."""
+    """Change rows as somebody with write access to the file would, bypassing triggers and references."""
     connection = database.engine.raw_connection()
     names = connection.execute("SELECT name FROM sqlite_master WHERE type = 'trigger'").fetchall()
     for statement in ("PRAGMA foreign_keys=OFF", *(f"DROP TRIGGER {name}" for (name,) in names), *statements):
@@ -90,19 +90,19 @@ CHANGES = [
     ),
     (
         "UPDATE plans SET plan = x'00' WHERE row = 1",
-        "plans 1", "plan: A stored value is not what was stored",
+        "plans 1", "plan: A stored value does not match its checksum",
     ),
     (
         "UPDATE recording_chunks SET data = CAST(data || x'00' AS BLOB) WHERE recording = 1",
-        "recordings 1", "not what was stored",
+        "recordings 1", "does not match its digest",
     ),
     (
         "DELETE FROM recording_chunks WHERE recording = 2",
-        "recordings 2", "not what was stored",
+        "recordings 2", "does not match its digest",
     ),
     (
         "UPDATE recordings SET size_bytes = 7 WHERE row = 1",
-        "recordings 1", "where its row says 7",
+        "recordings 1", "its row has 7",
     ),
     (
         "UPDATE recordings SET about = '{' WHERE row = 2",
@@ -110,11 +110,11 @@ CHANGES = [
     ),
     (
         "UPDATE demonstrations SET suture = 'simple-buried' WHERE row = 1",
-        "demonstrations 1", "its digest was taken",
+        "demonstrations 1", "it does not match its digest",
     ),
     (
         "UPDATE demonstrations SET arm = 'PSM9' WHERE row = 2",
-        "demonstrations 2", "its arm is not what was recorded",
+        "demonstrations 2", "its arm differs from the recording",
     ),
     (
         "UPDATE demonstrations SET hysteresis = 0.25 WHERE row = 1",
@@ -122,7 +122,7 @@ CHANGES = [
     ),
     (
         "UPDATE reward_maps SET demonstration_row = 3 - demonstration_row + 90",
-        "reward_maps 1", "is in no row",
+        "reward_maps 1", "has no row in",
     ),
     (
         "UPDATE policy_versions SET manifest = replace(manifest, '\"seed\": 0', '\"seed\": 7')",
@@ -146,19 +146,19 @@ CHANGES = [
     ),
     (
         "UPDATE demonstrations SET withdrawn_at = created_at WHERE row = 1",
-        "releases 1", "it stands, and its demonst",
+        "releases 1", "it is not withdrawn, but its demonst",
     ),
     (
         "UPDATE plans SET policy_row = 2 WHERE row = 1",
-        "plans 1", "not what was planned",
+        "plans 1", "A stored plan does not match its digest",
     ),
     (
         "UPDATE jobs SET request = replace(request, '\"seed\": 0', '\"seed\": 7') WHERE row = 1",
-        "jobs 1", "asked for",
+        "jobs 1", "does not match its identity",
     ),
     (
         "DELETE FROM surgeons WHERE slug = 'heron'",
-        "jobs 2", "its surgeon_row is in no row of surgeons",
+        "jobs 2", "its surgeon_row has no row in surgeons",
     ),
     (
         "UPDATE alembic_version SET version_num = '0001'",
@@ -166,7 +166,7 @@ CHANGES = [
     ),
     (
         "INSERT INTO reward_maps SELECT 77, sha256, 77, map FROM reward_maps LIMIT 1",
-        "reward_maps 77", "is in no row",
+        "reward_maps 77", "has no row in",
     ),
 ]  # fmt: skip
 
@@ -188,7 +188,7 @@ def test_every_packed_value_is_read(damaged: Database):
     assert len(packed) == sum(isinstance(c.type, Packed) for t in Base.metadata.tables.values() for c in t.columns)
     with damaged.reading() as session:
         demos = session.scalars(select(Demonstration.row)).all()
-    far_apart(damaged, demos)  # as an atlas does, so that there are such rows
+    far_apart(damaged, demos)  # as an atlas does, so that such rows exist
     for table, column in packed:
         key = Base.metadata.tables[table].primary_key.columns.keys()[0]
         with damaged.reading() as session:
@@ -199,12 +199,12 @@ def test_every_packed_value_is_read(damaged: Database):
         at = f"WHERE {key} = {row}"
         tamper(damaged, f"UPDATE {table} SET {column} = x'{kept[:-2]}{int(kept[-2:], 16) ^ 1:02x}' {at}")
         named = [why for what, why in looked_at(damaged)[1] if what == f"{table} {row}"]
-        assert any(f"{column}: A stored value is not what was stored" in why for why in named), (table, column)
+        assert any(f"{column}: A stored value does not match its checksum" in why for why in named), (table, column)
         tamper(damaged, f"UPDATE {table} SET {column} = x'{kept}' {at}")
 
 
 def test_every_table_with_a_digest_is_compared_with_it():
-    """A new table's packed values are read without more ado; what its digest was taken of has to be said."""
+    """A new table's packed values are inspected automatically; the input of its digest has to be declared."""
     known_by_digest = {
         mapper.class_
         for mapper in MAPPERS
@@ -215,7 +215,7 @@ def test_every_table_with_a_digest_is_compared_with_it():
     assert {RecordingChunk} == WITH_OTHERS
 
 
-def test_pages_are_walked_to_the_end_and_a_row_that_cannot_be_read_hides_no_other(
+def test_inspection_walks_all_pages_and_an_unreadable_row_hides_no_other(
     damaged: Database, monkeypatch: pytest.MonkeyPatch
 ):
     whole = looked_at(damaged)
@@ -223,7 +223,7 @@ def test_pages_are_walked_to_the_end_and_a_row_that_cannot_be_read_hides_no_othe
     assert looked_at(damaged) == whole
     tamper(damaged, "UPDATE jobs SET request = '[' WHERE row = 2", "UPDATE jobs SET kind = 'playback' WHERE row = 1")
     assert sorted(looked_at(damaged)[1]) == [
-        ("jobs 1", "it is not what was asked for"),
+        ("jobs 1", "its request does not match its identity"),
         ("jobs 2", "it cannot be read (JSONDecodeError)"),
     ]
 

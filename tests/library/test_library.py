@@ -1,31 +1,37 @@
-"""The use cases on both back ends: once where it is asked at once, and nothing where it was taken back."""
+"""The use cases on both back ends: concurrent requests give one result, and withdrawn inputs none."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 from sqlalchemy import func, select, text
+from sqlalchemy.orm import Session
 
+from skills import library
 from skills.db.base import Base
-from skills.db.books import Event, Job
 from skills.db.models import PolicyVersion, StoredRecording
+from skills.db.service_tables import Event, Job
 from skills.db.session import Database
-from skills.errors import BadSettings, Conflict, Corrupt, Erased
-from skills.library import jobs, releases, work
+from skills.demonstration import segments
+from skills.errors import Conflict, Corrupt, Erased
+from skills.gridworld.grid import PAPER_GRID, discretize
+from skills.gridworld.path_report import discretisation_rmse
+from skills.learning.dynamic_programming import ValueIteration
+from skills.learning.max_ent_irl import MaxEntIRL
+from skills.library import jobs, releases
 from skills.library.catalogue import find_surgeon, put_surgeon, seed_catalogue
-from skills.library.demos import find_demo, withdraw_demo
+from skills.library.demos import add_demo, find_demo, withdraw_demo
 from skills.library.erasure import erase_surgeon
 from skills.library.policies import learnt, policy_of
-from skills.library.recordings import recording_bytes
+from skills.library.recordings import recording_bytes, store_recording
+from skills.schemas.requests import DemoIn
 from skills.settings import Settings
-from skills.style.evaluation import discretisation_rmse
-from skills.style.grid import PAPER_GRID, discretize
-from skills.style.learning.irl import MaxEntIRL
-from skills.style.learning.value_iteration import ValueIteration
 from tests import backends
 from tests.library import cases
 
@@ -53,6 +59,34 @@ def test_the_catalogue_is_seeded_once(database: Database):
     assert counts(database)["suture_types"] == 11
 
 
+def test_a_recording_is_looked_at_before_the_transaction_that_stores_it(
+    database: Database, monkeypatch: pytest.MonkeyPatch
+):
+    begun: list[int] = []
+    looked: list[bool] = []
+    writing, look = Database.writing, segments._look
+
+    @contextmanager
+    def watched(self: Database) -> Iterator[Session]:
+        with writing(self) as session:
+            begun.append(1)
+            try:
+                yield session
+            finally:
+                begun.pop()
+
+    def seen(*given: Any) -> Any:
+        looked.append(bool(begun))
+        return look(*given)
+
+    monkeypatch.setattr(Database, "writing", watched)
+    monkeypatch.setattr(segments, "_look", seen)
+    demo = cases.add_demo(database, cases.hand_off((7.5, 0.0, 0.0)))
+    add_demo(database, demo.recording.sha256, DemoIn(surgeon="kestrel", suture=cases.SUTURE, segment="whole"), "test")
+    store_recording(database, cases.upload(cases.hand_off((7.5, 2.5, 0.0))), "test")
+    assert looked == [False] * 3
+
+
 def test_the_same_upload_eight_times_at_once_is_one_demonstration(database: Database):
     rows = at_once(lambda _: cases.add_demo(database).sha256)
     assert len(set(rows)) == 1
@@ -60,7 +94,7 @@ def test_the_same_upload_eight_times_at_once_is_one_demonstration(database: Data
     assert (found["recordings"], found["demonstrations"], found["reward_maps"]) == (1, 1, 1)
 
 
-def test_a_demonstration_without_hysteresis_is_known_by_the_digest_it_always_had(database: Database):
+def test_a_demo_without_hysteresis_keeps_its_old_digest(database: Database):
     before = "2d0be8822177b9f47a9808ec71e04fffe2e9bb86840f119ebb9ffa65720734d6"
     assert cases.add_demo(database).sha256 == cases.add_demo(database, hysteresis=0.0).sha256 == before
     assert cases.add_demo(database, hysteresis=0.25).sha256 != before
@@ -88,7 +122,7 @@ def test_hysteresis_is_kept_with_the_path_and_learnt_and_planned_with(database: 
 def test_a_hysteresis_that_cannot_be_meant_leaves_no_row(database: Database):
     before = counts(database)
     for hysteresis in (-0.1, 0.6, math.nan):
-        with pytest.raises(BadSettings):
+        with pytest.raises(ValidationError):
             cases.add_demo(database, hysteresis=hysteresis)
     assert counts(database) == before
 
@@ -112,7 +146,7 @@ def test_a_job_performed_twice_makes_one_version(database: Database):
     cases.add_demo(database)
     job = cases.work(database, cases.ask_training(database, release=True))
     first = job.result
-    work.perform_job(database, job.row, job.attempt, Settings(database_url=database.url))
+    library.perform_job(database, job.row, job.attempt, Settings(database_url=database.url))
     assert cases.work(database, job).result == first
     assert counts(database)["policy_versions"] == counts(database)["releases"] == 1
 
@@ -127,15 +161,15 @@ def test_the_same_training_gives_the_same_digest_in_any_database(database: Datab
 
 
 def interrupted(monkeypatch: pytest.MonkeyPatch, meanwhile: Callable[[], None]) -> None:
-    """Let something happen after the learning and before its result is stored."""
-    train = work.MAKERS["training"]
+    """Run a callback after the learning and before its result is stored."""
+    train = library.MAKERS["training"]
 
     def make(*asked: Any) -> Any:
         store = train(*asked)
         meanwhile()
         return store
 
-    monkeypatch.setitem(work.MAKERS, "training", make)
+    monkeypatch.setitem(library.MAKERS, "training", make)
 
 
 def test_a_job_cancelled_while_it_learns_leaves_no_policy(database: Database, monkeypatch: pytest.MonkeyPatch):
@@ -162,7 +196,7 @@ def test_a_demonstration_withdrawn_while_it_is_learnt_leaves_no_policy(
 
     interrupted(monkeypatch, withdraw)
     job = cases.work(database, cases.ask_training(database, release=True))
-    assert (job.state, job.error) == ("failed", "A demonstration was withdrawn while it was being learnt from.")
+    assert (job.state, job.error) == ("failed", "A demonstration was withdrawn while the training used it.")
     assert {"policy_versions", "releases"}.isdisjoint(counts(database))
 
 
@@ -177,7 +211,7 @@ def test_a_surgeon_erased_while_the_style_is_learnt_leaves_nothing(database: Dat
     interrupted(monkeypatch, erase)
     with database.writing() as session:
         session.get_one(Job, job.row).state = "running"
-    work.perform_job(database, job.row, job.attempt, Settings(database_url=database.url))
+    library.perform_job(database, job.row, job.attempt, Settings(database_url=database.url))
     assert set(counts(database)) == {"suture_types", "events", "erasures"}
 
 
@@ -205,7 +239,7 @@ def test_a_recording_whose_chunk_was_changed_is_not_given_back_whole(database: D
         on_server = "DROP TRIGGER recording_chunks_append_only ON recording_chunks"
         session.execute(text(drop.get(database.engine.dialect.name, on_server)))
         session.execute(text("UPDATE recording_chunks SET data = :data"), {"data": b"other bytes"})
-    with database.reading() as session, pytest.raises(Corrupt, match="not what was stored"):
+    with database.reading() as session, pytest.raises(Corrupt, match="does not match its digest"):
         list(recording_bytes(session, session.scalars(select(StoredRecording)).one()))
 
 
@@ -240,7 +274,7 @@ def test_what_stands_still_on_a_recovered_reward_is_kept_and_refused(database: D
     assert "starts do not reach the goal" in str(refused.value)
 
 
-def test_a_version_that_does_not_pass_is_not_released_whatever_its_row_says(database: Database):
+def test_a_failing_version_is_not_released_whatever_its_row_says(database: Database):
     cases.add_demo(database)
     version = cases.train(database, learner=cases.PUBLISHED)
     with database.writing() as session, pytest.raises(Conflict, match="do not reach the goal"):

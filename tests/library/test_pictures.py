@@ -1,4 +1,4 @@
-"""The pictures of a playback: asked for with the verdict, drawn after it, erased with what they show."""
+"""The pictures of a playback: requested with the verdict, drawn after it, erased with the playback."""
 
 from typing import Any
 
@@ -6,21 +6,20 @@ import pytest
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from skills.db.books import Job
 from skills.db.models import Plan, StoredPictures, StoredPlayback
+from skills.db.service_tables import Job
 from skills.db.session import Database
 from skills.errors import NotDrawnYet, SimulationFailed
-from skills.library import pictures
+from skills.library import playbacks
 from skills.library.erasure import erase_demo, erase_surgeon
+from skills.library.integrity import planned
 from skills.library.jobs import cancel
 from skills.library.plans import trajectory_of
-from skills.library.verified import planned
 from skills.settings import Settings
-from skills.sim import film
-from skills.style.pictures import Pictures
-from skills.style.playback import Playback
+from skills.simulation import film
+from skills.verification.playback import Pictures, Playback
 from tests.library import cases
-from tests.style.motions import ideal_playback, small_trajectory
+from tests.planning.motions import ideal_playback, small_trajectory
 
 REPORT = {
     "failure": None,
@@ -30,19 +29,19 @@ REPORT = {
 
 
 def store_playback(session: Session, plan: Plan, sha256: str, measured: Playback) -> StoredPlayback:
-    """Store a playback and ask for its pictures, as a worker does with the verdict."""
+    """Store a playback and request its pictures, as a worker does with the verdict."""
     row = StoredPlayback(
         sha256=sha256, plan=session.get_one(Plan, plan.row), feasible=True, report=REPORT, measured=measured
     )
     session.add(row)
     session.flush()
-    pictures.request(session, row, "test")
+    playbacks.request_pictures(session, row, "test")
     return row
 
 
 @pytest.fixture
 def playback(database: Database) -> StoredPlayback:
-    """A playback whose pictures are still to be drawn."""
+    """Return a playback whose pictures are still to be drawn."""
     cases.add_demo(database)
     cases.train(database, release=True)
     plan = cases.add_plan(database)
@@ -63,25 +62,25 @@ def drawn(database: Database) -> list[StoredPictures]:
 
 def refusal(database: Database, playback: StoredPlayback) -> str:
     with database.reading() as session, pytest.raises(NotDrawnYet) as caught:
-        pictures.find_pictures(session, playback)
+        playbacks.find_pictures(session, playback)
     return str(caught.value)
 
 
+@pytest.mark.needs("simulator")
 def test_pictures_are_drawn_and_stored_once_however_often_that_is_tried(
     database: Database, playback: StoredPlayback, monkeypatch: pytest.MonkeyPatch
 ):
-    pytest.importorskip("pybullet", reason="PYBULLET IS NOT INSTALLED: no film is made here")
     monkeypatch.setattr(film, "FRAMES", 2)
     monkeypatch.setattr(film, "FRAMES_PER_PASS", 2)
     [job] = asked(database)
     assert job.id in refusal(database, playback)
-    store = pictures.draw_pictures(database, job.request, Settings(database_url=database.url))
-    for _ in range(2):  # the second time by a worker who did not hear of the first
+    store = playbacks.draw_pictures(database, job.request, Settings(database_url=database.url))
+    for _ in range(2):  # the second time by a worker that does not know of the first
         with database.writing() as session:
             assert store(session, "test") == {"playback": playback.sha256}
     assert len(drawn(database)) == 1
     with database.reading() as session:
-        found = pictures.find_pictures(session, playback)
+        found = playbacks.find_pictures(session, playback)
     assert found.animation_mp4[4:8] == b"ftyp"
     assert found.animation_gif.startswith(b"GIF89a")
     assert all(png.startswith(b"\x89PNG") for png in (found.joints_png, found.clearance_png))
@@ -90,11 +89,11 @@ def test_pictures_are_drawn_and_stored_once_however_often_that_is_tried(
 def test_asking_again_gives_the_same_job_until_it_has_failed(database: Database, playback: StoredPlayback):
     [job] = asked(database)
     with database.writing() as session:
-        assert pictures.request(session, playback, "test")[0].row == job.row
+        assert playbacks.request_pictures(session, playback, "test")[0].row == job.row
         cancel(session, job.id, "test")
-    assert f"POST /playbacks/{playback.sha256}/pictures" in refusal(database, playback)
+    assert f"client.draw('{playback.sha256}')" in refusal(database, playback)
     with database.writing() as session:
-        again, new = pictures.request(session, playback, "test")
+        again, new = playbacks.request_pictures(session, playback, "test")
     assert new and again.row != job.row
     assert again.id in refusal(database, playback)
 
@@ -102,7 +101,7 @@ def test_asking_again_gives_the_same_job_until_it_has_failed(database: Database,
 def test_nobody_asked_for_pictures_of_older_playbacks(database: Database, playback: StoredPlayback):
     with database.writing() as session:
         session.delete(session.get_one(Job, asked(database)[0].row))
-    assert "Nobody has asked" in refusal(database, playback)
+    assert "No pictures of this playback were requested" in refusal(database, playback)
 
 
 def test_a_film_that_fails_fails_the_job_and_nothing_is_stored(
@@ -124,17 +123,18 @@ def test_a_playback_of_other_samples_is_refused_in_words(database: Database, pla
         store_playback(session, playback.plan, "b" * 64, ideal_playback(small_trajectory()))
     ended = cases.work(database, asked(database)[-1])
     assert ended.state == "failed"
-    assert "plan it and play it again" in ended.error
+    assert "make the plan and play it again" in ended.error
 
 
 @pytest.mark.parametrize("what", ["surgeon", "demonstration"])
 def test_they_are_erased_with_what_they_show(database: Database, playback: StoredPlayback, what: str):
     with database.writing() as session:
         session.add(StoredPictures(playback_row=playback.row, drawn=Pictures(b"mp4", b"gif", b"png", b"png")))
+    unfinished = [(job.row, job.attempt) for job in asked(database)]
     with database.writing() as session:
         if what == "surgeon":
             dropped = erase_surgeon(session, "kestrel", "test")
         else:
             dropped = erase_demo(session, playback.plan.policy.manifest["demos"][0], "test")
-    assert "pictures" in [job.kind for job in dropped]
+    assert unfinished and set(unfinished) <= set(dropped)
     assert drawn(database) == asked(database) == []

@@ -1,4 +1,4 @@
-"""The gate before the bag, and what is in it: on both back ends."""
+"""The gate before the bag, and the bag's content, on both back ends."""
 
 import io
 import json
@@ -12,25 +12,26 @@ import pytest
 from skills.db.models import Plan, StoredPlayback
 from skills.db.session import Database
 from skills.errors import BadPlan, Conflict, Corrupt, NotFound
-from skills.library import releases
+from skills.formats.replay_bag import arms_of
+from skills.formats.verify import check_bag
+from skills.library import releases, replay
 from skills.library.catalogue import find_surgeon, put_surgeon
 from skills.library.demos import withdraw_demo
-from skills.library.plans import Beside, PlanRequest, find_plan, plan_sutures, trajectory_of
+from skills.library.plans import find_plan, plan_sutures, trajectory_of
 from skills.library.playbacks import trajectory_digest
 from skills.library.policies import find_version
 from skills.library.replay import check_doubt, cleared, replay_bag
 from skills.packing import canonical, sha256
-from skills.recordings.replay import arms_of
-from skills.recordings.replay_check import check_bag
-from skills.style.plan import SuturePoint
-from skills.style.playback import Playback, link_pairs
+from skills.schemas.requests import PlanIn
+from skills.verification.playback import Playback, link_pairs
 from tests.library import cases
 
 ASKED: dict[str, Any] = {"tip_error_mm": 0.65, "lower_bound": 0.9}
+OF_A1_ALONE: dict[str, Any] = ASKED | {"handoff": "none"}
 
 
 def measured() -> Playback:
-    """What a simulator would have measured on nothing: the gate reads the report alone."""
+    """Return a simulator's measurements of nothing: the gate reads the report alone."""
     one = np.zeros((1, 3))
     return Playback(
         tip_mm=one,
@@ -72,12 +73,12 @@ def doubt(*lower: float | None, tip_error_mm: float = 0.65) -> dict[str, Any]:
 
 def gate(database: Database, plan: Plan, **asked: Any) -> str:
     with database.reading() as session:
-        return cleared(session, find_plan(session, plan.sha256), **(ASKED | asked)).sha256
+        return cleared(session, find_plan(session, plan.sha256), **(OF_A1_ALONE | asked)).sha256
 
 
 @pytest.fixture
 def plan(database: Database) -> Plan:
-    """A plan that follows what is released, not played yet."""
+    """Return a plan of the released policy, not played yet."""
     cases.add_demo(database)
     cases.train(database, release=True)
     return cases.add_plan(database)
@@ -86,8 +87,8 @@ def plan(database: Database) -> Plan:
 # ---- the gate
 
 
-def test_a_plan_is_cleared_by_the_newest_feasible_playback_of_exactly_this_plan(database: Database, plan: Plan):
-    with pytest.raises(Conflict, match="not played in the simulator yet; POST /playbacks"):
+def test_a_plan_is_cleared_by_its_own_newest_feasible_playback(database: Database, plan: Plan):
+    with pytest.raises(Conflict, match=r"not played in the simulator yet. Play it: client.play\("):
         gate(database, plan)
     other = cases.add_plan(database, speed_mm_s=10.0)
     judged(database, other)
@@ -98,7 +99,7 @@ def test_a_plan_is_cleared_by_the_newest_feasible_playback_of_exactly_this_plan(
     newer = judged(database, plan, samples=7)
     assert gate(database, plan) == newer
     judged(database, plan, **doubt(0.5))
-    with pytest.raises(Conflict, match=r"only 0.500, and 0.9 is asked for"):
+    with pytest.raises(Conflict, match=r"only 0.500, and 0.9 is required"):
         gate(database, plan)
     gate(database, plan, lower_bound=0.5)
     judged(database, plan, feasible=False)
@@ -107,6 +108,15 @@ def test_a_plan_is_cleared_by_the_newest_feasible_playback_of_exactly_this_plan(
     judged(database, plan, digest="1" * 64)
     with pytest.raises(Corrupt, match="verdict"):
         gate(database, plan)
+
+
+def test_a_bag_without_a_hand_off_is_given_only_on_request(database: Database, plan: Plan):
+    judged(database, plan)
+    with pytest.raises(Conflict, match="has no hand-off: no PSM_M, no A2"):
+        gate(database, plan, handoff=None)
+    both = cases.add_plan(database, psm_m={"approach": (-0.94, 0.1, -0.33)})
+    judged(database, both)
+    gate(database, both, handoff=None)
 
 
 def test_only_a_plan_that_follows_the_released_policy_is_replayed(database: Database, plan: Plan):
@@ -130,19 +140,40 @@ def test_consent_and_the_demonstration_have_to_stand(database: Database, plan: P
     judged(database, plan)
     for consent, words in (
         ({"uses": ["training"]}, "does not cover export"),
-        ({"uses": ["export"], "until": "2001-01-01"}, "ran out on 2001-01-01"),
+        ({"uses": ["export"]}, "does not cover training"),
+        ({"uses": ["training", "export"], "until": "2001-01-01"}, "expired on 2001-01-01"),
     ):
         with database.writing() as session:
             put_surgeon(session, "kestrel", {"consent": consent}, "test")
         with pytest.raises(Conflict, match=words):
             gate(database, plan)
     with database.writing() as session:
-        put_surgeon(session, "kestrel", {"consent": {"uses": ["export"]}}, "test")
+        put_surgeon(session, "kestrel", {"consent": {"uses": ["training", "export"]}}, "test")
+        with pytest.raises(Conflict, match="none is released"):  # because consent to training had ended
+            cleared(session, find_plan(session, plan.sha256), **OF_A1_ALONE)
+        releases.release(session, find_version(session, "kestrel", cases.SUTURE, 1), "test")
     gate(database, plan)
     with database.writing() as session:
         withdraw_demo(session, find_plan(session, plan.sha256).policy.demonstration.sha256, "test")
-    with pytest.raises(Conflict, match="demonstration that this plan rests on was withdrawn"):
+    with pytest.raises(Conflict, match="demonstration that this plan depends on was withdrawn"):
         gate(database, plan)
+
+
+def test_consent_that_is_withdrawn_while_a_bag_is_composed_is_seen(
+    database: Database, plan: Plan, monkeypatch: pytest.MonkeyPatch
+):
+    judged(database, plan)
+    composed = replay.seal
+
+    def withdrawn(members: dict[str, bytes]) -> bytes:
+        with database.writing() as session:
+            put_surgeon(session, "kestrel", {"consent": {"uses": ["training"], "until": None}}, "test")
+        return composed(members)
+
+    assert replay_bag(database, plan.sha256, **OF_A1_ALONE)
+    monkeypatch.setattr(replay, "seal", withdrawn)
+    with pytest.raises(Conflict, match="does not cover export"):
+        replay_bag(database, plan.sha256, **OF_A1_ALONE)
 
 
 @pytest.mark.parametrize(
@@ -151,12 +182,12 @@ def test_consent_and_the_demonstration_have_to_stand(database: Database, plan: P
         (doubt(0.95), {}, None),
         (doubt(0.9), {}, None),
         (doubt(0.95, 0.91), {}, None),
-        (doubt(0.95, 0.89), {}, "only 0.890, and 0.9 is asked for"),
+        (doubt(0.95, 0.89), {}, "only 0.890, and 0.9 is required"),
         (doubt(0.0), {"lower_bound": 0.0}, None),
         (doubt(0.95, None), {}, "only nan"),
         (doubt(math.nan), {}, "only nan"),
-        (doubt(0.95), {"lower_bound": math.nan}, "nan is asked for"),
-        (doubt(0.95), {"tip_error_mm": 3.0}, "With a tip error of 3 mm this plan was not judged"),
+        (doubt(0.95), {"lower_bound": math.nan}, "nan is required"),
+        (doubt(0.95), {"tip_error_mm": 3.0}, "This plan was not judged with a tip error of 3 mm"),
         (doubt(0.95), {"tip_error_mm": math.nan}, "was not judged"),
         (doubt(), {}, "was not judged"),
         ({"doubt": None}, {}, "was not judged"),
@@ -174,12 +205,12 @@ def test_the_least_certain_pass_has_to_reach_the_lower_bound(report, asked, word
 # ---- the bag
 
 
-def test_the_bag_is_whole_the_same_every_time_and_holds_the_plans_own_samples(database: Database, plan: Plan):
+def test_the_bag_is_complete_deterministic_and_holds_the_plans_samples(database: Database, plan: Plan):
     playback = judged(database, plan)
     with pytest.raises(NotFound):
-        replay_bag(database, "0" * 64, **ASKED)
-    data = replay_bag(database, plan.sha256, **ASKED)
-    assert data == replay_bag(database, plan.sha256, **ASKED)
+        replay_bag(database, "0" * 64, **OF_A1_ALONE)
+    data = replay_bag(database, plan.sha256, **OF_A1_ALONE)
+    assert data == replay_bag(database, plan.sha256, **OF_A1_ALONE)
     lines = check_bag(io.BytesIO(data))
     assert playback[:12] in lines[1]
     with database.reading() as session:
@@ -189,8 +220,8 @@ def test_the_bag_is_whole_the_same_every_time_and_holds_the_plans_own_samples(da
     assert np.array_equal(arm.joints[:, [0, 1, 3, 4, 5]], trajectory.joints[:, [0, 1, 3, 4, 5]])
     papers_say_whose_it_is_and_how_far_it_goes(data, plan)
     judged(database, plan, trajectory="1" * 64)
-    with pytest.raises(Conflict, match="otherwise than when the plan was played"):
-        replay_bag(database, plan.sha256, **ASKED)
+    with pytest.raises(Conflict, match="another motion than the older version"):
+        replay_bag(database, plan.sha256, **OF_A1_ALONE)
 
 
 def papers_say_whose_it_is_and_how_far_it_goes(data: bytes, plan: Plan) -> None:
@@ -213,7 +244,7 @@ def papers_say_whose_it_is_and_how_far_it_goes(data: bytes, plan: Plan) -> None:
 
 def samples(database: Database, plan: Plan, pass_index: int | None = None) -> list[tuple[str, int]]:
     """Check a bag, and count each arm's samples."""
-    lines = check_bag(io.BytesIO(replay_bag(database, plan.sha256, pass_index=pass_index, **ASKED)))
+    lines = check_bag(io.BytesIO(replay_bag(database, plan.sha256, pass_index=pass_index, **OF_A1_ALONE)))
     return [(line.split()[0], int(line.split()[3])) for line in lines[2:]]
 
 
@@ -221,15 +252,15 @@ def test_both_arms_have_a_bag_and_a_pass_alone_is_a_part_of_the_whole(database: 
     cases.add_demo(database)
     cases.train(database, release=True)
     half = math.radians(35) / 2
-    beside = Beside((-0.94, 0.10, -0.33), (160.0, 20.0, 20.0), (0.0, math.sin(half), 0.0, math.cos(half)))
-    points = [SuturePoint((5.0, 55.0, -125.0)), SuturePoint((8.0, 55.0, -125.0))]
-    plan, _ = plan_sutures(
-        database, PlanRequest("kestrel", cases.SUTURE, points, psm_m=beside, speed_mm_s=60.0, rate_hz=100.0), "test"
-    )
+    base = {"position_mm": (160.0, 20.0, 20.0), "rotation_xyzw": (0.0, math.sin(half), 0.0, math.cos(half))}
+    beside = {"approach": (-0.94, 0.10, -0.33), "base": base}
+    points = [{"position_mm": (5.0, 55.0, -125.0)}, {"position_mm": (8.0, 55.0, -125.0)}]
+    asked = {"surgeon": "kestrel", "suture": cases.SUTURE, "suture_points": points, "psm_m": beside}
+    plan, _ = plan_sutures(database, PlanIn(**asked, speed_mm_s=60.0, rate_hz=100.0), "test")
     judged(database, plan)
     (psm1, whole), (psm2, beside_it) = samples(database, plan)
     assert (psm1, psm2) == ("PSM1", "PSM2")
     assert whole == beside_it == plan.about["trajectory"]["samples"]
     assert whole == sum(samples(database, plan, number)[0][1] for number in (0, 1))
     with pytest.raises(BadPlan, match="0 to 1"):
-        replay_bag(database, plan.sha256, pass_index=2, **ASKED)
+        replay_bag(database, plan.sha256, pass_index=2, **OF_A1_ALONE)

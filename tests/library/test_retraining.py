@@ -1,23 +1,25 @@
-"""Batches: each style for itself, nothing twice, and released only what is asked for and not worse."""
+"""Batches: each style is trained independently and once, and released only on request and if not worse."""
 
 import math
+from dataclasses import replace
 
 import pytest
 from sqlalchemy import func, select
 
-from skills.db.books import Event, Job, StyleToRetrain
 from skills.db.models import PolicyVersion, Release
+from skills.db.service_tables import Event, Job, StyleToRetrain
 from skills.db.session import Database
 from skills.errors import Conflict, NotFound
-from skills.library import batch_work, batches, jobs, retraining
+from skills.learning.dynamic_programming import ValueIteration
+from skills.learning.q_learning import CellQLearning
+from skills.library import batch_work, jobs, retraining
 from skills.library.batch_work import compare
-from skills.library.batches import BATCH
 from skills.library.catalogue import put_surgeon
 from skills.library.demos import withdraw_demo
 from skills.library.erasure import erase_demo, erase_surgeon
+from skills.library.jobs import BATCH
 from skills.library.training import learn_style
-from skills.style.learning.q_learning import CellQLearning
-from skills.style.learning.value_iteration import ValueIteration
+from skills.schemas.policies import FitOnTheSame, PolicyFigures
 from tests.library import cases
 from tests.library.styles import (
     NO_CONSENT,
@@ -32,7 +34,7 @@ from tests.library.styles import (
     versions,
 )
 
-# ---- what is trained
+# ---- the selection of styles
 
 
 def test_all_styles_of_a_surgeon_or_of_a_suture_type_are_trained_once_each(database: Database):
@@ -41,7 +43,7 @@ def test_all_styles_of_a_surgeon_or_of_a_suture_type_are_trained_once_each(datab
     batch = retrain(database, surgeon=second)
     assert (batch.state, batch.progress, batch.result["done"], batch.error) == ("succeeded", 1.0, 2, None)
     assert batch.started_at <= batch.ended_at
-    retrain(database, suture=styles[0][1])  # one of each surgeon, of which one is known by now
+    retrain(database, suture=styles[0][1])  # one style of each surgeon, of which one is trained by now
     assert versions(database) == 3
     whole = retrain(database)
     assert states_of(database, whole) == ["done"] * 13
@@ -105,9 +107,11 @@ def test_only_stale_styles_are_trained_and_each_says_why(database: Database, mon
     cases.add_demo(database, cases.hand_off((5.0, 0.0, 0.0)))
     assert reasons() == [["a newer demonstration"]]
     assert reasons(learner=ValueIteration(), surgeon="kestrel") == [["other settings"]]
+    monkeypatch.setattr(retraining, "GATE_VERSION", retraining.GATE_VERSION + 1)
+    assert reasons(surgeon="surgeon-0") == []  # an accepted version stays; for the rest see test_release_gate
     monkeypatch.setattr(retraining, "LEARNER_VERSION", retraining.LEARNER_VERSION + 1)
     assert sorted(reasons()) == [["a newer learner"]] * 2 + [["other settings", "a newer learner"]]
-    with database.writing() as session:  # what the newest version rests on is gone: the one before it counts again
+    with database.writing() as session:  # the newest version's demonstration is gone: the one before counts again
         newest = session.scalars(select(PolicyVersion).order_by(PolicyVersion.row.desc())).first()
         withdraw_demo(session, newest.demonstration.sha256, "test")
     (style,) = styles_of(database, ask_retraining(database, only_stale=True, surgeon="kestrel"))
@@ -118,7 +122,7 @@ def test_only_stale_styles_are_trained_and_each_says_why(database: Database, mon
 
 
 @pytest.mark.parametrize(("together", "begun", "kept"), [(1, 3, 2), (2, 4, 2), (5, 4, 0)])
-def test_a_cancelled_batch_stops_at_its_next_commit_and_keeps_no_late_result(
+def test_a_cancelled_batch_stops_at_its_next_commit_and_drops_late_results(
     database: Database, monkeypatch: pytest.MonkeyPatch, together: int, begun: int, kept: int
 ):
     monkeypatch.setattr(retraining, "FEWEST_PARTS", 2)
@@ -152,13 +156,14 @@ def test_a_cancelled_batch_stops_at_its_next_commit_and_keeps_no_late_result(
 def test_an_erased_surgeon_leaves_batches_and_the_others_go_on(database: Database):
     styles = add_styles(database, 13)
     whole, own = ask_retraining(database), ask_retraining(database, surgeon=styles[-1][0])
+    unfinished = {(job.row, job.attempt) for job in (own, *parts_of(database, own))}
     first, *rest = parts_of(database, whole)
     cases.work(database, first)
     with database.writing() as session:
         erased = erase_surgeon(session, styles[-1][0], "test")
         demo = styles_of(database, whole)[5].demonstration
         erase_demo(session, demo.sha256, "test")
-    assert {job.kind for job in erased} == {BATCH, "retraining-part"}
+    assert set(erased) == unfinished
     for part in rest:
         cases.work(database, part)
     batch = look(database, whole)
@@ -166,7 +171,7 @@ def test_an_erased_surgeon_leaves_batches_and_the_others_go_on(database: Databas
     assert len(states_of(database, whole)) == 10
     with database.reading() as session:
         assert session.get(Job, own.row) is None
-    with database.writing() as session:  # trained, in a batch, and erased all the same
+    with database.writing() as session:  # trained in a batch, and still erased
         erase_surgeon(session, styles[0][0], "test")
     assert counted(database, StyleToRetrain) == 0
     assert versions(database) == 0
@@ -191,7 +196,7 @@ def test_parts_are_shared_out_and_nobody_sees_them(database: Database):
     assert len(parts_of(database, job)) == 14  # of three styles: enough for many workers
     with database.reading() as session:
         assert [one.id for one in jobs.list_jobs(session, 50, None, None)] == [job.id]
-        assert len(batches.to_tell(session, job)) == 14
+        assert len(jobs.to_tell(session, job)) == 14
         with pytest.raises(NotFound):
             jobs.find_job(session, parts_of(database, job)[0].id)
 
@@ -199,7 +204,7 @@ def test_parts_are_shared_out_and_nobody_sees_them(database: Database):
 # ---- releasing
 
 
-def test_a_version_is_released_only_if_that_was_asked_for_and_the_comparison_is_kept(database: Database):
+def test_retraining_releases_only_on_request_and_stores_the_comparison(database: Database):
     cases.add_demo(database)
     (style,) = styles_of(database, retrain(database))
     assert style.comparison["released"] is None
@@ -227,15 +232,24 @@ def test_a_worse_version_is_kept_and_not_released(database: Database):
     assert counted(database, Release) == 1
 
 
-FIGURES = {"demos": ["a"], "dtw_total_mm": 10.0, "exact_share": 0.9, "reaching_share": 0.95}
+FIGURES = PolicyFigures(
+    version=1, sha256="a", demos=("a", "b"), rests_on=2, dtw_total_mm=0.0, exact_share=0.9, reaching_share=0.95
+)
+SAME = FitOnTheSame(("a",), 10.0, 10.0)
 
 
 @pytest.mark.parametrize(
     ("name", "equal", "better", "worse"),
-    [("dtw_total_mm", 10.0, 9.0, 10.1), ("exact_share", 0.9, 1.0, 0.8), ("reaching_share", 0.95, 1.0, 0.9)],
+    [("rests_on", 2, 3, 1), ("exact_share", 0.9, 1.0, 0.8), ("reaching_share", 0.95, 1.0, 0.9)],
 )
 def test_worse_is_what_is_worse_in_one_figure_or_no_number(name: str, equal: float, better: float, worse: float):
     for value, reasons in ((equal, 0), (better, 0), (worse, 1), (math.nan, 1)):
-        assert len(compare(FIGURES, FIGURES | {name: value})["worse_because"]) == reasons
-    assert len(compare(FIGURES | {name: math.nan}, FIGURES)["worse_because"]) == 1
-    assert compare(None, FIGURES | {name: worse})["worse_because"] == []
+        assert len(compare(FIGURES, replace(FIGURES, **{name: value}), SAME).worse_because) == reasons
+    assert len(compare(replace(FIGURES, **{name: math.nan}), FIGURES, SAME).worse_because) == 1
+    assert compare(None, replace(FIGURES, **{name: worse}), None).worse_because == ()
+
+
+def test_worse_is_what_is_further_from_the_same_demonstrations():
+    for trained_mm, reasons in ((10.0, 0), (9.0, 0), (10.1, 1), (math.nan, 1)):
+        assert len(compare(FIGURES, FIGURES, FitOnTheSame(("a",), 10.0, trained_mm)).worse_because) == reasons
+    assert len(compare(FIGURES, FIGURES, FitOnTheSame(("a",), math.nan, 10.0)).worse_because) == 1

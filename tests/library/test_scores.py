@@ -1,20 +1,22 @@
-"""Scores on a real database: which reference, beside whom, over time, and only of those who agreed."""
+"""Scores on a real database: the reference, the percentiles, the history, and only surgeons with consent."""
 
 import numpy as np
 import pytest
 
-from skills.db.models import Demonstration, MeasuredShape, StoredRecording
+from skills.db.models import Demonstration, MeasuredShape, StoredCalibration, StoredRecording
 from skills.db.session import Database
 from skills.errors import BadInput, Conflict, NotFound
-from skills.library.beside import LEAST_DEMOS
+from skills.formats import read_recording
 from skills.library.calibrations import keep
 from skills.library.catalogue import put_surgeon
-from skills.library.demos import Cut, upload_demo, withdraw_demo
-from skills.library.scores import Asked, score
-from skills.recordings import read_recording
-from skills.style.scoring.model import as_numbers
+from skills.library.demos import upload_demo, withdraw_demo
+from skills.library.scores import LEAST_DEMOS, score
+from skills.packing import canonical, sha256
+from skills.schemas.comparison import Score
+from skills.schemas.requests import DemoIn, ScoreIn
+from skills.scoring.calibration import as_numbers
 from tests.library import cases
-from tests.style.scoring.test_model import model
+from tests.scoring.test_model import model
 
 NO_ATLAS = {"uses": ["training", "export"]}
 READ = read_recording
@@ -26,18 +28,18 @@ def put(database: Database, slug: str, **about: object) -> None:
 
 
 def bent(way_mm: float, surgeon: str, database: Database, samples: int = 20) -> Demonstration:
-    """Store the hand-off with a swerve, so that each is another one; more samples take more time."""
+    """Store the hand-off with a swerve, so that each one differs; more samples take more time."""
     tip = cases.points_mm(samples=samples)
     tip = tip + way_mm * np.sin(np.linspace(0, np.pi, len(tip)))[:, None] * np.array([0.0, 1.0, 0.3])
     return cases.add_demo(database, cases.table(tip), surgeon)
 
 
-def scored(database: Database, demo: Demonstration | None = None, **asked: object) -> dict:
+def scored(database: Database, demo: Demonstration | None = None, **asked: object) -> Score:
     about = {"demo": demo.sha256} if demo is not None else {}
-    return score(database, Asked("kestrel", cases.SUTURE, **about, **asked), READ)
+    return score(database, ScoreIn(surgeon="kestrel", suture=cases.SUTURE, **about, **asked), READ)
 
 
-def test_a_demonstration_is_scored_against_the_newest_of_the_style_and_then_against_the_released(
+def test_a_demo_is_scored_against_the_released_demo_or_else_the_newest(
     database: Database,
 ) -> None:
     first = bent(0.0, "kestrel", database)
@@ -46,43 +48,42 @@ def test_a_demonstration_is_scored_against_the_newest_of_the_style_and_then_agai
     put(database, "plover")
     mine = bent(6.0, "plover", database)
     told = scored(database, mine)
-    assert told["reference"]["demo"] == newest.sha256 and "newest" in told["reference"]["because"]
+    assert told.reference.demo == newest.sha256 and "newest" in told.reference.because
     cases.train(database, demos=[first.sha256], release=True)
     told = scored(database, mine)
-    assert told["reference"]["demo"] == first.sha256
-    assert f"version {version.version}" in told["reference"]["because"]
-    assert scored(database, mine, reference=newest.sha256)["reference"]["because"] == "it was asked for"
+    assert told.reference.demo == first.sha256
+    assert f"version {version.version}" in told.reference.because
+    assert scored(database, mine, reference=newest.sha256).reference.because == "it was requested"
 
 
 def test_figures_and_deviation_are_those_of_the_two_motions(database: Database) -> None:
     reference = bent(0.0, "kestrel", database)
     put(database, "plover")
     told = scored(database, bent(6.0, "plover", database, samples=40))
-    figures = {one["name"]: one for one in told["figures"]}
-    assert figures["duration_s"]["ratio"] == pytest.approx(119 / 59, rel=0.01)
-    assert figures["path_length_mm"]["reference"] == pytest.approx(reference.report["path_length_mm"])
-    assert told["deviation"]["total_mm"] > 100 and len(told["deviation"]["path_mm"]) == 100
-    assert np.sum(told["deviation"]["shares"]) == pytest.approx(1.0)
-    assert told["as_recorded"]["total_mm"] > 100
-    assert "middle third" in " ".join(told["as_recorded"]["words"])
-    assert told["skill"]["calibrated"] is False and "skills calibrate" in told["skill"]["words"][0]
-    assert "not a credential" in told["use"]
+    figures = {one.name: one for one in told.figures}
+    assert figures["duration_s"].ratio == pytest.approx(119 / 59, rel=0.01)
+    assert figures["path_length_mm"].reference == pytest.approx(reference.report["path_length_mm"])
+    assert told.deviation.total_mm > 100 and len(told.deviation.path_mm) == 100
+    assert np.sum(told.deviation.shares) == pytest.approx(1.0)
+    assert told.as_recorded.total_mm > 100
+    assert "middle third" in " ".join(told.as_recorded.words)
+    assert told.skill.calibrated is False and "calibrate it on rated trials" in told.skill.words[0]
+    assert "not a credential" in told.use
 
 
 def test_a_demonstration_lies_nowhere_from_itself(database: Database) -> None:
     told = scored(database, bent(0.0, "kestrel", database))
-    assert told["reference"]["is_itself"]
-    assert told["deviation"]["total_mm"] == 0.0
-    assert {one["ratio"] for one in told["figures"]} <= {None, 1.0}
+    assert told.reference.is_itself
+    assert told.deviation.total_mm == 0.0
+    assert {one.ratio for one in told.figures} <= {None, 1.0}
 
 
 def test_a_part_of_a_recording_is_scored_and_nothing_is_stored(database: Database) -> None:
     demo = bent(0.0, "kestrel", database)
     before = count(database)
-    part = Cut("kestrel", cases.SUTURE, start_s=0.2, end_s=1.0)
-    told = scored(database, recording=demo.recording.sha256, part=part)
-    assert (told["demo"], told["surgeon"], told["curve"]) == (None, None, [])
-    assert (told["start_s"], told["end_s"]) == (0.2, 1.0)
+    told = scored(database, recording=demo.recording.sha256, start_s=0.2, end_s=1.0)
+    assert (told.demo, told.surgeon, told.curve) == (None, None, [])
+    assert (told.start_s, told.end_s) == (0.2, 1.0)
     assert count(database) == before
 
 
@@ -98,18 +99,18 @@ def test_percentiles_count_demonstrations_by_level_and_need_enough_of_them(datab
     for number in range(LEAST_DEMOS - 1):
         bent(4.0 + number, "plover", database)
     mine = bent(2.5, "plover", database)
-    novice = next(one for one in scored(database, mine)["percentiles"] if one["level"] == "novice")
-    assert (novice["demos"], novice["surgeons"], novice["below"]) == (LEAST_DEMOS - 1, 1, None)  # itself is not one
-    assert "at least 5 demonstrations of 2 surgeons" in novice["reason"]
+    novice = next(one for one in scored(database, mine).percentiles if one.level == "novice")
+    assert (novice.demos, novice.surgeons, novice.below) == (LEAST_DEMOS - 1, 1, None)  # without itself
+    assert "at least 5 demonstrations of 2 surgeons" in novice.reason
     bent(9.0, "wren", database)
     bent(1.0, "wren", database)
-    novice = next(one for one in scored(database, mine)["percentiles"] if one["level"] == "novice")
-    assert (novice["demos"], novice["surgeons"], novice["reason"]) == (LEAST_DEMOS + 1, 2, None)
-    assert novice["below"]["distance_mm"] == pytest.approx(1 / 6)  # one of six is nearer to the reference
-    assert novice["below"]["duration_s"] == pytest.approx(0.5)  # all are equal
-    assert novice["below"]["clutch_presses"] == pytest.approx(0.5)
-    assert novice["below"]["spectral_arc_length"] is not None
-    assert novice["below"]["orientation_change_rad"] is None  # a table without it
+    novice = next(one for one in scored(database, mine).percentiles if one.level == "novice")
+    assert (novice.demos, novice.surgeons, novice.reason) == (LEAST_DEMOS + 1, 2, None)
+    assert novice.below["distance_mm"] == pytest.approx(1 / 6)  # one of six is nearer to the reference
+    assert novice.below["duration_s"] == pytest.approx(0.5)  # all are equal
+    assert novice.below["clutch_presses"] == pytest.approx(0.5)
+    assert novice.below["spectral_arc_length"] is not None
+    assert novice.below["orientation_change_rad"] is None  # a table has no orientation
 
 
 def test_the_curve_has_the_surgeons_demonstrations_up_to_this_one(database: Database) -> None:
@@ -117,26 +118,26 @@ def test_the_curve_has_the_surgeons_demonstrations_up_to_this_one(database: Data
     put(database, "plover")
     made = [bent(way, "plover", database) for way in (9.0, 6.0, 3.0, 2.0)]
     told = scored(database, made[2])
-    assert [one["demo"] for one in told["curve"]] == [one.sha256 for one in made[:3]]
-    distances = [one["distance_mm"] for one in told["curve"]]
+    assert [one.demo for one in told.curve] == [one.sha256 for one in made[:3]]
+    distances = [one.distance_mm for one in told.curve]
     assert distances == sorted(distances, reverse=True)
-    assert distances[-1] == pytest.approx(told["deviation"]["distance_mm"])
+    assert distances[-1] == pytest.approx(told.deviation.distance_mm)
 
 
-def test_whoever_did_not_agree_is_neither_scored_nor_compared_with_nor_counted(database: Database) -> None:
+def test_surgeons_without_consent_are_not_scored_compared_or_counted(database: Database) -> None:
     bent(0.0, "kestrel", database)
     put(database, "plover", skill_level="novice")
     mine = bent(3.0, "plover", database)
     put(database, "wren", skill_level="novice")
     others = [bent(4.0 + number, "wren", database) for number in range(LEAST_DEMOS)]
-    counted = next(one for one in scored(database, mine)["percentiles"] if one["level"] == "novice")
-    assert counted["demos"] == LEAST_DEMOS
+    counted = next(one for one in scored(database, mine).percentiles if one.level == "novice")
+    assert counted.demos == LEAST_DEMOS
     put(database, "wren", skill_level="novice", consent=NO_ATLAS)
-    left = next(one for one in scored(database, mine)["percentiles"] if one["level"] == "novice")
-    assert left["demos"] == 0
+    left = next(one for one in scored(database, mine).percentiles if one.level == "novice")
+    assert left.demos == 0
     with pytest.raises(Conflict, match="'wren' does not cover atlas"):
         scored(database, others[0])
-    with pytest.raises(Conflict, match="does not cover being compared") as refused:
+    with pytest.raises(Conflict, match="does not cover comparisons") as refused:
         scored(database, recording=others[0].recording.sha256)
     assert "wren" not in str(refused.value)
     put(database, "kestrel", consent=NO_ATLAS)
@@ -151,7 +152,9 @@ def test_what_cannot_be_scored_is_refused(database: Database) -> None:
     put(database, "plover")
     mine = bent(3.0, "plover", database)
     other = cases.upload(cases.hand_off((0.0, 0.0, 2.5)))
-    interrupted, _ = upload_demo(database, other, Cut("plover", "simple-interrupted"), "test")
+    interrupted = upload_demo(
+        database, other, DemoIn(surgeon="plover", suture="simple-interrupted", segment="whole"), "test"
+    ).row
     with pytest.raises(BadInput, match="another suture type"):
         scored(database, interrupted)
     with pytest.raises(BadInput, match="of another style"):
@@ -166,17 +169,26 @@ def test_what_cannot_be_scored_is_refused(database: Database) -> None:
 
 def test_a_calibrated_model_rates_and_says_on_what(database: Database) -> None:
     judged = {"rho": 0.9, "rho_interval": [0.8, 0.95], "accuracy": 0.75}
+    chance = {"rho": -0.2, "rho_p": 0.01, "accuracy": 0.2, "accuracy_p": 0.01, "commonest": 0.4}
+    duration = {"rho": 0.5, "accuracy": 0.5}
     about = {
         "model": as_numbers(model(rating_weights=[-0.3, -0.1])),
         "data": {"task": "Suturing", "of": "hand-off", "trials": 40, "surgeons": 8},
-        "validated": {"all_figures": judged, "duration_only": {"rho": 0.5}, "chance": {"rho": -0.2, "accuracy": 0.2}},
+        "validated": {"all_figures": judged, "duration_only": duration, "chance": chance, "over_duration": [0.1, 0.6]},
     }
+    demo = bent(0.0, "kestrel", database)
+    older = about | {"validated": {"all_figures": judged | {"rho": -0.84}, "duration_only": duration, "chance": chance}}
+    with database.writing() as session:
+        session.add(StoredCalibration(sha256=sha256(canonical(older)), about=older))
+    skill = scored(database, demo).skill
+    assert (skill.calibrated, skill.rating, skill.levels) == (False, None, None)
+    assert "older version" in skill.words[0] and "no better than the duration alone" in skill.words[0]
     with database.writing() as session:
         stored, _ = keep(session, about, "test")
-    skill = scored(database, bent(0.0, "kestrel", database))["skill"]
-    assert skill["calibrated"] and skill["calibration"] == stored.sha256
-    assert skill["rating"] == pytest.approx(18.0 + sum(skill["terms"].values()))
-    said = " ".join(skill["words"])
+    skill = scored(database, demo).skill
+    assert skill.calibrated and skill.calibration == stored.sha256
+    assert skill.rating == pytest.approx(18.0 + sum(skill.terms.values()))
+    said = " ".join(skill.words)
     assert "40 rated trials (Suturing, each hand-off) of 8 surgeons" in said
     assert "rank correlation of 0.90 (0.80 to 0.95; the duration alone: 0.50, chance: -0.20)" in said
-    assert skill["outside"] and "do not rely on that" in said  # one second, where 4 to 20 were seen
+    assert skill.outside and "do not rely on this rating" in said  # one second, while the calibration has 4 to 20

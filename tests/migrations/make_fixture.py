@@ -1,15 +1,14 @@
-"""Make the fixture of a release: `make fixture`, by hand at each release; what it writes is kept for ever.
+"""Generator of a release's fixture: `make fixture`, by hand at each release; its output is kept for ever.
 
     releases/VERSION/skills.sqlite        a populated installation in one file
     releases/VERSION/postgresql.sql.gz    the same, as PostgreSQL's own `pg_dump --inserts` writes it
-    releases/VERSION/expected.json        ETag and SHA-256 of each policy that it serves, as JSON and as arrays;
-                                          of arrays also the digest of their numbers, for how they are compressed
+    releases/VERSION/expected.json        ETag and SHA-256 of each policy that it serves, as JSON and as arrays; of
+                                          arrays also the digest of their numbers, because their compression
                                           depends on the zlib that Python was built with
 
-The installation is made once, through the service's own calls, on SQLite; PostgreSQL gets it by a backup that is
-restored. The dump holds the tables as that version made them, so it does not rest on our migrations still being what
-they were; written as INSERTs it can be run through psycopg, and nobody needs `psql`. `pg_dump` comes with the server
-of the tests.
+The installation is made once, through the service's own calls, on SQLite; PostgreSQL gets it by restoring a backup.
+The dump holds the tables as that version made them, so it does not require our migrations to stay unchanged; written
+as INSERTs it can be run through psycopg, without `psql`. `pg_dump` comes with the server of the tests.
 """
 
 import gzip
@@ -28,12 +27,11 @@ from sqlalchemy import make_url, select
 
 from skills import __version__
 from skills.db.models import StoredPictures, StoredPlayback
-from skills.db.schema import revisions
-from skills.db.session import Database
+from skills.db.session import Database, revisions
 from skills.library.backup import back_up, restore
 from skills.packing import canonical, sha256
 from skills.seeds.recordings import sample_recordings
-from skills.style.pictures import Pictures
+from skills.verification.playback import Pictures
 from tests import backends
 from tests.api.service import CSV, MCAP, Service, serving
 from tests.library import cases
@@ -77,16 +75,16 @@ def populate(service: Service) -> None:
     client.cancel(client.train(surgeon="heron", suture=cases.SUTURE, seed=3)["id"])
     client.train(surgeon="kestrel", suture=cases.SUTURE, learner={"kind": "value-iteration"}, release=True)
     service.work()
-    plan = client.plan("kestrel", cases.SUTURE, [{"position_mm": [5.0, 55.0, -125.0]}])
+    plan = client.plan("kestrel", cases.SUTURE, [{"position_mm": [5.0, 55.0, -125.0]}], handoff="none")
     client.play(plan["sha256"])
     service.work()
-    with service.database.writing() as session:  # real ones are as large as all the rest; their job goes on waiting
+    with service.database.writing() as session:  # real ones are as large as all the rest; their job stays queued
         playback = session.scalars(select(StoredPlayback.row)).one()
         session.add(StoredPictures(playback_row=playback, drawn=Pictures(b"mp4", b"gif", b"png", b"png")))
 
 
 def policies_of(service: Service) -> dict[str, Any]:
-    """Find all that is served and every version, byte for byte as a client gets it."""
+    """Return every served policy and every version, byte for byte as a client gets it."""
     client = service.client
     served = [f"/policies/{one['surgeon']}/{one['suture']}" for one in client.policies()]
     versions = [
@@ -98,7 +96,7 @@ def policies_of(service: Service) -> dict[str, Any]:
 
 
 def answer_of(service: Service, path: str, media_type: str) -> dict[str, str]:
-    """Get one answer: its ETag and the digest of its bytes."""
+    """Return the ETag and the digest of the bytes of one response."""
     answer = service.http.get(path, headers={"Accept": media_type})
     assert answer.status_code == 200, answer.text
     said = {"etag": answer.headers["etag"], "sha256": hashlib.sha256(answer.content).hexdigest()}
@@ -106,14 +104,14 @@ def answer_of(service: Service, path: str, media_type: str) -> dict[str, str]:
 
 
 def numbers_of(npz: bytes) -> str:
-    """Digest arrays, however they are compressed."""
+    """Return the digest of arrays, independent of their compression."""
     with np.load(io.BytesIO(npz)) as arrays:
         parts = [[name, str(a.dtype), list(a.shape), sha256(a.tobytes())] for name, a in sorted(arrays.items())]
     return sha256(canonical(parts))
 
 
 def write_sqlite(source: Path, target: Path) -> None:
-    """Write a database as one file, with nothing in it but what is stored."""
+    """Write a database as one file, without its free pages and log."""
     target.unlink(missing_ok=True)
     connection = sqlite3.connect(source)
     connection.execute("VACUUM INTO ?", (str(target),))
@@ -130,7 +128,7 @@ def write_postgresql(backup: Path, target: Path) -> None:
     where = make_url(url).set(drivername="postgresql").render_as_string(hide_password=False)
     options = ["--inserts", "--rows-per-insert=50", "--no-owner", "--no-privileges", "--no-comments"]
     dump = subprocess.run([Path(server).with_name("pg_dump"), *options, where], check=True, capture_output=True).stdout
-    lines = [line for line in dump.splitlines(keepends=True) if not line.startswith(b"\\")]  # words to psql
+    lines = [line for line in dump.splitlines(keepends=True) if not line.startswith(b"\\")]  # psql's own commands
     target.write_bytes(gzip.compress(b"".join(lines), mtime=0))
     backends.drop(url)
 

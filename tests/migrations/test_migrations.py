@@ -1,4 +1,4 @@
-"""The way up, the way down, and the way up again, on both back ends."""
+"""Migrations up, down, and up again, on both back ends."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -14,14 +14,13 @@ from sqlalchemy import inspect, text
 from sqlalchemy.exc import DatabaseError
 
 from skills.db.base import Base
-from skills.db.schema import alembic_config, revisions
-from skills.db.session import Database
+from skills.db.session import Database, alembic_config, revisions
 from skills.errors import Conflict
 from skills.library.demos import find_demo, withdraw_demo
 from skills.library.erasure import erase_demo
+from skills.library.integrity import learnt, planned
 from skills.library.plans import find_plan
 from skills.library.policies import find_by_digest
-from skills.library.verified import learnt, planned
 from tests import backends
 from tests.library import cases
 from tests.library.styles import ask_retraining, retrain
@@ -31,7 +30,7 @@ NOT_OURS = "jobs_of_the_engine"
 
 @pytest.fixture(params=backends.BACKENDS)
 def database(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Database]:
-    """A database without any table."""
+    """Yield a database without any table."""
     url = backends.blank(request.param, tmp_path)
     database = Database(url)
     yield database
@@ -52,7 +51,7 @@ def tables(database: Database) -> set[str]:
 
 
 def shape(database: Database) -> object:
-    """Everything that the database says of its tables: columns, keys, indexes, triggers."""
+    """Return the database's schema: columns, keys, indexes, triggers."""
     look = inspect(database.engine)
     kind = database.engine.dialect.name
     query = {
@@ -95,7 +94,7 @@ def test_every_revision_goes_down_and_up_on_tables_with_rows_in_them(database: D
     database.migrate()
 
 
-def test_the_names_of_the_files_say_which_revisions_there_are_and_in_which_order():
+def test_migration_file_names_list_the_revisions_in_order():
     known = [script.revision for script in ScriptDirectory.from_config(alembic_config()).walk_revisions()]
     assert list(revisions()) == known
 
@@ -107,7 +106,7 @@ def test_what_the_first_version_stored_is_kept_whole_and_still_guarded(database:
     cases.add_surgeon(database)
     demo, version = cases.add_demo(database), cases.train(database, release=True)
     plan = cases.add_plan(database)
-    go(database, command.downgrade, "0001")  # now it is what the first version would have written
+    go(database, command.downgrade, "0001")  # this is now a database of the first version
     assert shape(database) == first
     for column in ("arm", "sha256", "path"):
         assert_guarded(database, column)
@@ -127,7 +126,7 @@ def test_what_the_first_version_stored_is_kept_whole_and_still_guarded(database:
     assert_guarded(database, "withdrawn_at", "NULL")
 
 
-def test_a_policy_of_several_demonstrations_is_not_brought_down_to_a_version_that_knows_one(database: Database):
+def test_a_policy_of_several_demos_cannot_be_downgraded_to_one_demo(database: Database):
     database.migrate()
     cases.add_surgeon(database)
     demos = [cases.add_demo(database, cases.hand_off((shift, 0.0, 0.0))).sha256 for shift in (0.0, 2.5)]
@@ -138,7 +137,7 @@ def test_a_policy_of_several_demonstrations_is_not_brought_down_to_a_version_tha
         assert session.scalar(text("SELECT count(*) FROM policy_demonstrations")) == 1
 
 
-def test_batches_go_with_their_table_and_those_that_had_not_ended_are_cancelled(database: Database):
+def test_a_downgrade_drops_batches_and_cancels_the_unfinished_ones(database: Database):
     database.migrate()
     cases.add_surgeon(database)
     cases.add_demo(database)
@@ -162,13 +161,13 @@ def rows(database: Database, table: str) -> list[dict[str, object]]:
 
 
 def assert_guarded(database: Database, column: str, new: str | None = None) -> None:
-    """The column cannot be changed; on PostgreSQL an equal value would be no change."""
+    """Assert that the column cannot be changed; on PostgreSQL an equal value would be no change."""
     other = {"path": "'\\x00'", "hysteresis": "0.25"}.get(column, "'other'")
     with pytest.raises(DatabaseError, match="demonstrations is append-only"), database.writing() as session:
         session.execute(text(f"UPDATE demonstrations SET {column} = {new or other}"))
 
 
-def test_a_demonstration_with_hysteresis_cannot_go_down_and_nothing_is_changed(database: Database):
+def test_a_demo_with_hysteresis_blocks_the_downgrade_without_changes(database: Database):
     database.migrate()
     cases.add_surgeon(database)
     demo = cases.add_demo(database, hysteresis=0.25)
@@ -197,7 +196,7 @@ def test_a_database_of_a_newer_version_is_refused_and_left_as_it_was(database: D
     with database.writing() as session:
         session.execute(text("UPDATE alembic_version SET version_num = '9999'"))
     before = shape(database)
-    with pytest.raises(Conflict, match="newer version; update the code, nothing was changed"):
+    with pytest.raises(Conflict, match="newer version of suture-skills; nothing was changed"):
         database.migrate()
     assert shape(database) == before
     with database.reading() as session:

@@ -1,4 +1,4 @@
-"""Installations as older versions left them: this one takes them over and serves the same bytes."""
+"""Installations of older versions: this version migrates them and serves the same bytes."""
 
 import gzip
 import json
@@ -19,8 +19,7 @@ from alembic.script import ScriptDirectory
 from sqlalchemy import make_url, text
 
 from skills.db.base import Base
-from skills.db.schema import alembic_config, revision_of
-from skills.db.session import Database
+from skills.db.session import Database, alembic_config, revision_of
 from skills.library.inspection import inspect_installation
 from tests import backends
 from tests.api.service import assert_problem, serving
@@ -28,14 +27,14 @@ from tests.migrations.make_fixture import JSON, NPZ, RELEASES, answer_of
 from tests.migrations.test_migrations import go, tables
 
 KEPT = sorted(folder.name for folder in RELEASES.iterdir() if folder.is_dir())
-# The way down to the first version takes these away; the way up fills one again, from the events.
+# The downgrade to the first version removes these; the upgrade fills one of them again, from the events.
 ADDED_LATER = {
     "retraining_styles", "playback_pictures", "keys", "key_surgeons", "sign_ins", "recording_uploads",
-    "measured_shapes", "calibrations", "policy_demonstrations",
+    "measured_shapes", "calibrations", "policy_demonstrations", "recording_surgeons",
 }  # fmt: skip
 FILLED_AGAIN = {"recording_uploads"}
-KEYS = {"keys", "key_surgeons", "sign_ins"}  # empty: with a key in it, the installation would answer its tests nothing
-REFUSED = "written by a newer version; update the code, nothing was changed"
+KEYS = {"keys", "key_surgeons", "sign_ins"}  # empty: with a key, the installation would answer its tests with 401
+REFUSED = "This database was written by a newer version of suture-skills"
 
 
 Released = tuple[Database, dict[str, Any]]
@@ -43,7 +42,7 @@ Released = tuple[Database, dict[str, Any]]
 
 @pytest.fixture(params=[f"{version} {backend}" for version in KEPT for backend in backends.BACKENDS])
 def release(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Released]:
-    """A copy of an installation of an older version, not migrated, and what that version served of it."""
+    """Yield a copy of an older version's installation, not migrated, and the responses of that version."""
     version, backend = request.param.split()
     kept = RELEASES / version
     url = backends.blank(backend, tmp_path)
@@ -109,17 +108,17 @@ def test_code_that_is_older_than_the_tables_says_so_everywhere(release: Released
         with database.writing() as session:  # as a newer version does while this one runs
             session.execute(text("UPDATE alembic_version SET version_num = '9999'"))
         said = assert_problem(service.http.get("/readyz"), 503, "not-ready")["detail"]
-        assert said == "The database was brought to a newer version; update the code of this process."
+        assert said == "The database has a newer version; update the code of this process."
     before = rows(database)
     place = {"SKILLS_DATABASE_URL": database.url, "SKILLS_PORT": "0"}
-    for words, said in (
-        (["migrate"], REFUSED),
+    told = (
         (["serve"], REFUSED),
         (["worker"], REFUSED),
         (["train", "kestrel", "simple-running"], REFUSED),
         (["backup", str(tmp_path / "backup.zip")], "The tables are of another version"),
         (["verify"], "schema: it is at 9999"),
-    ):
+    )
+    for words, said in told if database.engine.dialect.name == "sqlite" else told[:1]:  # each takes seconds
         done = subprocess.run(
             [sys.executable, "-m", "skills", *words],
             env=os.environ | place,
@@ -137,7 +136,7 @@ Rows = dict[str, list[dict[str, str]]]
 
 
 def rows(database: Database) -> Rows:
-    """Read every row of every table of ours, raw, each of its values as a digest."""
+    """Read every row of every table of ours, with each of its values as a digest."""
     found = {}
     with database.reading() as session:
         for table in sorted(tables(database) & set(Base.metadata.tables)):
@@ -148,7 +147,7 @@ def rows(database: Database) -> Rows:
 
 
 def kept_of(of: Rows, like: Rows) -> Rows:
-    """Leave of rows the tables and columns that others have."""
+    """Reduce rows to the tables and columns that another database has."""
     return {
         table: sorted(
             ({name: row[name] for name in like[table][0]} for row in of[table]), key=lambda row: sorted(row.items())

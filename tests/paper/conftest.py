@@ -6,22 +6,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from skills.style.grid import PAPER_GRID, GridPath, discretize
-from skills.style.reward import RewardMap, sparse_reward
+from skills.gridworld.grid import PAPER_GRID, GridPath, discretize
+from skills.gridworld.reward import RewardMap, sparse_reward
+from tests.needs import need
 
 
 @pytest.fixture(scope="session")
 def paper_data() -> Path:
-    folder = os.environ.get("SKILLS_PAPER_DATA")
-    if not folder:
-        pytest.skip("THE PAPER'S DATA IS NOT HERE: set SKILLS_PAPER_DATA to its folder to run this test")
+    need("paper")
+    folder = os.environ["SKILLS_PAPER_DATA"]
     assert Path(folder, "user_path_grid11.csv").is_file(), f"SKILLS_PAPER_DATA={folder} has no user_path_grid11.csv"
     return Path(folder)
 
 
 @pytest.fixture(scope="session")
 def user_table(paper_data: Path) -> np.ndarray:
-    """The user's discretised demonstration, (28, 6): position and action in metres."""
+    """Return the user's discretised demonstration, (28, 6): position and action in metres."""
     return np.loadtxt(paper_data / "user_path_grid11.csv", delimiter=",")
 
 
@@ -37,5 +37,5 @@ def user_reward(user_path: GridPath) -> RewardMap:
 
 @pytest.fixture(scope="session")
 def published(paper_data: Path) -> list[np.ndarray]:
-    """The three published greedy policies, an action for each of the 1331 states."""
+    """Return the three published greedy policies, an action for each of the 1331 states."""
     return [np.load(paper_data / f"published_policy_{i}.npy").astype(int) for i in (1, 2, 3)]

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from skills.errors import BadSettings
-from skills.style.grid import PAPER_GRID, GridPath
-from skills.style.reward import RewardLevels, sparse_reward
-from tests.style.paths import WALKS, named_path
+from skills.gridworld.grid import PAPER_GRID, GridPath
+from skills.gridworld.reward import RewardLevels, sparse_reward
+from tests.gridworld.paths import WALKS, named_path
 
 
 def test_the_users_reward_map_has_one_goal_and_26_visited_states(user_reward, user_path):

@@ -1,11 +1,11 @@
-"""Fig. 6: what rounding a raw recording to 5 mm keeps of it."""
+"""Fig. 6: the loss from rounding a raw recording to 5 mm."""
 
 import numpy as np
 import pytest
 
 from skills.errors import OutsideGrid
-from skills.style.evaluation import discretisation_rmse
-from skills.style.grid import PAPER_GRID, choose_grid, discretize, fit_grid
+from skills.gridworld.grid import PAPER_GRID, choose_grid, discretize, fit_grid
+from skills.gridworld.path_report import discretisation_rmse
 
 
 @pytest.fixture(scope="module")
@@ -20,9 +20,9 @@ def test_a_raw_recording_of_the_study_needs_no_bridge_at_5_mm(raw_mm):
     assert path.bridged == 0
 
 
-def test_it_lies_off_the_papers_grid_which_is_said_where_that_grid_is_demanded(raw_mm):
+def test_the_raw_path_is_off_the_papers_grid_and_demanding_it_is_refused(raw_mm):
     assert choose_grid(raw_mm) == fit_grid(raw_mm)
-    with pytest.raises(OutsideGrid, match=f"{len(raw_mm)} of {len(raw_mm)} points lie outside"):
+    with pytest.raises(OutsideGrid, match=f"{len(raw_mm)} of {len(raw_mm)} points are outside"):
         discretize(raw_mm, choose_grid(raw_mm, "paper"))
 
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from skills.errors import OutsideGrid
-from skills.style.learning.q_learning import PhaseQLearning
-from skills.style.plan import SuturePoint, stack
-from skills.style.policy import learn_policy
+from skills.learning.policy import learn_tabular
+from skills.learning.q_learning import PhaseQLearning
+from skills.planning.plan import SuturePoint, stack
 
 SPACING_MM = np.array([0.0, -8.0, 1.5])
 EXACT_MM = 1e-9
@@ -14,7 +14,7 @@ EXACT_MM = 1e-9
 
 @pytest.fixture(scope="module")
 def policy(user_reward):
-    return learn_policy(user_reward, PhaseQLearning())
+    return learn_tabular(user_reward, PhaseQLearning())
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +47,7 @@ def test_the_user_may_present_the_needle_elsewhere_on_every_pass(policy, plan, u
         assert np.abs(np.diff(one.tip_mm, axis=0)).max() <= 5 + EXACT_MM  # by single cells, and to the first centre
 
 
-def test_a_start_outside_its_moved_grid_world_is_refused_by_the_number_of_its_pass(policy, plan):
+def test_a_start_outside_its_moved_grid_is_refused_with_the_pass_number(policy, plan):
     starts_mm = [None, None, (100.0, 55.0, -125.0), None, None]
     points = [one.point for one in plan.passes]
     with pytest.raises(OutsideGrid, match="Pass 2"):

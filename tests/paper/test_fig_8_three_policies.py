@@ -5,22 +5,22 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from skills.style import paper
-from skills.style.certificate import certify, coverage, mdp_of
-from skills.style.evaluation import measure
-from skills.style.exact import exact_values
-from skills.style.grid import MOVES
-from skills.style.learning.q_learning import CellQLearning, PhaseQLearning
-from skills.style.policy import Rollout, learn_policy, rollout
-from tests.style.paths import follow, joins_nearest
+from skills.gridworld import paper
+from skills.gridworld.grid import MOVES
+from skills.learning.certificate import certify, coverage, mdp_of
+from skills.learning.dynamic_programming import exact_values
+from skills.learning.evaluation import measure
+from skills.learning.policy import Rollout, learn_tabular, rollout
+from skills.learning.q_learning import CellQLearning, PhaseQLearning
+from tests.gridworld.paths import follow, joins_nearest
 
 EXACT_MM = 1e-9
 
 
 @pytest.fixture(scope="module")
 def true_values(user_reward):
-    """What each state of the certified domain is worth, by dynamic programming: no seed is in it."""
-    return exact_values(mdp_of(learn_policy(user_reward, PhaseQLearning())))
+    """Return the value of each state of the certified domain, by dynamic programming: independent of any seed."""
+    return exact_values(mdp_of(learn_tabular(user_reward, PhaseQLearning())))
 
 
 def is_the_demonstration(policy, true_values):
@@ -40,8 +40,8 @@ def is_the_demonstration(policy, true_values):
 
 @pytest.mark.parametrize("first", range(0, 100, 10))
 def test_on_each_of_100_seeds_28_of_28_states_and_1331_of_1331_starts(user_reward, true_values, first):
-    with ThreadPoolExecutor(2) as threads:  # the compiled loop lets others run
-        learnt = threads.map(lambda seed: learn_policy(user_reward, PhaseQLearning(), seed), range(first, first + 10))
+    with ThreadPoolExecutor(2) as threads:  # the compiled loop releases the interpreter lock
+        learnt = threads.map(lambda seed: learn_tabular(user_reward, PhaseQLearning(), seed), range(first, first + 10))
         assert [is_the_demonstration(policy, true_values) for policy in learnt] == [True] * 10
 
 
@@ -49,12 +49,12 @@ def test_on_each_of_100_seeds_28_of_28_states_and_1331_of_1331_starts(user_rewar
 def test_on_each_of_1000_seeds_28_of_28_states_and_1331_of_1331_starts(user_reward, true_values):
     seeds = range(100, 1000)
     with ThreadPoolExecutor(2) as threads:
-        learnt = threads.map(lambda seed: learn_policy(user_reward, PhaseQLearning(), seed), seeds)
+        learnt = threads.map(lambda seed: learn_tabular(user_reward, PhaseQLearning(), seed), seeds)
         assert all(is_the_demonstration(policy, true_values) for policy in learnt)
 
 
 def test_a_client_that_follows_the_served_actions_from_every_start_agrees(user_reward, user_path):
-    actions = learn_policy(user_reward, PhaseQLearning(), seed=8).table()
+    actions = learn_tabular(user_reward, PhaseQLearning(), seed=8).table()
     for start in range(1331):
         states, finished = follow(actions, (11, 11, 11), user_path.states.tolist(), start)
         assert finished
@@ -62,37 +62,37 @@ def test_a_client_that_follows_the_served_actions_from_every_start_agrees(user_r
 
 
 def test_the_certificate_of_the_users_policy_is_clean(user_reward):
-    certificate, _ = certify(learn_policy(user_reward, PhaseQLearning(), seed=9))
+    certificate, _ = certify(learn_tabular(user_reward, PhaseQLearning(), seed=9))
     assert certificate.every_action_optimal
     assert certificate.demonstration_reproduced
     assert (certificate.starts, certificate.starts_reaching, certificate.starts_joining_nearest) == (1331,) * 3
-    assert certificate.checked > 28 * 5**3 // 2  # phase 0 everywhere, and what is within reach of the path
+    assert certificate.checked > 28 * 5**3 // 2  # phase 0 everywhere, and all states within reach of the path
 
 
 def test_the_papers_state_reaches_the_goal_145_mm_off_whatever_the_seed(user_reward):
-    policies = [learn_policy(user_reward, CellQLearning(), seed) for seed in range(paper.N_POLICIES)]
+    policies = [learn_tabular(user_reward, CellQLearning(), seed) for seed in range(paper.N_POLICIES)]
     for policy in policies:
         metrics = measure(rollout(policy, paper.USER_START_MM))
         assert metrics.dtw_total_mm == pytest.approx(145, abs=EXACT_MM)
         assert metrics.exact_states < metrics.path_states == 28
 
 
-def test_three_seeds_learn_three_policies_that_differ_in_their_state_action_pairs(user_reward):
-    learner = CellQLearning(episodes=1000)  # with all 5000 they differ where two actions are equally good, or nowhere
-    tables = {learn_policy(user_reward, learner, seed).greedy.tobytes() for seed in range(paper.N_POLICIES)}
+def test_three_seeds_learn_three_policies_of_different_actions(user_reward):
+    learner = CellQLearning(episodes=1000)  # with all 5000 they differ where actions are equally good, or nowhere
+    tables = {learn_tabular(user_reward, learner, seed).greedy.tobytes() for seed in range(paper.N_POLICIES)}
     assert len(tables) == paper.N_POLICIES
 
 
 @pytest.mark.parametrize(("gamma", "total_mm"), [(0.1, 145), (0.3, 145), (0.5, 415), (0.85, 415), (0.88, 145)])
 def test_the_exactly_optimal_policy_of_the_papers_state_cuts_corners(user_reward, gamma, total_mm):
-    # So Table I is no accident of learning: the true best policy of that reward is as far off.
+    # So Table I is not an accident of learning: the truly best policy of that reward is as far off.
     states = optimal_states(user_reward.rewards, gamma)
     rolled_out = Rollout(user_reward.path, np.array(states), np.zeros(len(states), int), finished=True)
     assert measure(rolled_out).dtw_total_mm == pytest.approx(total_mm, abs=EXACT_MM)
 
 
 def optimal_states(rewards, gamma, start=551, goal=916):
-    """Iterate values over the 1331 cells and follow the best actions: the whole of the paper's MDP in a few lines."""
+    """Iterate values over the 1331 cells and follow the best actions: the paper's complete MDP in a few lines."""
     cells = np.stack(np.unravel_index(np.arange(1331), (11, 11, 11)), axis=-1)[:, None] + MOVES
     on_grid = ((cells >= 0) & (cells < 11)).all(axis=-1)
     after = np.where(on_grid, cells @ (121, 11, 1), np.arange(1331)[:, None])

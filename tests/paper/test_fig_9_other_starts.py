@@ -5,12 +5,12 @@ from itertools import product
 import numpy as np
 import pytest
 
-from skills.style import paper
-from skills.style.evaluation import measure
-from skills.style.grid import PAPER_GRID
-from skills.style.learning.q_learning import PhaseQLearning
-from skills.style.policy import learn_policy, rollout
-from tests.style.paths import joins_nearest
+from skills.gridworld import paper
+from skills.gridworld.grid import PAPER_GRID
+from skills.learning.evaluation import measure
+from skills.learning.policy import learn_tabular, rollout
+from skills.learning.q_learning import PhaseQLearning
+from tests.gridworld.paths import joins_nearest
 
 AXES_MM = [np.arange(min(ends), max(ends) + 1, paper.CELL_MM) for ends in paper.FIG9_START_RANGE_MM]
 STARTS_MM = list(product(*AXES_MM))
@@ -18,7 +18,7 @@ STARTS_MM = list(product(*AXES_MM))
 
 @pytest.fixture(scope="module")
 def policy(user_reward):
-    return learn_policy(user_reward, PhaseQLearning())
+    return learn_tabular(user_reward, PhaseQLearning())
 
 
 def test_the_range_of_starts_has_30_grid_points():
@@ -26,7 +26,7 @@ def test_the_range_of_starts_has_30_grid_points():
 
 
 @pytest.mark.parametrize("start_mm", STARTS_MM, ids=lambda mm: "{:g} {:g} {:g}".format(*mm))
-def test_from_every_start_of_the_range_it_joins_the_users_path_and_follows_it(policy, start_mm):
+def test_from_every_start_in_range_it_joins_and_follows_the_users_path(policy, start_mm):
     followed = rollout(policy, start_mm)
     assert followed.finished
     assert joins_nearest(policy.path, followed.states.tolist())
@@ -43,7 +43,7 @@ def test_between_grid_points_it_starts_from_the_nearest(policy):
         assert followed.states[0] == PAPER_GRID.states_at(start_mm)
 
 
-def test_the_single_policy_of_fig_9_cannot_have_been_the_first_published_one(published):
+def test_fig_9s_policy_cannot_be_the_first_published_policy(published):
     # From (-25, 50, -135) mm it never arrives, though the paper draws a path from there.
     state, seen = int(PAPER_GRID.states_at([-25, 50, -135])), set()
     while state not in seen:

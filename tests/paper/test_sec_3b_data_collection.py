@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skills.errors import OutsideGrid
-from skills.style import paper
-from skills.style.grid import MOVES, PAPER_GRID
+from skills.gridworld import paper
+from skills.gridworld.grid import MOVES, PAPER_GRID
 
 START, GOAL = 551, 916
 
@@ -18,7 +18,7 @@ def test_the_grid_world_has_1331_points():
     assert PAPER_GRID.n_states == 1331
 
 
-def test_state_to_index_numbers_the_points_from_0_to_1330_without_gap_or_repeat():
+def test_state_to_index_numbers_the_points_0_to_1330_exactly_once():
     cells = list(product(range(11), repeat=3))
     assert (
         PAPER_GRID.states_of(cells).tolist() == [121 * ix + 11 * iy + iz for ix, iy, iz in cells] == list(range(1331))
@@ -41,7 +41,7 @@ def test_the_users_start_and_goal_have_the_indices_of_the_published_data():
 
 
 @given(st.tuples(*[st.floats(-200, 200)] * 3))
-def test_a_point_has_an_index_if_it_is_within_half_a_cell_of_the_grid_and_none_otherwise(point_mm):
+def test_a_point_has_an_index_only_within_half_a_cell_of_the_grid(point_mm):
     steps = (np.array(point_mm) - paper.GRID_ORIGIN_MM) / 5
     if ((steps >= -0.5) & (steps < 10.5)).all():
         apart = np.abs(PAPER_GRID.centres_mm(PAPER_GRID.states_at(point_mm)) - point_mm)
@@ -89,4 +89,4 @@ def test_the_users_actions_lead_from_each_state_to_the_next(user_path, user_tabl
     assert (user_path.cells[:-1] + moves[:-1] == user_path.cells[1:]).all()
     actions = 9 * (moves[:, 0] + 1) + 3 * (moves[:, 1] + 1) + moves[:, 2] + 1
     assert (MOVES[actions] == moves).all()
-    assert moves[-1].any()  # it leads on, past the goal: the table was cut from a longer recording
+    assert moves[-1].any()  # it leads past the goal: the table was cut from a longer recording

@@ -1,15 +1,15 @@
-"""Sec. III-C and Fig. 5: maximum-entropy IRL finds the path, and value iteration on what it finds stands still."""
+"""Sec. III-C and Fig. 5: maximum-entropy IRL finds the path, and value iteration on its reward stands still."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from skills.style.certificate import certify, coverage
-from skills.style.evaluation import measure
-from skills.style.exact import Mdp, exact_q
-from skills.style.learning.irl import MaxEntIRL, recover_reward
-from skills.style.policy import learn_policy, rollout_from
+from skills.learning.certificate import certify, coverage
+from skills.learning.dynamic_programming import Mdp, exact_q
+from skills.learning.evaluation import measure
+from skills.learning.max_ent_irl import MaxEntIRL, recover_reward
+from skills.learning.policy import learn_tabular, rollout_from
 
 STAY = 13
 
@@ -38,7 +38,7 @@ def test_unlike_in_fig_5_the_visited_cells_stand_out(recovered, user_path):
 
 @pytest.mark.parametrize("gamma", [0.1, 0.8])
 def test_value_iteration_on_it_reaches_the_goal_from_the_goal_alone(recovered, user_reward, gamma):
-    policy = learn_policy(user_reward, MaxEntIRL(gamma=gamma))
+    policy = learn_tabular(user_reward, MaxEntIRL(gamma=gamma))
     states = rollout_from(policy, user_reward.path.start).states
     assert states[-1] == recovered.rewards.argmax()
     assert policy.greedy[states[-1]] == STAY
@@ -49,9 +49,9 @@ def test_value_iteration_on_it_reaches_the_goal_from_the_goal_alone(recovered, u
 
 
 def test_it_is_not_for_lack_of_exploration_that_it_fails(recovered, user_reward):
-    # The same reward less a constant, which the model cannot tell from it: now standing still costs.
+    # The same reward less a constant, which is equivalent for the model: now standing still costs.
     costs = recovered.rewards - recovered.rewards.max() - 1
-    policy = learn_policy(user_reward, MaxEntIRL(iterations=1))
+    policy = learn_tabular(user_reward, MaxEntIRL(iterations=1))
     for pays, reaching in ((recovered.rewards, 1), (costs, 1331)):
         q = exact_q(Mdp(policy.domain, replace(user_reward, rewards=pays), 0.99))
         assert coverage(replace(policy, q=q)).reaches.sum() == reaching

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from skills.errors import BadSettings
-from skills.style import paper
-from skills.style.certificate import certify
-from skills.style.grid import MOVES
-from skills.style.learning.q_learning import CellQLearning, PhaseQLearning
-from skills.style.policy import learn_policy, rollout
+from skills.gridworld import paper
+from skills.gridworld.grid import MOVES
+from skills.learning.certificate import certify
+from skills.learning.policy import learn_tabular, rollout
+from skills.learning.q_learning import CellQLearning, PhaseQLearning
 
 CELL = CellQLearning(episodes=300)
 PHASE = PhaseQLearning(max_steps=paper.MAX_STEPS)
@@ -37,13 +37,13 @@ def test_the_stop_rules_are_the_papers():
 
 @pytest.mark.parametrize("learner", [CELL, PHASE], ids=["cell", "phase"])
 def test_an_episode_ends_at_the_goal(learner, user_reward):
-    training = learn_policy(user_reward, learner).training
+    training = learn_tabular(user_reward, learner).training
     assert 0 < training.finished < training.episodes
 
 
 @pytest.mark.parametrize("learner", [CELL, PHASE], ids=["cell", "phase"])
 def test_an_episode_ends_after_100_steps(learner, user_reward):
-    training = learn_policy(user_reward, learner).training
+    training = learn_tabular(user_reward, learner).training
     assert training.out_of_steps > 0
     assert training.out_of_time == 0
     assert 100 * training.out_of_steps <= training.steps <= 100 * training.episodes
@@ -52,7 +52,7 @@ def test_an_episode_ends_after_100_steps(learner, user_reward):
 @pytest.mark.parametrize("learner", [CELL, PHASE], ids=["cell", "phase"])
 def test_an_episode_ends_when_the_arm_has_moved_for_30_minutes(learner, user_reward):
     slow = type(learner)(**{**vars(learner), "step_s": 60.0})  # so that 30 steps take the 30 minutes
-    training = learn_policy(user_reward, slow).training
+    training = learn_tabular(user_reward, slow).training
     assert training.out_of_time > 0
     assert training.out_of_steps == 0
     assert 30 * training.out_of_time <= training.steps <= 30 * training.episodes
@@ -60,38 +60,40 @@ def test_an_episode_ends_when_the_arm_has_moved_for_30_minutes(learner, user_rew
 
 @pytest.mark.parametrize("learner", [CELL, PHASE], ids=["cell", "phase"])
 def test_every_episode_ends_by_one_of_the_three_rules(learner, user_reward):
-    training = learn_policy(user_reward, learner).training
+    training = learn_tabular(user_reward, learner).training
     assert training.finished + training.out_of_steps == training.episodes
 
 
 def test_in_the_phase_state_every_action_of_every_cell_is_tried_once(user_reward):
-    training = learn_policy(user_reward, PhaseQLearning()).training
+    training = learn_tabular(user_reward, PhaseQLearning()).training
     assert training.steps == training.episodes == 1331 * 27
     assert training.finished == 27  # onto the goal, from each of its 26 neighbours and from itself
 
 
 @pytest.mark.parametrize("gamma", [0.9, 0.95, 1.0])
-def test_rewards_that_pay_more_for_standing_on_the_path_than_for_arriving_are_refused(user_reward, gamma):
-    # 1 / (1 - 0.9) = 10: what the paper's reward map did to its value iteration
-    with pytest.raises(BadSettings, match=r"[Ss]tanding on a visited cell pays"):
-        learn_policy(user_reward, CellQLearning(gamma=gamma))
+def test_rewards_that_pay_more_for_standing_than_arriving_are_refused(user_reward, gamma):
+    # 1 / (1 - 0.9) = 10: the effect of the paper's reward map on its value iteration
+    with pytest.raises(BadSettings, match=r"[Ss]tanding on a visited cell is"):
+        learn_tabular(user_reward, CellQLearning(gamma=gamma))
 
 
-def test_the_published_parameters_leave_the_users_start_stranded_on_nearly_every_seed(user_reward):
-    reached = [rollout(learn_policy(user_reward, CellQLearning.published(), s), paper.USER_START_MM) for s in range(20)]
+def test_published_parameters_strand_the_users_start_on_nearly_every_seed(user_reward):
+    reached = [
+        rollout(learn_tabular(user_reward, CellQLearning.published(), s), paper.USER_START_MM) for s in range(20)
+    ]
     assert sum(one.finished for one in reached) <= 1  # measured on 200 seeds: 0.5 %
 
 
 @pytest.mark.nightly
-def test_the_published_parameters_reach_the_goal_on_fewer_than_3_seeds_in_100(user_reward):
+def test_the_published_parameters_arrive_on_fewer_than_3_seeds_in_100(user_reward):
     reached = [
-        rollout(learn_policy(user_reward, CellQLearning.published(), s), paper.USER_START_MM) for s in range(200)
+        rollout(learn_tabular(user_reward, CellQLearning.published(), s), paper.USER_START_MM) for s in range(200)
     ]
     assert sum(one.finished for one in reached) < 6
 
 
 def test_in_the_papers_state_the_optimal_policy_cannot_cross_itself(user_reward):
-    policy = learn_policy(user_reward, CellQLearning(), seed=1)
+    policy = learn_tabular(user_reward, CellQLearning(), seed=1)
     certificate, _ = certify(policy)
     assert certificate.every_action_optimal
     assert not certificate.demonstration_reproduced

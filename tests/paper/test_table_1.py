@@ -5,9 +5,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from skills.style import paper
-from skills.style.evaluation import dtw
-from skills.style.grid import MOVES, PAPER_GRID
+from skills.gridworld import paper
+from skills.gridworld.grid import MOVES, PAPER_GRID
+from skills.learning.evaluation import dtw
 
 GOAL = 916
 PAIRS = 3 * 28  # each of the 28 states is aligned once to each of three shorter rollouts
@@ -15,7 +15,7 @@ EXACT_MM = 1e-9
 
 
 def follow(actions, state):
-    """Follow a published policy with the authors' indices; None where it leaves the grid or goes round in circles."""
+    """Follow a published policy with the authors' indices; None if it leaves the grid or enters a cycle."""
     states = [state]
     while states[-1] != GOAL:
         ix, iy, iz = states[-1] // 121, states[-1] // 11 % 11, states[-1] % 11
@@ -44,7 +44,7 @@ def test_the_printed_rmse_is_in_metres():
     assert 1000 * np.array(paper.RMSE_AS_PRINTED_MM) == pytest.approx(rmse_mm, abs=0.05)  # mm
 
 
-def test_the_similarity_of_the_discussion_is_table_1_averaged_over_the_axes():
+def test_the_discussions_similarity_is_table_1_averaged_over_the_axes():
     assert np.mean(paper.TABLE1_MEAN_MM) == pytest.approx(paper.SIMILARITY_MEAN_MM, abs=0.001)  # mm
     assert np.mean(paper.TABLE1_STD_MM) == pytest.approx(paper.SIMILARITY_STD_MM, abs=0.001)  # mm
 
@@ -75,7 +75,7 @@ def test_how_the_total_splits_over_the_axes_depends_on_the_tie_break(
 
 
 def split_bounds(path_mm, reference_mm, axis):
-    """The least and the most of one axis among all equally short alignments, in mm: whole numbers, so exact."""
+    """Return the least and the most of one axis among all equally short alignments, in mm: whole numbers, so exact."""
     apart = np.rint(np.abs(path_mm[:, None] - reference_mm[None])).astype(int).tolist()
     bounds = []
     for sign in (1, -1):

@@ -1,13 +1,13 @@
-"""The movement primitive: what the library does with it, run many at a time and pushed about."""
+"""The movement primitive: the same as the library's, run many at a time and with disturbances."""
 
 import numpy as np
 import pytest
 from movement_primitives.dmp import DMP
 
-from skills.report.dmp import REST_TICKS, STEPS, learn_primitive, rollouts, walk_primitive
-from skills.report.sources import sample_source
-from skills.style.disturbance import STEADY, draw_slips, judge
-from skills.style.grid import MOVES, discretize
+from skills.gridworld.grid import MOVES, discretize
+from skills.learning.slip import STEADY, draw_slips, judge
+from skills.report.figures import sample_source
+from skills.report.rivals import REST_TICKS, STEPS, learn_primitive, rollouts, walk_primitive
 
 PATH = sample_source().path
 PRIMITIVE = learn_primitive(PATH)
@@ -18,7 +18,7 @@ def steady(moves: int, runs: int = 1) -> np.ndarray:
     return np.full((moves, runs), STEADY, np.int8)
 
 
-def test_undisturbed_it_gives_the_demonstration_back_and_stops_with_its_clock():
+def test_an_undisturbed_primitive_repeats_the_demo_and_stops_on_its_clock():
     assert PRIMITIVE.weights.shape == (3, len(PATH.states) - 1 + REST_TICKS)
     walks = walk_primitive(PRIMITIVE, np.array([PATH.start, PATH.start]), steady(200, runs=2))
     assert [walks.of(run).tolist() for run in range(2)] == [PATH.states.tolist()] * 2

@@ -4,14 +4,13 @@ import numpy as np
 import pytest
 
 from skills.errors import BadInput
-from skills.report import fig_9, sources
-from skills.report.fig_7 import stack_passes
-from skills.report.published import follow, starts_reaching
-from skills.report.table_1 import as_printed, axis_bounds_mm, pooled
-from skills.style import paper
-from skills.style.grid import MOVES, PAPER_GRID, GridPath, GridWorld
-from skills.style.policy import Rollout
-from tests.style.paths import learnt, named_path
+from skills.gridworld import paper
+from skills.gridworld.grid import MOVES, PAPER_GRID, GridPath, GridWorld
+from skills.learning.policy import Rollout
+from skills.report import figures
+from skills.report.figures import follow, stack_passes, starts_reaching
+from skills.report.numbers import as_printed, axis_bounds_mm, pooled
+from tests.gridworld.paths import learnt, named_path
 
 LINE = GridWorld((0.0, 0.0, 0.0), 5.0, (6, 2, 2))
 STAY, AHEAD, BACK = (MOVES.tolist().index(move) for move in ([0, 0, 0], [1, 0, 0], [-1, 0, 0]))
@@ -26,7 +25,7 @@ def along_x(*xs: int) -> GridPath:
     return GridPath(LINE, LINE.states_of([(x, 0, 0) for x in xs]))
 
 
-def test_a_published_policy_is_followed_to_the_goal_round_in_circles_or_against_the_edge():
+def test_a_published_policy_ends_at_the_goal_in_a_circle_or_at_the_edge():
     path = along_x(2, 3)
     ahead = np.full(LINE.n_states, AHEAD)
     assert follow(ahead, path, path.start).states.tolist() == path.states.tolist()
@@ -95,8 +94,8 @@ def test_the_printed_row_is_the_papers_and_its_total_430_mm():
     assert row.total_mm == pytest.approx(430, abs=3 * 0.0005 * 84)  # mm, by its rounding
 
 
-def test_the_ten_starts_are_different_spread_over_the_printed_range_and_hold_the_one_that_fails():
-    starts = fig_9.starts_mm()
+def test_the_ten_starts_differ_span_the_range_and_include_the_failing_one():
+    starts = figures.starts_mm()
     assert len(set(starts)) == 10
     assert (-25.0, 50.0, -135.0) in starts
     assert paper.USER_START_MM not in starts
@@ -115,34 +114,34 @@ def test_five_passes_miss_the_moved_demonstration_by_nothing():
 
 @pytest.fixture
 def folder(tmp_path):
-    """A folder in the form of the paper's data, with none of it."""
+    """Return a folder in the form of the paper's data, with none of it."""
     path = named_path("an angle")
     tip_m = PAPER_GRID.centres_mm(PAPER_GRID.states_of(path.cells)) / 1000
-    np.savetxt(tmp_path / sources.USER_PATH, np.hstack((tip_m, np.zeros_like(tip_m))), delimiter=",")
-    np.savetxt(tmp_path / sources.RAW, np.hstack((np.zeros_like(tip_m), tip_m)), delimiter=",", header="r,p,y,X,Y,Z")
-    for name in sources.POLICIES:
+    np.savetxt(tmp_path / figures.USER_PATH, np.hstack((tip_m, np.zeros_like(tip_m))), delimiter=",")
+    np.savetxt(tmp_path / figures.RAW, np.hstack((np.zeros_like(tip_m), tip_m)), delimiter=",", header="r,p,y,X,Y,Z")
+    for name in figures.POLICIES:
         np.save(tmp_path / name, np.full(PAPER_GRID.n_states, 13.0))
     return tmp_path
 
 
 def test_data_in_the_papers_form_is_read_in_mm(folder):
-    source = sources.paper_source(folder)
+    source = figures.paper_source(folder)
     assert source is not None
     assert source.path.cells.tolist() == named_path("an angle").cells.tolist()
     assert source.recorded_elsewhere
     assert [actions.tolist() for actions in source.published] == [[13] * 1331] * 3
 
 
-@pytest.mark.parametrize("nowhere", [None, sources.Path("")])
+@pytest.mark.parametrize("nowhere", [None, figures.Path("")])
 def test_no_folder_is_no_source(nowhere):
-    assert sources.paper_source(nowhere) is None
+    assert figures.paper_source(nowhere) is None
 
 
-@pytest.mark.parametrize("name", [sources.USER_PATH, sources.RAW, *sources.POLICIES])
+@pytest.mark.parametrize("name", [figures.USER_PATH, figures.RAW, *figures.POLICIES])
 def test_a_missing_file_is_named(folder, name):
     (folder / name).unlink()
     with pytest.raises(BadInput, match=name):
-        sources.paper_source(folder)
+        figures.paper_source(folder)
 
 
 BAD_ARRAYS = {
@@ -155,29 +154,29 @@ BAD_ARRAYS = {
 
 @pytest.mark.parametrize("actions", BAD_ARRAYS.values(), ids=BAD_ARRAYS)
 def test_actions_that_are_none_are_refused(folder, actions):
-    np.save(folder / sources.POLICIES[1], actions)
+    np.save(folder / figures.POLICIES[1], actions)
     with pytest.raises(BadInput, match="action from 0 to 26"):
-        sources.paper_source(folder)
+        figures.paper_source(folder)
 
 
 @pytest.mark.parametrize(
     ("name", "text"),
     [
-        (sources.USER_PATH, "not,a,number"),
-        (sources.USER_PATH, "1,2"),
-        (sources.USER_PATH, ""),
-        (sources.RAW, "h\n1,2,3"),
+        (figures.USER_PATH, "not,a,number"),
+        (figures.USER_PATH, "1,2"),
+        (figures.USER_PATH, ""),
+        (figures.RAW, "h\n1,2,3"),
     ],
 )
 @pytest.mark.filterwarnings("ignore:loadtxt")
 def test_a_damaged_table_is_refused(folder, name, text):
     (folder / name).write_text(text)
-    with pytest.raises(BadInput, match="does not hold the paper's data"):
-        sources.paper_source(folder)
+    with pytest.raises(BadInput, match="does not contain the paper's data"):
+        figures.paper_source(folder)
 
 
 def test_metres_taken_for_millimetres_lie_outside_the_grid_and_are_refused(folder):
-    table = np.loadtxt(folder / sources.USER_PATH, delimiter=",")
-    np.savetxt(folder / sources.USER_PATH, 1000 * table, delimiter=",")
+    table = np.loadtxt(folder / figures.USER_PATH, delimiter=",")
+    np.savetxt(folder / figures.USER_PATH, 1000 * table, delimiter=",")
     with pytest.raises(BadInput, match="outside the grid"):
-        sources.paper_source(folder)
+        figures.paper_source(folder)

@@ -1,4 +1,4 @@
-"""`skills report`: the command, the page it leaves, and that its numbers are the core's."""
+"""`skills report`: the command, its page, and its numbers, which must equal the core's."""
 
 import json
 import os
@@ -10,14 +10,14 @@ import pytest
 from typer.testing import CliRunner
 
 from skills.cli import app
-from skills.report.sections import SECTIONS
-from skills.report.slips import SLIPS
-from skills.report.sources import sample_source
+from skills.gridworld.reward import sparse_reward
+from skills.learning.evaluation import measure
+from skills.learning.policy import learn_tabular, rollout_from
+from skills.learning.q_learning import CellQLearning
+from skills.report.figures import sample_source
+from skills.report.page import SECTIONS
+from skills.report.rivals import SLIPS
 from skills.settings import settings
-from skills.style.evaluation import measure
-from skills.style.learning.q_learning import CellQLearning
-from skills.style.policy import learn_policy, rollout_from
-from skills.style.reward import sparse_reward
 
 QUICK = ("--irl-iterations", "3", "--seeds", "2", "--runs", "20")
 FIGURES = ("fig-5", "fig-6", "fig-7", "fig-8", "fig-9")
@@ -26,7 +26,7 @@ PNG = b"\x89PNG\r\n\x1a\n"
 
 
 class Page(HTMLParser):
-    """What a page shows and asks for: its tables by id, images, sections, and every address in it."""
+    """The content of a page: its tables by id, images, sections, and every address in it."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -64,7 +64,7 @@ class Page(HTMLParser):
 
 
 def run(to: Path, data: Path | None, *words: str) -> tuple[int, str, str]:
-    """Run the command with the paper's data, or without: exit code, what it printed, what it said beside."""
+    """Run the command with the paper's data, or without; return exit code, standard output and standard error."""
     settings.cache_clear()
     try:
         answer = CliRunner(env={"SKILLS_PAPER_DATA": str(data) if data else None}).invoke(
@@ -77,7 +77,7 @@ def run(to: Path, data: Path | None, *words: str) -> tuple[int, str, str]:
 
 @pytest.fixture(scope="module")
 def without(tmp_path_factory: pytest.TempPathFactory):
-    """The report of the sample alone: its folder, and what the command printed."""
+    """Return the report of the sample alone: its folder, and the command's output."""
     to = tmp_path_factory.mktemp("without") / "made" / "by it"
     return to, *run(to, None)
 
@@ -87,11 +87,11 @@ def page(without) -> Page:
     return Page((without[0] / "index.html").read_text())
 
 
-def test_without_the_papers_data_it_draws_the_sample_and_says_what_is_absent(without):
+def test_without_the_papers_data_the_report_draws_the_sample_and_says_so(without):
     to, code, printed, said = without
     assert code == 0, printed + said
-    assert "THE PAPER'S DATA IS NOT HERE" in said
-    assert "THE PAPER'S DATA IS NOT HERE" in (to / "index.html").read_text().replace("&#x27;", "'")
+    assert "THE PAPER'S DATA IS MISSING" in said
+    assert "THE PAPER'S DATA IS MISSING" in (to / "index.html").read_text().replace("&#x27;", "'")
     assert sorted(file.name for file in to.glob("*.png")) == [f"{name}-sample.png" for name in PICTURES]
     assert all(file.read_bytes().startswith(PNG) for file in to.glob("*.png"))
     assert "DTW (mm)" in printed
@@ -118,12 +118,12 @@ def test_the_numbers_of_the_page_are_those_of_the_core(page):
     head, *rows = page.tables["fig-8-sample"]
     assert head[5] == "DTW (mm)"
     for seed in range(3):
-        policy = learn_policy(sparse_reward(path), CellQLearning(), seed)
+        policy = learn_tabular(sparse_reward(path), CellQLearning(), seed)
         followed = rollout_from(policy, path.start)
         assert rows[seed][1:4] == [f"seed {seed}", "yes", str(len(followed.states))]
         assert float(rows[seed][5]) == measure(followed).dtw_total_mm
     states = str(len(path.states))
-    assert [row[3:6] for row in rows[3:]] == [[states, states, "0"]] * 5  # ours, and the rivals, give it back
+    assert [row[3:6] for row in rows[3:]] == [[states, states, "0"]] * 5  # ours and the alternatives reproduce it
     assert page.tables["seeds-sample"][3][1:] == ["2", "2", "2"]
 
 
@@ -156,6 +156,7 @@ def test_the_page_says_how_policy_and_rivals_fare_with_slips(page):
     assert all(exact[slip, "ours, solved for this slip"] > exact[slip, "ours: phase and cell"] for slip in SLIPS[1:])
 
 
+@pytest.mark.nightly
 def test_the_same_command_twice_gives_the_same_numbers_and_pictures(without, tmp_path):
     to, _, printed, _ = without
     again = run(tmp_path, None)
@@ -170,11 +171,10 @@ def test_programs_get_the_tables_as_json(without):
     assert all(len(row) == len(table["columns"]) for table in tables.values() for row in table["rows"])
 
 
+@pytest.mark.nightly
+@pytest.mark.needs("paper")
 def test_with_the_papers_data_the_published_policies_stand_beside_ours(tmp_path):
-    folder = os.environ.get("SKILLS_PAPER_DATA")
-    if not folder:
-        pytest.skip("THE PAPER'S DATA IS NOT HERE: set SKILLS_PAPER_DATA to its folder to run this test")
-    code, printed, said = run(tmp_path, Path(folder), "--json")
+    code, printed, said = run(tmp_path, Path(os.environ["SKILLS_PAPER_DATA"]), "--json")
     assert (code, "NOT HERE" in said) == (0, False), said
     assert len(list(tmp_path.glob("*.png"))) == 2 * len(PICTURES)
     tables = {table["name"]: table["rows"] for table in json.loads(printed)}
@@ -183,7 +183,7 @@ def test_with_the_papers_data_the_published_policies_stand_beside_ours(tmp_path)
         ("published", 145.0, 1331),
         ("published", 145.0, 1181),
     ]
-    assert [row[2:6] for row in tables["fig-8-paper"][6:]] == [["yes", 28, 28, 0.0]] * 5  # ours, and the rivals
+    assert [row[2:6] for row in tables["fig-8-paper"][6:]] == [["yes", 28, 28, 0.0]] * 5  # ours and the alternatives
     assert tables["fig-9-paper"][0][:2] == ["-25, 50, -135", "yes"]
     assert tables["fig-9-paper"][0][4:7] == ["no", "yes", "yes"]  # the single policy of Fig. 9 was not the first one
     assert tables["range-paper"] == [
@@ -211,4 +211,4 @@ def test_a_file_where_the_folder_should_be_is_refused(tmp_path):
     file = tmp_path / "report"
     file.write_text("mine")
     code, _, said = run(file, None)
-    assert (code, "name a folder" in said, file.read_text()) == (1, True, "mine")
+    assert (code, "Name a folder" in said, file.read_text()) == (1, True, "mine")

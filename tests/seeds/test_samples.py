@@ -5,9 +5,9 @@ from importlib.resources import files
 import numpy as np
 import pytest
 
-from skills.recordings import read_recording
+from skills.demonstration.demonstration import cut_demo, propose_segments
+from skills.formats import read_recording
 from skills.seeds.recordings import sample_recordings
-from skills.style.demo import cut_demo, propose_segments
 
 ORIGIN_MM, CELL_MM, SHAPE = np.array([-30.0, 25.0, -140.0]), 5.0, 11  # the paper's grid
 SLUGS = [

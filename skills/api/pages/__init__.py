@@ -1,1 +1,1 @@
-"""Pages for people: one HTML document each, with everything in it and nothing that runs."""
+"""Web pages: each is one HTML document. Some need the site's scripts, others stand alone and run nothing."""

@@ -1,1 +1,1 @@
-"""The calls, a file for each kind of thing."""
+"""HTTP routes, a module for each kind of resource."""

@@ -1,38 +1,37 @@
-"""Surgeons and suture types."""
+"""Routes of surgeons, suture types and API keys. An installation's first key is created by `skills keys create`."""
 
-from typing import Annotated, Literal
+from typing import Annotated
 
-from fastapi import APIRouter, Query, Response
+from fastapi import APIRouter, Path, Query, Request, Response
 
-from skills.api.access import needs
-from skills.api.conditions import Condition, refuse_changed
-from skills.api.deps import Actor, Db, Jobs, Limit, Slug, SlugCursor
-from skills.api.documented import ends, gives, gives_page, makes
-from skills.api.replies import Giving, stored
-from skills.api.schemas.given import Page, Surgeon, SutureType
-from skills.api.schemas.sent import SurgeonIn, SutureTypeIn
-from skills.api.schemas.written import surgeon_out, suture_out
-from skills.api.strict import Strict
+from skills.api.authorisation import needs
+from skills.api.dependencies import Actor, Db, Jobs, Limit, RowCursor, Slug, SlugCursor, Strict
+from skills.api.openapi import ends, gives, gives_page, makes, says
+from skills.api.responses import Condition, Giving, refuse_changed, say, stored
 from skills.library import catalogue, erasure
+from skills.library.catalogue import surgeon_json, suture_json
+from skills.library.keys import about_key, create_key, list_keys, revoke_key
+from skills.schemas.base import SkillLevel
+from skills.schemas.given import Key, NewKey, Page, Surgeon, SutureType
+from skills.schemas.requests import KEY, LINE, KeyIn, SurgeonIn, SutureTypeIn
 from skills.settings import MEBIBYTE
 
 router = APIRouter(route_class=Strict, tags=["catalogue"], max_body_size=MEBIBYTE)
 
-Search = Annotated[str | None, Query(min_length=1, max_length=64, pattern=r"^[^\x00-\x1f\x7f]+$")]
-SkillLevel = Literal["novice", "intermediate", "expert"]
+Search = Annotated[str | None, Query(min_length=1, max_length=64, pattern=LINE)]
 
 
 @router.put("/surgeons/{surgeon}", dependencies=[needs("admin")], **makes(Surgeon, 410, 412))
 def put_surgeon(
     surgeon: Slug, body: SurgeonIn, db: Db, actor: Actor, if_match: Condition = None, if_none_match: Condition = None
 ) -> Response:
-    """Write a surgeon whole, under a pseudonym."""
+    """Create or replace a surgeon under a pseudonym; fields that are left out are cleared."""
     with db.writing() as session:
         if if_match or if_none_match:
             known = catalogue.known_surgeon(session, surgeon)
-            refuse_changed(known and surgeon_out(known), if_match, if_none_match)
+            refuse_changed(known and surgeon_json(known), if_match, if_none_match)
         row, created = catalogue.put_surgeon(session, surgeon, body.model_dump(mode="json"), actor)
-        return stored(surgeon_out(row), created, f"/surgeons/{surgeon}")
+        return stored(surgeon_json(row), created, f"/surgeons/{surgeon}")
 
 
 @router.get("/surgeons", dependencies=[needs("reader")], **gives_page(Page[Surgeon]))
@@ -44,27 +43,28 @@ def list_surgeons(
     limit: Limit = 50,
     cursor: SlugCursor = None,
 ) -> Response:
-    """List the surgeons by pseudonym, all or those in whose pseudonym the search is found."""
+    """List the surgeons in the order of their pseudonyms: all, or those whose pseudonym contains the search."""
     with db.reading() as session:
         found = catalogue.list_surgeons(session, limit, cursor, search, skill_level)
-        return give.page([surgeon_out(row) for row in found], limit, found[-1].slug if found else None)
+        return give.page([surgeon_json(row) for row in found], limit, found[-1].slug if found else None)
 
 
 @router.get("/surgeons/{surgeon}", dependencies=[needs("reader")], **gives(Surgeon, 404, 410))
 def get_surgeon(surgeon: Slug, db: Db, give: Giving) -> Response:
-    """Look a surgeon up."""
+    """Return a surgeon."""
     with db.reading() as session:
-        return give(surgeon_out(catalogue.find_surgeon(session, surgeon)))
+        return give(surgeon_json(catalogue.find_surgeon(session, surgeon)))
 
 
 @router.delete("/surgeons/{surgeon}", dependencies=[needs("admin")], **ends(404, 410, 412))
 def erase_surgeon(surgeon: Slug, db: Db, jobs: Jobs, actor: Actor, if_match: Condition = None) -> None:
-    """Erase a surgeon and everything derived from them, for good."""
+    """Erase a surgeon and everything derived from their data, permanently."""
     with db.writing() as session:
         if if_match:
-            refuse_changed(surgeon_out(catalogue.find_surgeon(session, surgeon)), if_match)
-        dropped = [(job.row, job.attempt) for job in erasure.erase_surgeon(session, surgeon, actor)]
-    db.forget()
+            refuse_changed(surgeon_json(catalogue.find_surgeon(session, surgeon)), if_match)
+        dropped = erasure.erase_surgeon(session, surgeon, actor)
+    db.forget()  # erased data must not stay in SQLite's write-ahead log
+    # after the commit, because one transaction cannot span our database and the engine's
     for row, attempt in dropped:
         jobs.cancel(row, attempt)
 
@@ -73,27 +73,61 @@ def erase_surgeon(surgeon: Slug, db: Db, jobs: Jobs, actor: Actor, if_match: Con
 def put_suture_type(
     suture: Slug, body: SutureTypeIn, db: Db, actor: Actor, if_match: Condition = None, if_none_match: Condition = None
 ) -> Response:
-    """Write a suture type whole."""
+    """Create or replace a suture type; fields that are left out get their defaults."""
     with db.writing() as session:
         if if_match or if_none_match:
             known = catalogue.known_suture_type(session, suture)
-            refuse_changed(known and suture_out(known), if_match, if_none_match)
+            refuse_changed(known and suture_json(known), if_match, if_none_match)
         row, created = catalogue.put_suture_type(session, suture, body.model_dump(), actor)
-        return stored(suture_out(row), created, f"/suture-types/{suture}")
+        return stored(suture_json(row), created, f"/suture-types/{suture}")
 
 
 @router.get("/suture-types", dependencies=[needs("reader")], **gives_page(Page[SutureType]))
 def list_suture_types(
     db: Db, give: Giving, search: Search = None, limit: Limit = 50, cursor: SlugCursor = None
 ) -> Response:
-    """List the suture types, all or those in whose name, family or slug the search is found."""
+    """List the suture types: all, or those whose name, family or slug contains the search."""
     with db.reading() as session:
         found = catalogue.list_suture_types(session, limit, cursor, search)
-        return give.page([suture_out(row) for row in found], limit, found[-1].slug if found else None)
+        return give.page([suture_json(row) for row in found], limit, found[-1].slug if found else None)
 
 
 @router.get("/suture-types/{suture}", dependencies=[needs("reader")], **gives(SutureType, 404))
 def get_suture_type(suture: Slug, db: Db, give: Giving) -> Response:
-    """Look a suture type up."""
+    """Return a suture type."""
     with db.reading() as session:
-        return give(suture_out(catalogue.find_suture_type(session, suture)))
+        return give(suture_json(catalogue.find_suture_type(session, suture)))
+
+
+key_router = APIRouter(route_class=Strict, tags=["keys"], max_body_size=MEBIBYTE)
+
+KeyId = Annotated[str, Path(pattern=KEY)]
+
+
+@key_router.get("/keys", dependencies=[needs("admin")], **gives_page(Page[Key]))
+def list_all_keys(db: Db, give: Giving, limit: Limit = 50, cursor: RowCursor = None) -> Response:
+    """List all keys, including those that were revoked or have expired."""
+    with db.reading() as session:
+        found = list_keys(session, limit, cursor)
+        return give.page([about_key(key) for key in found], limit, found[-1].row if found else None)
+
+
+@key_router.post("/keys", dependencies=[needs("admin")], **makes(NewKey, 404, 410, located=False))
+def make_key(body: KeyIn, db: Db, actor: Actor, request: Request) -> Response:
+    """Create a key; only this response ever contains its secret."""
+    with db.writing() as session:
+        key, text = create_key(
+            session, body.owner, body.role, actor, expires_at=body.expires_at, surgeons=body.surgeons
+        )
+        made = about_key(key) | {"secret": text}
+    request.app.state.access.forget()
+    return say(made, 201, {"Cache-Control": "no-store"})  # no cache may store the secret
+
+
+@key_router.delete("/keys/{key}", dependencies=[needs("admin")], **says(Key, 404))
+def end_key(key: KeyId, db: Db, actor: Actor, request: Request) -> Response:
+    """Revoke a key permanently: it is refused from now on, and sign-ins with it end."""
+    with db.writing() as session:
+        revoked = about_key(revoke_key(session, key, actor))
+    request.app.state.access.forget()
+    return say(revoked)

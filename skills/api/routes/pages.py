@@ -1,4 +1,4 @@
-"""The pages of the site, and what they load. They only look; whatever changes something is one of the calls."""
+"""Routes of the web pages and of the files that they load. Pages only read; changes go through the public calls."""
 
 from collections.abc import Callable, Coroutine
 from typing import Annotated, Any, Literal, get_args
@@ -7,30 +7,33 @@ import orjson
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.exceptions import RequestValidationError
 from fastapi.routing import APIRoute
-from markupsafe import Markup
 from sqlalchemy.orm import Session
 
 from skills import errors
-from skills.api.access import Asking, needs, open_to_all
-from skills.api.answers import JSON
-from skills.api.deps import Db, Digest, Limit, Read, RowCursor, Slug, SlugCursor
-from skills.api.pages import score_drawing
-from skills.api.pages.assets import assets, build
-from skills.api.pages.page import render
+from skills.api.authorisation import Asking, needs, open_to_all
+from skills.api.dependencies import Configured, Db, Digest, Limit, Read, RowCursor, Slug, SlugCursor
+from skills.api.pages import demonstration
+from skills.api.pages.page import assets, build, render
+from skills.api.responses import JSON
+from skills.api.routes.jobs import JobId
 from skills.api.routes.policies import Version
-from skills.api.routes.trainings import JobId
-from skills.library import batches, jobs, overview, policies, retraining, scores, views
+from skills.formats import MEDIA_TYPES, SUFFIXES
+from skills.kinematics import INSTRUMENTS
+from skills.library import jobs, overview, policies, retraining, scores
 from skills.library.demos import find_demo
-from skills.library.plans import find_plan
+from skills.library.plans import find_plan, hands_over, plan_in_words
+from skills.library.playbacks import headline_of
 from skills.library.recordings import find_recording
-from skills.recordings import MEDIA_TYPES
+from skills.library.releases import outcomes_of
+from skills.planning.handoff import Enters
+from skills.schemas.requests import DIGEST, ScoreIn
 from skills.settings import MEBIBYTE
-from skills.style.handoff import Enters
-from skills.style.kinematics import INSTRUMENTS
 
-# What is told on a page; all else is 404.
+# Statuses of errors that are shown as a page; all others are 404.
 STATUS: dict[type[Exception], int] = {errors.Erased: 410, errors.Conflict: 409, errors.BadPath: 422}
 LOST: tuple[type[Exception], ...] = (errors.NotFound, RequestValidationError, *STATUS)
+PSM_M_FROM_GOAL_MM = (155.0, -35.0, 145.0)  # ours, assumed: the base of the samples' PSM_M relative to their goal
+PSM_M_TURN = "0, 0.300706, 0, 0.953717"  # 35 degrees about y
 FOR_GOOD = "public, max-age=31536000, immutable"
 
 Words = Annotated[str, Query(max_length=200)]
@@ -38,10 +41,10 @@ Picked = Annotated[str | None, Query(max_length=64)]
 
 
 class PageRoute(APIRoute):
-    """A route for a person: what is not there is told on a page."""
+    """A route for browsers: errors about missing things are rendered as a page."""
 
     def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
-        """Answer as the route does, or say on a page what is not there."""
+        """Return a handler that renders the errors in `LOST` as a page."""
         answer = super().get_route_handler()
 
         async def answer_or_tell(request: Request) -> Response:
@@ -49,7 +52,7 @@ class PageRoute(APIRoute):
                 return await answer(request)
             except LOST as lost:
                 status = next((code for kind, code in STATUS.items() if isinstance(lost, kind)), 404)
-                said = str(lost) if isinstance(lost, errors.SkillsError) else "There is no page of this address."
+                said = lost.words() if isinstance(lost, errors.SkillsError) else "There is no page at this address."
                 return render(
                     request,
                     "lost.html",
@@ -67,7 +70,7 @@ router = APIRouter(route_class=PageRoute, include_in_schema=False, max_body_size
 
 @router.get("/static/{version}/{name}", dependencies=[open_to_all()])
 def get_static(version: str, name: str, request: Request) -> Response:
-    """Give what a page loads; under the address of this build a browser may keep it for good."""
+    """Return a file that a page loads; under the URL of this build a browser may cache it permanently."""
     asset = assets().get(name)
     if asset is None:
         raise errors.NotFound("There is no such file.")
@@ -88,7 +91,7 @@ def show_catalogue(
     skill: Literal["", "novice", "intermediate", "expert"] = "",
     cursor: SlugCursor = None,
 ) -> Response:
-    """Show the styles: surgeons and suture types, what is stored, trained and released."""
+    """Show the styles: surgeons and suture types, with their stored, trained and released state."""
     with db.reading() as session:
         found = overview.matrix(session, q, state or None, skill or None, cursor)
         asked = {"q": q, "state": state, "skill": skill}
@@ -105,7 +108,7 @@ def show_style(
     version: Annotated[int | None, Query(ge=1)] = None,
     beside: Annotated[int | None, Query(ge=1)] = None,
 ) -> Response:
-    """Show a style: in 3-D, its numbers, versions and demonstrations; `beside` is a version to compare."""
+    """Show a style in 3-D, with its figures, versions and demonstrations; `beside` is a version to compare with."""
     with db.reading() as session:
         whole = overview.whole_style(session, surgeon, suture)
         shown = _chosen(session, whole, version)
@@ -114,7 +117,7 @@ def show_style(
 
 
 def _chosen(session: Session, whole: overview.WholeStyle, version: int | None) -> Any:
-    """Choose what to show: the version asked for, else the served one, else the newest."""
+    """Return the version to show: the requested one, else the served one, else the newest."""
     if version is not None:
         return policies.find_version(session, whole.surgeon.slug, whole.suture.slug, version)
     if whole.served is not None:
@@ -124,16 +127,16 @@ def _chosen(session: Session, whole: overview.WholeStyle, version: int | None) -
 
 @router.get("/pages/styles/{surgeon}/{suture}/versions/{version}/view", dependencies=[needs("reader")])
 def view_version(surgeon: Slug, suture: Slug, version: Version, caller: Asking, db: Db) -> Response:
-    """Give what the 3-D view of a version is drawn from."""
+    """Return the data of a version's 3-D view."""
     with db.reading() as session:
-        return _json(views.view_of_version(session, policies.find_version(session, surgeon, suture, version)))
+        return _json(overview.view_of_version(session, policies.find_version(session, surgeon, suture, version)))
 
 
 @router.get("/pages/demos/{demo}/view", dependencies=[needs("reader")])
 def view_demo(demo: Digest, caller: Asking, db: Db) -> Response:
-    """Give what the 3-D view of a demonstration is drawn from."""
+    """Return the data of a demonstration's 3-D view."""
     with db.reading() as session:
-        return _json(views.view_of_demo(session, find_demo(session, demo)))
+        return _json(overview.view_of_demo(session, find_demo(session, demo)))
 
 
 @router.get("/pages/demos/{demo}/score", dependencies=[needs("reader")])
@@ -145,18 +148,18 @@ def show_score(
     read: Read,
     surgeon: Annotated[str, Query(max_length=64)] = "",
 ) -> Response:
-    """Show the score of a demonstration against a surgeon's style; left out, an expert's, if there is one."""
+    """Show the score of a demonstration against a surgeon's style; by default that of an expert, if there is one."""
     with db.reading() as session:
         found = find_demo(session, demo)
         surgeons = scores.references(session, found.suture)
     others = [one.slug for one in surgeons if one.row != found.surgeon_row]
     against = surgeon or next(iter(others), found.surgeon.slug)
-    score = scores.score(db, scores.Asked(against, found.suture, found.sha256), read)
+    score = scores.score(db, ScoreIn(surgeon=against, suture=found.suture, demo=found.sha256), read)
     drawn: dict[str, Any] = {
-        "views": [(name, Markup(svg)) for name, svg in score_drawing.views(score["deviation"])],  # noqa: S704 - our own
-        "along": Markup(score_drawing.along(score["deviation"])),  # noqa: S704
-        "curve": Markup(score_drawing.over_time(score["curve"], found.sha256)) if len(score["curve"]) > 1 else None,  # noqa: S704
-        "key": score_drawing.key(),
+        "views": demonstration.deviation_views(score.deviation),
+        "along": demonstration.deviation_along(score.deviation),
+        "curve": demonstration.score_curve(score.curve, found.sha256) if len(score.curve) > 1 else None,
+        "key": demonstration.score_key(),
     }
     return render(request, "score.html", caller, demo=found, score=score, surgeons=surgeons, **drawn)
 
@@ -171,16 +174,15 @@ def show_recordings(request: Request, caller: Asking, db: Db, cursor: RowCursor 
 
 @router.get("/pages/recordings/new", dependencies=[needs("reader")])
 def show_upload(request: Request, caller: Asking, surgeon: Picked = None, suture: Picked = None) -> Response:
-    """Show where a recording is sent from."""
-
-    return render(request, "upload.html", caller, kinds=MEDIA_TYPES, surgeon=surgeon, suture=suture)
+    """Show the form that uploads a recording."""
+    return render(request, "upload.html", caller, kinds=MEDIA_TYPES, suffixes=SUFFIXES, surgeon=surgeon, suture=suture)
 
 
 @router.get("/pages/recordings/{recording}", dependencies=[needs("reader")])
 def show_recording(
     recording: Digest, request: Request, caller: Asking, db: Db, surgeon: Picked = None, suture: Picked = None
 ) -> Response:
-    """Show a recording: its quality, its proposed hand-offs, and what was cut out of it."""
+    """Show a recording: its quality, its proposed hand-offs, and the demonstrations cut out of it."""
     with db.reading() as session:
         found = find_recording(session, recording)
         demos = overview.demos_of_recording(session, found)
@@ -200,15 +202,18 @@ def show_recording(
 
 @router.get("/pages/recordings/{recording}/traces", dependencies=[needs("reader")])
 def trace_recording(recording: Digest, caller: Asking, db: Db, read: Read) -> Response:
-    """Give what the time line of a recording is drawn from."""
-    return _json(views.traces_of(db, recording, read))
+    """Return the data of a recording's timeline."""
+    return _json(overview.traces_of(db, recording, read))
 
 
 @router.get("/pages/plans", dependencies=[needs("reader")])
-def show_plans(request: Request, caller: Asking, db: Db, cursor: RowCursor = None) -> Response:
+def show_plans(request: Request, caller: Asking, db: Db, settings: Configured, cursor: RowCursor = None) -> Response:
     """Show the newest plans with their verdicts."""
     with db.reading() as session:
-        found = overview.newest_plans(session, cursor)
+        found = [
+            (plan, plan_in_words(plan.about), None if played is None else headline_of(played, settings))
+            for plan, played in overview.newest_plans(session, cursor)
+        ]
         return render(request, "plans.html", caller, found=found, most=overview.MOST)
 
 
@@ -220,9 +225,9 @@ def show_plan_editor(
     surgeon: Picked = None,
     suture: Picked = None,
     version: Annotated[int | None, Query(ge=1)] = None,
-    like: Annotated[str | None, Query(pattern=r"^[0-9a-f]{64}$")] = None,
+    like: Annotated[str | None, Query(pattern=DIGEST)] = None,
 ) -> Response:
-    """Show the plan editor, filled from a style or from a plan that exists."""
+    """Show the plan editor, filled from a style or from an existing plan."""
     with db.reading() as session:
         before = None if like is None else find_plan(session, like)
         if before is not None:
@@ -244,11 +249,18 @@ def show_plan_editor(
             before=before,
             instruments=sorted(INSTRUMENTS),
             enters=get_args(Enters),
+            assumed=None if policy is None else _assumed_psm_m(policy.manifest["goal_mm"]),
         )
 
 
+def _assumed_psm_m(goal_mm: list[float]) -> dict[str, str]:
+    """Return a plausible PSM_M for a demonstration without one: placed relative to the goal as in the samples."""
+    base_mm = [round(at + off, 1) for at, off in zip(goal_mm, PSM_M_FROM_GOAL_MM, strict=True)]
+    return {"approach": "-0.94, 0.1, -0.33", "base_mm": ", ".join(f"{x:g}" for x in base_mm), "base_xyzw": PSM_M_TURN}
+
+
 @router.get("/pages/plans/{plan}", dependencies=[needs("reader")])
-def show_plan(plan: Digest, request: Request, caller: Asking, db: Db) -> Response:
+def show_plan(plan: Digest, request: Request, caller: Asking, db: Db, settings: Configured) -> Response:
     """Show a plan with its playbacks."""
     with db.reading() as session:
         found = find_plan(session, plan)
@@ -257,7 +269,9 @@ def show_plan(plan: Digest, request: Request, caller: Asking, db: Db) -> Respons
             "plan.html",
             caller,
             plan=found,
-            played=overview.playbacks_of(session, found),
+            played=[(one, headline_of(one.playback, settings)) for one in overview.playbacks_of(session, found)],
+            in_words=plan_in_words(found.about),
+            hands_over=hands_over(found.about),
             job=overview.newest_job(session, "playback", plan=found.sha256),
         )
 
@@ -270,7 +284,7 @@ def show_jobs(
     state: Literal["", "queued", "running", "succeeded", "failed", "cancelled"] = "",
     cursor: RowCursor = None,
 ) -> Response:
-    """Show jobs, the newest first, and where a batch is started."""
+    """Show jobs, the newest first, and the form that starts a batch."""
     with db.reading() as session:
         return render(
             request,
@@ -288,16 +302,17 @@ def show_jobs(
 def show_job(
     job: JobId, request: Request, caller: Asking, db: Db, limit: Limit = overview.MOST, cursor: RowCursor = None
 ) -> Response:
-    """Show a job as it runs; of a batch its styles too."""
+    """Show a job as it runs, and the styles of a batch."""
     with db.reading() as session:
         found = jobs.find_job(session, job)
-        batch = found.kind == batches.BATCH
+        batch = found.kind == jobs.BATCH
         return render(
             request,
             "job.html",
             caller,
             job=found,
-            counts=batches.count(session, found.row) if batch else None,
+            came_of=outcomes_of(session, [found])[found.row],
+            counts=jobs.count(session, found.row) if batch else None,
             styles=retraining.list_styles(session, found, limit, cursor, None) if batch else [],
             limit=limit,
         )
@@ -305,7 +320,7 @@ def show_job(
 
 @router.get("/pages/catalogue", dependencies=[needs("reader")])
 def show_people(request: Request, caller: Asking, db: Db) -> Response:
-    """Show surgeons and suture types, to add and change."""
+    """Show surgeons and suture types, with forms that add and change them."""
     with db.reading() as session:
         return render(
             request,

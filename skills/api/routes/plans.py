@@ -1,17 +1,40 @@
-"""Plans and their playback."""
+"""Routes of plans: suture points, plans, trajectories, replay bags, playbacks and pictures.
 
-from fastapi import APIRouter, Response
+`POST /suture-points` reads the suture points for a plan from a simulator's recording. The motion of a plan is returned
+as JSON, as a table, or as the bag that a robot replays; a recording of the replay is compared with the plan. A still
+picture of a playback comes with its verdict; the film and the plots are drawn afterwards.
+"""
 
-from skills.api.access import needs
-from skills.api.deps import Actor, Configured, Db, Digest, Jobs, room_for_a_job
-from skills.api.documented import gives, makes, starts_job
-from skills.api.replies import Giving, accepted, stored
-from skills.api.schemas.given import Plan, Playback
-from skills.api.schemas.sent import PlanIn, PlaybackIn
-from skills.api.schemas.written import plan_out, playback_out
-from skills.api.strict import Strict
+import csv
+import io
+from collections.abc import Callable
+from typing import Annotated, Any, Literal
+
+import orjson
+from fastapi import APIRouter, Query, Response
+
+from skills.api.authorisation import needs
+from skills.api.dependencies import Actor, Configured, Db, Digest, Incoming, Jobs, Read, Strict, room_for_a_job
+from skills.api.openapi import gives, gives_file, makes, says, starts_job
+from skills.api.responses import JSON, Giving, accepted, as_asked, say, stored
+from skills.api.routes.demos import RAW_BODY
+from skills.api.routes.policies import Accept
+from skills.db.session import Database
+from skills.errors import UnknownFormat
+from skills.formats import BYTES
+from skills.formats.replay_bag import rows_of_pass
 from skills.library import plans, playbacks
-from skills.settings import MEBIBYTE
+from skills.library.jobs import QUEUED, did_nothing
+from skills.library.plans import find_suture_points, motion_of, plan_json, trajectory_of
+from skills.library.playbacks import find_playback, playback_json
+from skills.library.replay import compare_with_plan, replay_bag
+from skills.planning.plan import MAX_PASSES
+from skills.planning.trajectory import Trajectory
+from skills.schemas.given import Comparison, Plan, Playback, SuturePoints
+from skills.schemas.given import Trajectory as GivenTrajectory
+from skills.schemas.requests import DIGEST, Name, PlanIn, PlaybackIn, Schema
+from skills.settings import MEBIBYTE, Settings
+from skills.verification.playback import Pictures
 
 router = APIRouter(route_class=Strict, tags=["plans"], max_body_size=MEBIBYTE)
 
@@ -19,31 +42,219 @@ router = APIRouter(route_class=Strict, tags=["plans"], max_body_size=MEBIBYTE)
 @router.post("/plans", dependencies=[needs("trainer")], **makes(Plan, 404, 410))
 def make_plan(body: PlanIn, db: Db, actor: Actor) -> Response:
     """Stack a style's grid world at suture points."""
-    row, created = plans.plan_sutures(db, body.request, actor)
+    row, created = plans.plan_sutures(db, body, actor)
     with db.reading() as session:
-        return stored(plan_out(plans.find_plan(session, row.sha256)), created, f"/plans/{row.sha256}")
+        return stored(plan_json(plans.find_plan(session, row.sha256)), created, f"/plans/{row.sha256}")
 
 
 @router.get("/plans/{plan}", dependencies=[needs("reader")], **gives(Plan, 404))
 def get_plan(plan: Digest, db: Db, give: Giving) -> Response:
-    """Look a plan up."""
+    """Return a plan."""
     with db.reading() as session:
-        return give(plan_out(plans.find_plan(session, plan)))
+        return give(plan_json(plans.find_plan(session, plan)))
 
 
 @router.post("/playbacks", dependencies=[needs("trainer"), room_for_a_job], **starts_job(404))
 def play(body: PlaybackIn, db: Db, jobs: Jobs, actor: Actor, settings: Configured) -> Response:
-    """Ask for a plan to be played in the simulator."""
+    """Request the playback of a plan in the simulator."""
     with db.writing() as session:
         job, new = playbacks.request_playback(session, body.plan, actor, settings)
+        answer = accepted(session, job, QUEUED if new else did_nothing(job))
+    # after the commit; if the engine cannot be notified now, a worker finds the job's row later
     if new:
         jobs.tell(job.row, job.attempt, job.kind)
-    return accepted(job)
+    return answer
 
 
 @router.get("/playbacks/{playback}", dependencies=[needs("reader")], **gives(Playback, 404))
-def get_playback(playback: Digest, db: Db, give: Giving) -> Response:
-    """Give the simulator's verdict on a plan."""
+def get_playback(playback: Digest, db: Db, give: Giving, settings: Configured) -> Response:
+    """Return the simulator's verdict on a plan."""
     with db.reading() as session:
         row = playbacks.find_playback(session, playback)
-        return give(playback_out(row) | {"policy": playbacks.standing_of(session, row)})
+        written = playback_json(row, playbacks.headline_of(row, settings))
+        return give(written | {"policy": playbacks.standing_of(session, row)})
+
+
+suture_point_router = APIRouter(tags=["plans"])
+
+
+class SuturePointsUpload(Schema):
+    """Query parameters of a scene upload: the arm whose base frame is used, and the frame's name (see `receive`)."""
+
+    arm: Name | None = None
+    rate_hz: float | None = None
+    frame: str | None = None
+
+
+@suture_point_router.post(
+    "/suture-points", dependencies=[needs("uploader")], openapi_extra=RAW_BODY, **says(SuturePoints)
+)
+def read_suture_points(upload: Incoming, asked: Annotated[SuturePointsUpload, Query()], read: Read) -> Response:
+    """Read the Entry and Exit marks of a simulator's MCAP file, in an arm's base frame; nothing is stored.
+
+    `is_goal` proposes the exits as goals of passes: there the needle comes out and is handed over. A suture point of a
+    plan takes `position_mm`, and as its rotation `turn_xyzw` if the style was demonstrated at the first of them.
+    """
+    return say(find_suture_points(upload, asked.arm, read).model_dump(mode="json"))
+
+
+trajectory_router = APIRouter(tags=["plans"])
+
+BAG, TABLE = "application/zip", "text/csv"
+COLUMNS = (
+    "t_s,pass,phase,x_mm,y_mm,z_mm,qx,qy,qz,qw,yaw_rad,pitch_rad,insertion_mm,roll_rad,wrist_pitch_rad,wrist_yaw_rad"
+)
+
+_PASS: Any = Query(alias="pass", ge=0, lt=MAX_PASSES, description="A single pass, counted from 0 as in reports.")
+PassIndex = Annotated[int | None, _PASS]
+OnePass = Annotated[int, _PASS]
+
+
+@trajectory_router.get(
+    "/plans/{plan}/trajectory",
+    dependencies=[needs("reader")],
+    **gives(GivenTrajectory, 404, 409, 415, as_well=(TABLE, BAG)),
+)
+def get_trajectory(
+    plan: Digest,
+    db: Db,
+    settings: Configured,
+    give: Giving,
+    pass_index: PassIndex = None,
+    handoff: Annotated[
+        Literal["none"] | None, Query(description="`none` is required for the bag of a plan without a hand-off.")
+    ] = None,
+    accept: Accept = "*/*",
+) -> Response:
+    """Return the sampled motion of a plan: JSON, `Accept: text/csv` a table, `Accept: application/zip` the replay bag.
+
+    All of them are 409 if the surgeon's consent does not cover training. The bag is 409 until a feasible playback
+    exists for exactly this plan, its policy is the released one, its demonstration is not withdrawn, the consent covers
+    an export, and every pass is certain enough to succeed; for a plan without a hand-off it also needs `handoff=none`.
+    """
+    media_type = _media_type(accept)
+    content = _contents(db, plan, pass_index, handoff, media_type, settings)
+    given = give.bytes(content, media_type)
+    if media_type == BAG:
+        which = "" if pass_index is None else f"-pass-{pass_index}"
+        given.headers["Content-Disposition"] = f'attachment; filename="replay-{plan[:12]}{which}.zip"'
+    return given
+
+
+@trajectory_router.get("/plans/{plan}/comparison", dependencies=[needs("reader")], **gives(Comparison, 404))
+def compare(
+    plan: Digest, demo: Annotated[str, Query(pattern=DIGEST)], db: Db, give: Giving, pass_index: OnePass = 0
+) -> Response:
+    """Compare a pass of a plan with a demonstration cut from the recording of its replay."""
+    with db.reading() as session:
+        return give(compare_with_plan(session, plan, demo, pass_index))
+
+
+def _media_type(accept: str) -> str:
+    """Return the media type that the client names first.
+
+    Raises:
+        UnknownFormat: It accepts none of the three.
+    """
+    for one in (part.partition(";")[0].strip().lower() for part in accept.split(",")):
+        if one in (JSON, TABLE, BAG):
+            return one
+        if one in ("*/*", "application/*"):
+            return JSON
+    raise UnknownFormat(
+        f"A trajectory is available as {JSON}, {TABLE}, or {BAG} for replay; name one of them in Accept."
+    )
+
+
+def _contents(
+    db: Database,
+    plan: str,
+    pass_index: int | None,
+    handoff: Literal["none"] | None,
+    media_type: str,
+    settings: Settings,
+) -> bytes:
+    if media_type == BAG:
+        asked = {"tip_error_mm": settings.replay_tip_error_mm, "lower_bound": settings.replay_lower_bound}
+        return replay_bag(db, plan, pass_index=pass_index, handoff=handoff, **asked)
+    with db.reading() as session:
+        motion = motion_of(session, plan)
+    trajectory = trajectory_of(motion)
+    rows = _rows(trajectory, pass_index)
+    return _table(rows) if media_type == TABLE else _json(rows, trajectory.rate_hz)
+
+
+def _rows(trajectory: Trajectory, pass_index: int | None) -> list[list[Any]]:
+    t, chosen = trajectory, rows_of_pass(trajectory, pass_index)
+    parts = [part[chosen] for part in (t.stamps_s, t.pass_index, t.phase, t.tip_mm, t.rotation_xyzw, t.joints)]
+    columns = [column for part in parts for column in (part.T.tolist() if part.ndim == 2 else [part.tolist()])]
+    return [list(row) for row in zip(*columns, strict=True)]
+
+
+def _table(rows: list[list[Any]]) -> bytes:
+    out = io.StringIO()
+    writer = csv.writer(out)
+    writer.writerow(COLUMNS.split(","))
+    writer.writerows(rows)
+    return out.getvalue().encode()
+
+
+def _json(rows: list[list[Any]], rate_hz: float) -> bytes:
+    return orjson.dumps({"rate_hz": rate_hz, "columns": COLUMNS.split(","), "rows": rows})
+
+
+picture_router = APIRouter(prefix="/playbacks/{playback}", tags=["plans"], max_body_size=MEBIBYTE)
+
+PNG, GIF, MP4 = "image/png", "image/gif", "video/mp4"
+
+
+def _given(kind: str) -> dict[str, Any]:
+    """Describe a picture route; plain bytes are a second media type, for generated clients that know no other."""
+    return gives_file((BYTES, kind), 404)
+
+
+@picture_router.get("/picture.png", dependencies=[needs("reader")], **_given(PNG))
+def get_picture(playback: Digest, db: Db, give: Giving, accept: Accept = "*/*") -> Response:
+    """Return a still picture of the playback: the scene with all passes."""
+    with db.reading() as session:
+        return give.bytes(find_playback(session, playback).measured.picture_png, as_asked(accept, PNG))
+
+
+@picture_router.get("/animation.mp4", dependencies=[needs("reader")], **_given(MP4))
+def get_animation(playback: Digest, db: Db, give: Giving, accept: Accept = "*/*") -> Response:
+    """Return the film of the whole trajectory, as H.264."""
+    return give.bytes(_drawn(db, playback, lambda drawn: drawn.animation_mp4), as_asked(accept, MP4))
+
+
+@picture_router.get("/animation.gif", dependencies=[needs("reader")], **_given(GIF))
+def get_animation_gif(playback: Digest, db: Db, give: Giving, accept: Accept = "*/*") -> Response:
+    """Return the same film as a GIF."""
+    return give.bytes(_drawn(db, playback, lambda drawn: drawn.animation_gif), as_asked(accept, GIF))
+
+
+@picture_router.get("/joints.png", dependencies=[needs("reader")], **_given(PNG))
+def get_joints_plot(playback: Digest, db: Db, give: Giving, accept: Accept = "*/*") -> Response:
+    """Return a plot of the joints of both arms over time, with their limits."""
+    return give.bytes(_drawn(db, playback, lambda drawn: drawn.joints_png), as_asked(accept, PNG))
+
+
+@picture_router.get("/clearance.png", dependencies=[needs("reader")], **_given(PNG))
+def get_clearance_plot(playback: Digest, db: Db, give: Giving, accept: Accept = "*/*") -> Response:
+    """Return a plot of the distances between surfaces over time, with the permitted minimum."""
+    return give.bytes(_drawn(db, playback, lambda drawn: drawn.clearance_png), as_asked(accept, PNG))
+
+
+@picture_router.post("/pictures", dependencies=[needs("trainer"), room_for_a_job], **starts_job(404))
+def draw_pictures(playback: Digest, db: Db, actor: Actor) -> Response:
+    """Request the film and the plots; every new playback has requested them already, so this returns that job.
+
+    The engine is not notified, because nobody waits for pictures: a worker finds the job in the queue by itself.
+    """
+    with db.writing() as session:
+        job, new = playbacks.request_pictures(session, find_playback(session, playback), actor)
+        return accepted(session, job, QUEUED if new else did_nothing(job))
+
+
+def _drawn(db: Database, playback: str, which: Callable[[Pictures], bytes]) -> bytes:
+    with db.reading() as session:
+        return which(playbacks.find_pictures(session, find_playback(session, playback)))

@@ -1,34 +1,36 @@
-"""Policies: what is served, its history, and what it does from a place."""
+"""Routes of policies: the released policy of a style, its versions, releases, rollouts and policy cards.
+
+A policy card is the JSON or HTML description of a version, built from verified values only.
+"""
 
 from typing import Annotated
 
 from fastapi import APIRouter, Header, Path, Query, Request, Response
 from sqlalchemy.orm import Session
 
-from skills.api.access import needs
-from skills.api.answers import JSON, NPZ, Encoded, answer, negotiate
-from skills.api.conditions import names
-from skills.api.deps import SLUG, Actor, Db, Digest, Limit, RowCursor, Slug
-from skills.api.documented import ends, gives, gives_page, says
-from skills.api.replies import Giving, say
-from skills.api.schemas.given import NextStep, Page, Policy, PolicySummary, Rollout
-from skills.api.schemas.given import Version as GivenVersion
-from skills.api.schemas.sent import NextIn, RolloutIn
-from skills.api.schemas.written import summary_out, version_out
-from skills.api.served import Served
-from skills.api.strict import Strict
+from skills.api.authorisation import needs
+from skills.api.dependencies import Actor, Db, Digest, Limit, RowCursor, Slug, Strict
+from skills.api.openapi import ends, gives, gives_page, says
+from skills.api.pages.page import HTML, standalone_headers, wants_page
+from skills.api.pages.policy_card import card_page
+from skills.api.policy_cache import PolicyCache
+from skills.api.responses import JSON, NPZ, Condition, Encoded, Giving, answer, json_of, names, negotiate, say, tag_of
 from skills.errors import PreconditionFailed
+from skills.learning.policy import next_step
 from skills.library import policies, releases
+from skills.library.cards import Card, card_of
 from skills.library.catalogue import find_surgeon, find_suture_type
-from skills.library.verified import learnt
+from skills.library.integrity import learnt
+from skills.library.policies import summary_json, version_json
+from skills.schemas.given import NextStep, Page, Policy, PolicyCard, PolicySummary, Rollout
+from skills.schemas.given import Version as GivenVersion
+from skills.schemas.requests import SLUG, NextIn, RolloutIn
 from skills.settings import MEBIBYTE
-from skills.style.policy import next_step
 
 router = APIRouter(route_class=Strict, tags=["policies"], max_body_size=MEBIBYTE)
 
 Version = Annotated[int, Path(ge=1, le=2**31)]
 Accept = Annotated[str, Header(max_length=500)]
-Match = Annotated[str | None, Header(max_length=2000)]
 
 
 @router.get("/policies", dependencies=[needs("reader")], **gives_page(Page[PolicySummary], 404, 410))
@@ -43,26 +45,27 @@ def list_policies(
     """List the styles that serve a policy."""
     with db.reading() as session:
         found = policies.list_served(session, limit, cursor, surgeon, suture)
-        return give.page([summary_out(one) for one in found], limit, found[-1].row if found else None)
+        return give.page([summary_json(one) for one in found], limit, found[-1].row if found else None)
 
 
 @router.head("/policies/{surgeon}/{suture}", dependencies=[needs("reader")], include_in_schema=False)
 @router.get(
     "/policies/{surgeon}/{suture}", dependencies=[needs("reader")], **gives(Policy, 404, 410, 412, 415, as_well=(NPZ,))
 )
+# async, because a response from the cache takes less time than starting a thread for it
 async def get_policy(
     surgeon: Slug,
     suture: Slug,
     request: Request,
     accept: Accept = "*/*",
-    if_none_match: Match = None,
-    if_match: Match = None,
+    if_none_match: Condition = None,
+    if_match: Condition = None,
 ) -> Response:
-    """Serve the style's released policy: JSON, or with `Accept: application/x-npz` its arrays with the Q values.
+    """Return the style's released policy: JSON, or with `Accept: application/x-npz` its arrays with the Q values.
 
-    Encoded once and given from memory, for as long as nothing has changed (`skills.api.served`).
+    It is encoded once and served from memory until something changes (`skills.api.policy_cache`).
     """
-    served: Served = request.app.state.served
+    served: PolicyCache = request.app.state.served
     return answer(await served.body(surgeon, suture, negotiate(accept)), if_none_match, if_match)
 
 
@@ -75,13 +78,13 @@ def list_versions(
     """List the versions of a style, the newest first."""
     with db.reading() as session:
         found = policies.list_versions(session, surgeon, suture, limit, cursor)
-        return give.page([version_out(row) for row in found], limit, found[-1].version if found else None)
+        return give.page([version_json(row) for row in found], limit, found[-1].version if found else None)
 
 
 @router.get(
     "/policies/{surgeon}/{suture}/versions/{version}",
     dependencies=[needs("reader")],
-    **gives(Policy, 404, 410, 412, 415, as_well=(NPZ,)),
+    **gives(Policy, 404, 409, 410, 412, 415, as_well=(NPZ,)),
 )
 def get_version(
     surgeon: Slug,
@@ -90,29 +93,31 @@ def get_version(
     db: Db,
     request: Request,
     accept: Accept = "*/*",
-    if_none_match: Match = None,
-    if_match: Match = None,
+    if_none_match: Condition = None,
+    if_match: Condition = None,
 ) -> Response:
-    """Give one version of a style, released or not."""
+    """Return one version of a style, released or not, while the surgeon's consent covers training."""
     encoded: Encoded = request.app.state.encoded
     with db.reading() as session:
-        policy = policies.find_version(session, surgeon, suture, version)
+        policy = policies.followable(policies.find_version(session, surgeon, suture, version))
         return answer(encoded.policy(policy, None, accept), if_none_match, if_match)
 
 
-@router.get("/policy-versions/{policy}", dependencies=[needs("reader")], **gives(Policy, 404, 412, 415, as_well=(NPZ,)))
+@router.get(
+    "/policy-versions/{policy}", dependencies=[needs("reader")], **gives(Policy, 404, 409, 412, 415, as_well=(NPZ,))
+)
 def get_policy_version(
     policy: Digest,
     db: Db,
     request: Request,
     accept: Accept = "*/*",
-    if_none_match: Match = None,
-    if_match: Match = None,
+    if_none_match: Condition = None,
+    if_match: Condition = None,
 ) -> Response:
-    """Give a policy version by its digest, as it is cited."""
+    """Return a policy version by the digest under which it is cited, while the surgeon's consent covers training."""
     encoded: Encoded = request.app.state.encoded
     with db.reading() as session:
-        found = policies.find_by_digest(session, policy)
+        found = policies.followable(policies.find_by_digest(session, policy))
         return answer(encoded.policy(found, None, accept), if_none_match, if_match)
 
 
@@ -122,11 +127,11 @@ def get_policy_version(
     **says(PolicySummary, 404, 409, 410, 412),
 )
 def release(
-    surgeon: Slug, suture: Slug, version: Version, db: Db, request: Request, actor: Actor, if_match: Match = None
+    surgeon: Slug, suture: Slug, version: Version, db: Db, request: Request, actor: Actor, if_match: Condition = None
 ) -> Response:
-    """Release a version if it passes the gate; an older one too, to roll back.
+    """Release a version if it passes the gate; releasing an older version rolls back.
 
-    `If-Match` takes the ETag of the JSON served now, so that nobody's release is overtaken unseen.
+    `If-Match` takes the ETag of the JSON that is served now, so that a concurrent release is not overwritten unnoticed.
     """
     encoded: Encoded = request.app.state.encoded
     with db.writing() as session:
@@ -134,14 +139,14 @@ def release(
         if if_match is not None:
             _refuse_overtaken(session, encoded, surgeon, suture, if_match)
         released = releases.release(session, policy, actor)
-        return say(summary_out(released))
+        return say(summary_json(released))
 
 
 @router.delete("/policies/{surgeon}/{suture}/release", dependencies=[needs("releaser")], **ends(404, 409, 410, 412))
-def withdraw(surgeon: Slug, suture: Slug, db: Db, request: Request, actor: Actor, if_match: Match = None) -> None:
-    """Withdraw what is released: nothing of the style is served until somebody releases again.
+def withdraw(surgeon: Slug, suture: Slug, db: Db, request: Request, actor: Actor, if_match: Condition = None) -> None:
+    """Withdraw the released policy: the style serves nothing until a version is released again.
 
-    `If-Match` takes the ETag of the JSON served now.
+    `If-Match` takes the ETag of the JSON that is served now.
     """
     encoded: Encoded = request.app.state.encoded
     with db.writing() as session:
@@ -151,29 +156,82 @@ def withdraw(surgeon: Slug, suture: Slug, db: Db, request: Request, actor: Actor
         releases.withdraw(session, who, what.slug, actor)
 
 
-@router.post("/policies/{surgeon}/{suture}/rollouts", dependencies=[needs("reader")], **says(Rollout, 404, 410))
+@router.post("/policies/{surgeon}/{suture}/rollouts", dependencies=[needs("reader")], **says(Rollout, 404, 409, 410))
 def roll_out(surgeon: Slug, suture: Slug, body: RolloutIn, db: Db) -> Response:
-    """Follow the policy from a place to the goal."""
+    """Follow the policy from a position to the goal."""
     with db.reading() as session:
-        return say(policies.about_rollout(policies.choose(session, surgeon, suture, body.version), body.start_mm))
+        found = policies.about_rollout(policies.choose(session, surgeon, suture, body.version), body.start_mm)
+        return say(found.model_dump(mode="json"))
 
 
 @router.post("/policies/{surgeon}/{suture}/next", dependencies=[needs("reader")], **says(NextStep, 404, 410))
 def next_action(surgeon: Slug, suture: Slug, body: NextIn, db: Db) -> Response:
-    """Say what the policy would do at a place; nothing moves."""
+    """Return the policy's next action at a position; nothing moves."""
     with db.reading() as session:
         policy = policies.policy_of(session, surgeon, suture).policy
         step = next_step(learnt(policy), body.position_mm, body.phase)
         about = {"version": policy.version, "sha256": policy.sha256, "frame": policy.manifest["frame"]}
-        return say(about | vars(step))
+        return say(NextStep(**about, **vars(step)).model_dump(mode="json"))
 
 
 def _refuse_overtaken(session: Session, encoded: Encoded, surgeon: str, suture: str, if_match: str) -> None:
-    """Refuse to decide about a policy that is no longer the one that the client looked at.
+    """Check that If-Match names the policy that is released now.
 
     Raises:
         PreconditionFailed: Another one is released now.
     """
     served = policies.policy_of(session, surgeon, suture)
     if not names(if_match, encoded.policy(served.policy, served.release, JSON).etag):
-        raise PreconditionFailed("Another policy is released now; look at it, then decide again.")
+        raise PreconditionFailed("Another policy is released now; read it, then repeat the request.")
+
+
+card_router = APIRouter(tags=["policies"], max_body_size=MEBIBYTE)
+
+
+@card_router.get(
+    "/policies/{surgeon}/{suture}/versions/{version}/card",
+    dependencies=[needs("reader")],
+    **gives(PolicyCard, 404, 410, 415, as_well=(HTML,)),
+)
+def get_policy_card(
+    surgeon: Slug, suture: Slug, version: Version, db: Db, accept: Accept = "*/*", if_none_match: Condition = None
+) -> Response:
+    """Return the policy card of a version: JSON, or with `Accept: text/html` one file to attach to a paper.
+
+    It states whether the version is released now and what rests on it, so its ETag changes with these.
+    """
+    as_page = wants_page(accept, "A policy card")
+    with db.reading() as session:
+        card = card_of(session, policies.find_version(session, surgeon, suture, version))
+    return _answer(card, as_page, if_none_match)
+
+
+@card_router.get(
+    "/policy-versions/{policy}/card",
+    dependencies=[needs("reader")],
+    **gives(PolicyCard, 404, 415, as_well=(HTML,)),
+)
+def get_policy_version_card(
+    policy: Digest, db: Db, accept: Accept = "*/*", if_none_match: Condition = None
+) -> Response:
+    """Return the policy card of a version by the digest under which it is cited."""
+    as_page = wants_page(accept, "A policy card")
+    with db.reading() as session:
+        card = card_of(session, policies.find_by_digest(session, policy))
+    return _answer(card, as_page, if_none_match)
+
+
+def _answer(card: Card, as_page: bool, if_none_match: str | None) -> Response:
+    content = card_page(card).encode() if as_page else json_of(card.written(), indented=True)
+    tag, told = tag_of(content), card.facts.policy
+    name = f"{told.surgeon}-{told.suture}-v{told.version}-card.{'html' if as_page else 'json'}"
+    headers = {
+        "ETag": tag,
+        "Vary": "Accept",
+        "Cache-Control": "no-cache",
+        "Content-Disposition": f'inline; filename="{name}"',  # the name under which a browser saves it
+        **(standalone_headers("card") if as_page else {}),
+    }
+    if if_none_match is not None and names(if_none_match, tag):
+        return Response(status_code=304, headers=headers)
+    return Response(content, headers=headers, media_type=HTML if as_page else JSON)

@@ -1,4 +1,4 @@
-"""Signing in to the page with a key, and out again."""
+"""Routes of signing in to the web page with a key, and of signing out."""
 
 import re
 from typing import Annotated
@@ -6,16 +6,16 @@ from urllib.parse import parse_qs
 
 from fastapi import APIRouter, Query, Request, Response
 
-from skills.api.access import Asking, needs, open_to_all
-from skills.api.deps import Configured
-from skills.api.gate import COOKIE, Access, refuse_without_token
+from skills.api.authentication import COOKIE, Access, refuse_without_token
+from skills.api.authorisation import Asking, needs, open_to_all
+from skills.api.dependencies import Configured
 from skills.api.pages.page import render
 from skills.errors import BadInput, NotSignedIn
-from skills.library.sign_ins import sign_in, sign_out
+from skills.library.keys import sign_in, sign_out
 from skills.settings import Settings
 
 FORM_BYTES, FIELDS = 4096, 4
-HERE = re.compile(r"/(?![/\\])[^\\\x00-\x20\x7f]*")  # a path of this service, and no address of another
+HERE = re.compile(r"/(?![/\\])[^\\\x00-\x20\x7f]*")  # a path of this service, never the URL of another
 
 router = APIRouter(include_in_schema=False, max_body_size=FORM_BYTES)
 
@@ -24,22 +24,23 @@ Next = Annotated[str, Query(max_length=2000)]
 
 @router.get("/sign-in", dependencies=[open_to_all()])
 def show_sign_in(request: Request, next: Next = "/") -> Response:
-    """Ask for a key."""
+    """Show the form that takes a key."""
     return render(request, "sign_in.html", None, next=_here(next), wrong=None)
 
 
 @router.post("/sign-in", dependencies=[open_to_all()])
 async def begin(request: Request, settings: Configured) -> Response:
-    """Take a key, and give a cookie for it."""
+    """Exchange a key for a session cookie."""
     form = await _form(request)
     access: Access = request.app.state.access
     where = _here(form.get("next", "/"))
     try:
         caller = await access.by_key(form.get("key", "").strip(), request.client.host if request.client else "")
+        # `by_key` also accepts this process's own key, which belongs to no user
         if caller.key is None:
-            raise NotSignedIn("This is no key for people.")
+            raise NotSignedIn("This key cannot be used to sign in.")
     except NotSignedIn:
-        said = "This is none of the keys here, or it was revoked or has run out."
+        said = "The key is unknown to this service, revoked or expired."
         return render(request, "sign_in.html", None, status=401, next=where, wrong=said)
     key = caller.key
     cookie = await access.write(lambda session: sign_in(session, key, access.lasts))
@@ -58,7 +59,7 @@ async def begin(request: Request, settings: Configured) -> Response:
 
 @router.post("/sign-out", dependencies=[needs("reader")])
 async def end(request: Request, caller: Asking) -> Response:
-    """Forget a sign-in; the form carries its token."""
+    """End a sign-in; the form carries its CSRF token."""
     cookie = request.cookies.get(COOKIE)
     answer = _go(request, "/sign-in")
     if cookie is not None and caller.csrf is not None:
@@ -66,25 +67,26 @@ async def end(request: Request, caller: Asking) -> Response:
         refuse_without_token(caller, request.headers.get("x-csrf-token", form.get("csrf", "")))
         access: Access = request.app.state.access
         await access.write(lambda session: sign_out(session, cookie))
+        access.forget()
         answer.delete_cookie(COOKIE, path=_root(request) or "/", httponly=True, samesite="strict")
     return answer
 
 
 async def _form(request: Request) -> dict[str, str]:
-    """Read the fields of a form, the first of each name.
+    """Return the fields of a form, the first value of each name.
 
     Raises:
-        BadInput: There are more than any form of ours has.
+        BadInput: There are more fields than any of our forms has.
     """
     try:
         fields = parse_qs((await request.body()).decode("utf-8", "replace"), max_num_fields=FIELDS)
     except ValueError:
-        raise BadInput("The form has more fields than this page's.") from None
+        raise BadInput("The form has more fields than this page has.") from None
     return {name: values[0] for name, values in fields.items()}
 
 
 def _here(where: str) -> str:
-    """Keep to this service: a link must not lead through its sign-in to somewhere else."""
+    """Return a path of this service, else "/": a link must not redirect through the sign-in to another site."""
     return where if HERE.fullmatch(where) else "/"
 
 
@@ -97,6 +99,6 @@ def _go(request: Request, where: str) -> Response:
 
 
 def _is_secure(request: Request, settings: Settings) -> bool:
-    """Keep the cookie to TLS, unless this is plain HTTP on this very machine."""
+    """Return whether the cookie is restricted to TLS: always, except over plain HTTP on loopback."""
     by_tls = settings.tls_cert is not None or settings.tls_by_proxy or settings.beyond_loopback
     return by_tls or request.headers.get("origin", "").startswith("https://")

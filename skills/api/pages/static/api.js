@@ -1,4 +1,4 @@
-// The calls of the service, from a page: one way to ask, one kind of error, one way to watch a job.
+// The calls of the service from a page: requests, one class of error, and following a job.
 
 const meta = (name) => document.querySelector(`meta[name="${name}"]`)?.content ?? "";
 export const root = meta("root");
@@ -7,7 +7,9 @@ export class Problem extends Error {
   constructor(status, body) {
     const wrong = (body.errors ?? []).map((one) => `${one.where || "The request"}: ${one.why}`);
     const reasons = body.reasons ?? [];
-    super([body.detail || body.title || `The server answered ${status}.`, ...wrong, ...reasons].join(" "));
+    const advice = (body.remedies ?? []).filter((one) => typeof one === "string");  // the others are data for programs
+    const said = body.reason && [body.reason, ...advice].join(" ");
+    super([said || body.detail || body.title || `The server answered ${status}.`, ...wrong, ...reasons].join(" "));
     this.status = status;
     this.body = body;
   }
@@ -31,7 +33,7 @@ export async function ask(method, path, { json, accept = "application/json" } = 
   try {
     answer = await fetch(root + path, { method, headers, body, credentials: "same-origin" });
   } catch {
-    throw new Problem(0, { detail: "The server cannot be reached; see whether it runs, then try again." });
+    throw new Problem(0, { detail: "The server cannot be reached; check that it runs, then try again." });
   }
   if (!answer.ok) throw await problemOf(answer.status, await answer.text());
   return answer;
@@ -42,7 +44,7 @@ export async function call(method, path, json) {
   return answer.status === 204 ? null : answer.json();
 }
 
-// Save an answer as a file; the type is chosen by Accept, which a link cannot do.
+// Save a response as a file; a link could not set Accept, which selects the type.
 export async function save(path, accept, name) {
   const answer = await ask("GET", path, { accept });
   const link = document.createElement("a");
@@ -54,7 +56,7 @@ export async function save(path, accept, name) {
 
 export const ACTIVE = ["queued", "running"];
 
-// Follow a job to its end, telling each change; the last one is returned.
+// Follow a job to its end with a callback for each change; returns the last state.
 export function watch(id, tell) {
   return new Promise((resolve, reject) => {
     const source = new EventSource(`${root}/jobs/${id}/events`);

@@ -1,4 +1,4 @@
-// Starting a batch; and a running job, told of as it changes.
+// The form that starts a batch, and the live view of a running job.
 import { call, root, watch } from "./api.js";
 
 const batch = document.getElementById("batch");

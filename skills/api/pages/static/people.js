@@ -1,4 +1,4 @@
-// Surgeons and suture types: written whole, under their pseudonym or slug.
+// Forms that create or replace surgeons and suture types, by pseudonym or slug.
 import { call } from "./api.js";
 import { say } from "./site.js";
 

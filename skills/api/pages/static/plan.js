@@ -1,4 +1,4 @@
-// A plan in 3-D, its playback as it runs, and the film once it is drawn.
+// The 3-D view of a plan, the live view of its playback, and the film once it is drawn.
 import { call, watch } from "./api.js";
 import { Scene, box, colour, dots, layerList, line } from "./scene.js";
 import { jobLine, say } from "./site.js";
@@ -6,12 +6,12 @@ import { jobLine, say } from "./site.js";
 const place = document.getElementById("plan");
 const grid = JSON.parse(place.dataset.grid);
 const goal = JSON.parse(place.dataset.goal);
-// Pass by pass; each has its number too, from 0 as in reports.
+// One trace per pass, with its number, counted from 0 as in reports.
 const COLOURS = ["path", "learnt", "goal", "other", "reward", "recorded"];
 
 const layers = [
   { id: "passes", name: "Paths of the passes", shape: "line", colour: "path", on: true },
-  { id: "transfers", name: "Ways to the next start", shape: "dashes", colour: "box", on: true },
+  { id: "transfers", name: "Transfers to the next start", shape: "dashes", colour: "box", on: true },
   { id: "points", name: "Suture points", shape: "ends", colour: "goal", on: true },
   { id: "boxes", name: "Grid worlds", shape: "box", colour: "box", on: false },
 ];

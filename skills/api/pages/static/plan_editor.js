@@ -1,4 +1,4 @@
-// Suture points in a table and from above, one list behind both; then the plan. Passes count from 0, as in reports.
+// The plan editor: suture points in a table and in a view from above, with one list behind both. Passes count from 0, as in reports.
 import { call, root } from "./api.js";
 
 const form = document.getElementById("plan");
@@ -14,7 +14,7 @@ let points = [];
 
 const degrees = ([x, y, z, w]) => (x || y ? null : (2 * Math.atan2(z, w) * 180) / Math.PI);
 const turned = (angle) => [0, 0, Math.sin((angle * Math.PI) / 360), Math.cos((angle * Math.PI) / 360)];
-// A turn that is not about z alone comes from another plan, and is kept until its number is changed.
+// A rotation that is not about z alone comes from another plan, and is preserved until its number is changed.
 const rotation = (point) => (point.angle === null ? point.rotation : turned(point.angle));
 
 function lay(count, dx, dy) {
@@ -31,7 +31,7 @@ function show() {
 function field(value, label, changed) {
   const input = document.createElement("input");
   Object.assign(input, { type: "number", step: "any", value: value === null ? "" : Number(value.toFixed(3)), required: value !== null });
-  if (value === null) input.placeholder = "as it was";
+  if (value === null) input.placeholder = "unchanged";
   input.setAttribute("aria-label", label);
   input.addEventListener("input", () => {
     if (input.value === "" || !input.validity.valid) return;
@@ -63,7 +63,7 @@ function rowOf(point, index) {
   return row;
 }
 
-// Turn and move a point of the demonstrated grid world to a pass.
+// Rotate and move a point of the demonstrated grid world to a pass.
 function placed(point, place) {
   const [d, e, f] = point.map((value, i) => value - goal[i]);
   const [x, y, z, w] = rotation(place);
@@ -90,7 +90,7 @@ const element = (name, attributes, text) => {
 let scale = 1;
 let width = 560;
 let held = null;
-let window_mm = null; // kept while a point is dragged, so that the ground stands still under it
+let window_mm = null; // fixed while a point is dragged, so that the view does not move under it
 
 function draw() {
   const boxes = points.map((point) => floor().map((corner) => placed(corner, point)));
@@ -187,7 +187,7 @@ function psmM() {
 
 form.addEventListener("submit", async (event) => {
   event.preventDefault();
-  const { arm, frame, instrument, speed_mm_s: speed, tip_offset_mm: offset, realignment } = form.elements;
+  const { arm, frame, instrument, speed_mm_s: speed, tip_offset_mm: offset, handoff } = form.elements;
   const button = form.querySelector("button:not([type])");
   const said = get("plan-said");
   said.className = "said";
@@ -198,7 +198,7 @@ form.addEventListener("submit", async (event) => {
       surgeon: form.dataset.surgeon, suture: form.dataset.suture, version: Number(form.dataset.version),
       suture_points: points.map((point) => ({ position_mm: point.at, rotation_xyzw: rotation(point) })),
       arm: arm.value || null, frame: frame.value || null, instrument: instrument.value || null,
-      speed_mm_s: Number(speed.value), tip_offset_mm: Number(offset.value), psm_m: psmM(), realignment: realignment.checked,
+      speed_mm_s: Number(speed.value), tip_offset_mm: Number(offset.value), ...(handoff.value === "none" ? { handoff: "none" } : { psm_m: psmM() }),
     });
     location.assign(`${root}/pages/plans/${plan.id}`);
   } catch (problem) {

@@ -1,4 +1,4 @@
-// A recording's time line, the hand-off that is cut out of it, and what is made of that.
+// A recording's timeline, and the form that cuts a hand-off out of it and trains it.
 import { call, root, watch } from "./api.js";
 import { jobLine } from "./site.js";
 
@@ -19,7 +19,7 @@ function tell(id, text, kind = "wrong") {
   get(id).textContent = text;
 }
 
-// What is cut: kept in the two number fields; sliders, handles and proposals write there.
+// The two number fields hold the cut; sliders, handles and proposals write to them.
 function set(start, end) {
   const [a, b] = [Math.max(0, Math.min(start, duration)), Math.max(0, Math.min(end, duration))];
   first.value = Number(a.toFixed(6));
@@ -31,7 +31,7 @@ function shown() {
   get("from").value = first.value;
   get("to").value = last.value;
   const wrong = Number(first.value) >= Number(last.value);
-  last.setCustomValidity(wrong ? "A hand-off ends after it begins." : "");
+  last.setCustomValidity(wrong ? "The end must be after the beginning." : "");
   draw();
 }
 
@@ -239,7 +239,7 @@ get("train").addEventListener("click", async () => {
     if (ended.state !== "succeeded") return;
     version = ended.result.policy_version;
     const passes = ended.result.releasable;
-    tell("train-said", passes ? `Version ${version} was learnt and passes the gate.` : `Version ${version} was learnt; it does not pass the gate, and the style's page says why.`, passes ? "well" : "wrong");
+    tell("train-said", passes ? `Version ${version} was learnt and passes the gate.` : `Version ${version} was learnt; it does not pass the gate, see the reasons on the style's page.`, passes ? "well" : "wrong");
     get("release").textContent = `Release version ${version}`;
     get("release").hidden = !passes;
     get("see").href = `${root}/pages/styles/${demo.surgeon}/${demo.suture}?version=${version}`;
@@ -255,7 +255,7 @@ get("release").addEventListener("click", async () => {
   tell("release-said", "");
   try {
     await call("POST", `/policies/${demo.surgeon}/${demo.suture}/versions/${version}/release`);
-    tell("release-said", `Version ${version} is released: clients of this style are served it from now on.`, "well");
+    tell("release-said", `Version ${version} is released and served to the clients of this style.`, "well");
     get("release").hidden = true;
   } catch (problem) {
     tell("release-said", problem.message);

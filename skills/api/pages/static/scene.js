@@ -1,4 +1,4 @@
-// A view in 3-D that can be turned by mouse, finger, keys and buttons. Drawn by plotly; coordinates are mm.
+// A 3-D view, rotated by mouse, touch, keys and buttons. Drawn by plotly; coordinates are mm.
 import { say } from "./site.js";
 
 const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
@@ -27,7 +27,7 @@ export function dots(points, { name, size = 4, symbol = "circle", ...more }) {
   };
 }
 
-// The twelve edges of a grid world, its outermost cells' faces; `place` moves a corner to where the box stands.
+// The twelve edges of a grid world, at the outer faces of its cells; `place` moves a corner to the position of the box.
 export function box(grid, place = (point) => point) {
   const low = grid.origin_mm.map((o) => o - grid.cell_mm / 2);
   const high = low.map((l, axis) => l + grid.shape[axis] * grid.cell_mm);
@@ -37,7 +37,7 @@ export function box(grid, place = (point) => point) {
 }
 
 export class Scene {
-  // `traces` gives what is drawn, anew whenever it is asked, so that it has the colours of the theme.
+  // `traces` returns new traces at every call, so that they have the colours of the current theme.
   constructor(traces, { frame, picked } = {}) {
     this.place = document.getElementById("view");
     this.traces = traces;
@@ -47,7 +47,7 @@ export class Scene {
       this.listen();
       this.place.dataset.drawn = "true";
     });
-    this.drawn.catch((failed) => say(this.place, `The view cannot be drawn: ${failed.message}. The numbers below stand.`));
+    this.drawn.catch((failed) => say(this.place, `The view cannot be drawn: ${failed.message}. The numbers below are valid.`));
   }
 
   draw(camera) {
@@ -112,7 +112,7 @@ export class Scene {
   }
 }
 
-// A list of layers with a mark of each, to switch on and off.
+// A list of layers with their markers, to switch them on and off.
 export function layerList(place, layers, changed) {
   for (const layer of layers) {
     const item = document.createElement("li");

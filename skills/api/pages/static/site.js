@@ -1,4 +1,4 @@
-// What every page does: light and dark, buttons that make a call, confirmations, times, parts that renew themselves.
+// Behaviour of every page: light and dark theme, buttons that make a call, confirmations, times, and polled parts.
 import { call, save, watch, root } from "./api.js";
 
 const page = document.documentElement;
@@ -20,7 +20,7 @@ document.getElementById("theme").addEventListener("click", () => {
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => document.dispatchEvent(new Event("theme")));
 showTheme();
 
-// Say something where it arose: in the place that `near` names, or right after it.
+// Show a message at its origin: in the element that `near` names, or right after it.
 export function say(near, text, kind = "wrong") {
   let place = near.dataset.said ? document.getElementById(near.dataset.said) : near.parentElement.querySelector(":scope > .said");
   if (!place) {
@@ -33,7 +33,7 @@ export function say(near, text, kind = "wrong") {
   if (text) place.scrollIntoView({ block: "nearest" });
 }
 
-// Ask before something that cannot be taken back lightly; with a word, it must be typed.
+// Confirm an action that is hard to undo; if there is a word, it must be typed.
 export function confirmed({ what, means, yes, word }) {
   const dialog = document.getElementById("ask");
   const [label, button] = [document.getElementById("ask-word"), document.getElementById("ask-yes")];
@@ -54,7 +54,7 @@ export function confirmed({ what, means, yes, word }) {
   );
 }
 
-// Show a job while it runs, beside what asked for it.
+// Show a running job next to the element that requested it.
 export function jobLine(near) {
   const line = document.createElement("p");
   line.className = "said running";
@@ -113,7 +113,7 @@ document.addEventListener("click", (event) => {
   else if (button) saveFile(button);
 });
 
-// A part of a page that changes by itself is asked for again, as the server draws it, until it says that it rests.
+// A part of a page that changes by itself is fetched again as HTML until the server marks it as final.
 async function renew(part) {
   while (part.dataset.renew) {
     await new Promise((wake) => setTimeout(wake, Number(part.dataset.renew)));

@@ -1,4 +1,4 @@
-// A style in 3-D: what was recorded, what became of it in the grid, and what was learnt, layer by layer.
+// The 3-D view of a style: the recorded motion, its path in the grid, and the learnt policy, by layers.
 import { call } from "./api.js";
 import { Scene, box, colour, dots, layerList, line } from "./scene.js";
 import { say } from "./site.js";
@@ -6,12 +6,12 @@ import { say } from "./site.js";
 const place = document.getElementById("style");
 const { view: address, rollouts, version } = place.dataset;
 const get = (id) => document.getElementById(id);
-// Cividis, which people with every common colour vision see alike, from few moves to many; on dark ground its dark end
-// would not be seen, and begins lighter.
+// Cividis, which looks alike to readers with every common colour vision, from few moves to many; on a dark background
+// its dark end would be invisible, so it begins lighter there.
 const CIVIDIS = [[0, "#00224e"], [0.25, "#3b496c"], [0.5, "#7d7c78"], [0.75, "#bcae6c"], [1, "#fee838"]];
 const ON_DARK = [[0, "#5b7bb5"], [0.5, "#9c9b8e"], [0.75, "#c9bb70"], [1, "#fee838"]];
 const scale = () => (getComputedStyle(document.documentElement).colorScheme === "dark" ? ON_DARK : CIVIDIS);
-// Each learnt path has its own colour, line and number.
+// A colour, line style and number for each learnt path.
 const WAYS = [["learnt", "solid"], ["other", "dash"], ["reward", "longdash"], ["goal", "dot"], ["recorded", "dashdot"]];
 
 const layers = [
@@ -81,7 +81,7 @@ function learnt({ path_mm: points, number }) {
   ];
 }
 
-// The cells from which the policy reaches the goal; those from which it does not are crosses, whatever the colours.
+// The cells from which the policy reaches the goal; those from which it does not are crosses, in every colouring.
 function starts() {
   const { at_mm: at, reaches, nearest, moves } = view.starts;
   const height = heights[Number(get("slice").value)];

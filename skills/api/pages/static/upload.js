@@ -1,17 +1,17 @@
-// Sending a recording: the raw bytes, with their digest, and how far it is.
+// Upload of a recording as raw bytes with their digest, with a progress bar.
 import { changing, problemOf, root } from "./api.js";
 
 const get = (id) => document.getElementById(id);
 const form = get("upload");
-const KINDS = { mcap: "application/vnd.mcap", zip: "application/zip", csv: "text/csv", txt: "text/plain", bag: "application/x-rosbag", db3: "application/vnd.sqlite3" };
+const KINDS = Object.fromEntries([...get("kind").options].map((one) => [one.dataset.suffix, one.value]));
 const TABLE = "text/csv";
-const DIGESTED_BYTES = 512 * 2 ** 20; // the digest needs the whole file in memory; a larger one is sent without
+const DIGESTED_BYTES = 512 * 2 ** 20; // the digest needs the complete file in memory; a larger file is sent without one
 const mebibytes = (bytes) => `${(bytes / 2 ** 20).toFixed(1)} MiB`;
 
 function chosen() {
   const [file] = get("file").files;
   if (!file) return;
-  const kind = KINDS[file.name.split(".").pop().toLowerCase()];
+  const kind = KINDS[`.${file.name.split(".").pop().toLowerCase()}`];
   if (kind) get("kind").value = kind;
   get("chosen").textContent = `${file.name}, ${mebibytes(file.size)}`;
   ofTable();
@@ -46,8 +46,8 @@ function send(file, headers, query) {
     };
     request.onload = async () =>
       request.status < 300 ? resolve(JSON.parse(request.responseText)) : reject(await problemOf(request.status, request.responseText));
-    request.onerror = () => reject(new Error("The line broke; send it again. Nothing was kept."));
-    request.onabort = () => reject(new Error("Stopped; nothing was kept."));
+    request.onerror = () => reject(new Error("The connection was lost; send it again. Nothing was stored."));
+    request.onabort = () => reject(new Error("Stopped; nothing was stored."));
   });
   request.open("POST", `${root}/recordings?${query}`);
   for (const [name, value] of Object.entries({ ...headers, ...changing() })) request.setRequestHeader(name, value);

@@ -1,0 +1,205 @@
+"""Cache of released policies: encoded once, served from memory, and validated against the database at every request.
+
+The end of a surgeon's consent changes nothing in the database, so its last day is cached with the response.
+"""
+
+import asyncio
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager, suppress
+from dataclasses import dataclass
+from datetime import date
+from typing import Any
+
+from fastapi import APIRouter, Response
+from fastapi.routing import APIRoute
+from sqlalchemy.exc import SQLAlchemyError
+from starlette._utils import get_route_path
+from starlette.requests import Request
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from skills.api.authorisation import Needs
+from skills.api.responses import KEPT_BYTES, Body, Encoded, answer, negotiate
+from skills.db.changes import Unasked, changes_of
+from skills.db.session import Database
+from skills.errors import SkillsError, UnknownFormat
+from skills.library import consent, integrity, policies
+from skills.library.cache import Kept
+from skills.library.releases import STANDS
+
+Style = tuple[str, str, str]  # surgeon, suture type, and media type of the response
+
+USUAL = frozenset({b"accept", b"if-none-match"})
+READ = USUAL | {b"if-match"}
+LONGEST = 500  # a longer header is left to the route
+SWEEP_S = 2.0  # an erased policy leaves memory within this time; it is not served from the erasure on
+
+
+@dataclass
+class Known:
+    """A cached response: a style's policy, its release, and the database version at which both were valid."""
+
+    body: Body
+    release: tuple[Any, ...]  # the row of the query `STANDS`; its last column is the policy's digest
+    last_day: date | None  # of the surgeon's consent
+    version: int | None
+
+    @property
+    def over(self) -> bool:
+        """Return whether the last day of consent has passed, so that the policy must not be served."""
+        return self.last_day is not None and not consent.today() <= self.last_day
+
+
+class PolicyCache:
+    """The released policies cached by one process. They are the same for all callers, who were authorised before."""
+
+    def __init__(self, database: Database, encoded: Encoded) -> None:
+        self._database = database
+        self._encoded = encoded
+        self.changes = changes_of(database)
+        self._known: Kept[Style, Known] = Kept(KEPT_BYTES, lambda known: len(known.body.content))
+
+    @asynccontextmanager
+    async def watching(self) -> AsyncIterator[None]:
+        """Track changes of the database on this event loop; outside this context every request reads the tables."""
+        await self.changes.open()
+        sweeping = asyncio.create_task(self._sweep())
+        try:
+            yield
+        finally:
+            sweeping.cancel()
+            with suppress(asyncio.CancelledError):
+                await sweeping
+            await self.changes.close()
+
+    def at_hand(self, surgeon: str, suture: str, media_type: str) -> Body | None:
+        """Return the current policy of a style from the cache; None if that would need a query that blocks."""
+        version = self.changes.version()  # read before the tables, so that a commit in between is not missed
+        known = self._known.get((surgeon, suture, media_type))
+        if known is None or version is None or known.over:
+            return None
+        if known.version != version:
+            try:
+                if self.changes.first(STANDS, {"surgeon": surgeon, "suture": suture}) != known.release:
+                    return None
+            except Unasked:
+                return None
+            known.version = version
+        return known.body
+
+    async def body(self, surgeon: str, suture: str, media_type: str) -> Body:
+        """Return the current policy of a style, from the cache or else from the database.
+
+        Raises:
+            NotFound: The style does not exist, or has no released policy.
+            Corrupt: The stored policy does not match the digest that was certified.
+        """
+        return self.at_hand(surgeon, suture, media_type) or await self._read(surgeon, suture, media_type)
+
+    async def _read(self, surgeon: str, suture: str, media_type: str) -> Body:
+        version = self.changes.version()  # read before the tables, so that a commit in between is not missed
+        key = (surgeon, suture, media_type)
+        try:
+            known = await asyncio.to_thread(self._look, key)
+        except SkillsError:
+            self._known.forget([key])
+            raise
+        known.version = version
+        self._known.put(key, known)
+        return known.body
+
+    def _look(self, key: Style) -> Known:
+        """Read the tables, all within one transaction."""
+        surgeon, suture, media_type = key
+        with self._database.reading() as session:
+            release = session.execute(STANDS, {"surgeon": surgeon, "suture": suture}).first()
+            known = self._known.get(key)
+            if known is not None and release is not None and known.release == tuple(release) and not known.over:
+                return Known(known.body, known.release, known.last_day, None)
+            served = policies.policy_of(session, surgeon, suture)
+            assert release is not None, "both look at the same state"
+            body = self._encoded.policy(served.policy, served.release, media_type)
+            return Known(body, tuple(release), consent.last_day(served.policy.surgeon.consent), None)
+
+    async def _sweep(self) -> None:
+        """Remove erased policies from memory periodically, also those that are not requested any more."""
+        while True:
+            await asyncio.sleep(SWEEP_S)
+            with suppress(SkillsError, SQLAlchemyError):  # the database may be readable again at the next sweep
+                await asyncio.to_thread(self.forget_erased)
+
+    def forget_erased(self) -> None:
+        """Remove from memory every policy that is no longer in the database."""
+        here = self._encoded.policies() | set(integrity.remembered())
+        if not here:
+            return
+        with self._database.reading() as session:
+            gone = policies.missing(session, here)
+        integrity.forget(gone)
+        self._encoded.forget(gone)
+        self._known.forget([key for key, known in self._known.items() if known.release[-1] in gone])
+
+
+class AtHand:
+    """ASGI middleware that answers GET of a released policy from the cache: no routing, but the route's authorisation.
+
+    It stands between the authentication and the application. A request that needs a query, has an unusual header or is
+    to be refused goes on to the route, which gives the same answers.
+    """
+
+    def __init__(self, app: ASGIApp, served: PolicyCache, endpoint: Callable[..., Any], router: APIRouter) -> None:
+        """Take the path, and the role that it needs, from the route that a router has for an endpoint."""
+        self.app = app
+        self._served = served
+        (self._route,) = (
+            one
+            for one in router.routes
+            if isinstance(one, APIRoute) and one.endpoint is endpoint and one.include_in_schema
+        )
+        self._needs = [one.dependency for one in self._route.dependencies if isinstance(one.dependency, Needs)]
+        assert len(self._needs) == len(self._route.dependencies) > 0, "nothing else is asked here"
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Send the cached response, or pass the request on."""
+        answered = self._find(scope) if scope["type"] == "http" and scope["method"] in ("GET", "HEAD") else None
+        if answered is not None and await self._may(scope):
+            await answered(scope, receive, send)
+        else:
+            await self.app(scope, receive, send)
+
+    def _find(self, scope: Scope) -> Response | None:
+        found = self._route.path_regex.match(get_route_path(scope))
+        asked = None if found is None else _asked(scope["headers"])
+        if found is None or asked is None:
+            return None
+        media_type, if_none_match = asked
+        body = self._served.at_hand(found["surgeon"], found["suture"], media_type)
+        if body is None:
+            return None
+        # read by the authorisation and by the metrics
+        scope["route"], scope["path_params"] = self._route, found.groupdict()
+        return answer(body, if_none_match)
+
+    async def _may(self, scope: Scope) -> bool:
+        try:
+            for needed in self._needs:
+                await needed(Request(scope))
+        except SkillsError:
+            return False
+        return True
+
+
+def _asked(headers: list[tuple[bytes, bytes]]) -> tuple[str, str | None] | None:
+    """Return the negotiated media type and If-None-Match; None if a header is unusual, repeated or too long."""
+    found: dict[bytes, bytes] = {}
+    for name, value in headers:
+        if name in READ:
+            if name not in USUAL or name in found or len(value) > LONGEST:
+                return None
+            found[name] = value
+    have = found.get(b"if-none-match")
+    try:
+        return negotiate(found.get(b"accept", b"*/*").decode("latin-1")), None if have is None else have.decode(
+            "latin-1"
+        )
+    except UnknownFormat:
+        return None

@@ -1,0 +1,45 @@
+"""Arrays of the library's values: validated once, C-ordered, read-only."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from skills.errors import BadInput
+from skills.fields import Point
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Bytes = NDArray[np.int8]
+Flags = NDArray[np.bool_]
+
+
+def frozen(values: ArrayLike, dtype: Any, shape: tuple[int | None, ...], name: str) -> NDArray[Any]:
+    """Copy values into a read-only C-ordered array of the given type and shape.
+
+    Args:
+        values: The values.
+        dtype: The type of the array.
+        shape: The required shape; None stands for any length.
+        name: Name of the values, for the message.
+
+    Returns:
+        The array.
+
+    Raises:
+        BadInput: The shape is another one, or a number is NaN or infinite.
+    """
+    array = np.array(values, dtype=dtype, order="C", copy=True)  # a copy, which the caller cannot change later
+    if array.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, array.shape, strict=True)):
+        wanted = " x ".join("any" if n is None else str(n) for n in shape)
+        raise BadInput(f"{name} has shape {array.shape}; give {wanted}.", shape=array.shape)
+    if array.dtype.kind == "f" and not np.isfinite(array).all():
+        raise BadInput(f"{name} contains NaN or infinity; every number must be finite.")
+    array.setflags(write=False)
+    return array
+
+
+def xyz(values: Floats) -> Point:
+    """Return three numbers, shape (3,), as Python's own."""
+    x, y, z = values.tolist()
+    return x, y, z

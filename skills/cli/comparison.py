@@ -1,0 +1,299 @@
+"""Commands of atlases, scores, calibrations, and the report that redraws the paper's figures."""
+
+import re
+from contextlib import closing
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from skills.cli.recordings import ready
+from skills.cli.shell import (
+    AsJson,
+    Suture,
+    cell,
+    complete_surgeons,
+    complete_sutures,
+    err,
+    out,
+    print_json,
+    refusing,
+    service,
+    show,
+)
+from skills.errors import BadInput
+
+if TYPE_CHECKING:
+    from skills.schemas.given import Atlas
+
+SHORT = 12  # characters of a digest: enough to distinguish it from the others in a table
+
+commands = typer.Typer()
+
+
+@commands.command()
+@refusing
+def atlas(
+    suture: Suture,
+    scaled: Annotated[bool, typer.Option("--scaled", help="Scale all demonstrations to one size.")] = False,
+    clusters: Annotated[int | None, typer.Option(help="Number of clusters; by default as many as are found.")] = None,
+    demo: Annotated[
+        str | None, typer.Option(help="Recognise the surgeon of this demonstration, by its digest.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Compare all demonstrations of a suture type: clusters, differences between surgeons, and recognition."""
+    with service() as client:
+        found = client.atlas(suture, scaled=scaled, clusters=clusters, demo=demo)
+    if as_json:
+        print_json(found)
+        return
+    out.print(
+        f"Demonstrations of {suture}: {len(found.demos)}, of {found.recordings} recordings; distances in {found.unit}, "
+        "about as at one place"
+    )
+    for sentence in found.left_out.because:
+        out.print(sentence, markup=False, soft_wrap=True)
+    _tables(found)
+    for pair in found.differences:
+        out.print(f"- {pair.said}", markup=False, soft_wrap=True)
+    _recognition(found)
+
+
+def _tables(found: "Atlas") -> None:
+    surgeons = [
+        one.model_dump() | {"medoid": one.medoid[:SHORT], "consistency": _rounded(one.spread)} for one in found.surgeons
+    ]
+    show(surgeons, False, ("surgeon", "demos", "recordings", "sessions", "consistency", "medoid"))
+    clusters = [
+        {
+            "cluster": one.cluster,
+            "demos": one.demos,
+            "spread": _rounded(one.spread),
+            "medoid": one.medoid[:SHORT],
+            "surgeons": ", ".join(f"{of.demos} of {of.surgeon}" for of in one.surgeons),
+        }
+        for one in found.clusters
+    ]
+    show(clusters, False, ("cluster", "demos", "spread", "medoid", "surgeons"))
+
+
+def _recognition(found: "Atlas") -> None:
+    seen = found.recognition
+    if seen is None:
+        out.print(f"recognition: none. {found.no_recognition_because}", soft_wrap=True)
+        return
+    low, high = seen.interval
+    out.print(
+        f"recognition: {seen.right} of {seen.tested} with their session left out, {seen.accuracy:.0%} "
+        f"({low:.0%} to {high:.0%}), by chance {seen.chance:.0%}; log loss {seen.log_loss:.2f} nat, guessing "
+        f"{seen.log_loss_of_guessing:.2f}",
+        soft_wrap=True,
+    )
+    if found.whose is not None:
+        likely = ", ".join(f"{one.surgeon} {one.probability:.0%}" for one in found.whose.likely[:3])
+        out.print(f"{found.whose.demo[:SHORT]} of {found.whose.surgeon}: {likely}", soft_wrap=True)
+    out.print("Set-up and day are confounded with the surgeon: see docs/atlas.md.")
+
+
+def _rounded(distance: float | None) -> str | None:
+    return None if distance is None else f"{distance:.3g}"
+
+
+if TYPE_CHECKING:
+    from skills.client import Client
+    from skills.schemas.given import Score
+
+scoring_commands = typer.Typer()
+
+DIGEST = re.compile("[0-9a-f]{8,64}")
+
+
+@scoring_commands.command()
+@refusing
+def score(
+    what: Annotated[str, typer.Argument(help="A recording's file, which is then stored; or a demonstration's digest.")],
+    surgeon: Annotated[
+        str, typer.Option(help="The surgeon whose style is the reference.", autocompletion=complete_surgeons)
+    ],
+    suture: Annotated[str, typer.Option(help="The suture type.", autocompletion=complete_sutures)],
+    proposal: Annotated[int | None, typer.Option(help="The proposed hand-off of a file, counted from 1.")] = None,
+    arm: Annotated[str | None, typer.Option(help="The arm, for a file.")] = None,
+    start_s: Annotated[float | None, typer.Option(help="The start of the hand-off in a file.")] = None,
+    end_s: Annotated[float | None, typer.Option(help="The end of the hand-off in a file.")] = None,
+    reference: Annotated[str | None, typer.Option(help="The demonstration of the style to compare with.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Score a motion against a style: its distance, where it deviates, and its percentiles. Not a credential."""
+    with service() as client:
+        if Path(what).exists():
+            part = _part(client, Path(what), proposal, arm, start_s, end_s)
+            scored = client.score(surgeon, suture, reference=reference, **part)
+        elif DIGEST.fullmatch(what) is None or any(one is not None for one in (proposal, arm, start_s, end_s)):
+            raise BadInput(
+                f"There is no file {what}. Name a recording's file, or a demonstration by its digest and without "
+                "--proposal, --arm, --start-s and --end-s."
+            )
+        else:
+            scored = client.score(surgeon, suture, demo=what, reference=reference)
+    if as_json:
+        print_json(scored)
+    else:
+        _tell(scored)
+
+
+def _part(
+    client: "Client", path: Path, proposal: int | None, arm: str | None, start_s: float | None, end_s: float | None
+) -> dict[str, Any]:
+    """Store a recording, and return the part to score: the given times, else the proposed hand-off."""
+    with ready(path) as (file, progress):
+        stored = client.add_recording(file, progress=progress)
+    if proposal is None and (start_s, end_s) != (None, None):
+        return {"recording": stored.sha256, "arm": arm, "start_s": start_s, "end_s": end_s}
+    proposed = [part for part in stored.segments if arm in (None, part.arm)]
+    number = proposal or 1
+    if not 1 <= number <= len(proposed) or (proposal is None and len(proposed) > 1):
+        raise BadInput(
+            f"The recording has {len(proposed)} proposed hand-offs; choose one with --proposal, or give --start-s and "
+            "--end-s."
+        )
+    part = proposed[number - 1]
+    return {"recording": stored.sha256, "arm": part.arm, "start_s": part.start_s, "end_s": part.end_s}
+
+
+def _tell(scored: "Score") -> None:
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False)
+    beside = [one for one in scored.percentiles if one.below]
+    for name in ("", "value", "reference", "ratio", "", *(f"below {one.level}" for one in beside)):
+        table.add_column(name)
+    for one in scored.figures:
+        below = [level.below.get(one.name) if level.below else None for level in beside]
+        shares = ["" if share is None else f"{100 * share:.0f} %" for share in below]
+        numbers = ["" if n is None else f"{n:.2f}" for n in (one.value, one.reference, one.ratio)]
+        table.add_row(one.label, *numbers, one.unit, *shares)
+    out.print(table)
+    out.print(f"Beside {scored.reference.demo}: {scored.reference.because}.", soft_wrap=True)
+    for sentence in (*scored.deviation.words, *scored.skill.words):
+        out.print(sentence, markup=False, soft_wrap=True)
+    out.print(scored.use, markup=False, soft_wrap=True)
+
+
+@scoring_commands.command()
+@refusing
+def calibrate(
+    folder: Annotated[
+        Path,
+        typer.Argument(
+            help="A folder with TASK/kinematics/AllGestures/*.txt and TASK/meta_file_TASK.txt.", file_okay=False
+        ),
+    ],
+    task: Annotated[str | None, typer.Option(help="The task, such as Suturing; needed if there are several.")] = None,
+    arm: Annotated[Literal["PSM_left", "PSM_right"] | None, typer.Option(help="Only this arm.")] = None,
+    of: Annotated[
+        Literal["hand-off", "trial"],
+        typer.Option(help="The motion that is measured: each proposed hand-off, or the complete trial."),
+    ] = "hand-off",
+    seed: Annotated[int, typer.Option(help="Seed of the bootstrap and the permutations.", min=0)] = 0,
+    permutations: Annotated[
+        int, typer.Option(help="Number of permutations for the chance level.", min=20, max=10_000)
+    ] = 200,
+    as_json: AsJson = False,
+) -> None:
+    """Fit a model of skill ratings to a folder of rated trials, and store it: every score uses the newest model."""
+    from skills.db.session import Database
+    from skills.library.calibrations import calibrate_on, keep, read_cohort
+    from skills.serving import prepare
+    from skills.settings import settings
+
+    prepare(settings())
+    with err.status("reading") as status:
+        rated = read_cohort(folder, task=task, arm=arm, of=of, told=lambda share: status.update(f"reading {share:.0%}"))
+        _tell_left_out(rated.left_out)
+        about = calibrate_on(
+            rated,
+            seed=seed,
+            permutations=permutations,
+            told=lambda share: status.update(f"measuring the chance level {share:.0%}"),
+        )
+    with closing(Database(settings().database_url)) as database, database.writing() as session:
+        stored, _ = keep(session, about, "local")
+    if as_json:
+        print_json({"sha256": stored.sha256, **about})
+    else:
+        _tell_calibration(stored.sha256, about)
+
+
+def _tell_left_out(left_out: dict[str, list[str]]) -> None:
+    for why, names in left_out.items():
+        said = f"Left out, {why}: {', '.join(names)}."
+        err.print(said, style="yellow", markup=False, soft_wrap=True)
+
+
+def _tell_calibration(digest: str, about: dict[str, Any]) -> None:
+    from rich.table import Table
+
+    from skills.scoring.features import KIND_OF
+
+    data, judged, model = about["data"], about["validated"], about["model"]
+    levels = ", ".join(f"{count} {level}" for level, count in data["levels"].items())
+    out.print(f"{digest}  {data['task']}, each {data['of']}", soft_wrap=True)
+    out.print(f"{data['trials']} trials ({levels}) of {data['surgeons']} surgeons, {data['motions']} motions")
+    table = Table(box=None, pad_edge=False)
+    for name in ("a surgeon left out", "rho", "95 %", "level right", "95 %"):
+        table.add_column(name)
+    for name, row in (("all figures", judged["all_figures"]), ("duration only", judged["duration_only"])):
+        table.add_row(name, f"{row['rho']:.2f}", _span(row["rho_interval"]), f"{100 * row['accuracy']:.0f} %",
+                      _span(row["accuracy_interval"]))  # fmt: skip
+    chance = judged["chance"]
+    table.add_row("chance", f"{chance['rho']:.2f}", f"p = {chance['rho_p']:.3f}", f"{100 * chance['accuracy']:.0f} %",
+                  f"p = {chance['accuracy_p']:.3f}")  # fmt: skip
+    out.print(table)
+    weights = Table(box=None, pad_edge=False)
+    for name in ("figure", "mean", "deviation", "unit", "points per deviation"):
+        weights.add_column(name)
+    for name, centre, scale, weight in zip(
+        model["figures"], model["centre"], model["scale"], model["rating_weights"], strict=True
+    ):
+        kind = KIND_OF[name]
+        weights.add_row(kind.label, f"{centre:.2f}", f"{scale:.2f}", cell(kind.unit), f"{weight:+.2f}")
+    out.print(weights)
+    out.print(f"Rating at the means {model['rating']:.1f}; 90 % of unseen ones within {model['rating_margin']:.1f}.")
+
+
+def _span(interval: list[float] | tuple[float, float]) -> str:
+    low, high = interval
+    return f"{low:.2f} to {high:.2f}"
+
+
+report_commands = typer.Typer()
+
+
+@report_commands.command()
+@refusing
+def report(
+    to: Annotated[Path, typer.Option(help="The folder to write to.")] = Path("build/report"),
+    irl_iterations: Annotated[int, typer.Option(min=1, help="Iterations of maximum-entropy IRL, for Fig. 5.")] = 200,
+    seeds: Annotated[int, typer.Option(min=1, help="Number of seeds for each learner.")] = 200,
+    runs: Annotated[
+        int, typer.Option(min=1, help="Runs of each policy and rival, for each probability of a slip.")
+    ] = 1000,
+    as_json: AsJson = False,
+) -> None:
+    """Redraw the paper's Figures 5 to 9 and Table I, compared with rivals: pictures and one HTML page."""
+    from skills.report import ABSENT, Effort, write_report
+    from skills.settings import settings
+
+    with err.status("...") as status:
+        effort = Effort(irl_iterations=irl_iterations, seeds=seeds, runs=runs)
+        written = write_report(to, settings().paper_data, effort, status.update)
+    if not written.has_paper_data:
+        err.print(ABSENT, soft_wrap=True)
+    if as_json:
+        out.print(written.numbers.read_text(), markup=False, soft_wrap=True)
+        return
+    for one in written.tables:
+        out.print(f"\n{one.caption}", markup=False, soft_wrap=True)
+        show([dict(zip(one.columns, row, strict=True)) for row in one.rows], False, one.columns)
+    out.print(f"\n{len(written.pictures)} pictures and the page: {written.page}", soft_wrap=True)

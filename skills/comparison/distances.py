@@ -1,0 +1,275 @@
+"""DTW distances between demonstrations as shapes, and the differences of two shapes by thirds and axes.
+
+    Demo --shape_of--> points equally far apart along the path, in a frame of the hand-off
+    shapes --distances--> DTW distances between all of them
+
+The place of a hand-off, its speed and optionally its size are not part of the style, so motions are compared in a frame
+of their own. That frame has its origin at the start, x towards the goal, and z as far along the base's z axis as x
+allows; y then points to the left. So two shapes begin together and go the same way; scaled, they end together too.
+Tempo is left out: states are even along the path, as in the paper's grid, where standing still adds no state. This is
+ours; the paper compares paths only at the place where they were recorded.
+
+The distance is dynamic time warping with Manhattan distance (Sec. IV). The total is exact and does not depend on a
+tie-break; divided by the number of states of a shape it is about the mm by which they differ at a place. One more shape
+costs one row of distances.
+
+`Measured` is the stored result of one demonstration: its shape, and its distances from some others.
+
+`difference` names the axis and the part of the path that separate two shapes, for text and pictures.
+"""
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from skills.arrays import Floats, Ints, frozen
+from skills.comparison import _kernels
+from skills.demonstration.demonstration import Demo
+from skills.demonstration.movement import smoothed_tip
+from skills.errors import BadPath
+from skills.learning.evaluation import dtw
+
+STATES = 100  # of a shape; the paper's demonstration has 28 states, our samples 20 to 60
+TREMOR_S = 0.2  # a Hann window this wide stops 10 Hz, which would lengthen the path, and rounds no corner of a hand
+LEAST_MM = 1.0  # from start to goal; tremor would change the direction of a shorter path
+STEEPEST = 0.99  # cosine between x and the base's z axis; beyond it, the base's y axis replaces its z axis
+
+
+THREADS = 2  # the loops release the GIL; the service, which calls this too, needs its other cores
+WORTH_A_THREAD = 200  # pairs; with 100 states they take 6 ms
+VERSION = 1  # of shapes and distances: raise it when their numbers change, so that stored ones are measured again
+AXES = ("along the way", "sideways", "upwards")  # x, y and z of a shape's own frame
+FURTHER = (("less far along", "further along"), ("further right", "further left"), ("lower", "higher"))  # by sign
+PARTS = ("first third", "middle third", "last third")
+
+
+def shape_of(demo: Demo, *, scaled: bool = False) -> Floats:
+    """Return a demonstration's path in its own frame, shape (STATES, 3), in mm or scaled.
+
+    Args:
+        demo: The demonstration.
+        scaled: Whether the unit is the distance from start to goal, instead of mm.
+
+    Raises:
+        BadPath: It ends within `LEAST_MM` of its start.
+    """
+    way_mm = resampled(smoothed_tip(demo.stamps_s, demo.tip_mm, TREMOR_S)[1])
+    return placed(way_mm, scaled=scaled)
+
+
+def in_lengths(shape_mm: Floats) -> Floats:
+    """Return a shape in units of the distance from start to goal: the scaled shape of the same demonstration.
+
+    Args:
+        shape_mm: The shape in mm, (T, 3).
+    """
+    return np.asarray(shape_mm / shape_mm[-1, 0])
+
+
+def resampled(tip_mm: Floats, states: int = STATES) -> Floats:
+    """Return points equally far apart along a path, shape (states, 3).
+
+    Args:
+        tip_mm: The path, shape (T, 3).
+        states: Number of points, the ends included.
+    """
+    along_mm = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(tip_mm, axis=0), axis=1)))
+    at_mm = np.linspace(0.0, along_mm[-1], states)
+    return np.stack([np.interp(at_mm, along_mm, axis) for axis in tip_mm.T], axis=1)
+
+
+def placed(tip_mm: Floats, *, scaled: bool = False) -> Floats:
+    """Return a path in the frame of its start and goal, shape (T, 3).
+
+    Args:
+        tip_mm: The path in the arm's base frame, shape (T, 3).
+        scaled: Whether the unit is the distance from start to goal, instead of mm.
+
+    Raises:
+        BadPath: It ends within `LEAST_MM` of its start.
+    """
+    way_mm = tip_mm[-1] - tip_mm[0]
+    length_mm = float(np.linalg.norm(way_mm))
+    if not length_mm >= LEAST_MM:
+        raise BadPath(
+            f"It ends {length_mm:.2f} mm from where it began, so it has no direction and cannot be compared; cut "
+            "the hand-off from its start to the point where the needle is taken.",
+            length_mm=length_mm,
+        )
+    x = way_mm / length_mm
+    up = np.array([0.0, 0.0, 1.0] if abs(x[2]) < STEEPEST else [0.0, 1.0, 0.0])
+    z = up - (up @ x) * x
+    z /= np.linalg.norm(z)
+    axes = np.stack([x, np.cross(z, x), z])
+    return frozen((tip_mm - tip_mm[0]) @ axes.T / (length_mm if scaled else 1.0), np.float64, (None, 3), "tip_mm")
+
+
+def distances(shapes: ArrayLike, references: ArrayLike) -> Floats:
+    """Return the distance of each shape to each reference, shape (N, M), in their unit.
+
+    Args:
+        shapes: Shape (N, T, 3).
+        references: Shape (M, R, 3), in the same unit.
+    """
+    paths = frozen(shapes, np.float64, (None, None, 3), "shapes")
+    to = frozen(references, np.float64, (None, None, 3), "references")
+    pairs = np.stack(np.divmod(np.arange(len(paths) * len(to)), max(1, len(to))), axis=1)
+    return _measured(paths, to, pairs).reshape(len(paths), len(to))
+
+
+def distances_of(shapes: ArrayLike, pairs: ArrayLike) -> Floats:
+    """Return the distance between the shapes of each pair, shape (K,), in their unit.
+
+    Args:
+        shapes: Shape (N, T, 3).
+        pairs: Indices of two shapes each, shape (K, 2).
+    """
+    paths = frozen(shapes, np.float64, (None, None, 3), "shapes")
+    return _measured(paths, paths, np.asarray(pairs))
+
+
+def _measured(paths: Floats, references: Floats, pairs: Ints) -> Floats:
+    chosen = frozen(pairs, np.int64, (None, 2), "pairs")
+    totals = np.empty(len(chosen))
+
+    def measure(part: slice) -> None:
+        row = np.empty(references.shape[1] + 1)
+        _kernels.warp_pairs_compiled(paths, references, chosen[part], row, totals[part])
+
+    ends = np.linspace(0, len(chosen), 1 + min(THREADS, 1 + len(chosen) // WORTH_A_THREAD)).astype(int).tolist()
+    parts = [slice(*ends[at : at + 2]) for at in range(len(ends) - 1)]
+    if len(parts) == 1:
+        measure(parts[0])
+        return totals
+    with ThreadPoolExecutor(len(parts)) as threads:
+        list(threads.map(measure, parts))
+    return totals
+
+
+def medoid(apart: Floats, members: Ints) -> int:
+    """Return the member that is nearest to all members; the first among equals.
+
+    Args:
+        apart: Distances between all demonstrations, shape (N, N).
+        members: Indices into `apart`, at least one.
+    """
+    return int(members[apart[np.ix_(members, members)].sum(axis=1).argmin()])
+
+
+def spread(apart: Floats, members: Ints) -> float:
+    """Return the consistency of members: the mean distance of the others to their medoid; 0 for a single one.
+
+    Args:
+        apart: Distances between all demonstrations, shape (N, N).
+        members: Indices into `apart`, at least one.
+    """
+    others = members[members != (centre := medoid(apart, members))]
+    return float(apart[centre, others].mean()) if len(others) else 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """A shape, and its distances from those of other demonstrations.
+
+    Attributes:
+        shape_mm: The result of `shape_of`, shape (STATES, 3); None: the demonstration has no direction.
+        others: Numbers that identify the others, shape (K,).
+        apart_mm: Distance from each, with the size taken into account, shape (K,).
+        apart_scaled: The same for scaled shapes, in units of the distance from start to goal, shape (K,).
+    """
+
+    shape_mm: Floats | None
+    others: Ints
+    apart_mm: Floats
+    apart_scaled: Floats
+
+    def __post_init__(self) -> None:
+        count = len(self.others)
+        if self.shape_mm is not None:
+            object.__setattr__(self, "shape_mm", frozen(self.shape_mm, np.float64, (STATES, 3), "shape_mm"))
+        object.__setattr__(self, "others", frozen(self.others, np.int64, (count,), "others"))
+        for name in ("apart_mm", "apart_scaled"):
+            object.__setattr__(self, name, frozen(getattr(self, name), np.float64, (count,), name))
+
+
+@dataclass(frozen=True, eq=False)
+class Difference:
+    """The difference of one shape from another.
+
+    Attributes:
+        total: The warping distance, in the shapes' unit.
+        offsets: Signed offset of the first shape from the second, averaged over the states of each third of the
+            second's path, shape (3 parts, 3 axes).
+        nets: The same averaged over the pairs of states there, as `shares` are: a stretch without a counterpart counts
+            by its length.
+        sizes: The same as `nets`, without signs.
+        shares: The part of the total in each third and axis, shape (3 parts, 3 axes); they sum to 1, or are all 0.
+        along: Mean offset of the first shape at each state of the second, shape (R, 3), signed.
+    """
+
+    total: float
+    offsets: Floats
+    nets: Floats
+    sizes: Floats
+    shares: Floats
+    along: Floats
+
+    def __post_init__(self) -> None:
+        for name, shape in {
+            "offsets": (3, 3),
+            "nets": (3, 3),
+            "sizes": (3, 3),
+            "shares": (3, 3),
+            "along": (None, 3),
+        }.items():
+            object.__setattr__(self, name, frozen(getattr(self, name), np.float64, shape, name))
+
+    @property
+    def where(self) -> tuple[str, str]:
+        """The part and the axis with the largest share of the distance, by their names."""
+        part, axis = self._most
+        return PARTS[part], AXES[axis]
+
+    @property
+    def most(self) -> tuple[float, float, float]:
+        """The share of the distance there, its net and its size."""
+        return float(self.shares[self._most]), float(self.nets[self._most]), float(self.sizes[self._most])
+
+    @property
+    def direction(self) -> str | None:
+        """The direction in which the first shape is offset there; None if the two cross and no direction prevails."""
+        _, net, size = self.most
+        return FURTHER[self._most[1]][int(net > 0)] if abs(net) > size / 2 else None
+
+    @property
+    def _most(self) -> tuple[int, int]:
+        part, axis = np.unravel_index(int(self.shares.argmax()), self.shares.shape)
+        return int(part), int(axis)
+
+
+def difference(shape: Floats, reference: Floats) -> Difference:
+    """Compare a shape with another, each in its own frame.
+
+    Args:
+        shape: The first shape, (T, 3), as `skills.comparison.distances.shape_of` returns it.
+        reference: The second, (R, 3), in the same unit.
+
+    Raises:
+        EmptyPath: One of them has no state.
+    """
+    aligned = dtw(shape, reference)
+    states = aligned.pairs[:, 1]
+    signed = shape[aligned.pairs[:, 0]] - reference[states]
+    paired = np.bincount(states, minlength=len(reference))[:, None]
+    along = np.stack([np.bincount(states, axis, len(reference)) for axis in signed.T], axis=1) / paired
+    third = np.arange(len(reference)) * len(PARTS) // len(reference)
+    offsets = np.stack(
+        [along[third == part].mean(axis=0) if (third == part).any() else np.zeros(3) for part in range(len(PARTS))]
+    )
+    inside = third[states] == np.arange(len(PARTS))[:, None]  # membership of the pairs in the thirds
+    pairs = inside.sum(axis=1, keepdims=True).clip(1)
+    apart = inside @ aligned.differences_mm
+    shares = apart / (aligned.total_mm or 1.0)
+    return Difference(aligned.total_mm, offsets, inside @ signed / pairs, apart / pairs, shares, along)

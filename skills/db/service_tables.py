@@ -1,0 +1,159 @@
+"""The tables of the service's own state: jobs and workers, keys and sign-ins, and events.
+
+Events are append-only. Revoked keys are not deleted; a sign-in is deleted when it ends.
+"""
+
+from datetime import datetime
+from typing import Any
+
+from sqlalchemy import CheckConstraint, ForeignKey, Index, String, UniqueConstraint, text
+from sqlalchemy.orm import Mapped, mapped_column, relationship
+
+from skills.db.base import Base, RowId, Sha256, now
+from skills.db.models import Demonstration, PolicyVersion, Surgeon
+
+LONGEST_REASON = 2000  # characters
+
+
+class Job(Base):
+    """A request for work.
+
+    `identity` is the digest of its resolved inputs: there is at most one active or succeeded job of an identity.
+    `attempt` is the number of the current attempt; its workflow is named "<row>-<attempt>". `told_at` is the time at
+    which the attempt was enqueued in the engine.
+    """
+
+    __tablename__ = "jobs"
+
+    row: Mapped[RowId]
+    id: Mapped[str] = mapped_column(String(32), unique=True)
+    kind: Mapped[str] = mapped_column(String(20))
+    identity: Mapped[str] = mapped_column(Sha256)
+    state: Mapped[str] = mapped_column(String(10), default="queued")
+    progress: Mapped[float] = mapped_column(default=0.0)
+    request: Mapped[dict[str, Any]]
+    result: Mapped[dict[str, Any] | None]
+    error: Mapped[str | None] = mapped_column(String(LONGEST_REASON))
+    attempt: Mapped[int] = mapped_column(default=1)
+    surgeon_row: Mapped[int | None] = mapped_column(ForeignKey("surgeons.row"), index=True)
+    asked_by: Mapped[str] = mapped_column(default="local")
+    told_at: Mapped[datetime | None]
+    created_at: Mapped[datetime] = mapped_column(default=now)
+    started_at: Mapped[datetime | None]
+    ended_at: Mapped[datetime | None]
+
+    __table_args__ = (
+        CheckConstraint("state IN ('queued', 'running', 'succeeded', 'failed', 'cancelled')", name="state"),
+        CheckConstraint("progress >= 0 AND progress <= 1", name="progress"),
+        Index("ix_jobs_identity", "identity", "row"),
+        Index("ix_jobs_state", "state", "row"),
+        Index("ix_jobs_kind", "kind", "state"),  # for the counts at every metrics scrape
+        Index(  # partial, so that failed and cancelled jobs can be requested again
+            "uq_jobs_identity_live",
+            "identity",
+            unique=True,
+            sqlite_where=text("state IN ('queued', 'running', 'succeeded')"),
+            postgresql_where=text("state IN ('queued', 'running', 'succeeded')"),
+        ),
+    )
+
+
+class StyleToRetrain(Base):
+    """One style of a batch: its demonstration, its part of the batch, and its outcome.
+
+    `tries` counts how often a worker has started it, `stale` holds the reasons why it needed training, and `comparison`
+    compares the new policy version with the released one.
+    """
+
+    __tablename__ = "retraining_styles"
+
+    row: Mapped[RowId]
+    job_row: Mapped[int] = mapped_column(ForeignKey("jobs.row"))
+    part_row: Mapped[int] = mapped_column(ForeignKey("jobs.row"))
+    demonstration_row: Mapped[int] = mapped_column(ForeignKey("demonstrations.row"), index=True)
+    stale: Mapped[list[Any]]
+    state: Mapped[str] = mapped_column(String(10), default="queued")
+    tries: Mapped[int] = mapped_column(default=0)
+    policy_row: Mapped[int | None] = mapped_column(ForeignKey("policy_versions.row"), index=True)
+    reason: Mapped[str | None] = mapped_column(String(LONGEST_REASON))
+    comparison: Mapped[dict[str, Any] | None]
+    ended_at: Mapped[datetime | None]
+
+    demonstration: Mapped[Demonstration] = relationship(lazy="joined", innerjoin=True)
+    policy: Mapped[PolicyVersion | None] = relationship(lazy="selectin")  # with a join SQLite would read all rows
+    __table_args__ = (
+        CheckConstraint("state IN ('queued', 'done', 'failed', 'cancelled')", name="state"),
+        UniqueConstraint("job_row", "demonstration_row", name="uq_retraining_styles_demonstration"),
+        Index("ix_retraining_styles_job", "job_row", "row"),
+        Index("ix_retraining_styles_state", "job_row", "state", "row"),
+        Index("ix_retraining_styles_part", "part_row", "state"),
+    )
+
+
+class Executor(Base):
+    """A worker process and its last heartbeat; an `id` is never reused."""
+
+    __tablename__ = "executors"
+
+    id: Mapped[str] = mapped_column(String(64), primary_key=True)
+    beat_at: Mapped[datetime] = mapped_column(default=now)
+
+
+class Key(Base):
+    """An API key of a person or a program: the digest of its secret, which is not stored itself, and its permissions.
+
+    `id` is the public part of the key. `restricted` limits a key to its surgeons even when all of them are erased.
+    """
+
+    __tablename__ = "keys"
+
+    row: Mapped[RowId]
+    id: Mapped[str] = mapped_column(String(16), unique=True)
+    digest: Mapped[str] = mapped_column(Sha256)
+    owner: Mapped[str] = mapped_column(String(64))
+    role: Mapped[str] = mapped_column(String(10))
+    restricted: Mapped[bool]
+    created_at: Mapped[datetime] = mapped_column(default=now)
+    created_by: Mapped[str]
+    expires_at: Mapped[datetime | None]
+    revoked_at: Mapped[datetime | None]
+
+    surgeons: Mapped[list[Surgeon]] = relationship(secondary="key_surgeons", lazy="selectin", order_by=Surgeon.slug)
+    __table_args__ = (CheckConstraint("role IN ('reader', 'uploader', 'trainer', 'releaser', 'admin')", name="role"),)
+
+
+class KeySurgeon(Base):
+    """A surgeon that a restricted key may see, one of possibly several; deleted with the surgeon."""
+
+    __tablename__ = "key_surgeons"
+
+    key_row: Mapped[int] = mapped_column(ForeignKey("keys.row"), primary_key=True)
+    surgeon_row: Mapped[int] = mapped_column(ForeignKey("surgeons.row", ondelete="CASCADE"), primary_key=True)
+
+
+class SignIn(Base):
+    """A browser session of a key: the digest of the cookie, and the time of its last use."""
+
+    __tablename__ = "sign_ins"
+
+    digest: Mapped[str] = mapped_column(Sha256, primary_key=True)
+    key_row: Mapped[int] = mapped_column(ForeignKey("keys.row"))
+    created_at: Mapped[datetime] = mapped_column(default=now)
+    used_at: Mapped[datetime] = mapped_column(default=now)
+
+    key: Mapped[Key] = relationship(lazy="joined", innerjoin=True)
+
+
+class Event(Base):
+    """An audit event: actor, action, object and time; people appear only by their random subject."""
+
+    __tablename__ = "events"
+
+    row: Mapped[RowId]
+    sha256: Mapped[str] = mapped_column(Sha256, unique=True)
+    at: Mapped[datetime] = mapped_column(default=now)
+    actor: Mapped[str]
+    action: Mapped[str]
+    object_kind: Mapped[str]
+    object_id: Mapped[str]
+    subject: Mapped[str | None] = mapped_column(String(32), index=True)

@@ -1,0 +1,287 @@
+"""Movement and rest of a tip: speeds without tremor, onset and offset, and smoothness.
+
+A held hand trembles at 8 to 12 Hz and drifts by about a millimetre per second, so speeds are computed from positions
+averaged by a Hann window. A movement starts and stops too slowly for a threshold above that drift to detect its ends.
+Near its ends the speed of a minimum-jerk movement grows with the square of time (Flash and Hogan, 1985), so the square
+root of the speed is extrapolated linearly to zero (`onset`, `offset`). The thresholds are ours; the paper cut by hand.
+
+Smoothness is the spectral arc length of the speed profile v:
+
+    SPARC = - integral from 0 to w_c of sqrt( (1 / w_c)^2 + (dV/dw)^2 ) dw,   V(w) = |FFT(v)| / |FFT(v)(0)|
+
+after Balasubramanian, Melendez-Calderon, Roby-Brami and Burdet, "On the analysis of movement smoothness", Journal of
+NeuroEngineering and Rehabilitation 12:112 (2015); the code is ours, the three parameters are theirs. A movement that
+starts and stops has more ripples in its spectrum, so a longer arc and a lower value. One minimum-jerk stroke has -1.41.
+SPARC has no unit, does not depend on the distance or the speed of the movement, and, unlike jerk, depends little on
+noise.
+"""
+
+from bisect import bisect_left
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from skills.arrays import Flags, Floats, Ints
+
+MOVING_MM_S = 2.0  # above the drift of a held hand, far below the 20-90 mm/s of a hand-off
+TURNING_RAD_S = 0.15  # 9 degrees/s: above an unsteady wrist, below the 45 degrees/s of an intended turn
+SMOOTHING_S = 0.5  # a Hann window this wide takes 8-12 Hz tremor out
+GRID_STEP_S = 0.01
+GRID_LIMIT = 1_000_000  # samples, so that a stamp that is years off does not exhaust memory
+LOOK_S = 1.5  # the onset is fitted to the first 1.5 s of a movement
+FURTHEST_S = 0.5  # longest extrapolation: a longer one would follow drift and tremor
+LOW, HIGH = 0.1, 0.5  # of the peak speed within LOOK_S: the line is fitted between these two
+_LOOK = round(LOOK_S / GRID_STEP_S)
+
+Span = tuple[float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Movement:
+    """The motion of one arm over time, without tremor.
+
+    Attributes:
+        seconds: Evenly spaced times, shape (N,).
+        tip_mm: Smoothed positions, shape (N, 3).
+        speed_mm_s: Speed of the smoothed tip, shape (N,).
+        rotation_xyzw: Smoothed orientations, unit quaternions, shape (N, 4); None if not recorded.
+        turning_rad_s: Angular speed, shape (N,); 0 if no orientation was recorded.
+        moving_mm_s: Speed above which the tip counts as moving: `MOVING_MM_S`, or more if even the rests are faster.
+    """
+
+    seconds: Floats
+    tip_mm: Floats
+    speed_mm_s: Floats
+    rotation_xyzw: Floats | None
+    turning_rad_s: Floats
+    moving_mm_s: float
+
+    def index(self, second: float) -> int:
+        """Return the index of the sample nearest to a time in s."""
+        after = min(max(bisect_left(self.seconds, second), 1), len(self.seconds) - 1)
+        before = after - 1
+        return before if second - self.seconds[before] <= self.seconds[after] - second else after
+
+    def turn_rad(self, start_s: float, end_s: float) -> float:
+        """Return the angle between the orientations at two times in s; 0 if no orientation was recorded."""
+        if self.rotation_xyzw is None:
+            return 0.0
+        return angle_between(self.rotation_xyzw[self.index(start_s)], self.rotation_xyzw[self.index(end_s)])
+
+    def extent_mm(self, start_s: float, end_s: float) -> float:
+        """Return the longest side of the box around the path between two times in s."""
+        return float(np.ptp(self.tip_mm[self.index(start_s) : self.index(end_s) + 1], axis=0).max())
+
+
+def movement_of(seconds: Floats, tip_mm: Floats, rotation_xyzw: Floats | None) -> Movement:
+    """Smooth a motion and compute its speeds.
+
+    Args:
+        seconds: Time stamps from any origin, shape (T,), strictly increasing, T at least 1.
+        tip_mm: Positions of the tip in one frame, shape (T, 3).
+        rotation_xyzw: Unit quaternions in the same frame, shape (T, 4), or None.
+
+    Returns:
+        The smoothed motion on evenly spaced times.
+    """
+    grid_s, tip_mm = smoothed_tip(seconds, tip_mm, SMOOTHING_S)
+    speed = _rate(grid_s, tip_mm)
+    calm, fast = np.quantile(speed, (0.1, 0.95)).tolist()
+    # A hand that never rests raises the threshold, but to no more than a tenth of its fast movements.
+    moving_mm_s = max(MOVING_MM_S, min(3.0 * calm, 0.1 * fast))
+    if rotation_xyzw is None:
+        return Movement(grid_s, tip_mm, speed, None, np.zeros(len(grid_s)), moving_mm_s)
+    rotation = smoothed_tip(seconds, same_signs(rotation_xyzw), SMOOTHING_S)[1]
+    # The mean of unit quaternions is shorter than 1.
+    rotation = rotation / np.linalg.norm(rotation, axis=1, keepdims=True).clip(1e-12)
+    return Movement(grid_s, tip_mm, speed, rotation, 2.0 * _rate(grid_s, rotation), moving_mm_s)
+
+
+def smoothed_speed(seconds: Floats, tip_mm: Floats) -> tuple[Floats, Floats]:
+    """Return the tip's speed without tremor at evenly spaced times.
+
+    Args:
+        seconds: Time stamps, shape (T,), strictly increasing, T at least 1.
+        tip_mm: Positions of the tip, shape (T, 3).
+
+    Returns:
+        Times in s and speeds in mm/s, both of shape (N,).
+    """
+    grid_s, smooth = smoothed_tip(seconds, tip_mm, SMOOTHING_S)
+    return grid_s, _rate(grid_s, smooth)
+
+
+def smoothed_tip(seconds: Floats, tip_mm: Floats, window_s: float) -> tuple[Floats, Floats]:
+    """Return the tip averaged by a Hann window at evenly spaced times.
+
+    Args:
+        seconds: Time stamps, shape (T,), strictly increasing, T at least 1.
+        tip_mm: Positions of the tip, shape (T, 3), or values with any other number of columns.
+        window_s: Full width of the window; of a movement faster than 2 / `window_s`, in Hz, little is left.
+
+    Returns:
+        Times in s, shape (N,), and positions in mm, shape (N, 3).
+    """
+    duration = float(seconds[-1] - seconds[0])
+    count = int(min(duration / GRID_STEP_S, GRID_LIMIT)) + 2
+    grid_s = np.linspace(seconds[0], seconds[-1], count)
+    step_s = duration / (count - 1)
+    # The bound in grid steps keeps the window small: with samples nanoseconds apart it would take gigabytes.
+    half = 0 if duration == 0 else int(min(window_s / step_s / 2, window_s / GRID_STEP_S))
+    window = np.hanning(2 * half + 3)[1:-1]
+    even = [np.interp(grid_s, seconds, axis) for axis in tip_mm.T]
+    smooth = [np.convolve(np.pad(axis, half, mode="edge"), window / window.sum(), mode="valid") for axis in even]
+    return grid_s, np.stack(smooth, axis=1)
+
+
+def spans_of(seconds: Floats, on: Flags) -> list[Span]:
+    """Return the intervals in which a condition holds, each from its first sample to its last.
+
+    Args:
+        seconds: Times, shape (N,), increasing.
+        on: The condition at each time, shape (N,).
+
+    Returns:
+        Start and end of each interval in s, in order of time.
+    """
+    edges = np.diff(np.concatenate(([False], on, [False])).astype(np.int8))
+    starts, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1
+    return [(float(seconds[a]), float(seconds[b])) for a, b in zip(starts, ends, strict=True)]
+
+
+def inside(seconds: Floats, spans: list[Span]) -> Flags:
+    """Return for each time whether it lies in one of the intervals, both ends included.
+
+    Args:
+        seconds: Times, shape (N,), increasing.
+        spans: Start and end of each interval in s.
+
+    Returns:
+        Flags of shape (N,).
+    """
+    bounds = np.array(spans, dtype=np.float64).reshape(-1, 2)
+    return covered(
+        len(seconds), np.searchsorted(seconds, bounds[:, 0]), np.searchsorted(seconds, bounds[:, 1], side="right")
+    )
+
+
+def covered(count: int, firsts: Ints, ends: Ints) -> Flags:
+    """Return for each sample whether it lies in one of K slices.
+
+    Args:
+        count: The number of samples, N.
+        firsts: First index of each slice, shape (K,).
+        ends: End index of each slice, exclusive, shape (K,); a slice that ends before it starts is empty.
+
+    Returns:
+        Flags of shape (N,).
+    """
+    some = firsts < ends
+    steps = np.bincount(firsts[some], minlength=count + 1) - np.bincount(ends[some], minlength=count + 1)
+    return np.asarray(np.cumsum(steps)[:count] > 0)
+
+
+def onset(seconds: Floats, speed: Floats, seen: int, least: float) -> float:
+    """Estimate the time at which a movement begins, which is before its speed first exceeds a threshold.
+
+    Args:
+        seconds: Evenly spaced times, shape (N,).
+        speed: Speed in any unit, shape (N,).
+        seen: Index of the first sample above the threshold.
+        least: The threshold, in the unit of `speed`.
+
+    Returns:
+        The time in s. The extrapolation goes back by at most `FURTHEST_S` from the first sample of the fit.
+    """
+    ahead = speed[seen : seen + _LOOK]
+    ahead = ahead[: int(np.argmax(ahead < least)) or None]  # without the next movement, whose peak may be higher
+    low, high = max(least, LOW * float(ahead.max())), HIGH * float(ahead.max())
+    if high <= low:
+        return float(seconds[seen])
+    first, second = int(np.argmax(ahead >= low)), int(np.argmax(ahead >= high))
+    root_low, root_high = np.sqrt(ahead[[first, second]])
+    if second == first or root_high <= root_low:
+        return float(seconds[seen + first])
+    at, later = float(seconds[seen + first]), float(seconds[seen + second])
+    return at - min(FURTHEST_S, (later - at) * float(root_low / (root_high - root_low)))
+
+
+def offset(seconds: Floats, speed: Floats, seen: int, least: float) -> float:
+    """Estimate the time at which a movement ends: `onset` with time reversed.
+
+    Args:
+        seconds: Evenly spaced times, shape (N,).
+        speed: Speed in any unit, shape (N,).
+        seen: Index of the last sample above the threshold.
+        least: The threshold, in the unit of `speed`.
+
+    Returns:
+        The time in s.
+    """
+    before = slice(max(0, seen + 1 - _LOOK), seen + 1)
+    return -onset(-seconds[before][::-1], speed[before][::-1], 0, least)
+
+
+def same_signs(rotation_xyzw: Floats) -> Floats:
+    """Choose the signs of quaternions so that neighbours agree; q and -q are the same orientation.
+
+    Args:
+        rotation_xyzw: Unit quaternions in order of time, shape (T, 4).
+
+    Returns:
+        The same orientations, shape (T, 4), neighbours with a dot product that is not negative.
+    """
+    flips = np.where((rotation_xyzw[1:] * rotation_xyzw[:-1]).sum(axis=1) < 0, -1.0, 1.0)
+    return np.asarray(rotation_xyzw * np.append(1.0, np.cumprod(flips))[:, None])
+
+
+def angle_between(one_xyzw: Floats, other_xyzw: Floats) -> float:
+    """Return the angle between two orientations.
+
+    Args:
+        one_xyzw: Unit quaternion, shape (4,).
+        other_xyzw: Unit quaternion, shape (4,).
+
+    Returns:
+        The angle in rad, 0 to pi.
+    """
+    return float(2.0 * np.arccos(min(1.0, abs(float(one_xyzw @ other_xyzw)))))
+
+
+def _rate(grid_s: Floats, values: Floats) -> Floats:
+    """Return the norm of the time derivative of rows, (N, K): shape (N,)."""
+    if grid_s[-1] == grid_s[0]:
+        return np.zeros(len(grid_s))
+    step_s = float(grid_s[-1] - grid_s[0]) / (len(grid_s) - 1)
+    return np.asarray(np.linalg.norm(np.gradient(values, step_s, axis=0), axis=1))
+
+
+CUT_OFF_HZ = 10.0  # the highest frequency that is considered
+LEAST_AMPLITUDE = 0.05  # w_c is the highest frequency at which V is at least this
+PADDING = 4  # zero-padded to 2^4 times its length (rounded up to a power of 2), so that the arc is sampled finely
+
+
+def spectral_arc_length(speed: ArrayLike, step_s: float) -> float | None:
+    """Return the smoothness of a speed profile: negative, and the nearer to 0 the smoother.
+
+    Args:
+        speed: Speed at evenly spaced times, in any unit, shape (N,).
+        step_s: The time between two samples.
+
+    Returns:
+        The spectral arc length, without unit; None if nothing moved or the profile is too short to have a spectrum.
+    """
+    profile = np.asarray(speed, float)
+    if len(profile) < 2 or not step_s > 0 or not profile.sum() > 0:
+        return None
+    padded = 2 ** (int(np.ceil(np.log2(len(profile)))) + PADDING)
+    amplitude = np.abs(np.fft.rfft(profile, padded))
+    hertz = np.fft.rfftfreq(padded, step_s)
+    seen = hertz <= CUT_OFF_HZ
+    shape, hertz = amplitude[seen] / amplitude[0], hertz[seen]
+    last = int(np.flatnonzero(shape >= LEAST_AMPLITUDE)[-1])
+    if last == 0:
+        return None
+    along = np.diff(hertz[: last + 1]) / hertz[last]
+    return float(-np.hypot(along, np.diff(shape[: last + 1])).sum())

@@ -1,0 +1,73 @@
+"""Types of fields that cross HTTP, and `schema`, which makes a value's dataclass the schema of its JSON.
+
+A value of the domain that is part of a response is declared once, as a dataclass: pydantic reads its fields, and the
+OpenAPI document takes its descriptions from the docstring. Lengths are mm; a position's frame is in a field of its own.
+"""
+
+import re
+from functools import cache
+from inspect import cleandoc
+from typing import Annotated, Any, TypeVar
+
+from pydantic import ConfigDict, Field, TypeAdapter
+from pydantic import computed_field as computed_field  # a property that is part of the JSON
+
+Slug = Annotated[str, Field(description="Lower-case letters, digits, - and _.")]
+Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$", description="SHA-256, in hex.")]
+Point = tuple[float, float, float]
+Quaternion = Annotated[tuple[float, float, float, float], Field(description="x, y, z, w; of length 1.")]
+Fraction = Annotated[float, Field(ge=0, le=1)]
+Count = Annotated[int, Field(ge=0)]
+# A number for each joint of an arm.
+Six = Annotated[tuple[float, ...], Field(min_length=6, max_length=6)]
+# NaN where it could not be measured, which is null in JSON.
+Figure = float | None
+
+T = TypeVar("T")
+_ATTRIBUTE = re.compile(r"^ {4}(\w+): (.*(?:\n {8,}.*)*)", re.MULTILINE)
+
+
+def schema(cls: type[T]) -> type[T]:
+    """Make a dataclass the schema of its JSON: every field is required, and described as in the docstring."""
+    return _schema(cls, defaults_required=True)
+
+
+def stored_schema(cls: type[T]) -> type[T]:
+    """Make a dataclass the schema of stored JSON: older versions did not store the fields that have a default."""
+    return _schema(cls, defaults_required=False)
+
+
+def _schema(cls: type[T], *, defaults_required: bool) -> type[T]:
+    cls.__pydantic_config__ = ConfigDict(  # type: ignore[attr-defined]
+        json_schema_serialization_defaults_required=defaults_required,
+        json_schema_extra=lambda json: _describe(json, cls),
+    )
+    return cls
+
+
+def _describe(json: dict[str, Any], cls: type) -> None:
+    """Add the docstring's text, and the sections Attributes of the class and its bases, to a JSON schema."""
+    for field in json["properties"].values():
+        field.pop("default", None)  # of a constructor's argument, not of the JSON
+        field.pop("readOnly", None)  # of a property: no request has these classes
+    for base in reversed(cls.__mro__):  # from the most general on, so that a subclass may describe a field anew
+        text, _, attributes = cleandoc(base.__doc__ or "").partition("\nAttributes:\n")
+        json["description"] = text.strip()
+        for name, description in _ATTRIBUTE.findall(attributes):
+            if name in json["properties"]:
+                json["properties"][name]["description"] = re.sub(r"\bNone\b", "null", " ".join(description.split()))
+
+
+_adapter = cache(TypeAdapter[Any])  # built once for each class
+
+
+def as_json(value: Any) -> Any:
+    """Return a schema's value as plain JSON: tuples as lists, with the properties that are part of its JSON."""
+    # Not in pydantic's mode "json", which would write a sum of nothing, 0, as 0.0: the numbers stay as they are.
+    return _with_lists(_adapter(value.__class__).dump_python(value))
+
+
+def _with_lists(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _with_lists(part) for name, part in value.items()}
+    return [_with_lists(part) for part in value] if isinstance(value, tuple | list) else value

@@ -1,0 +1,133 @@
+"""Readers of recordings: MCAP files of a dVRK, zipped bag folders, other bags (through rosbags), JIGSAWS, and tables.
+
+    bytes --read_recording--> Recording
+
+The format is detected from the content, never from a name. A file is either read completely or refused.
+"""
+
+import codecs
+from collections.abc import Callable
+from typing import BinaryIO
+
+from skills.demonstration.recording import Recording
+from skills.errors import BadSettings, MixedFrames, UnknownFormat, UnreadableRecording
+from skills.formats import archive, jigsaws, rosbag, tables
+from skills.formats.bag_folder import read_one, read_zip
+from skills.formats.mcap.recording import MAGIC
+from skills.formats.tables import DEFAULT_FRAME, read_table
+from skills.formats.writer import write_bag, write_mcap
+
+__all__ = ["BYTES", "MEDIA_TYPES", "SUFFIXES", "media_type_of", "read_recording", "write_bag", "write_mcap"]
+
+MCAP, ZIP, TABLE, TEXT = "application/vnd.mcap", "application/zip", "text/csv", "text/plain"
+ROSBAG1, SQLITE = "application/x-rosbag", "application/vnd.sqlite3"
+BYTES = "application/octet-stream"  # any of them: the format is detected from the content
+MEDIA_TYPES = {
+    MCAP: "an MCAP file",
+    ZIP: "a bag folder or a trial of JIGSAWS, zipped",
+    TABLE: "a table",
+    TEXT: "JIGSAWS kinematics",
+    ROSBAG1: "a ROS 1 bag",
+    SQLITE: "a .db3 bag",
+}
+SUFFIXES = {MCAP: ".mcap", ZIP: ".zip", TABLE: ".csv", TEXT: ".txt", ROSBAG1: ".bag", SQLITE: ".db3"}  # for dialogs
+
+_HEAD_BYTES = 65536
+_MAGIC = ((MAGIC, MCAP), (archive.MAGIC, ZIP), (rosbag.ROS1_MAGIC, ROSBAG1), (rosbag.DB3_MAGIC, SQLITE))
+_OTHERS = (
+    (b"PK\x05\x06", "an empty zip archive"),
+    (b"\x1f\x8b", "gzip; unpack it first"),
+    (
+        b"\x28\xb5\x2f\xfd",
+        "zstd (a bag compressed as a file); unpack it with `zstd -d`, or send the bag folder as a zip",
+    ),
+    (b"\x89HDF", "HDF5; export a table"),
+)
+_READ = "MCAP, zipped bag folders, ROS 1 and .db3 bags, CSV and JIGSAWS kinematics can be read."
+
+
+def read_recording(file: BinaryIO, *, rate_hz: float | None = None, frame: str | None = None) -> Recording:
+    """Read a recording of any supported format.
+
+    Args:
+        file: Seekable; read from its beginning and left open.
+        rate_hz: Samples per second, for a table without times.
+        frame: The frame of a table's positions, by default "PSM_base". Any other recording names its own frames; it is
+            refused if none of its motions is in the given frame.
+
+    Returns:
+        The recording, in millimetres.
+
+    Raises:
+        UnknownFormat: The content is of no supported format.
+        BadRecording: It is of a supported format and cannot be used; `skills.errors` has the subclasses.
+        BadSettings: `rate_hz` is not a rate, or was given for a recording with stamps or a rate of its own.
+    """
+    kind = media_type_of(file)
+    if kind == TABLE and not _is_extract(file):
+        return read_table(file, rate_hz=rate_hz, frame=DEFAULT_FRAME if frame is None else frame)
+    if rate_hz is not None:
+        raise BadSettings(f"This is {MEDIA_TYPES[kind]}, which has its own stamps or rate; omit rate_hz.")
+    return _in_frame(_READERS[kind](file), frame)
+
+
+def media_type_of(file: BinaryIO) -> str:
+    """Return the media type of a file, detected from its content; the position is at the beginning afterwards.
+
+    Raises:
+        UnknownFormat: It is of no supported format.
+        UnreadableRecording: The file is empty.
+    """
+    file.seek(0)
+    head = file.read(_HEAD_BYTES)
+    file.seek(0)
+    if not head:
+        raise UnreadableRecording("The file is empty; the transfer was interrupted or nothing was recorded.")
+    for magic, kind in _MAGIC:
+        if head.startswith(magic) or magic.startswith(head):  # the latter: truncated, reported by its reader
+            return kind
+    for magic, name in _OTHERS:
+        if head.startswith(magic):
+            raise UnknownFormat(f"This is {name}. {_READ}")
+    return _kind_of_text(head)
+
+
+def _kind_of_text(head: bytes) -> str:
+    try:
+        text = codecs.getincrementaldecoder("utf-8-sig")().decode(head)
+    except UnicodeDecodeError:
+        raise UnknownFormat(f"The content is neither a recording nor UTF-8 text. {_READ}") from None
+    first_line = text.split("\n", 1)[0]
+    if first_line.startswith(tables.FIRST):
+        return TABLE
+    if "\0" not in text and jigsaws.looks_like_kinematics(first_line):
+        return TEXT
+    # Markup, JSON and binary data are refused here: the table reader would only complain about columns.
+    if "\0" in text or text.lstrip()[:1] in ("<", "{", "[") or "," not in first_line:
+        raise UnknownFormat(
+            f"The content is neither a table with a header of comma-separated names nor another known format. {_READ}"
+        )
+    return TABLE
+
+
+def _is_extract(file: BinaryIO) -> bool:
+    first = file.read(len(tables.FIRST))
+    file.seek(0)
+    return first == tables.FIRST.encode()
+
+
+_READERS: dict[str, Callable[[BinaryIO], Recording]] = {
+    MCAP: read_one,
+    ZIP: read_zip,
+    TABLE: tables.read_extract,
+    TEXT: jigsaws.read_jigsaws,
+    ROSBAG1: lambda file: rosbag.read_rosbag([file], ".bag"),
+    SQLITE: lambda file: rosbag.read_rosbag([file], ".db3"),
+}
+
+
+def _in_frame(recording: Recording, frame: str | None) -> Recording:
+    frames = sorted({motion.frame for motion in recording.motions})
+    if frame is not None and frame not in frames:
+        raise MixedFrames(f"No motion is in the frame {frame!r}; the frames are {', '.join(frames)}.", frames=frames)
+    return recording

@@ -1,0 +1,426 @@
+"""Bag folders: reading zips of them, and joining the parts of split bags.
+
+`read_zip` reads a zipped folder: a bag with the files that its recorder wrote next to it, or one JIGSAWS trial.
+
+    session/
+        rosbag_1/metadata.yaml     the bag's files in order, and their numbers of messages
+        rosbag_1/rosbag_1_0.mcap   one file or several; also .mcap.zstd, .db3, or .bag of ROS 1
+        *.json                     the tags of the recorders (see `annotations`)
+        *.mp4 and others           ignored
+
+The bag is in one folder, anywhere in the archive. A bag in several files is joined topic by topic, in order of time.
+If there is a `metadata.yaml`, it must name exactly these files and count exactly these messages.
+"""
+
+import re
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from pathlib import PurePosixPath
+from tempfile import TemporaryFile
+from typing import IO, Any, BinaryIO
+
+import numpy as np
+import yaml
+import zstandard
+
+from skills.demonstration.recording import (
+    Format,
+    Integrity,
+    Joints,
+    Label,
+    Motion,
+    Recording,
+    Signal,
+    Topic,
+    recorded_motion,
+)
+from skills.errors import MixedFrames, NoUsableTopic, UnknownFormat, UnreadableRecording
+from skills.formats import jigsaws
+from skills.formats.annotations import read_labels
+from skills.formats.archive import Archive, refusing, shown
+from skills.formats.mcap.recording import NeedsRosbags, read_mcap
+from skills.formats.rosbag import Suffix, read_rosbag
+from skills.remedies import Action, Remedy
+
+Pairs = Iterable[tuple[str, Signal]]
+
+
+def join(parts: Sequence[Recording]) -> Recording:
+    """Join the parts of one recording.
+
+    Args:
+        parts: In order of time, at least one.
+
+    Raises:
+        MixedFrames: A topic has different frames in different parts.
+        BackwardStamps, RepeatedStamps: As for one recording.
+    """
+    if len(parts) == 1:
+        return parts[0]
+    first = parts[0]
+    pedals, clutches = _signals(part.pedals for part in parts), [part.clutch for part in parts if part.clutch]
+    return Recording(
+        format=first.format,
+        integrity=_weakest([part.integrity for part in parts]),
+        motions=_motions(part.motions for part in parts),
+        jaws=_signals(part.jaws for part in parts),
+        clutch=_clutch(pedals, clutches),
+        topics=_topics(part.topics for part in parts),
+        joints=_joints(part.joints for part in parts),
+        masters=_motions(part.masters for part in parts),
+        grippers=_signals(part.grippers for part in parts),
+        pedals=pedals,
+        following=_signals(part.following for part in parts),
+        scales=_signals(part.scales for part in parts),
+        tools=tuple({arm: tool for part in parts for arm, tool in part.tools}.items()),
+        labels=in_time(label for part in parts for label in part.labels),
+        notes=tuple(dict.fromkeys(note for part in parts for note in part.notes)),
+        left_out=tuple(dict(pair for part in parts for pair in part.left_out).items()),
+    )
+
+
+def in_time(labels: Iterable[Label]) -> tuple[Label, ...]:
+    """Return labels in order of time, without duplicates."""
+    return tuple(sorted(set(labels), key=lambda label: (label.start_ns, label.end_ns, label.name)))
+
+
+def _weakest(all_of: list[Integrity]) -> Integrity:
+    kinds = set(all_of)
+    return all_of[0] if len(kinds) == 1 else "partial"
+
+
+def _motions(parts: Iterable[Iterable[Motion]]) -> tuple[Motion, ...]:
+    by_topic: dict[str, list[Motion]] = {}
+    for motions in parts:
+        for motion in motions:
+            by_topic.setdefault(motion.topic, []).append(motion)
+    return tuple(_joined_motion(pieces) for _, pieces in sorted(by_topic.items()))
+
+
+def _joined_motion(pieces: list[Motion]) -> Motion:
+    first, frames = pieces[0], sorted({piece.frame for piece in pieces})
+    if len(frames) > 1:
+        raise MixedFrames(
+            f"{first.topic} is in the frames {' and '.join(map(repr, frames))}; record each frame on a separate topic."
+        )
+    turns = [piece.rotation_xyzw for piece in pieces if piece.rotation_xyzw is not None]
+    whole = recorded_motion(
+        arm=first.arm,
+        topic=first.topic,
+        frame=first.frame,
+        stamps_ns=np.concatenate([piece.stamps_ns for piece in pieces]),
+        tip_mm=np.concatenate([piece.tip_mm for piece in pieces]),
+        rotation_xyzw=np.concatenate(turns) if len(turns) == len(pieces) else None,
+    )
+    # `recorded_motion` counts only duplicates between the pieces; each piece has counted its own before.
+    dropped = sum(piece.duplicate_stamps for piece in pieces)
+    return replace(whole, duplicate_stamps=whole.duplicate_stamps + dropped)
+
+
+def _joints(parts: Iterable[Iterable[Joints]]) -> tuple[Joints, ...]:
+    by_topic: dict[str, list[Joints]] = {}
+    for joints in parts:
+        for one in joints:
+            by_topic.setdefault(one.topic, []).append(one)
+    return tuple(
+        Joints(
+            pieces[0].arm,
+            topic,
+            np.concatenate([piece.stamps_ns for piece in pieces]),
+            np.concatenate([piece.positions for piece in pieces]),
+        )
+        for topic, pieces in sorted(by_topic.items())
+    )
+
+
+def _signals(parts: Iterable[Pairs]) -> tuple[tuple[str, Signal], ...]:
+    by_name: dict[str, list[Signal]] = {}
+    for pairs in parts:
+        for name, signal in pairs:
+            by_name.setdefault(name, []).append(signal)
+    return tuple((name, _joined_signal(pieces)) for name, pieces in sorted(by_name.items()))
+
+
+def _joined_signal(pieces: list[Signal]) -> Signal:
+    stamps_ns = np.concatenate([piece.stamps_ns for piece in pieces])
+    return Signal(stamps_ns, np.concatenate([piece.values for piece in pieces]), pieces[0].topic)
+
+
+def _clutch(pedals: tuple[tuple[str, Signal], ...], clutches: list[Signal]) -> Signal | None:
+    """Return the clutch: the joined pedal of its topic, or else its signals in the parts, joined."""
+    if not clutches:
+        return None
+    same = [clutch for clutch in clutches if clutch.topic == clutches[0].topic]
+    return dict(pedals).get(clutches[0].topic) or _joined_signal(same)
+
+
+def _topics(parts: Iterable[Iterable[Topic]]) -> tuple[Topic, ...]:
+    counts: Counter[tuple[str, str]] = Counter()
+    for topics in parts:
+        for topic in topics:
+            counts[topic.name, topic.type] += topic.messages
+    return tuple(Topic(name, kind, count) for (name, kind), count in sorted(counts.items()))
+
+
+FILES = 1000
+METADATA = "metadata.yaml"
+METADATA_CHARACTERS = 1 << 20  # that of 60 topics with their QoS has 60,000
+METADATA_PARTS, METADATA_DEPTH = 100_000, 20  # events of the parser; of 60 topics at most 6000, in a depth of 9
+TAGS_BYTES = 32 << 20  # per JSON file: the frames of a day of video
+TEXTS = 10  # for one trial: its kinematics, a transcription, the meta files, a README
+UNZSTD_BYTES = 4 << 30
+SUFFIXES = (".mcap", ".mcap.zstd", ".db3", ".bag")
+
+_DIRECTIVE = re.compile("(?:^|[\r\n\x85\u2028\u2029])%")
+
+
+@dataclass(frozen=True)
+class Metadata:
+    """The used contents of a metadata.yaml: the names of the bag's files in order, and numbers of messages by topic."""
+
+    files: tuple[str, ...]
+    counts: dict[str, int]
+
+
+def read_zip(file: BinaryIO) -> Recording:
+    """Read the bag, or the JIGSAWS trial, in a zip archive.
+
+    Args:
+        file: The archive, seekable.
+
+    Returns:
+        The recording, in millimetres.
+
+    Raises:
+        UnknownFormat: It contains neither.
+        UnreadableRecording: The archive is damaged or dangerous, the bag incomplete, or a part of it unreadable.
+        NoUsableTopic: No topic of the bag, or of a part of it, has the pose of a PSM.
+        BadRecording: As for the files in it.
+    """
+    archive = Archive(file)
+    names = [name for name in archive.names if not _is_shadow(name)]
+    if bag := [name for name in names if suffix_of(name)]:
+        return _read_bag(archive, names, bag)
+    texts = [name for name in names if name.lower().endswith(".txt")]
+    if texts:
+        return _read_trial(archive, texts)
+    raise UnknownFormat("The archive has no bag (.mcap, .mcap.zstd, .db3 or .bag) and no JIGSAWS kinematics (.txt).")
+
+
+def suffix_of(name: str) -> str:
+    """Return the suffix that marks a file as part of a bag; "" if it is not."""
+    return next((suffix for suffix in sorted(SUFFIXES, key=len, reverse=True) if name.endswith(suffix)), "")
+
+
+def read_metadata(text: str) -> Metadata:
+    """Parse the used parts of a metadata.yaml.
+
+    Raises:
+        UnreadableRecording: It is not that of a bag.
+    """
+    if len(text) > METADATA_CHARACTERS:
+        raise UnreadableRecording(f"{METADATA} has more than {METADATA_CHARACTERS} characters. Remove it.")
+    counts: Counter[str] = Counter()
+    try:
+        bag = _plain_yaml(text)["rosbag2_bagfile_information"]
+        files = tuple(PurePosixPath(name).name for name in bag["relative_file_paths"])
+        for topic in bag["topics_with_message_count"]:
+            name, messages = topic["topic_metadata"]["name"], topic["message_count"]
+            if not (name and messages.isdecimal()):
+                raise ValueError(messages)
+            counts[name] += int(messages[:18])  # as many digits as 64 bits hold
+        if not files:
+            raise ValueError("no files")
+    except (yaml.YAMLError, LookupError, TypeError, AttributeError, ValueError) as error:
+        raise UnreadableRecording(
+            f"{METADATA} is not the metadata of a bag. Remove it, or write it with `ros2 bag reindex`."
+        ) from error
+    return Metadata(files, dict(counts))
+
+
+def _plain_yaml(text: str) -> Any:
+    """Return a YAML document as texts, lists and mappings of texts.
+
+    All scalars stay texts: the numbers of `yaml.SafeLoader` may be keys with one hash, or cost time in the square of
+    their length (base 60).
+
+    Raises:
+        yaml.YAMLError: It is no YAML, or has aliases or directives, more parts or a greater depth than a bag's.
+    """
+    depth = 0
+    if _DIRECTIVE.search(text):  # libyaml's time grows with the square of their number
+        raise yaml.YAMLError("a directive")
+    for number, event in enumerate(yaml.parse(text, yaml.CBaseLoader)):
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        if isinstance(event, yaml.AliasEvent) or depth > METADATA_DEPTH or number > METADATA_PARTS:
+            raise yaml.YAMLError(str(event))
+    return yaml.load(text, yaml.CBaseLoader)  # noqa: S506 - a part of the safe loader: it constructs texts only
+
+
+def in_order(files: Sequence[str], metadata: Metadata | None) -> list[str]:
+    """Return the names of a bag's files in order of recording: that of the metadata, or else sorted.
+
+    Raises:
+        UnreadableRecording: The metadata names other files.
+    """
+    if metadata is None:
+        return sorted(files)
+    by_name = {PurePosixPath(name).name: name for name in files}
+    missing = [name for name in metadata.files if name not in by_name]
+    unknown = [name for name in by_name if name not in metadata.files]
+    if missing or unknown:
+        what = (
+            f"{shown(missing[0])}, which is missing" if missing else f"no file {shown(unknown[0])}, which is in the bag"
+        )
+        raise UnreadableRecording(f"{METADATA} names {what}. Send the complete bag, or remove {METADATA}.")
+    return [by_name[name] for name in metadata.files]
+
+
+def check_counts(metadata: Metadata, topics: Iterable[Topic]) -> None:
+    """Compare the numbers of messages found with those in the metadata.
+
+    Raises:
+        UnreadableRecording: A topic has more or fewer.
+    """
+    found: Counter[str] = Counter()
+    for topic in topics:
+        found[topic.name] += topic.messages
+    for name in sorted({*found, *metadata.counts}):
+        if found[name] != metadata.counts.get(name, 0):
+            said = metadata.counts.get(name, 0)
+            raise UnreadableRecording(
+                f"{METADATA} lists {said} messages of {name[:200]}, the bag has {found[name]}: one of them is "
+                "incomplete. Copy it again, or rewrite the metadata with `ros2 bag reindex`.",
+                said=said,
+                found=found[name],
+            )
+
+
+def unzstd(file: BinaryIO, out: IO[bytes]) -> None:
+    """Decompress a file that rosbag2 compressed as one zstd stream.
+
+    Raises:
+        UnreadableRecording: Damaged, or it decompresses to more than 4 GiB.
+    """
+    # The window is limited because the decompressor allocates as much as the file demands.
+    size, unpacker = 0, zstandard.ZstdDecompressor(max_window_size=1 << 27)
+    with refusing("A .zstd file of the bag", "Copy it again."), unpacker.stream_reader(file) as reader:
+        while data := reader.read(1 << 20):
+            size += len(data)
+            if size > UNZSTD_BYTES:
+                raise UnreadableRecording(f"A file of the bag unpacks to more than {UNZSTD_BYTES} bytes. Split it.")
+            out.write(data)
+
+
+def read_one(file: BinaryIO) -> Recording:
+    """Read one MCAP file, through rosbags if its types are defined in IDL."""
+    try:
+        return read_mcap(file)
+    except NeedsRosbags as needs:
+        integrity: Any = needs.numbers.get("integrity", "none")
+        return read_rosbag([file], ".mcap", integrity)
+
+
+def _read_bag(archive: Archive, names: list[str], bag: list[str]) -> Recording:
+    folders = sorted({str(PurePosixPath(name).parent) for name in bag})
+    suffixes = sorted({suffix_of(name) for name in bag})
+    if len(folders) > 1 or len(suffixes) > 1 or len(bag) > FILES:
+        raise UnreadableRecording(
+            f"The archive has {len(bag)} files of bags in {len(folders)} folders, as {', '.join(suffixes)}; send one "
+            "bag at a time."
+        )
+    described = str(PurePosixPath(folders[0]) / METADATA)
+    metadata = read_metadata(archive.text(described)) if described in names else None
+    ordered = in_order(bag, metadata)
+    recording = _READERS[suffixes[0]](archive, ordered)
+    if metadata is not None:
+        check_counts(metadata, recording.topics)
+    labels = read_labels(dict(_tags(archive, names)))
+    kind: Format = "rosbag1" if suffixes[0] == ".bag" else "rosbag2"
+    # "full", because a zip archive has a checksum (CRC-32) of every file in it
+    return replace(recording, format=kind, integrity="full", labels=in_time((*recording.labels, *labels)))
+
+
+def _read_mcaps(archive: Archive, names: list[str]) -> Recording:
+    """Read the parts one after the other, so that only one at a time is unpacked."""
+    parts = []
+    for name in names:
+        with _plain(archive, name) as file:
+            try:
+                parts.append(read_one(file))
+            except NoUsableTopic as error:
+                if len(names) == 1:
+                    raise
+                raise NoUsableTopic(
+                    f"{shown(name)}, a part of the bag: {error.message}", *error.remedies, Remedy(Action.JOIN_BAG)
+                ) from error
+    return join(sorted(parts, key=lambda part: part.origin_ns))  # without metadata, names do not give the order
+
+
+def _through_rosbags(suffix: Suffix) -> Callable[[Archive, list[str]], Recording]:
+    def read(archive: Archive, names: list[str]) -> Recording:
+        with ExitStack() as files:
+            return read_rosbag([files.enter_context(archive.unpacked(name)) for name in names], suffix)
+
+    return read
+
+
+_READERS: dict[str, Callable[[Archive, list[str]], Recording]] = {
+    ".mcap": _read_mcaps,
+    ".mcap.zstd": _read_mcaps,
+    ".db3": _through_rosbags(".db3"),
+    ".bag": _through_rosbags(".bag"),
+}
+
+
+@contextmanager
+def _plain(archive: Archive, name: str) -> Iterator[BinaryIO]:
+    with archive.unpacked(name) as file:
+        if not name.endswith(".zstd"):
+            yield file
+            return
+        with TemporaryFile() as out:
+            unzstd(file, out)
+            out.seek(0)
+            yield out
+
+
+def _tags(archive: Archive, names: list[str]) -> Iterator[tuple[str, str]]:
+    """Yield the JSON files by name and contents.
+
+    A file larger than any tags has the frames of a video, and is skipped; so are files beyond twice that size in total.
+    """
+    left = 2 * TAGS_BYTES
+    for name in names:
+        if name.lower().endswith(".json") and archive.size(name) <= TAGS_BYTES and archive.size(name) <= left:
+            left -= archive.size(name)
+            yield name, archive.text(name)
+
+
+def _read_trial(archive: Archive, names: list[str]) -> Recording:
+    if len(names) > TEXTS:
+        raise UnreadableRecording(
+            f"The archive has {len(names)} text files; send one trial with its transcription at a time.",
+            Remedy(Action.ADD_JIGSAWS, folder="FOLDER"),
+        )
+    texts = {name: archive.text(name) for name in names}
+    kinematics = [name for name, text in texts.items() if jigsaws.looks_like_kinematics(text.split("\n", 1)[0])]
+    transcriptions = [name for name, text in texts.items() if jigsaws.is_transcription(text)]
+    if len(kinematics) != 1 or len(transcriptions) > 1:
+        raise UnreadableRecording(
+            f"The archive has {len(kinematics)} texts with JIGSAWS kinematics and {len(transcriptions)} "
+            "transcriptions; send one trial with its transcription at a time.",
+            kinematics=len(kinematics),
+        )
+    trial = PurePosixPath(kinematics[0]).stem
+    rated = next((found for text in texts.values() if (found := jigsaws.read_meta(text).get(trial))), None)
+    with archive.unpacked(kinematics[0]) as file:
+        return jigsaws.read_jigsaws(file, "".join(texts[name] for name in transcriptions), rated)
+
+
+def _is_shadow(name: str) -> bool:
+    """Return whether a member holds only macOS metadata of another member."""
+    path = PurePosixPath(name)
+    return path.name.startswith("._") or "__MACOSX" in path.parts

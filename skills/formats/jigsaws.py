@@ -1,0 +1,293 @@
+"""Reader of JIGSAWS trials (Gao et al., "The JHU-ISI Gesture and Skill Assessment Working Set", M2CAI 2014).
+
+A kinematics file has one row per video frame, 30 per second, with 76 numbers and no header:
+
+    columns 1-19 master left, 20-38 master right, 39-57 instrument left, 58-76 instrument right; for each
+    x y z (m), rotation matrix by rows (9), linear velocity (3), angular velocity (3), gripper (rad)
+
+A transcription has one gesture per line, `start end G6`, in frames counted from 1, both inclusive. A meta file has one
+trial per line: its name, the surgeon's self-reported skill (N, I or E), the global rating score and its six parts.
+
+The data set does not specify the frame of the poses, only that it is the same for both sides; it is called "jigsaws"
+here. It is not the base of an arm, so it cannot be determined whether an arm can reach a pose. The instruments are
+named `PSM_left` and `PSM_right`, the masters `MTML` and `MTMR`. Velocities are not used. Text has no checksum:
+integrity "none".
+"""
+
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO, Literal
+
+import numpy as np
+
+from skills.arrays import Floats, Ints
+from skills.demonstration.recording import Label, Motion, Recording, Signal, Topic, recorded_motion
+from skills.errors import NotAQuaternion, NotFinite, UnreadableRecording
+from skills.formats.tables import is_number
+
+COLUMNS = 76
+RATE_HZ = 30.0
+FRAME = "jigsaws"
+ROWS = 1_000_000  # nine hours; the longest trial has 9,000
+GESTURES = 10_000  # of a trial; the longest has 60
+ORTHONORMAL = 5e-3  # ours: we measured deviations of 1e-3 in the masters' matrices of the data set
+Skill = Literal["novice", "intermediate", "expert"]
+SKILLS: dict[str, Skill] = {"N": "novice", "I": "intermediate", "E": "expert"}
+SCORES = (
+    "respect for tissue",
+    "suture and needle handling",
+    "time and motion",
+    "flow of operation",
+    "overall performance",
+    "quality of final product",
+)
+
+_ARMS = {"MTML": 0, "MTMR": 19, "PSM_left": 38, "PSM_right": 57}  # index of the first of the arm's 19 columns
+_GESTURE = re.compile(r"\s*(\d{1,7})\s+(\d{1,7})\s+(G\d{1,2})\s*")
+_TRIAL = re.compile(r"(?P<task>[A-Za-z_]+)_(?P<user>[A-Z])(?P<number>\d{3})")
+
+
+@dataclass(frozen=True)
+class RatedTrial:
+    """The ratings of one trial in a meta file.
+
+    Attributes:
+        trial: Its name, such as "Suturing_B001".
+        skill: "novice", "intermediate" or "expert", as reported by the surgeon.
+        score: The global rating score, 6 to 30: the sum of the parts.
+        parts: One to five for each of `SCORES`.
+    """
+
+    trial: str
+    skill: Skill
+    score: int
+    parts: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Trial:
+    """The files of one trial in a JIGSAWS folder.
+
+    Attributes:
+        name: Such as "Suturing_B001".
+        task: Such as "Suturing".
+        user: The letter of the surgeon.
+        kinematics: The file with its motion.
+        transcription: The file with its gestures, None where there is none.
+        rated: Its ratings in the task's meta file, None where there are none.
+    """
+
+    name: str
+    task: str
+    user: str
+    kinematics: Path
+    transcription: Path | None
+    rated: RatedTrial | None
+
+
+def looks_like_kinematics(first_line: str) -> bool:
+    """Return whether a text with this first line may be kinematics."""
+    return "," not in first_line and len(first_line.split()) == COLUMNS
+
+
+def read_jigsaws(file: BinaryIO, transcription: str = "", rated: RatedTrial | None = None) -> Recording:
+    """Read a trial.
+
+    Args:
+        file: The kinematics, at their beginning.
+        transcription: The text of its transcription.
+        rated: Its ratings, which are stored in the notes.
+
+    Returns:
+        The recording, in millimetres, in the frame "jigsaws".
+
+    Raises:
+        UnreadableRecording: A row without 76 numbers, or a gesture outside the trial.
+        NotFinite: NaN or infinity.
+        NotAQuaternion: A matrix that is not a rotation.
+        NotMetres: As in `skills.demonstration.recording`.
+    """
+    table = _table(file)
+    stamps_ns = np.rint(np.arange(len(table)) * (1e9 / RATE_HZ)).astype(np.int64)
+    motions = {arm: _motion(arm, table, stamps_ns, first) for arm, first in _ARMS.items()}
+    grippers = {arm: Signal(stamps_ns, table[:, first + 18], _columns(first)) for arm, first in _ARMS.items()}
+    return Recording(
+        format="jigsaws",
+        integrity="none",
+        motions=tuple(motion for arm, motion in motions.items() if arm.startswith("PSM")),
+        masters=tuple(motion for arm, motion in motions.items() if arm.startswith("MTM")),
+        jaws=tuple((arm, signal) for arm, signal in grippers.items() if arm.startswith("PSM")),
+        grippers=tuple((arm, signal) for arm, signal in grippers.items() if arm.startswith("MTM")),
+        topics=tuple(Topic(_columns(first), "jigsaws", len(table)) for first in sorted(_ARMS.values())),
+        labels=_gestures(transcription, stamps_ns),
+        notes=() if rated is None else _notes(rated),
+    )
+
+
+def read_meta(text: str) -> dict[str, RatedTrial]:
+    """Parse a meta file and return the ratings by trial; lines in another form are skipped."""
+    rated = {}
+    for line in text.splitlines():
+        cells = line.split()
+        if len(cells) == 3 + len(SCORES) and cells[1] in SKILLS and all(cell.isdecimal() for cell in cells[2:]):
+            score, *parts = (int(cell[:4]) for cell in cells[2:])
+            rated[cells[0]] = RatedTrial(cells[0], SKILLS[cells[1]], score, tuple(parts))
+    return rated
+
+
+def meta_line(rated: RatedTrial) -> str:
+    """Return the line of a meta file that `read_meta` parses into these ratings."""
+    letter = next(letter for letter, skill in SKILLS.items() if skill == rated.skill)
+    return "\t".join([rated.trial, "", letter, str(rated.score), "", *(str(part) for part in rated.parts)]) + "\r\n"
+
+
+def is_transcription(text: str) -> bool:
+    """Return whether a text starts with a line of a transcription."""
+    return _GESTURE.fullmatch(text.lstrip().split("\n", 1)[0]) is not None
+
+
+def trials(folder: Path) -> Iterator[Trial]:
+    """Yield the trials in a folder of the data set, or of one of its tasks, sorted by path."""
+    for kinematics in sorted(folder.rglob("kinematics/AllGestures/*.txt")):
+        named = _TRIAL.fullmatch(kinematics.stem)
+        if named is None:
+            continue
+        home, task = kinematics.parents[2], named["task"]
+        transcription = home / "transcriptions" / kinematics.name
+        yield Trial(
+            name=kinematics.stem,
+            task=task,
+            user=named["user"],
+            kinematics=kinematics,
+            transcription=transcription if transcription.is_file() else None,
+            rated=_meta_of(home, task).get(kinematics.stem),
+        )
+
+
+def _meta_of(home: Path, task: str) -> Mapping[str, RatedTrial]:
+    meta = home / f"meta_file_{task}.txt"
+    return read_meta(meta.read_text(errors="replace")) if meta.is_file() else {}
+
+
+def _table(file: BinaryIO) -> Floats:
+    """Return the numbers, shape (T, 76)."""
+    try:
+        table = np.loadtxt(file, dtype=np.float64, comments=None, ndmin=2, max_rows=ROWS + 1, encoding="utf-8")
+    except (ValueError, UnicodeDecodeError) as error:
+        raise UnreadableRecording(f"{_wrong_row(file)} JIGSAWS kinematics have {COLUMNS} numbers per row.") from error
+    if table.shape[1:] != (COLUMNS,) or len(table) > ROWS:
+        raise UnreadableRecording(
+            f"The table has {table.shape[1]} columns and {len(table)} rows; JIGSAWS kinematics have {COLUMNS} columns "
+            f"and at most {ROWS} rows."
+        )
+    wrong = ~np.isfinite(table)
+    if wrong.any():
+        row, column = (int(index) + 1 for index in np.argwhere(wrong)[0])
+        raise NotFinite(f"Row {row}, column {column}: NaN or infinity; cut the row.", row=row, column=column)
+    return table
+
+
+def _wrong_row(file: BinaryIO) -> str:
+    """Return a description of the first invalid row, with its position."""
+    file.seek(0)
+    for number, line in enumerate(file, start=1):
+        cells = line.split()
+        if cells and len(cells) != COLUMNS:
+            return f"Row {number} has {len(cells)} cells."
+        for column, cell in enumerate(cells, start=1):
+            if not is_number(cell.decode("ascii", "replace")):
+                return f"Row {number}, column {column}: not a number."
+    return "The text cannot be read."
+
+
+def _motion(arm: str, table: Floats, stamps_ns: Ints, first: int) -> Motion:
+    return recorded_motion(
+        arm=arm,
+        topic=_columns(first),
+        frame=FRAME,
+        stamps_ns=stamps_ns,
+        tip_mm=1000.0 * table[:, first : first + 3],  # the data set is in metres
+        rotation_xyzw=_quaternions(arm, table[:, first + 3 : first + 12].reshape(-1, 3, 3)),
+    )
+
+
+def _quaternions(arm: str, matrices: Floats) -> Floats:
+    """Convert rotation matrices to unit quaternions x, y, z, w with continuous signs.
+
+    Args:
+        arm: For error messages.
+        matrices: Shape (T, 3, 3).
+
+    Returns:
+        Shape (T, 4).
+
+    Raises:
+        NotAQuaternion: A matrix deviates from orthonormality by more than `ORTHONORMAL`, or is a reflection.
+    """
+    off = np.abs(matrices @ matrices.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+    wrong = (off > ORTHONORMAL) | (np.linalg.det(matrices) < 0)
+    if wrong.any():
+        row = int(np.argmax(wrong)) + 1
+        raise NotAQuaternion(
+            f"Row {row}: the matrix of {arm} is not a rotation: its deviation is {off[row - 1]:.2g}; at most "
+            f"{ORTHONORMAL} is accepted as rounding. Check that the columns are in the order of JIGSAWS.",
+            row=row,
+            off=float(off[row - 1]),
+        )
+    return _continuous(_nearest(matrices))
+
+
+def _nearest(matrices: Floats) -> Floats:
+    """Convert matrices to unit quaternions by the largest of the four components (Shepperd, 1978).
+
+    Dividing by the largest component is numerically stable for every rotation.
+    """
+    m = matrices
+    trace = np.trace(m, axis1=1, axis2=2)
+    squares = np.stack([*(2 * m[:, k, k] - trace + 1 for k in range(3)), trace + 1], axis=1)  # four times x2 y2 z2 w2
+    best = squares.argmax(axis=1)
+    xy, xz, yz = m[:, 0, 1] + m[:, 1, 0], m[:, 0, 2] + m[:, 2, 0], m[:, 1, 2] + m[:, 2, 1]
+    xw, yw, zw = m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1]
+    x2, y2, z2, w2 = squares.T
+    columns = [(x2, xy, xz, xw), (xy, y2, yz, yw), (xz, yz, z2, zw), (xw, yw, zw, w2)]
+    products = np.array(columns)  # [k, j]: four times component k by component j
+    chosen = products[best, :, np.arange(len(m))]
+    unit: Floats = chosen / np.linalg.norm(chosen, axis=1, keepdims=True)
+    return unit
+
+
+def _continuous(turns: Floats) -> Floats:
+    """Choose the sign of each quaternion, as q and -q are the same rotation, to be nearer to the one before."""
+    flips = np.where((turns[1:] * turns[:-1]).sum(axis=1) < 0, -1.0, 1.0)
+    signed: Floats = turns * np.concatenate(([1.0], np.cumprod(flips)))[:, None]
+    return signed
+
+
+def _gestures(transcription: str, stamps_ns: Ints) -> tuple[Label, ...]:
+    labels: list[Label] = []
+    for number, line in enumerate(transcription.splitlines(), start=1):
+        if not line.strip():
+            continue
+        if len(labels) == GESTURES:
+            raise UnreadableRecording(f"The transcription has more than {GESTURES} gestures.")
+        found = _GESTURE.fullmatch(line)
+        start, end = (int(found[1]), int(found[2])) if found else (0, 0)
+        if found is None or not 1 <= start <= end <= len(stamps_ns):
+            raise UnreadableRecording(
+                f"Line {number} of the transcription is not a gesture of this trial; `start end G6` is expected, "
+                f"in frames from 1 to {len(stamps_ns)}."
+            )
+        labels.append(Label(found[3], "gesture", int(stamps_ns[start - 1]), int(stamps_ns[end - 1])))
+    return tuple(sorted(labels, key=lambda label: label.start_ns))
+
+
+def _notes(rated: RatedTrial) -> tuple[tuple[str, str], ...]:
+    parts = zip(SCORES, rated.parts, strict=True)
+    about = [("trial", rated.trial), ("skill", rated.skill), ("global rating score", str(rated.score))]
+    return (*about, *((name, str(value)) for name, value in parts))
+
+
+def _columns(first: int) -> str:
+    return f"columns {first + 1}-{first + 19}"

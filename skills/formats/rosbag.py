@@ -1,0 +1,283 @@
+"""ROS 1 bags, .db3 bags, and MCAP files with IDL types, read through rosbags; and limits on SQLite files.
+
+rosbags decodes the messages; those that are used here are written again as MCAP and read as any other recording, so
+that the checks exist once and a motion is the same whatever file it was in. rosbags needs paths: the bytes are copied
+into a temporary folder. ROS 1 bags and .db3 files have no checksums: their integrity is "none".
+
+A .db3 file is an SQLite database. A database can have views, triggers, generated columns and virtual tables, so that
+reading a table may execute code of its author, without end if intended. `guard` checks every connection that rosbags
+opens before its first query, and limits:
+
+    objects      the tables and the one index that rosbag2 and rosbags write (rosbag2_storage_sqlite3, schema 1 to 4)
+    statements   SELECT on them, with the three aggregates that rosbags uses; an authorizer refuses all others
+    steps        of SQLite's virtual machine, in proportion to the file; a query that needs more is interrupted
+    text         of the quality-of-service profiles, which are YAML and slow to parse
+"""
+
+import shutil
+import tempfile
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import IO, Any, BinaryIO, Literal
+
+import apsw
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
+
+from skills.demonstration.recording import Format, Integrity, Recording, Topic
+from skills.errors import NoUsableTopic, UnreadableRecording
+from skills.formats import topics, writer
+from skills.formats.archive import refusing
+from skills.formats.mcap.recording import read_mcap
+from skills.formats.writer import Message, write_messages
+
+TABLES = frozenset({"schema", "metadata", "topics", "message_definitions", "messages"})
+STATISTICS = frozenset({"sqlite_stat1", "sqlite_stat4", "sqlite_sequence", "sqlite_schema", "sqlite_temp_schema"})
+INDEX = "timestamp_idx"
+TOPICS = 4096  # as many channels as an MCAP file may have
+PROFILES_CHARACTERS = 1 << 17  # the profiles of 60 topics have 60,000
+STEPS, STEPS_PER_BYTE = 10_000_000, 20  # a row of 30 bytes takes fewer than 100 steps; a million steps take 20 ms
+_EVERY_STEPS = 100_000
+_ADVICE = "Send the bag as written by `ros2 bag record`, or convert it with `ros2 bag convert`."
+_FUNCTIONS = frozenset({"count", "min", "max"})
+_PRAGMAS = frozenset({"table_info"})
+
+
+def guard_connections() -> None:
+    """Install `guard` for every SQLite connection that rosbags opens from now on."""
+    if guard not in apsw.connection_hooks:
+        apsw.connection_hooks.append(guard)
+
+
+def guard(connection: apsw.Connection) -> None:
+    """Check that a database contains a rosbag2 and nothing else, and limit the work of any query on it.
+
+    Raises:
+        UnreadableRecording: It contains anything else, or is not a database.
+    """
+    size = Path(connection.filename).stat().st_size
+    connection.config(apsw.SQLITE_DBCONFIG_ENABLE_VIEW, 0)
+    connection.config(apsw.SQLITE_DBCONFIG_ENABLE_TRIGGER, 0)
+    connection.config(apsw.SQLITE_DBCONFIG_TRUSTED_SCHEMA, 0)
+    connection.config(apsw.SQLITE_DBCONFIG_DEFENSIVE, 1)
+    connection.limit(apsw.SQLITE_LIMIT_LENGTH, max(size, 1 << 20))
+    _limit_steps(connection, STEPS + STEPS_PER_BYTE * size)
+    try:
+        _check_objects(connection)
+        _check_profiles(connection)
+    except apsw.Error as error:
+        raise UnreadableRecording("The SQLite bag (.db3) is truncated or corrupt. Copy it again.") from error
+    connection.authorizer = _allowed
+
+
+def _limit_steps(connection: apsw.Connection, steps: int) -> None:
+    left = steps
+
+    def over() -> bool:
+        nonlocal left
+        left -= _EVERY_STEPS
+        return left < 0
+
+    connection.set_progress_handler(over, _EVERY_STEPS)
+
+
+def _check_objects(connection: apsw.Connection) -> None:
+    """Refuse objects that rosbag2 does not write.
+
+    Both SQLite's interpretation of the schema and the schema table in the file are checked.
+    """
+    found = {name: kind for schema, name, kind, *_ in connection.execute("PRAGMA table_list") if schema == "main"}
+    for kind, shown in (("view", "view"), ("virtual", "virtual table"), ("shadow", "shadow table"), ("table", "table")):
+        for name in sorted(name for name, its_kind in found.items() if its_kind == kind):
+            if kind != "table" or name not in TABLES | STATISTICS:
+                raise _foreign(shown, name)
+    for kind, name, table in connection.execute("SELECT type, name, tbl_name FROM main.sqlite_schema"):
+        own_index = kind == "index" and (name == INDEX or str(name).startswith("sqlite_autoindex_"))
+        if table not in TABLES | STATISTICS or not (own_index or (kind == "table" and name == table)):
+            raise _foreign(str(kind), name)
+        if kind == "table" and any(column[6] for column in connection.pragma("table_xinfo", name) or ()):
+            raise _foreign("computed column in the table", name)
+        if kind == "index" and any(column[1] == -2 for column in connection.pragma("index_xinfo", name) or ()):
+            raise _foreign("computed index", name)
+
+
+def _check_profiles(connection: apsw.Connection) -> None:
+    columns = [column[1] for column in connection.pragma("table_xinfo", "topics") or ()]
+    profiles = "total(length(offered_qos_profiles))" if "offered_qos_profiles" in columns else "0"
+    ((count, characters),) = connection.execute(f"SELECT count(*), {profiles} FROM topics")  # noqa: S608 - ours
+    if count > TOPICS or characters > PROFILES_CHARACTERS:
+        raise UnreadableRecording(
+            f"The SQLite bag (.db3) has {count} topics with {characters:.0f} characters of quality-of-service "
+            f"profiles; at most {TOPICS} with {PROFILES_CHARACTERS} can be read. {_ADVICE}",
+            topics=count,
+        )
+
+
+def _foreign(kind: str, name: object) -> UnreadableRecording:
+    shown = "".join(letter if letter.isprintable() else "?" for letter in str(name))[:80]
+    return UnreadableRecording(
+        f"The SQLite bag (.db3) has a {kind} {shown!r}, which rosbag2 does not write; it is refused. {_ADVICE}",
+        kind=kind,
+    )
+
+
+def _allowed(action: int, one: str | None, other: str | None, _schema: str | None, _inner: str | None) -> int:
+    fine = (
+        action == apsw.SQLITE_SELECT
+        or (action == apsw.SQLITE_READ and one in TABLES | {"sqlite_master", "sqlite_schema"})
+        or (action == apsw.SQLITE_FUNCTION and other in _FUNCTIONS)
+        or (action == apsw.SQLITE_PRAGMA and one in _PRAGMAS)
+    )
+    return apsw.SQLITE_OK if fine else apsw.SQLITE_DENY
+
+
+ROS1_MAGIC = b"#ROSBAG V"
+DB3_MAGIC = b"SQLite format 3\0"
+
+Suffix = Literal[".bag", ".db3", ".mcap"]
+_FORMATS: dict[Suffix, Format] = {".bag": "rosbag1", ".db3": "rosbag2", ".mcap": "mcap"}
+_NAMES = {".bag": "ROS 1 bag", ".db3": "SQLite bag (.db3)", ".mcap": "MCAP file"}
+_NANO = 1_000_000_000
+
+guard_connections()
+
+
+def read_rosbag(files: Sequence[BinaryIO], suffix: Suffix, integrity: Integrity = "none") -> Recording:
+    """Read a dVRK recording through rosbags.
+
+    Args:
+        files: The bag, or its parts in order; each is read from its beginning.
+        suffix: Their format.
+        integrity: The integrity of their checksums, where it is known.
+
+    Returns:
+        The recording, in millimetres.
+
+    Raises:
+        UnreadableRecording: Truncated, corrupt, or not in the format of the suffix.
+        NoUsableTopic: No topic has the pose of a PSM.
+        MixedFrames, BackwardStamps, RepeatedStamps, NotFinite, NotMetres, NotAQuaternion: See `skills.errors`.
+    """
+    with ExitStack() as open_files:
+        with tempfile.TemporaryDirectory() as folder:
+            paths = [_copied(file, Path(folder) / f"part{number}{suffix}") for number, file in enumerate(files)]
+            reader = open_files.enter_context(_reading(paths))  # open files stay readable without their folder
+        out = open_files.enter_context(tempfile.TemporaryFile())  # unnamed: deleted when closed
+        with _refusing(paths[0]):
+            here = _convert(reader, out)
+        out.seek(0)
+        return replace(read_mcap(out), format=_FORMATS[suffix], integrity=integrity, topics=here)
+
+
+def convert(paths: Sequence[Path], out: IO[bytes], notes: dict[str, str] | None = None) -> tuple[Topic, ...]:
+    """Write the used messages of one recording, ROS 1 or ROS 2, as one MCAP file.
+
+    Args:
+        paths: The recording's files.
+        out: The MCAP file.
+        notes: Stored in a metadata record of the MCAP file.
+
+    Returns:
+        All topics of the recording, with the numbers of their messages.
+
+    Raises:
+        UnreadableRecording: rosbags cannot read it.
+        NoUsableTopic: No topic has the pose of a PSM.
+    """
+    with _reading(paths) as reader, _refusing(paths[0]):
+        return _convert(reader, out, notes)
+
+
+def topics_in(paths: Sequence[Path]) -> tuple[Topic, ...]:
+    """Return the topics of a recording, with the numbers of their messages.
+
+    Raises:
+        UnreadableRecording: rosbags cannot read it.
+    """
+    with _reading(paths) as reader:
+        return _topics(reader)
+
+
+@contextmanager
+def _reading(paths: Sequence[Path]) -> Iterator[AnyReader]:
+    with ExitStack() as stack:
+        with _refusing(paths[0]):
+            reader = stack.enter_context(AnyReader(paths, default_typestore=get_typestore(Stores.ROS2_JAZZY)))
+        yield reader
+
+
+def _refusing(path: Path) -> AbstractContextManager[None]:
+    advice = "Copy it again, or convert it with `ros2 bag convert` or `rosbags-convert`."
+    return refusing(f"The {_NAMES.get(path.suffix, 'bag')}", advice)
+
+
+def _convert(reader: AnyReader, out: IO[bytes], notes: dict[str, str] | None = None) -> tuple[Topic, ...]:
+    here = _topics(reader)
+    if not any(topics.arm_of_pose(topic.name, topic.type) for topic in here):
+        said = ", ".join(f"{topic.name} ({topic.type})" for topic in here[:20])
+        raise NoUsableTopic(f"No topic has the pose of a PSM. It has {said or 'no topics'}.")
+    write_messages(_messages(reader), out, notes)
+    return here
+
+
+def _topics(reader: AnyReader) -> tuple[Topic, ...]:
+    counts: Counter[tuple[str, str]] = Counter()
+    for connection in reader.connections:
+        counts[connection.topic, connection.msgtype] += connection.msgcount
+    return tuple(Topic(name, kind, count) for (name, kind), count in sorted(counts.items()))
+
+
+def _messages(reader: AnyReader) -> Iterator[Message]:
+    wanted = [one for one in reader.connections if topics.meaning(one.topic, one.msgtype) is not None]
+    for connection, log_ns, data in reader.messages(connections=wanted):
+        write = _WRITERS[connection.msgtype]
+        yield write(connection.topic, log_ns, reader.deserialize(data, connection.msgtype))
+
+
+def _pose(topic: str, log_ns: int, said: Any) -> Message:
+    place, turn = said.pose.position, said.pose.orientation
+    return _tip(topic, log_ns, said.header, place, turn)
+
+
+def _transform(topic: str, log_ns: int, said: Any) -> Message:
+    """Write a TransformStamped, with which older dVRKs publish the tip, as a pose."""
+    return _tip(topic, log_ns, said.header, said.transform.translation, said.transform.rotation)
+
+
+def _tip(topic: str, log_ns: int, header: Any, place: Any, turn: Any) -> Message:
+    place_m, turn_xyzw = (place.x, place.y, place.z), (turn.x, turn.y, turn.z, turn.w)
+    return writer.pose(topic, _stamp_ns(header), header.frame_id, place_m, turn_xyzw, log_ns=log_ns)
+
+
+def _joint_state(topic: str, log_ns: int, said: Any) -> Message:
+    stamp_ns, frame = _stamp_ns(said.header), said.header.frame_id
+    return writer.joint_state(topic, stamp_ns, said.position.tolist(), said.name, frame=frame, log_ns=log_ns)
+
+
+def _joy(topic: str, log_ns: int, said: Any) -> Message:
+    return writer.joy(topic, _stamp_ns(said.header), said.buttons.tolist(), frame=said.header.frame_id, log_ns=log_ns)
+
+
+_WRITERS: dict[str, Callable[[str, int, Any], Message]] = {
+    topics.POSE: _pose,
+    topics.TRANSFORM: _transform,
+    topics.JOINT_STATE: _joint_state,
+    topics.JOY: _joy,
+    topics.BOOL: lambda topic, log_ns, said: writer.boolean(topic, log_ns, said.data),
+    topics.FLOAT64: lambda topic, log_ns, said: writer.number(topic, log_ns, said.data),
+    topics.STRING: lambda topic, log_ns, said: writer.text(topic, log_ns, said.data),
+}
+
+
+def _stamp_ns(header: Any) -> int:
+    return int(header.stamp.sec) * _NANO + int(header.stamp.nanosec)
+
+
+def _copied(file: BinaryIO, path: Path) -> Path:
+    file.seek(0)
+    with path.open("wb") as out:
+        shutil.copyfileobj(file, out, 1 << 20)
+    return path

@@ -1,0 +1,118 @@
+"""Topic names and message types of a dVRK recording, and the quantities that they carry.
+
+dVRK 2.2 and later publish the tip as PoseStamped, earlier versions as TransformStamped; both in metres, with the time
+of measurement in the header. The topics follow the CRTK conventions (dVRK documentation, "Arms" and "Console"); they
+may be below any namespace, as in `/CRTK/psm2/measured_cp`.
+
+Only measured motions are used. Commands (`setpoint_cp`, `servo_cp`, `move_cp` and the like) are not, nor are poses of
+other things (`T_b_w`, the base of an arm in a simulator's world).
+"""
+
+import re
+from dataclasses import dataclass
+from enum import Enum, auto
+
+POSE = "geometry_msgs/msg/PoseStamped"
+TRANSFORM = "geometry_msgs/msg/TransformStamped"
+JOINT_STATE = "sensor_msgs/msg/JointState"
+JOY = "sensor_msgs/msg/Joy"
+BOOL = "std_msgs/msg/Bool"
+FLOAT64 = "std_msgs/msg/Float64"
+STRING = "std_msgs/msg/String"
+
+CLUTCH_TOPICS = ("/console/clutch", "/footpedals/clutch")  # the first one present is used
+RELEASED, PRESSED, QUICK_TAP = 0, 1, 2  # buttons[0] of a pedal
+
+_PSM = re.compile(r"PSM\d*", re.IGNORECASE)
+_MTM = re.compile(r"MTM[LR]?\d*", re.IGNORECASE)
+_PAIR = re.compile(r"MTM[LR]?\d*_PSM\d*", re.IGNORECASE)
+_COMMANDS = re.compile(r"setpoint|desired|goal|servo|move|T_b_w")
+_CONSOLE = ("clutch", "camera", "operator_present")
+
+
+class Kind(Enum):
+    """The quantity that a topic carries."""
+
+    MOTION = auto()  # pose of a PSM's tip
+    MASTER = auto()  # pose of an MTM's tip
+    JOINTS = auto()  # measured joint positions of a PSM or an MTM
+    JAW = auto()
+    GRIPPER = auto()
+    PEDAL = auto()
+    FOLLOWING = auto()  # true while an MTM drives its PSM
+    SCALE = auto()
+    TOOL = auto()
+
+
+@dataclass(frozen=True)
+class Meaning:
+    """The quantity that a topic carries, and its source.
+
+    `whose` is an arm such as "PSM2", a teleoperation such as "MTMR_PSM1", or the topic of a pedal.
+    """
+
+    kind: Kind
+    whose: str
+
+
+def meaning(topic: str, message_type: str) -> Meaning | None:
+    """Return the meaning of a topic of this message type; None where it is not used here."""
+    if message_type in (POSE, TRANSFORM):
+        return _of_pose(topic)
+    if message_type == JOINT_STATE and topic.endswith("/measured_js"):
+        return _of_joints(topic)
+    if message_type in (JOY, BOOL) and _is_pedal(topic):
+        return Meaning(Kind.PEDAL, topic)
+    if message_type == BOOL and topic.endswith("/following"):
+        return _about(Kind.FOLLOWING, _named(_PAIR, topic))
+    if message_type == FLOAT64 and topic.endswith("/scale"):
+        return _about(Kind.SCALE, _named(_PAIR, topic))
+    if message_type == STRING and topic.endswith("/tool_type"):
+        return _about(Kind.TOOL, _named(_PSM, topic))
+    return None
+
+
+def arm_of_pose(topic: str, message_type: str) -> str | None:
+    """Return the PSM whose tip pose a topic carries, None for any other topic.
+
+    `/PSM2/local/measured_cp` and `/CRTK/psm2/measured_cp` are poses of a PSM; `/SUJ/PSM2/...` is the passive arm that
+    carries it.
+    """
+    said = meaning(topic, message_type)
+    return said.whose if said is not None and said.kind is Kind.MOTION else None
+
+
+def _of_pose(topic: str) -> Meaning | None:
+    if _COMMANDS.search(topic.rsplit("/", 1)[-1]):
+        return None
+    return _about(Kind.MOTION, _named(_PSM, topic)) or _about(Kind.MASTER, _named(_MTM, topic))
+
+
+def _of_joints(topic: str) -> Meaning | None:
+    psm, mtm = _named(_PSM, topic), _named(_MTM, topic)
+    part = topic.split("/")[-2]
+    if part == "jaw":
+        return _about(Kind.JAW, psm)
+    if part == "gripper":
+        return _about(Kind.GRIPPER, mtm)
+    return Meaning(Kind.JOINTS, part) if part in (psm, mtm) else None
+
+
+def _is_pedal(topic: str) -> bool:
+    *_, group, name = ["", "", *topic.split("/")]
+    return group == "footpedals" or (group == "console" and name in _CONSOLE)
+
+
+def _about(kind: Kind, whose: str | None) -> Meaning | None:
+    return None if whose is None else Meaning(kind, whose)
+
+
+def _named(pattern: re.Pattern[str], topic: str) -> str | None:
+    """Return the first component of a topic that matches the pattern.
+
+    Topics of a passive arm (SUJ) have no match, because the pose of the passive arm is not that of the PSM's tip.
+    """
+    names = topic.split("/")
+    if "SUJ" in names:
+        return None
+    return next((name for name in names if pattern.fullmatch(name)), None)

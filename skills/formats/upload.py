@@ -1,0 +1,387 @@
+"""Preparing the user's own recordings for upload: finding a bag on disk, and making it small, complete and one file.
+
+    path --find_bag--> Bag --ready_to_send--> the path of the file to send
+
+    a file          unchanged; with pictures, a copy without them
+    a bag folder    with one file, like that file; with several, joined
+    with tags       (the recorders' JSON, anywhere in the session's folder) a zip of the bag and its stages
+
+A bag is rewritten only to drop pictures or to join parts, as MCAP with notes about its original files (the metadata
+record `suture-skills`). Topics with pictures, point clouds and their calibrations are left out, and so are attachments,
+which reduces a session's gigabytes; every other message is copied unchanged, with its stamps, schema and channel.
+Checksums of the original are verified while copying, and the copy has its own.
+"""
+
+import hashlib
+import json
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import IO
+
+from mcap.reader import make_reader
+from mcap.records import Channel, Chunk, DataEnd, McapRecord, Message, Schema, Statistics
+from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.writer import Writer
+
+from skills.demonstration.recording import Label, Topic
+from skills.errors import BadInput, UnreadableRecording
+from skills.formats import rosbag
+from skills.formats.annotations import read_labels
+from skills.formats.archive import pack
+from skills.formats.bag_folder import METADATA, TAGS_BYTES, check_counts, in_order, read_metadata, suffix_of, unzstd
+from skills.formats.jigsaws import trials
+from skills.formats.mcap.reader import NOTES
+from skills.formats.mcap.recording import MAGIC
+from skills.formats.mcap.records import RECOVER
+from skills.remedies import Action, Remedy, did_you_mean
+
+PICTURES = frozenset(
+    {
+        "sensor_msgs/msg/Image",
+        "sensor_msgs/msg/CompressedImage",
+        "sensor_msgs/msg/CameraInfo",
+        "sensor_msgs/msg/PointCloud",
+        "sensor_msgs/msg/PointCloud2",
+        "stereo_msgs/msg/DisparityImage",
+        "theora_image_transport/msg/Packet",
+        "ffmpeg_image_transport_msgs/msg/FFMPEGPacket",
+        "foxglove_msgs/msg/CompressedImage",
+        "foxglove_msgs/msg/CompressedVideo",
+        "audio_common_msgs/msg/AudioData",
+    }
+)
+_RECORD_BYTES = 4 << 30  # generous, because the user's own file is trusted
+_PIECE = 1 << 20
+_NAME = "bag"  # the original file names may identify a person
+
+Progress = Callable[[int], None]  # called with the number of bytes processed since the last call
+
+
+def ignore(_: int) -> None:
+    """Ignore progress: the default callback."""
+
+
+@dataclass(frozen=True)
+class Bag:
+    """A bag on this machine: its files in order, its metadata.yaml and its stages."""
+
+    files: tuple[Path, ...]
+    metadata: Path | None = None
+    labels: tuple[Label, ...] = ()
+
+    @property
+    def size_bytes(self) -> int:
+        """The total size of its files."""
+        return sum(file.stat().st_size for file in self.files)
+
+
+def find_bag(path: Path) -> Bag:
+    """Find the recording at a path: a file, or the only bag in a folder.
+
+    Raises:
+        BadInput: There is no bag, or more than one.
+        UnreadableRecording: Its metadata.yaml or its tags are unreadable, or name other files than those present.
+    """
+    if path.is_file():
+        return Bag((path,))
+    if not path.is_dir():
+        beside = [one.name for one in path.parent.iterdir()] if path.parent.is_dir() else []
+        raise BadInput(
+            f"{path} is neither a file nor a folder.",
+            *did_you_mean(path.name, beside),
+            "Check its spelling and the current folder.",
+        )
+    files = [file for file in sorted(path.rglob("*")) if file.is_file() and suffix_of(file.name)]
+    homes = sorted({file.parent for file in files})
+    if not homes and next(trials(path), None) is not None:
+        raise BadInput(f"{path} is a folder with trials of JIGSAWS.", Remedy(Action.ADD_JIGSAWS, folder=str(path)))
+    if not homes:
+        raise BadInput(f"{path} has no .mcap, .db3 or .bag file.", "Name a recording's file, or the folder of a bag.")
+    if len(homes) != 1:
+        listed = "".join(f"\n  {home}" for home in homes[:20])
+        raise BadInput(f"{path} has {len(homes)} folders with bags; name one of them:{listed}.")
+    if len({suffix_of(file.name) for file in files}) > 1:
+        raise BadInput(f"{homes[0]} has bags of several formats; name one of the files.")
+    metadata = homes[0] / METADATA
+    known = read_metadata(metadata.read_text(errors="replace")) if metadata.is_file() else None
+    names = {file.name: file for file in files}
+    ordered = in_order(sorted(names, key=_by_number), known) if known else sorted(names, key=_by_number)
+    return Bag(
+        files=tuple(names[name] for name in ordered),
+        metadata=metadata if known else None,
+        labels=_labels_in(path),
+    )
+
+
+@contextmanager
+def ready_to_send(bag: Bag, progress: Progress = ignore) -> Iterator[Path]:
+    """Prepare a bag for upload, and yield the path of the file to send.
+
+    If the bag has to be rewritten, the file is in a temporary folder that is removed after the block.
+
+    Args:
+        bag: The bag, from `find_bag`.
+        progress: Callback, called with the numbers of bytes of the original as they are read, each byte once or twice.
+
+    Raises:
+        UnreadableRecording: It is truncated or corrupt, or its messages differ from its metadata.yaml.
+    """
+    with TemporaryDirectory() as folder:
+        path = _one_file(bag, Path(folder), progress)
+        if not bag.labels:
+            yield path
+            return
+        packed = Path(folder) / "session.zip"
+        stages = Path(folder) / "session_tags.json"
+        stages.write_bytes(_stages(bag.labels))
+        with path.open("rb") as file, stages.open("rb") as said, packed.open("wb") as out:
+            pack({f"{_NAME}/{_NAME}{suffix_of(path.name)}": file, "session_tags.json": said}, out)
+        yield packed
+
+
+def _one_file(bag: Bag, folder: Path, progress: Progress) -> Path:
+    """Return the bag as one file without pictures; the original file if it is one already."""
+    if len(bag.files) == 1 and not _can_be_rewritten(bag.files[0]):
+        return bag.files[0]
+    files = [_plain_file(file, folder) for file in bag.files]
+    if len(files) == 1 and files[0] == bag.files[0]:
+        topics = _topics_in(files)
+        if not any(topic.type in PICTURES for topic in topics):
+            _check(bag, topics)
+            return files[0]
+    digests = [digest_of(file, progress) for file in bag.files]
+    out = folder / f"{_NAME}.mcap"
+    with out.open("wb") as file:
+        if files[0].suffix == ".mcap":
+            notes = origin(digests, (topic for path in files for topic in topics_of(path)))
+            topics = lighten(files, file, notes, progress)
+        else:
+            topics = rosbag.convert(files, file, origin(digests, rosbag.topics_in(files)))
+    _check(bag, topics)
+    return out
+
+
+def _can_be_rewritten(file: Path) -> bool:
+    """Return whether a file is a bag by both content and name.
+
+    Others are sent unchanged, so that the service reports the error.
+    """
+    with file.open("rb") as content:
+        head = content.read(16)
+    kinds = {".mcap": MAGIC, ".bag": rosbag.ROS1_MAGIC, ".db3": rosbag.DB3_MAGIC, ".zstd": b"\x28\xb5\x2f\xfd"}
+    return file.suffix in kinds and head.startswith(kinds[file.suffix])
+
+
+def _topics_in(files: Sequence[Path]) -> tuple[Topic, ...]:
+    return topics_of(files[0]) if files[0].suffix == ".mcap" else rosbag.topics_in(files)
+
+
+def _check(bag: Bag, topics: Sequence[Topic]) -> None:
+    if bag.metadata is not None:
+        check_counts(read_metadata(bag.metadata.read_text(errors="replace")), topics)
+
+
+def _plain_file(file: Path, folder: Path) -> Path:
+    """Return a file, decompressed into the folder if rosbag2 compressed it."""
+    if file.suffix != ".zstd":
+        return file
+    plain = folder / file.stem
+    with file.open("rb") as packed, plain.open("wb") as out:
+        unzstd(packed, out)
+    return plain
+
+
+def _labels_in(folder: Path) -> tuple[Label, ...]:
+    """Read the stages from the JSON files in a session's folder.
+
+    A file over `TAGS_BYTES` has the frames of a long video, and is skipped.
+    """
+    texts = {}
+    for file in sorted(folder.rglob("*.json")):
+        if file.is_file() and file.stat().st_size <= TAGS_BYTES:
+            texts[file.relative_to(folder).as_posix()] = _text(file)
+    return read_labels(texts)
+
+
+def _text(file: Path) -> str:
+    try:
+        return file.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise UnreadableRecording(f"{file.name} is not UTF-8 text; remove it from the folder.") from error
+
+
+def _stages(labels: Sequence[Label]) -> bytes:
+    """Serialise stages in the recorders' format, with their times and no other data of the session."""
+    stages = [
+        {"name": label.name, "start": {"cpu_ts": label.start_ns}, "end": {"cpu_ts": label.end_ns}} for label in labels
+    ]
+    return json.dumps({"stages": stages}, indent=1, ensure_ascii=False).encode()
+
+
+def _by_number(name: str) -> tuple[int, str]:
+    """Sort key for rosbag2's parts: `_2` before `_10`."""
+    digits = name.split(".", 1)[0].rpartition("_")[2]
+    return (int(digits) if digits.isdecimal() else 0, name)
+
+
+# ---- copies without pictures -----------------------------------------------------------------------------------------
+
+
+def digest_of(path: Path, progress: Progress = ignore) -> str:
+    """Return the SHA-256 of a file, in hex."""
+    seen = hashlib.sha256()
+    with path.open("rb") as file:
+        while data := file.read(_PIECE):
+            seen.update(data)
+            progress(len(data))
+    return seen.hexdigest()
+
+
+def origin(digests: Sequence[str], topics: Iterable[Topic]) -> dict[str, str]:
+    """Return the notes about a copy's original: the SHA-256 of each file, and the topics that were left out."""
+    names = ["sha256"] if len(digests) == 1 else [f"sha256 of part {number + 1}" for number in range(len(digests))]
+    dropped = dict.fromkeys(f"{topic.name} ({topic.type})" for topic in topics if topic.type in PICTURES)
+    notes = {f"original {name}": digest for name, digest in zip(names, digests, strict=True)}
+    return notes | ({"left out": ", ".join(dropped)[:10_000]} if dropped else {})
+
+
+def topics_of(path: Path) -> tuple[Topic, ...]:
+    """Return the topics of an MCAP file from its summary; a file without one is read completely.
+
+    Raises:
+        UnreadableRecording: It is truncated or corrupt.
+    """
+    try:
+        with path.open("rb") as file:
+            summary = make_reader(file).get_summary()
+            if summary is not None and summary.statistics is not None:
+                counts, schemas = summary.statistics.channel_message_counts, summary.schemas
+                return tuple(
+                    Topic(one.topic, _type(schemas, one), counts.get(one.id, 0)) for one in summary.channels.values()
+                )
+            file.seek(0)
+            copy = _Copy(None)
+            for record in _records(file, ignore):
+                copy.take(record)
+            return copy.topics
+    except Exception as error:
+        raise _unreadable(path, error) from error
+
+
+def lighten(
+    paths: Sequence[Path], out: IO[bytes], notes: Mapping[str, str], progress: Progress = ignore
+) -> tuple[Topic, ...]:
+    """Copy MCAP files, one after the other, into one file without pictures.
+
+    Args:
+        paths: The files, in order of time.
+        out: The copy.
+        notes: For the copy's metadata record, from `origin`.
+        progress: Callback, called with numbers of bytes as they are read.
+
+    Returns:
+        The topics of the originals, including pictures.
+
+    Raises:
+        UnreadableRecording: One of them is truncated or corrupt.
+    """
+    writer = Writer(out)
+    writer.start(profile="ros2", library="suture-skills")
+    writer.add_metadata(NOTES, dict(notes))
+    copy = _Copy(writer)
+    for path in paths:
+        copy.start_file()
+        try:
+            with path.open("rb") as file:
+                for record in _records(file, progress):
+                    copy.take(record)
+        except Exception as error:
+            raise _unreadable(path, error) from error
+    writer.finish()  # type: ignore[no-untyped-call]
+    return copy.topics
+
+
+@dataclass
+class _Copy:
+    """Schemas and channels of the files so far, and their numbers in the copy; without a writer it only counts."""
+
+    writer: Writer | None
+    schemas: dict[int, Schema] = field(default_factory=dict)
+    channels: dict[int, Channel] = field(default_factory=dict)
+    counts: Counter[tuple[str, str]] = field(default_factory=Counter)
+    _placed: dict[int, int] = field(default_factory=dict)  # channel numbers of the current file, and in the copy
+    _known_schemas: dict[tuple[str, str, bytes], int] = field(default_factory=dict)
+    _known_channels: dict[tuple[object, ...], int] = field(default_factory=dict)
+
+    @property
+    def topics(self) -> tuple[Topic, ...]:
+        """The topics of the files, with their numbers of messages."""
+        return tuple(Topic(name, kind, count) for (name, kind), count in sorted(self.counts.items()))
+
+    def start_file(self) -> None:
+        """Forget the schema and channel numbers of the previous file."""
+        self.schemas, self.channels, self._placed = {}, {}, {}
+
+    def take(self, record: McapRecord) -> None:
+        """Process a record: copy a message unless it is of a picture, remember a schema or a channel."""
+        if isinstance(record, Schema):
+            self.schemas[record.id] = record
+        elif isinstance(record, Channel):
+            self.channels[record.id] = record
+            self.counts[record.topic, _type(self.schemas, record)] += 0  # topics without messages are listed too
+        elif isinstance(record, Message):
+            channel = self.channels[record.channel_id]
+            kind = _type(self.schemas, channel)
+            self.counts[channel.topic, kind] += 1
+            if self.writer is not None and kind not in PICTURES:
+                number = self._placed.get(channel.id) or self._place(self.writer, channel)
+                self.writer.add_message(number, record.log_time, record.data, record.publish_time, record.sequence)
+
+    def _place(self, writer: Writer, channel: Channel) -> int:
+        """Return the number of a channel in the copy; equal channels of two files share one."""
+        schema_number = 0
+        if channel.schema_id:
+            schema = self.schemas[channel.schema_id]
+            known = (schema.name, schema.encoding, schema.data)
+            if known not in self._known_schemas:
+                self._known_schemas[known] = writer.register_schema(*known)
+            schema_number = self._known_schemas[known]
+        same = (channel.topic, channel.message_encoding, schema_number, tuple(sorted(channel.metadata.items())))
+        if same not in self._known_channels:
+            number = writer.register_channel(channel.topic, channel.message_encoding, schema_number, channel.metadata)
+            self._known_channels[same] = number
+        self._placed[channel.id] = self._known_channels[same]
+        return self._placed[channel.id]
+
+
+def _records(file: IO[bytes], progress: Progress) -> Iterator[McapRecord]:
+    """Yield the records of a file, including those in its chunks, and check that the file is complete.
+
+    Records after the end of the data section are checked but not yielded, because they repeat earlier ones.
+    """
+    ended, at, found = False, 0, 0
+    reader = StreamReader(file, emit_chunks=True, validate_crcs=True, record_size_limit=_RECORD_BYTES)
+    for record in reader.records:
+        progress(file.tell() - at)
+        at = file.tell()
+        ended = ended or isinstance(record, DataEnd)
+        if isinstance(record, Statistics) and record.message_count != found:
+            raise UnreadableRecording(f"it declares {record.message_count} messages, but has {found}")
+        for one in breakup_chunk(record, validate_crc=True) if isinstance(record, Chunk) else [record]:
+            found += isinstance(one, Message)
+            if not ended:  # the summary repeats schemas and channels
+                yield one
+    if not ended:
+        raise UnreadableRecording("its data section has no end")
+
+
+def _type(schemas: Mapping[int, Schema], channel: Channel) -> str:
+    return schemas[channel.schema_id].name if channel.schema_id else ""
+
+
+def _unreadable(path: Path, error: Exception) -> UnreadableRecording:
+    return UnreadableRecording(f"{path.name} is truncated or corrupt ({error}). {RECOVER}")

@@ -1,0 +1,406 @@
+"""Offline verification of a replay bag, from its bytes alone: `skills verify FILE.zip`.
+
+    zip --verify_bag--> the checks that passed, one line each; the first failed check raises `BadBag`
+
+The checksums must be complete and correct, the JSON papers must refer to one plan, and each arm's setpoints must be the
+ones that `replay_bag` writes: they are read by the walker, which verifies every checksum of an MCAP file, then compared
+with the closed-form kinematics and the limits of the instrument, and finally written again and compared byte for byte.
+
+So a verified bag was exported by this project, and the arm can follow it. Whether the robot's frames, tool and
+surroundings are those of the plan is not verified: `docs/replay.md`. Data that are not played, such as the papers' text
+and the indexes of an MCAP file, are covered only by the checksums, which detect damage but not manipulation.
+"""
+
+import hashlib
+import json
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from skills.arrays import Floats, Ints
+from skills.errors import BadBag, UnknownInstrument
+from skills.formats.archive import Archive, shown
+from skills.formats.bag_folder import METADATA
+from skills.formats.mcap.cdr import WANTED_POSE, Columns, Decoder, Wanted, fields_of
+from skills.formats.mcap.reader import MessageSchema, Walker
+from skills.formats.replay_bag import CRTK_ARMS, SUMS, ArmMotion, Role, arm_names, messages_of, notes_of, velocities_of
+from skills.formats.topics import JOINT_STATE, POSE
+from skills.formats.writer import DEFINITIONS, Written, metadata_of
+from skills.kinematics import INSERTION, JOINTS, angle_between, forward, instrument_of, joint_margins, matrix_of
+from skills.packing import canonical, sha256
+
+PLAN, VERDICT, POLICY, README = "plan.json", "verdict.json", "policy.json", "README.txt"
+PAPERS = (PLAN, VERDICT, POLICY, README)
+SAMPLES_LIMIT = 2_000_000  # per arm: 200 passes of 50 s at 200 Hz
+FORM_MM, FORM_RAD = 1e-6, 1e-6  # round-off is 1e-13; a joint that is off by a millionth of its range is found
+GOAL_MM = 1e-3  # an exported pass ends within 1e-9 of its path's end
+SPEED_RATIO = 1.000001  # a tolerance of 1e-6 for round-off, as in the playback's verdict
+
+_UNTYPED = MessageSchema("", "", b"")
+_SUM = re.compile(r"([0-9a-f]{64})  (\S+)")
+_JOINTS = Wanted(("position", "velocity"))
+
+
+def verify_bag(path: Path) -> list[str]:
+    """Verify a replay bag, and return the checks that passed as text.
+
+    Raises:
+        BadBag: It must not be played; the message has the reason.
+        UnreadableRecording: The archive or a file in it is damaged or dangerous.
+    """
+    with path.open("rb") as file:
+        return check_bag(file)
+
+
+def check_bag(file: BinaryIO) -> list[str]:
+    """Verify a replay bag in an open file; see `verify_bag`."""
+    archive = Archive(file)
+    arms = _arms_in(archive.names)
+    _check_sums(archive)
+    plan, verdict, policy = (_paper(archive, name) for name in (PLAN, VERDICT, POLICY))
+    _check_papers(plan, verdict, policy)
+    motions = [_read_arm(archive, name, plan) for name in arms]
+    _check_roles(motions, plan)
+    return [
+        f"{len(archive.names)} files, and {SUMS} has the right checksum of each other file.",
+        f"Plan {plan['sha256'][:12]}, the feasible verdict {verdict['sha256'][:12]} and policy {policy['sha256'][:12]} "
+        "belong together.",
+        *(_told(motion) for motion in motions),
+        *([] if plan.get("psm_m") else ["It has no hand-off: no PSM_M, no A2."]),
+    ]
+
+
+# ---- the archive and its papers ---------------------------------------------------------------------------------
+
+
+def _arms_in(names: list[str]) -> list[str]:
+    """Return the arms, PSM_A and optionally PSM_M, and refuse any file besides their folders and the papers."""
+    arms = [name for name in CRTK_ARMS if f"{name}/{name}.mcap" in names]
+    expected = {SUMS, *PAPERS} | {f"{name}/{file}" for name in arms for file in (METADATA, f"{name}.mcap")}
+    missing, extra = sorted(expected - set(names)), sorted(set(names) - expected)
+    if not 1 <= len(arms) <= 2:
+        raise BadBag(
+            f"A bag for replay has one folder for each of one or two arms; this has {len(arms)}. Export it again."
+        )
+    if missing or extra:
+        what = f"lacks {missing[0]}" if missing else f"has {shown(extra[0])}, which does not belong to it"
+        raise BadBag(f"The bag {what}. Export it again.")
+    return arms
+
+
+def _check_sums(archive: Archive) -> None:
+    lines = [_SUM.fullmatch(line) for line in archive.text(SUMS).splitlines()]
+    said = {line[2]: line[1] for line in lines if line is not None}
+    if None in lines or len(said) != len(lines) or set(said) != {*archive.names} - {SUMS}:
+        raise BadBag(f"{SUMS} must list every other file of the bag exactly once, and no others. Export it again.")
+    for name, digest in sorted(said.items()):
+        with archive.unpacked(name) as file:
+            if _digest(file) != digest:
+                raise BadBag(
+                    f"{name} does not match its checksum in {SUMS}: it was changed or damaged. Export it again."
+                )
+
+
+def _digest(file: BinaryIO) -> str:
+    seen = hashlib.sha256()
+    while data := file.read(1 << 20):
+        seen.update(data)
+    return seen.hexdigest()
+
+
+def _paper(archive: Archive, name: str) -> dict[str, Any]:
+    try:
+        paper = json.loads(archive.text(name))
+    except (ValueError, RecursionError):
+        paper = None
+    if not isinstance(paper, dict):
+        raise BadBag(f"{name} is not a JSON object. Export the bag again.")
+    return paper
+
+
+def _check_papers(plan: dict[str, Any], verdict: dict[str, Any], policy: dict[str, Any]) -> None:
+    """Check that plan, verdict and policy belong together, and that the verdict is feasible and unchanged."""
+    try:
+        plan_sha256, report = plan["sha256"], verdict["report"]
+        policies = {plan["policy"]["sha256"], verdict["policy"], policy["sha256"]}
+        if verdict["plan"] != plan_sha256:
+            raise BadBag(f"{VERDICT} belongs to another plan than {PLAN}. Export the bag again.")
+        if len(policies) != 1:
+            raise BadBag(f"{PLAN}, {VERDICT} and {POLICY} name {len(policies)} policies. Export the bag again.")
+        if verdict["feasible"] is not True or report["feasible"] is not True:
+            raise BadBag(f"{VERDICT} does not find the plan feasible; it must not be played.")
+        if sha256(canonical([plan_sha256, report])) != verdict["sha256"]:
+            raise BadBag(f"{VERDICT} does not match its digest. Export the bag again.")
+    except (LookupError, TypeError, ValueError) as error:
+        raise BadBag(f"{PLAN}, {VERDICT} or {POLICY} has a missing or invalid field. Export the bag again.") from error
+
+
+# ---- one arm ----------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class _Topic:
+    """The messages of one topic, in the order of the file."""
+
+    type: str
+    wanted: Wanted
+    log_ns: list[Ints] = field(default_factory=list)
+    columns: list[Columns] = field(default_factory=list)
+    messages: list[bytes] = field(default_factory=list)
+
+    @property
+    def stamps_ns(self) -> Ints:
+        """The stamps of the headers, shape (T,); both message types have a header."""
+        return np.concatenate([columns.stamps_ns for columns in self.columns if columns.stamps_ns is not None])
+
+    @property
+    def values(self) -> Floats:
+        """The numbers, shape (T, K)."""
+        widths = {columns.values.shape[1] for columns in self.columns}
+        if len(widths) != 1:
+            raise BadBag("A topic of the bag has messages with different numbers of values. Export the bag again.")
+        return np.concatenate([columns.values for columns in self.columns])
+
+
+def _read_arm(archive: Archive, name: str, plan: dict[str, Any]) -> ArmMotion:
+    """Read one arm's folder, and run all checks that concern this arm alone."""
+    file_name = f"{name}.mcap"
+    with archive.unpacked(f"{name}/{file_name}") as file:
+        walker, topics = _walk(file, name)
+    motion = _motion(name, topics, walker.notes, plan)
+    _check_stamps(motion, topics)
+    counts = {(topic, said.type): len(said.messages) for topic, said in topics.items()}
+    written = Written(counts, int(motion.stamps_ns[0]), int(motion.stamps_ns[-1]))
+    if archive.text(f"{name}/{METADATA}").encode() != metadata_of(written, file_name):
+        raise BadBag(f"{name}/{METADATA} does not describe {file_name}. Export the bag again.")
+    _check_joints(motion, topics)
+    _check_form(motion)
+    _check_written(motion, walker.notes, topics, plan)
+    return motion
+
+
+def _walk(file: BinaryIO, name: str) -> tuple[Walker, dict[str, _Topic]]:
+    """Read the three topics of an arm; refuse any other topic."""
+    topics = {
+        f"/{name}/setpoint_js": _Topic(JOINT_STATE, _JOINTS),
+        f"/{name}/setpoint_cp": _Topic(POSE, WANTED_POSE),
+        f"/{name}/jaw/setpoint_js": _Topic(JOINT_STATE, _JOINTS),
+    }
+    walker, decoders = Walker(file), dict[str, Decoder]()
+    for part in walker.stretches():
+        topic = part.channel.topic
+        if topic not in topics:
+            raise BadBag(f"{name}.mcap has the topic {topic[:100]!r}, which is not a setpoint topic of {name}.")
+        said, data = topics[topic], part.data
+        if topic not in decoders:
+            schema = walker.schemas.get(part.channel.schema, _UNTYPED)
+            expected = ("cdr", said.type, "ros2msg", DEFINITIONS[said.type].encode())
+            if (part.channel.encoding, schema.name, schema.encoding, schema.definition) != expected:
+                raise BadBag(f"{topic} does not have the type {said.type}. Export the bag again.")
+            decoders[topic] = Decoder(topic, fields_of(schema.name, schema.definition.decode()), said.wanted)
+        said.columns.append(decoders[topic].decode(data, part.begin, part.length))
+        said.log_ns.append(part.log_ns.astype(np.int64))
+        spans = zip(part.begin.tolist(), part.length.tolist(), strict=True)
+        said.messages += [data[begin : begin + length].tobytes() for begin, length in spans]
+        if len(said.messages) > SAMPLES_LIMIT:
+            raise BadBag(f"{topic} has more than {SAMPLES_LIMIT} messages; a plan is never so long.")
+    if walker.integrity != "full":
+        raise BadBag(f"Not every message of {name}.mcap is covered by a checksum. Export the bag again.")
+    return walker, topics
+
+
+def _motion(name: str, topics: dict[str, _Topic], notes: dict[str, str], plan: dict[str, Any]) -> ArmMotion:
+    """Convert the messages that were read back into an `ArmMotion`."""
+    on_joints, on_tip, on_jaw = topics.values()
+    counts = [len(said.messages) for said in (on_joints, on_tip, on_jaw)]
+    if len(set(counts)) != 1 or not counts[0]:
+        raise BadBag(
+            f"{name} has {counts[0]} setpoints of its joints, {counts[1]} of its tip and {counts[2]} of its jaw; "
+            "the numbers must be equal. Export the bag again.",
+            joints=counts[0],
+            tip=counts[1],
+            jaw=counts[2],
+        )
+    joints, tip, jaw = on_joints.values, on_tip.values, on_jaw.values
+    if (joints.shape[1], jaw.shape[1]) != (2 * len(JOINTS), 2):
+        raise BadBag(f"{name} has a setpoint without its velocities, or with other joints than a PSM's.")
+    if not all(np.isfinite(values).all() for values in (joints, tip, jaw)):
+        raise BadBag(f"{name} has NaN or infinity in a setpoint; it must not be played.")
+    try:
+        instrument_of(instrument := notes["instrument"])
+        role: Role = "PSM_A" if notes["role"] == "PSM_A" else "PSM_M"
+        rate_hz, number = float(notes["rate_hz"]), notes["pass"]
+        frame = plan["frame"] if role == "PSM_A" else f"{name}_base"
+        if not (10 <= rate_hz <= 2000 and isinstance(frame, str) and (number == "all" or number.isdecimal())):
+            raise ValueError(number)
+    except (LookupError, ValueError, UnknownInstrument) as error:
+        raise BadBag(f"{name}.mcap does not name its role, its instrument and its rate. Export it again.") from error
+    return ArmMotion(
+        name=name,
+        role=role,
+        instrument=instrument,
+        frame=frame,
+        rate_hz=rate_hz,
+        stamps_ns=on_joints.stamps_ns,
+        joints=joints[:, : len(JOINTS)],
+        tip_m=tip[:, :3],
+        rotation_xyzw=tip[:, 3:],
+        jaw_rad=float(jaw[0, 0]),
+        pass_index=None if number == "all" else int(number),
+    )
+
+
+def _check_stamps(motion: ArmMotion, topics: dict[str, _Topic]) -> None:
+    """Check the stamps of all topics.
+
+    They are above 0, strictly increasing, no closer than the rate allows, and equal on all three topics and in the log.
+    """
+    stamps_ns = motion.stamps_ns
+    later = np.diff(stamps_ns, prepend=0) > 0
+    if not later.all():
+        sample = int(np.argmin(later))
+        raise BadBag(
+            f"{motion.name}: the stamp of sample {sample} is {stamps_ns[sample]} ns, not later than the one before; a "
+            "robot would drop it. Export the bag again.",
+            sample=sample,
+        )
+    in_time = np.diff(stamps_ns) >= 1e9 / motion.rate_hz - 1.0  # tolerance of 1 ns for rounding
+    if not in_time.all():
+        sample = int(np.argmin(in_time)) + 1
+        raise BadBag(
+            f"{motion.name}: sample {sample} is earlier than {motion.rate_hz:g} Hz allows; the arm would move "
+            "faster than was checked. Export the bag again.",
+            sample=sample,
+        )
+    for topic, said in topics.items():
+        if not (np.array_equal(said.stamps_ns, stamps_ns) and np.array_equal(np.concatenate(said.log_ns), stamps_ns)):
+            raise BadBag(
+                f"{topic} has stamps or log times that differ from those of {motion.topics[0]}. Export it again."
+            )
+
+
+def _check_joints(motion: ArmMotion, topics: dict[str, _Topic]) -> None:
+    """Check that positions and speeds of the joints are within their limits, and that velocities match positions."""
+    on_joints, _, on_jaw = topics.values()
+    tool = instrument_of(motion.instrument)
+    joints = _in_mm(motion.joints)
+    _first("is beyond its limit", motion, joint_margins(joints, motion.instrument) >= -1e-9)
+    tick_s = 1.0 / motion.rate_hz  # over a pause too: a robot moves to the next setpoint only when it arrives
+    speeds = np.abs(np.diff(joints, axis=0, prepend=joints[:1])) / tick_s / tool.speed
+    _first("jumps: it would be faster than its limit", motion, speeds <= SPEED_RATIO)
+    velocities = velocities_of(motion.stamps_ns, motion.joints, motion.rate_hz)
+    _first(
+        "has a velocity that does not match the differences of its positions",
+        motion,
+        on_joints.values[:, len(JOINTS) :] == velocities,
+    )
+    low, high = tool.jaw_rad
+    if not (low <= motion.jaw_rad <= high and (on_jaw.values == [motion.jaw_rad, 0.0]).all()):
+        raise BadBag(f"{motion.name}: the jaw is not held at one angle that the instrument can have.")
+
+
+def _first(what: str, motion: ArmMotion, good: np.ndarray[Any, np.dtype[np.bool_]]) -> None:
+    """Raise an error for the first sample and joint that fails a check.
+
+    Args:
+        what: The failure, as the predicate of the message.
+        motion: The arm.
+        good: True where the check passes, shape (T, 6).
+    """
+    if not good.all():
+        sample, joint = (int(index) for index in np.argwhere(~good)[0])
+        raise BadBag(
+            f"{motion.name}, sample {sample}: {JOINTS[joint]} {what}. It must not be played; export the bag again.",
+            sample=sample,
+            joint=JOINTS[joint],
+        )
+
+
+def _check_form(motion: ArmMotion) -> None:
+    """Check that the tip's poses agree with the forward kinematics of the joints."""
+    off_mm, off_rad = _off_the_form(motion)
+    if not (off_mm <= FORM_MM and off_rad <= FORM_RAD):
+        raise BadBag(
+            f"{motion.name}: {motion.topics[1]} is up to {off_mm:.3g} mm and {off_rad:.3g} rad from the pose at "
+            f"which {motion.topics[0]} puts the tip of a {motion.instrument}. It must not be played.",
+            off_mm=off_mm,
+            off_rad=off_rad,
+        )
+
+
+def _off_the_form(motion: ArmMotion) -> tuple[float, float]:
+    """Return the largest deviations of tip and rotation from the closed form.
+
+    Returns:
+        In mm and rad; NaN if a quaternion is not of length one.
+    """
+    length = np.linalg.norm(motion.rotation_xyzw, axis=1)
+    if not (np.abs(length - 1.0) <= FORM_RAD).all():
+        return np.nan, np.nan
+    tip_mm, rotation = forward(_in_mm(motion.joints), motion.instrument)
+    apart_mm = np.linalg.norm(1000.0 * motion.tip_m - tip_mm, axis=1)
+    return float(apart_mm.max()), float(angle_between(matrix_of(motion.rotation_xyzw), rotation).max())
+
+
+def _check_written(motion: ArmMotion, notes: dict[str, str], topics: dict[str, _Topic], plan: dict[str, Any]) -> None:
+    """Write the arm's messages again and compare them byte for byte, which covers names, frames and all else."""
+    if notes != notes_of(motion, plan["sha256"]):
+        raise BadBag(f"{motion.name}.mcap was made from another plan than {PLAN}. Export the bag again.")
+    left = {topic: iter(said.messages) for topic, said in topics.items()}
+    if any(next(left[message.topic]) != message.data for message in messages_of(motion)):
+        raise BadBag(f"{motion.name}.mcap has other names of joints or frames than the plan. Export the bag again.")
+
+
+# ---- the arms together ------------------------------------------------------------------------------------------
+
+
+def _check_roles(motions: list[ArmMotion], plan: dict[str, Any]) -> None:
+    """Check that one arm of the bag executes the plan, and that the other one matches it.
+
+    The first must have the plan's arm, instrument, rate and number of samples, and end where the plan does.
+    """
+    planned = [motion for motion in motions if motion.role == "PSM_A"]
+    try:
+        if [one.name for one in planned] != [arm_names(plan["arm"])[0]]:
+            raise BadBag(f"The plan is for {plan['arm']}, but the bag has another PSM_A, or none.")
+        psm_a, asked = planned[0], plan["trajectory"]
+        last = plan["passes"][-1 if psm_a.pass_index is None else psm_a.pass_index]
+        goal_mm = np.array(last["path_mm"][-1], dtype=np.float64)
+        same = (psm_a.instrument, psm_a.rate_hz) == (plan["instrument"], asked["rate_hz"])
+        other = plan["psm_m"] or {"base_mm": None}
+        others = [] if other["base_mm"] is None else [other["instrument"]]
+        whole = psm_a.pass_index is not None or len(psm_a.stamps_ns) == asked["samples"]
+        off_mm = float(np.linalg.norm(1000.0 * psm_a.tip_m[-1] - goal_mm))
+    except (LookupError, TypeError, ValueError, AttributeError) as error:
+        raise BadBag(f"{PLAN} has a missing or invalid field. Export the bag again.") from error
+    if not (same and whole):
+        raise BadBag(f"{psm_a.name} has another instrument, rate or number of samples than {PLAN}.")
+    if [motion.instrument for motion in motions if motion.role == "PSM_M"] != others:
+        raise BadBag(f"PSM_M is in the bag and not in {PLAN}, or the other way round, or with another instrument.")
+    if not off_mm <= GOAL_MM:
+        raise BadBag(f"{psm_a.name} ends {off_mm:.3g} mm from the end of the motion in {PLAN}. It must not be played.")
+    if any(not np.array_equal(motion.stamps_ns, psm_a.stamps_ns) for motion in motions):
+        raise BadBag("The two arms have different stamps; they would not move together. Export the bag again.")
+
+
+def _told(motion: ArmMotion) -> str:
+    """Return the summary of an arm's checks, with the bounding box of its motion."""
+    off_mm, _ = _off_the_form(motion)
+    low, high = motion.extent_mm.tolist()
+    box = ", ".join(f"{axis} [{a:.2f}, {b:.2f}]" for axis, a, b in zip("XYZ", low, high, strict=True))
+    seconds = float(motion.stamps_ns[-1] - motion.stamps_ns[0]) / 1e9
+    return (
+        f"{motion.name} ({motion.role}, {motion.instrument}): {len(motion.stamps_ns)} samples in {seconds:.2f} s, "
+        "stamps, jaw and velocities correct, joints and their speeds within the limits, the tip within "
+        f"{off_mm:.1g} mm of the closed form; {box} mm in {motion.frame}."
+    )
+
+
+def _in_mm(joints: Floats) -> Floats:
+    """Return joints in the domain's units: the insertion in mm."""
+    in_mm = joints.copy()
+    in_mm[:, INSERTION] *= 1000.0
+    return in_mm

@@ -1,0 +1,399 @@
+"""Writing MCAP files and bag folders as a dVRK's recorder does, and the ROS 2 messages in them.
+
+    Recording --messages_of--> Message ... --write_messages--> MCAP file --write_bag--> bag folder, zipped
+
+Files have profile ros2, CDR messages with ros2msg schemas, and zstd chunks with checksums. Positions are written in
+metres, angles in radians, stamps in whole nanoseconds; the log time of a message is its stamp. The same messages give
+the same bytes with the same version of the mcap library. `metadata.yaml` is of version 9, which ROS 2 Jazzy writes and
+reads.
+
+A CDR message is a header of four bytes (little-endian), then every number aligned to its own size, counted from the end
+of that header; a string is its length including the terminating zero, then its bytes (OMG CDR; ROS 2 design,
+"Serialization").
+"""
+
+import io
+import struct
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import IO
+
+from mcap.writer import Writer
+
+from skills.arrays import Floats
+from skills.demonstration.recording import Joints, Motion, Recording, Signal
+from skills.errors import BadRecording
+from skills.formats import topics
+from skills.formats.archive import pack
+from skills.formats.mcap.reader import NOTES
+from skills.formats.topics import BOOL, FLOAT64, JOINT_STATE, JOY, POSE, STRING
+
+__all__ = [
+    "DEFINITIONS",
+    "Written",
+    "bag_folder",
+    "messages_of",
+    "metadata_of",
+    "write_bag",
+    "write_mcap",
+    "write_messages",
+]
+
+_NANO = 1_000_000_000
+_RULE = "=" * 80
+_HEADER = f"""{_RULE}
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+{_RULE}
+MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec
+"""
+DEFINITIONS = {
+    POSE: f"""std_msgs/Header header
+geometry_msgs/Pose pose
+{_RULE}
+MSG: geometry_msgs/Pose
+geometry_msgs/Point position
+geometry_msgs/Quaternion orientation
+{_RULE}
+MSG: geometry_msgs/Point
+float64 x
+float64 y
+float64 z
+{_RULE}
+MSG: geometry_msgs/Quaternion
+float64 x
+float64 y
+float64 z
+float64 w
+{_HEADER}""",
+    JOINT_STATE: f"""std_msgs/Header header
+string[] name
+float64[] position
+float64[] velocity
+float64[] effort
+{_HEADER}""",
+    JOY: f"""std_msgs/Header header
+float32[] axes
+int32[] buttons
+{_HEADER}""",
+    BOOL: "bool data\n",
+    FLOAT64: "float64 data\n",
+    STRING: "string data\n",
+}
+HASHES = {  # type description hashes (REP 2016) of ROS 2 Jazzy
+    POSE: "RIHS01_10f3786d7d40fd2b54367835614bff85d4ad3b5dab62bf8bca0cc232d73b4cd8",
+    JOINT_STATE: "RIHS01_a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e",
+    JOY: "RIHS01_0d356c79cad3401e35ffeb75a96a96e08be3ef896b8b83841d73e890989372c5",
+    BOOL: "RIHS01_feb91e995ff9ebd09c0cb3d2aed18b11077585839fb5db80193b62d74528f6c9",
+    FLOAT64: "RIHS01_705ba9c3d1a09df43737eb67095534de36fd426c0587779bda2bc51fe790182a",
+    STRING: "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """One serialised message: log time, topic, type and bytes."""
+
+    log_ns: int
+    topic: str
+    type: str
+    data: bytes
+
+
+def pose(
+    topic: str,
+    stamp_ns: int,
+    frame: str,
+    place_m: Sequence[float],
+    turn_xyzw: Sequence[float],
+    *,
+    log_ns: int | None = None,
+) -> Message:
+    """Return a PoseStamped message.
+
+    Args:
+        topic: The topic.
+        stamp_ns: Stamp of the header.
+        frame: Frame of the header.
+        place_m: Position, 3 numbers.
+        turn_xyzw: Unit quaternion, 4 numbers.
+        log_ns: Log time, by default the stamp; the same for the functions below.
+    """
+    body = _Body()
+    body.header(stamp_ns, frame)
+    body.put("7d", *place_m, *turn_xyzw)
+    return Message(stamp_ns if log_ns is None else log_ns, topic, POSE, bytes(body.data))
+
+
+def joint_state(
+    topic: str,
+    stamp_ns: int,
+    positions: Sequence[float],
+    names: Sequence[str] = (),
+    *,
+    velocities: Sequence[float] = (),
+    frame: str = "",
+    log_ns: int | None = None,
+) -> Message:
+    """Return a JointState message with positions in rad or m, optional velocities, and no efforts."""
+    body = _Body()
+    body.header(stamp_ns, frame)
+    body.put("I", len(names))
+    for name in names:
+        body.text(name)
+    body.numbers("d", positions)
+    body.numbers("d", velocities)
+    body.numbers("d", ())
+    return Message(stamp_ns if log_ns is None else log_ns, topic, JOINT_STATE, bytes(body.data))
+
+
+def joy(topic: str, stamp_ns: int, buttons: Sequence[int], *, frame: str = "", log_ns: int | None = None) -> Message:
+    """Return a Joy message with a pedal's state: `buttons[0]` is 0 released, 1 pressed, 2 a quick tap."""
+    body = _Body()
+    body.header(stamp_ns, frame)
+    body.numbers("f", ())
+    body.numbers("i", buttons)
+    return Message(stamp_ns if log_ns is None else log_ns, topic, JOY, bytes(body.data))
+
+
+def boolean(topic: str, log_ns: int, value: bool) -> Message:
+    """Return a Bool message, which has no stamp."""
+    body = _Body()
+    body.put("?", value)
+    return Message(log_ns, topic, BOOL, bytes(body.data))
+
+
+def number(topic: str, log_ns: int, value: float) -> Message:
+    """Return a Float64 message, which has no stamp."""
+    body = _Body()
+    body.put("d", value)
+    return Message(log_ns, topic, FLOAT64, bytes(body.data))
+
+
+def text(topic: str, log_ns: int, value: str) -> Message:
+    """Return a String message, which has no stamp."""
+    body = _Body()
+    body.text(value)
+    return Message(log_ns, topic, STRING, bytes(body.data))
+
+
+class _Body:
+    """A builder of a message's bytes."""
+
+    def __init__(self) -> None:
+        self.data = bytearray(b"\x00\x01\x00\x00")  # plain CDR, little-endian
+
+    def put(self, code: str, *values: float) -> None:
+        """Append numbers of one size, aligned to it."""
+        size = struct.calcsize(code[-1])
+        self.data.extend(bytes(-(len(self.data) - 4) % size))  # aligned from the end of the header
+        self.data += struct.pack("<" + code, *values)
+
+    def text(self, value: str) -> None:
+        """Append a string."""
+        data = value.encode() + b"\0"
+        self.put("I", len(data))
+        self.data += data
+
+    def numbers(self, code: str, values: Sequence[float]) -> None:
+        """Append a sequence: its length, then its elements."""
+        self.put("I", len(values))
+        if values:
+            self.put(f"{len(values)}{code}", *values)
+
+    def header(self, stamp_ns: int, frame: str) -> None:
+        """Append a std_msgs/Header."""
+        self.put("i", stamp_ns // _NANO)
+        self.put("I", stamp_ns % _NANO)
+        self.text(frame)
+
+
+_LIBRARY = "suture-skills"
+_QOS = "offered_qos_profiles"
+_INSERTION = 2  # the PSM's only prismatic joint
+
+
+@dataclass
+class Written:
+    """Statistics of a written file: messages by topic, and the log times of the first and the last message."""
+
+    counts: dict[tuple[str, str], int] = field(default_factory=dict)
+    first_ns: int | None = None
+    last_ns: int = 0
+
+    def count(self, message: Message) -> int:
+        """Count a message, and return the number of earlier messages on its topic."""
+        before = self.counts.get((message.topic, message.type), 0)
+        self.counts[message.topic, message.type] = before + 1
+        self.first_ns = message.log_ns if self.first_ns is None else min(self.first_ns, message.log_ns)
+        self.last_ns = max(self.last_ns, message.log_ns)
+        return before
+
+
+def write_mcap(recording: Recording) -> bytes:
+    """Return the recording as the bytes of an MCAP file.
+
+    Args:
+        recording: Every motion needs an orientation, because a PoseStamped has one; stamps count from 1970.
+
+    Raises:
+        BadRecording: A motion without orientation, or a stamp before 1970.
+    """
+    file = io.BytesIO()
+    write_messages(messages_of(recording), file, dict(recording.notes))
+    return file.getvalue()
+
+
+def write_messages(said: Iterable[Message], file: IO[bytes], notes: Mapping[str, str] | None = None) -> Written:
+    """Write messages as an MCAP file.
+
+    Args:
+        said: The messages, in the order of writing.
+        file: The file.
+        notes: Stored in a metadata record of the file.
+    """
+    writer, written = Writer(file), Written()
+    writer.start(profile="ros2", library=_LIBRARY)
+    schemas: dict[str, int] = {}
+    channels: dict[tuple[str, str], int] = {}
+    if notes:
+        writer.add_metadata(NOTES, dict(notes))
+    for message in said:
+        key = (message.topic, message.type)
+        if message.type not in schemas:
+            definition = DEFINITIONS[message.type].encode()
+            schemas[message.type] = writer.register_schema(message.type, "ros2msg", definition)
+        if key not in channels:
+            channels[key] = writer.register_channel(message.topic, "cdr", schemas[message.type], {_QOS: "[]"})
+        writer.add_message(channels[key], message.log_ns, message.data, message.log_ns, written.count(message))
+    writer.finish()  # type: ignore[no-untyped-call]
+    return written
+
+
+def write_bag(said: Iterable[Message], name: str = "bag", notes: Mapping[str, str] | None = None) -> bytes:
+    """Return messages as a zipped bag folder, which `ros2 bag` can open when unpacked."""
+    out = io.BytesIO()
+    pack({member: io.BytesIO(data) for member, data in bag_folder(said, name, notes).items()}, out)
+    return out.getvalue()
+
+
+def bag_folder(said: Iterable[Message], name: str, notes: Mapping[str, str] | None = None) -> dict[str, bytes]:
+    """Return messages as the files of a bag folder: `NAME/metadata.yaml` and `NAME/NAME.mcap`."""
+    file = io.BytesIO()
+    written = write_messages(said, file, notes)
+    return {f"{name}/metadata.yaml": metadata_of(written, f"{name}.mcap"), f"{name}/{name}.mcap": file.getvalue()}
+
+
+def messages_of(recording: Recording) -> list[Message]:
+    """Return the complete contents of a recording as messages, in order of time.
+
+    Raises:
+        BadRecording: As `write_mcap`.
+    """
+    if recording.origin_ns < 0:
+        raise BadRecording("A message needs a stamp after 1970; set one before writing.")
+    # By topic too, so that messages of the same time have a defined order.
+    return sorted(_messages(recording), key=lambda message: (message.log_ns, message.topic))
+
+
+def _messages(recording: Recording) -> Iterator[Message]:
+    for motion in recording.motions:
+        yield from _poses(motion, "local/measured_cp")
+    for motion in recording.masters:
+        yield from _poses(motion, "measured_cp")
+    for joints in recording.joints:
+        topic = _named(joints.topic, f"/{joints.arm}/measured_js")
+        for stamp_ns, row in zip(joints.stamps_ns.tolist(), _metric(joints).tolist(), strict=True):
+            yield joint_state(topic, stamp_ns, row)
+    for kind, signals in (("jaw", recording.jaws), ("gripper", recording.grippers)):
+        for arm, signal in signals:
+            for stamp_ns, value in _samples(signal):
+                yield joint_state(f"/{arm}/{kind}/measured_js", stamp_ns, [value], [kind])
+    for topic, pedal in _pedals(recording):
+        for stamp_ns, value in _samples(pedal):
+            yield joy(topic, stamp_ns, [int(value)])
+    for name, signal in recording.following:
+        for stamp_ns, value in _samples(signal):
+            yield boolean(f"/{name}/following", stamp_ns, bool(value))
+    for name, signal in recording.scales:
+        for stamp_ns, value in _samples(signal):
+            yield number(f"/{name}/scale", stamp_ns, value)
+    for arm, tool in recording.tools:
+        yield text(f"/{arm}/tool_type", recording.origin_ns, tool)
+
+
+def _poses(motion: Motion, topic: str) -> Iterator[Message]:
+    if motion.rotation_xyzw is None:
+        raise BadRecording(f"{motion.topic} has no orientation, and a pose message needs one; add it before writing.")
+    topic = _named(motion.topic, f"/{motion.arm}/{topic}")
+    places = (motion.tip_mm / 1000.0).tolist()  # ROS messages are in metres
+    for stamp_ns, place_m, turn in zip(motion.stamps_ns.tolist(), places, motion.rotation_xyzw.tolist(), strict=True):
+        yield pose(topic, stamp_ns, motion.frame, place_m, turn)
+
+
+def _metric(joints: Joints) -> Floats:
+    """Return joint positions in a message's units: the insertion in metres."""
+    positions = joints.positions.copy()
+    if joints.arm.upper().startswith("PSM"):
+        positions[:, _INSERTION : _INSERTION + 1] /= 1000.0
+    return positions
+
+
+def _pedals(recording: Recording) -> Iterator[tuple[str, Signal]]:
+    yield from recording.pedals
+    clutch = recording.clutch
+    if clutch is not None:
+        topic = _named(clutch.topic, topics.CLUTCH_TOPICS[0])
+        if topic not in dict(recording.pedals):  # an MCAP file's clutch is one of its pedals, a table's is not
+            yield topic, clutch
+
+
+def _named(topic: str, otherwise: str) -> str:
+    return topic if topic.startswith("/") else otherwise
+
+
+def _samples(signal: Signal) -> Iterator[tuple[int, float]]:
+    return zip(signal.stamps_ns.tolist(), signal.values.tolist(), strict=True)
+
+
+def metadata_of(written: Written, file: str) -> bytes:
+    """Return the metadata.yaml of a bag with one file, as ROS 2 Jazzy writes it (version 9)."""
+    start_ns, count = written.first_ns or 0, sum(written.counts.values())
+    duration_ns = written.last_ns - start_ns
+    topics_with_count = "".join(
+        f"""
+    - topic_metadata:
+        name: {topic}
+        type: {kind}
+        serialization_format: cdr
+        {_QOS}: []
+        type_description_hash: {HASHES[kind]}
+      message_count: {messages_on}"""
+        for (topic, kind), messages_on in written.counts.items()
+    )
+    return f"""rosbag2_bagfile_information:
+  version: 9
+  storage_identifier: mcap
+  duration:
+    nanoseconds: {duration_ns}
+  starting_time:
+    nanoseconds_since_epoch: {start_ns}
+  message_count: {count}
+  topics_with_message_count:{topics_with_count or " []"}
+  compression_format: ""
+  compression_mode: ""
+  relative_file_paths:
+    - {file}
+  files:
+    - path: {file}
+      starting_time:
+        nanoseconds_since_epoch: {start_ns}
+      duration:
+        nanoseconds: {duration_ns}
+      message_count: {count}
+  custom_data: ~
+  ros_distro: jazzy
+""".encode()

@@ -1,0 +1,1 @@
+"""The grid world (Sec. III-B, III-C): cells, moves, rewards, phases. Pure: numpy in, numpy out."""

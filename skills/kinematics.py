@@ -1,0 +1,552 @@
+"""The patient-side manipulator (PSM) as numbers: its constants, forward kinematics and closed-form inverse kinematics.
+
+Joints are rows of six in the order of `JOINTS`: yaw, pitch, insertion, roll, wrist pitch, wrist yaw. All are radians
+but the insertion, which is in **millimetres** like every length of the domain; `skills.simulation` converts it to
+metres for the simulator. Positions are in the PSM base frame: origin at the remote centre, the tool along -z at zero
+joints.
+
+The tip is that of the dVRK's `local/measured_cp`: on the hinge of the jaws, `JAW_TIP_MM` before the finger tips.
+A rotation's columns are [n o a]: n the hinge axis, o from finger to finger, a the approach.
+
+Source: jhu-dvrk/sawIntuitiveResearchKit @9e535e68, share/kinematic/PSM.json and PSM_Si.json, share/tool/
+LARGE_NEEDLE_DRIVER_400006.json and _420006.json, in modified (Craig) Denavit-Hartenberg convention,
+T_i = Rx(alpha) Tx(a) Rz(theta) Tz(d). The inverse is ours.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import isnan, nan, pi, radians
+from types import MappingProxyType
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from skills.arrays import Flags, Floats, Ints, frozen
+from skills.errors import BadInput, ImproperRotation, UnknownInstrument, Unreachable
+from skills.fields import Point, Six, schema
+
+JOINTS = ("yaw", "pitch", "insertion", "roll", "wrist_pitch", "wrist_yaw")
+Unit = Literal["rad", "mm"]
+UNITS: tuple[Unit, ...] = ("rad", "rad", "mm", "rad", "rad", "rad")
+INSERTION = 2
+ROLL = 3
+
+WRIST_MM = 9.1  # from the wrist's pitch axis to the hinge of the jaws
+JAW_TIP_MM = 10.2  # from the hinge to the finger tips, along the approach (dvrk_model @70998aa)
+CANNULA_MM = 35.0  # with a smaller insertion the wrist is still inside the cannula (saw engages at 25 mm)
+_ROUND_OFF = 1e-9  # rad and mm: a joint exactly at its limit is within it
+
+
+@schema
+@dataclass(frozen=True)
+class ArmConstants:
+    """A PSM without its instrument: the position of its remote centre and the limits of its joints.
+
+    Attributes:
+        name: Name for messages.
+        remote_centre_mm: Position of the remote centre in the insertion's row of the DH table, where d is the insertion
+            minus this.
+        lower: Lower joint limits, rad, insertion mm.
+        upper: Upper joint limits, rad, insertion mm.
+        speed: Speed limits with which saw plans, not those of the motors, rad/s, insertion mm/s.
+        acceleration: Acceleration limits with which saw plans, not those of the motors, rad/s2, insertion mm/s2.
+        effort: ftmax in Nm, insertion N, used by the servo check.
+    """
+
+    name: str
+    remote_centre_mm: float
+    lower: Six
+    upper: Six
+    speed: Six
+    acceleration: Six
+    effort: Six
+
+
+@schema
+@dataclass(frozen=True)
+class InstrumentConstants:
+    """A tool on an arm.
+
+    Attributes:
+        name: The tool's number in the dVRK's files.
+        arm: The arm that it fits on.
+        shaft_mm: Length of its shaft up to the wrist.
+        jaw_rad: Range of the opening of its jaws.
+    """
+
+    name: str
+    arm: ArmConstants
+    shaft_mm: float
+    jaw_rad: tuple[float, float]
+
+    @property
+    def wrist_offset_mm(self) -> float:
+        """Distance by which the wrist lags behind the insertion: at this insertion it is in the remote centre."""
+        return self.arm.remote_centre_mm - self.shaft_mm
+
+    @property
+    def lower(self) -> Floats:
+        """The joints' lower limits, rad and mm, shape (6,)."""
+        return np.array(self.arm.lower)
+
+    @property
+    def upper(self) -> Floats:
+        """The joints' upper limits, rad and mm, shape (6,)."""
+        return np.array(self.arm.upper)
+
+    @property
+    def speed(self) -> Floats:
+        """The joints' speed limits, rad/s and mm/s, shape (6,)."""
+        return np.array(self.arm.speed)
+
+    @property
+    def acceleration(self) -> Floats:
+        """The joints' acceleration limits, rad/s2 and mm/s2, shape (6,)."""
+        return np.array(self.arm.acceleration)
+
+
+_SPEED: Six = (radians(90), radians(90), 200.0, radians(1080), radians(1080), radians(1080))
+_ACCELERATION: Six = (radians(90), radians(90), 200.0, radians(720), radians(720), radians(720))
+_EFFORT: Six = (3.316, 3.316, 9.878, 0.33, 0.25, 0.20)
+
+CLASSIC = ArmConstants(
+    name="PSM Classic",
+    remote_centre_mm=431.8,
+    lower=(radians(-91), radians(-53), 0.0, radians(-260), radians(-80), radians(-80)),
+    upper=(radians(91), radians(53), 240.0, radians(260), radians(80), radians(80)),
+    speed=_SPEED,
+    acceleration=_ACCELERATION,
+    effort=_EFFORT,
+)
+# For the Si only the limits of the first three joints are published; the others are assumed to be the Classic's.
+SI = ArmConstants(
+    name="PSM Si",
+    remote_centre_mm=482.6,
+    lower=(-2.964, -1.265, 0.0, radians(-260), radians(-80), radians(-80)),
+    upper=(2.964, 1.301, 290.0, radians(260), radians(80), radians(80)),
+    speed=_SPEED,
+    acceleration=_ACCELERATION,
+    effort=_EFFORT,
+)
+
+DEFAULT_INSTRUMENT = "400006"
+INSTRUMENTS: Mapping[str, InstrumentConstants] = MappingProxyType(
+    {
+        "400006": InstrumentConstants("400006", CLASSIC, 416.2, (radians(-40), radians(80))),
+        "420006": InstrumentConstants("420006", SI, 467.0, (radians(-20), radians(80))),
+    }
+)
+
+# The paper's orientation at zero joints: the tool points down, its hinge axis along +y.
+POINTING_DOWN: Floats = frozen([[0, 1, 0], [1, 0, 0], [0, 0, -1]], np.float64, (3, 3), "POINTING_DOWN")
+# From the last DH frame to the tip: a rotation only, because the tip is on the hinge.
+_TIP_IN_HINGE: Floats = frozen([[0, -1, 0], [0, 0, 1], [-1, 0, 0]], np.float64, (3, 3), "_TIP_IN_HINGE")
+
+
+def instrument_of(name: str) -> InstrumentConstants:
+    """Return an instrument by its number.
+
+    Args:
+        name: The tool's number in the dVRK's files, such as "400006".
+
+    Returns:
+        The instrument, with its arm.
+
+    Raises:
+        UnknownInstrument: No constants are known for it; the message lists those that are.
+    """
+    if name not in INSTRUMENTS:
+        known = ", ".join(INSTRUMENTS)
+        raise UnknownInstrument(f"The instrument {name!r} is unknown; use one of {known}.", instrument=name)
+    return INSTRUMENTS[name]
+
+
+# ---- forward ---------------------------------------------------------------------------------------------------
+
+
+def forward(joints: ArrayLike, instrument: str = DEFAULT_INSTRUMENT) -> tuple[Floats, Floats]:
+    """Compute the pose of the tip from the joints.
+
+    Args:
+        joints: Rows of `JOINTS`, rad and mm, shape (T, 6). Limits are not checked.
+        instrument: Number of the instrument.
+
+    Returns:
+        The tip in the PSM base frame in mm, shape (T, 3), and its rotation [n o a], shape (T, 3, 3).
+    """
+    q = frozen(joints, np.float64, (None, 6), "joints")
+    tool = instrument_of(instrument)
+    pose = np.broadcast_to(np.eye(4), (len(q), 4, 4))
+    for alpha, a, theta, d in (
+        (+pi / 2, 0.0, q[:, 0] + pi / 2, 0.0),
+        (-pi / 2, 0.0, q[:, 1] - pi / 2, 0.0),
+        (+pi / 2, 0.0, 0.0, q[:, 2] - tool.arm.remote_centre_mm),
+        (0.0, 0.0, q[:, 3], tool.shaft_mm),
+        (-pi / 2, 0.0, q[:, 4] - pi / 2, 0.0),
+        (-pi / 2, WRIST_MM, q[:, 5] - pi / 2, 0.0),
+    ):
+        pose = pose @ _link(alpha, a, theta, d, len(q))
+    return pose[:, :3, 3].copy(), pose[:, :3, :3] @ _TIP_IN_HINGE
+
+
+def _link(alpha: float, a: float, theta: Floats | float, d: Floats | float, count: int) -> Floats:
+    """Return one row of the modified DH table as a homogeneous transform per sample, shape (T, 4, 4)."""
+    # Exact for the table's multiples of a right angle, where np.cos(pi / 2) would leave 6e-17.
+    ca, sa = float(np.round(np.cos(alpha), 12)), float(np.round(np.sin(alpha), 12))
+    ct, st = np.cos(theta), np.sin(theta)
+    link = np.zeros((count, 4, 4))
+    link[:, 0, 0], link[:, 0, 1], link[:, 0, 3] = ct, -st, a
+    link[:, 1, 0], link[:, 1, 1], link[:, 1, 2], link[:, 1, 3] = st * ca, ct * ca, -sa, -sa * d
+    link[:, 2, 0], link[:, 2, 1], link[:, 2, 2], link[:, 2, 3] = st * sa, ct * sa, ca, ca * d
+    link[:, 3, 3] = 1.0
+    return link
+
+
+# ---- inverse ---------------------------------------------------------------------------------------------------
+
+
+def inverse(
+    tip_mm: ArrayLike, rotation: ArrayLike, instrument: str = DEFAULT_INSTRUMENT, near: ArrayLike | None = None
+) -> Floats:
+    """Compute the joints of given poses of the tip, in closed form.
+
+    Of the solutions within the limits each sample takes the one nearest to that of the sample before: the least time at
+    full joint speed, summed over the joints. Only solutions with the wrist beyond the remote centre are considered,
+    where it is outside the cannula.
+
+    Args:
+        tip_mm: Tip in the PSM base frame, mm, shape (T, 3).
+        rotation: Its rotation [n o a], shape (T, 3, 3), or (3, 3) if it is constant.
+        instrument: Number of the instrument.
+        near: Joints before the first sample, shape (6,), rad and mm; by default all 0, with roll and wrist straight.
+
+    Returns:
+        Rows of `JOINTS`, rad and mm, shape (T, 6).
+
+    Raises:
+        BadInput: A number is NaN or infinite, or the shapes do not agree.
+        ImproperRotation: A rotation is not orthonormal with determinant 1.
+        Unreachable: A pose is out of reach; its attributes name the first such sample, its joint, value and limit.
+    """
+    tool = instrument_of(instrument)
+    tip, turned = _poses(tip_mm, rotation)
+    if not len(tip):
+        return np.empty((0, 6))
+    solutions = solutions_of(tip, turned, tool)
+    allowed = _within_limits(solutions, tool)
+    reached = allowed.any(axis=1)
+    if not reached.all():
+        raise _out_of_reach(int(np.argmin(reached)), tip, solutions, tool)
+    before = np.zeros(6) if near is None else frozen(near, np.float64, (6,), "near")
+    chosen = _nearest_branch(solutions, allowed, before, tool)
+    return solutions[np.arange(len(tip)), chosen]
+
+
+def reachable(tip_mm: ArrayLike, rotation: ArrayLike, instrument: str = DEFAULT_INSTRUMENT) -> Flags:
+    """Return which poses the arm can take within its joint limits.
+
+    Args:
+        tip_mm: Tip in the PSM base frame, mm, shape (T, 3).
+        rotation: Its rotation [n o a], shape (T, 3, 3), or (3, 3) if it is constant.
+        instrument: Number of the instrument.
+
+    Returns:
+        Flags of shape (T,).
+
+    Raises:
+        BadInput, ImproperRotation: As for `inverse`.
+    """
+    tool = instrument_of(instrument)
+    tip, turned = _poses(tip_mm, rotation)
+    return np.asarray(_within_limits(solutions_of(tip, turned, tool), tool).any(axis=1))
+
+
+@schema
+@dataclass(frozen=True)
+class NearestLimit:
+    """The place on a path at which a joint comes nearest to its limit, or goes furthest beyond it.
+
+    Joints are compared relative to their range, and at each place in the solution that stays furthest from the limits.
+
+    Attributes:
+        tip_mm: The place, in the PSM base frame.
+        joint: Name of the joint.
+        unit: Unit of the following numbers.
+        limit: The limit nearest to the joint's value.
+        value: Value of the joint; null if no joints put the tip there.
+        margin: Distance from the limit, negative beyond it; null if no joints put the tip there.
+    """
+
+    tip_mm: Point
+    joint: str
+    unit: Unit
+    limit: float
+    value: float | None
+    margin: float | None
+
+
+def nearest_limit(
+    tip_mm: ArrayLike, rotation: ArrayLike, instrument: str = DEFAULT_INSTRUMENT
+) -> tuple[NearestLimit, int]:
+    """Find the pose that comes nearest to a joint limit, and count the poses beyond the limits.
+
+    Args:
+        tip_mm: Tip in the PSM base frame, mm, shape (T, 3), T at least 1.
+        rotation: Its rotation [n o a], shape (T, 3, 3), or (3, 3) if it is constant.
+        instrument: Number of the instrument.
+
+    Returns:
+        The nearest pose, with its joint and margin; and the number of poses that no joints within the limits reach.
+
+    Raises:
+        BadInput, ImproperRotation: As for `inverse`.
+    """
+    tool = instrument_of(instrument)
+    tip, turned = _poses(tip_mm, rotation)
+    solutions = solutions_of(tip, turned, tool)
+    return _nearest_limit(tip, solutions, tool), int(np.count_nonzero(~_within_limits(solutions, tool).any(axis=1)))
+
+
+def joint_margins(joints: ArrayLike, instrument: str = DEFAULT_INSTRUMENT) -> Floats:
+    """Return the distance of each joint from its nearer limit; negative beyond the limit.
+
+    Args:
+        joints: Rows of `JOINTS`, rad and mm, shape (T, 6).
+        instrument: Number of the instrument.
+
+    Returns:
+        Distances in rad and mm, shape (T, 6).
+    """
+    tool = instrument_of(instrument)
+    q = np.asarray(joints, dtype=np.float64)
+    return np.minimum(q - tool.lower, tool.upper - q)
+
+
+def _poses(tip_mm: ArrayLike, rotation: ArrayLike) -> tuple[Floats, Floats]:
+    """Check the poses of a caller (finite, of one length, the rotations proper), and repeat a constant rotation."""
+    tip = frozen(tip_mm, np.float64, (None, 3), "tip_mm")
+    turned = np.asarray(rotation, dtype=np.float64)
+    held = turned.shape == (3, 3)
+    turned = frozen(turned[None] if held else turned, np.float64, (None, 3, 3), "rotation")
+    if not held and len(turned) != len(tip):
+        raise BadInput(f"{len(tip)} positions need {len(tip)} rotations or one, not {len(turned)}.")
+    check_rotation(turned)
+    return tip, np.broadcast_to(turned, (len(tip), 3, 3))
+
+
+def solutions_of(tip: Floats, rotation: Floats, tool: InstrumentConstants) -> Floats:
+    """List all solutions of all poses regardless of limits: two wrists times three turns of the roll.
+
+    The wrist's pitch axis z5 is normal to both the tip's position and the wrist's yaw axis z6, because shaft, wrist
+    and hinge lie in one plane; its two signs are the two branches.
+
+    Args:
+        tip: Tip in the PSM base frame, mm, shape (T, 3).
+        rotation: Its rotation [n o a], shape (T, 3, 3), checked.
+        tool: The instrument.
+
+    Returns:
+        Joints, rad and mm, shape (T, 6, 6): solutions, then joints; NaN where the wrist is in the remote centre.
+    """
+    hinge = rotation @ _TIP_IN_HINGE.T
+    x6, z6 = hinge[:, :, 0], hinge[:, :, 2]
+    normal = _cross(tip, z6)
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    # If the tip lies on z6, every perpendicular is a solution; x6 is one of them.
+    z5 = np.where(length > 1e-9, normal / np.where(length > 1e-9, length, 1.0), x6)
+    wrists = _wrists(tip, x6, z6, np.stack([z5, -z5]), tool)
+    # Only the roll, with limits of 260 degrees either way, has room for a full turn more or less.
+    turns = np.zeros((3, 6))
+    turns[:, ROLL] = 0.0, 2 * pi, -2 * pi
+    return (wrists.swapaxes(0, 1)[:, :, None, :] + turns).reshape(len(tip), 6, 6)
+
+
+def _wrists(tip: Floats, x6: Floats, z6: Floats, z5: Floats, tool: InstrumentConstants) -> Floats:
+    """Compute all joints for two choices of the wrist's pitch axis z5, (2, T, 6); NaN if the shaft has no direction."""
+    x5 = _cross(z6, z5)
+    wrist = tip - WRIST_MM * x5
+    depth = np.linalg.norm(wrist, axis=-1)
+    # With the wrist in the remote centre the shaft's direction is undetermined; the wrist is inside the cannula there.
+    shaft = wrist / np.where(depth > 1e-6, depth, np.nan)[..., None]
+    yaw = np.arctan2(shaft[..., 0], -shaft[..., 2])
+    pitch = -np.arcsin(np.clip(shaft[..., 1], -1.0, 1.0))
+    s1, c1, s2, c2 = np.sin(yaw), np.cos(yaw), np.sin(pitch), np.cos(pitch)
+    x3 = np.stack([-s1 * s2, -c2, c1 * s2], axis=-1)
+    y3 = _cross(shaft, x3)
+    roll = np.arctan2(-_dot(z5, x3), _dot(z5, y3))
+    x4 = np.cos(roll)[..., None] * x3 + np.sin(roll)[..., None] * y3
+    wrist_pitch = _wrapped(np.arctan2(-_dot(x5, shaft), _dot(x5, x4)) + pi / 2)
+    wrist_yaw = _wrapped(np.arctan2(-_dot(x6, z5), _dot(x6, x5)) + pi / 2)
+    return np.stack([yaw, pitch, depth + tool.wrist_offset_mm, roll, wrist_pitch, wrist_yaw], axis=-1)
+
+
+def _within_limits(solutions: Floats, tool: InstrumentConstants) -> Flags:
+    """Return which solutions are within the limits of all joints, shape (T, solutions); false for NaN."""
+    inside = (solutions >= tool.lower - _ROUND_OFF) & (solutions <= tool.upper + _ROUND_OFF)
+    return np.asarray(inside.all(axis=2))
+
+
+def _nearest_branch(solutions: Floats, allowed: Flags, before: Floats, tool: InstrumentConstants) -> Ints:
+    """Choose for each sample the allowed solution nearest to the one chosen for the sample before, shape (T,)."""
+    width = int(allowed.sum(axis=1).max())
+    # The allowed ones come first; they are rarely more than two, so the arrays below stay small.
+    order = np.argsort(~allowed, axis=1, kind="stable")[:, :width]
+    best = np.take_along_axis(solutions, order[:, :, None], axis=1)
+    barred = ~np.take_along_axis(allowed, order, axis=1)
+    first = np.where(barred[0], np.inf, (np.abs(best[0] - before) / tool.speed).sum(axis=1))
+    seconds = (np.abs(best[1:, None, :, :] - best[:-1, :, None, :]) / tool.speed).sum(axis=3)
+    following = np.where(barred[1:, None, :], np.inf, seconds).argmin(axis=2).tolist()
+    branch = [int(first.argmin())]
+    for options in following:
+        branch.append(options[branch[-1]])
+    return np.asarray(order[np.arange(len(order)), branch], dtype=np.int64)
+
+
+def _nearest_limit(tip: Floats, solutions: Floats, tool: InstrumentConstants) -> NearestLimit:
+    """Find the pose whose best solution, of shape (T, solutions, 6), is nearest a limit; NaN is furthest beyond."""
+    margins = np.minimum(solutions - tool.lower, tool.upper - solutions)
+    parts = np.where(np.isnan(margins), -np.inf, margins / (tool.upper - tool.lower))
+    best = parts.min(axis=2).argmax(axis=1)
+    of_best = parts[np.arange(len(parts)), best]
+    sample = int(of_best.min(axis=1).argmin())
+    joint = int(of_best[sample].argmin())
+    value, margin = (float(of[sample, best[sample], joint]) for of in (solutions, margins))
+    x, y, z = tip[sample].tolist()
+    nearer_upper = tool.upper[joint] - value < value - tool.lower[joint]
+    return NearestLimit(
+        tip_mm=(x, y, z),
+        joint=JOINTS[joint],
+        unit=UNITS[joint],
+        limit=float(tool.upper[joint] if nearer_upper else tool.lower[joint]),
+        value=None if isnan(value) else value,
+        margin=None if isnan(margin) else margin,
+    )
+
+
+def _out_of_reach(sample: int, tip: Floats, solutions: Floats, tool: InstrumentConstants) -> Unreachable:
+    """Return the error that names the joint furthest over its limit, in the solution that exceeds the limits least."""
+    nearest = _nearest_limit(tip[sample : sample + 1], solutions[sample : sample + 1], tool)
+    value = nan if nearest.value is None else nearest.value
+    where = ", ".join(f"{x:.1f}" for x in tip[sample])
+    return Unreachable(
+        f"Sample {sample} at ({where}) mm needs {nearest.joint} {value:.5g} {nearest.unit}, beyond the limit "
+        f"{nearest.limit:.4g} of the {tool.arm.name} with {tool.name}; move the point or turn the tool.",
+        sample=sample,
+        joint=nearest.joint,
+        value=value,
+        limit=nearest.limit,
+        tip_mm=tip[sample].tolist(),
+    )
+
+
+def _dot(u: Floats, v: Floats) -> Floats:
+    return np.asarray(np.einsum("...i,...i->...", u, v))
+
+
+def _cross(u: Floats, v: Floats) -> Floats:
+    """Return the cross product; numpy's own, for vectors of any length, takes four times as long for a short path."""
+    a, b, c = u[..., 0], u[..., 1], u[..., 2]
+    x, y, z = v[..., 0], v[..., 1], v[..., 2]
+    return np.stack([b * z - c * y, c * x - a * z, a * y - b * x], axis=-1)
+
+
+def _wrapped(angle: Floats) -> Floats:
+    """Wrap angles into (-pi, pi]."""
+    return np.asarray(pi - (pi - angle) % (2 * pi))
+
+
+# ---- rotations -------------------------------------------------------------------------------------------------
+
+
+def check_rotation(rotation: Floats) -> None:
+    """Refuse matrices that are not proper rotations to within 1e-6.
+
+    Args:
+        rotation: Matrices, shape (T, 3, 3).
+
+    Raises:
+        ImproperRotation: A matrix is not orthonormal with determinant 1; `sample` is the index of the first.
+    """
+    skew = np.abs(np.swapaxes(rotation, -1, -2) @ rotation - np.eye(3)).max(axis=(-1, -2), initial=0.0)
+    good = (skew < 1e-6) & (np.linalg.det(rotation) > 0)
+    if not good.all():
+        sample = int(np.argmin(good))
+        raise ImproperRotation(f"Rotation {sample} is not orthonormal with determinant 1; normalise it.", sample=sample)
+
+
+def matrix_of(rotation_xyzw: ArrayLike) -> Floats:
+    """Convert quaternions to rotation matrices.
+
+    Args:
+        rotation_xyzw: Quaternions x, y, z, w of any length but 0, shape (T, 4).
+
+    Returns:
+        Rotations, shape (T, 3, 3).
+
+    Raises:
+        BadInput: A number is NaN or infinite.
+        ImproperRotation: A quaternion has length 0.
+    """
+    q = frozen(rotation_xyzw, np.float64, (None, 4), "rotation_xyzw")
+    length = np.linalg.norm(q, axis=1, keepdims=True)
+    if not (length > 1e-9).all():
+        raise ImproperRotation("A quaternion has length 0; give a unit quaternion.", sample=int(np.argmin(length)))
+    x, y, z, w = (q / length).T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.moveaxis(np.array(rows), 2, 0)
+
+
+def quaternion_of(rotation: ArrayLike) -> Floats:
+    """Convert rotation matrices to unit quaternions.
+
+    Of the two quaternions of a rotation, the first sample has its largest component positive, and each following sample
+    has the one nearer to its predecessor, so that a smooth turn has smooth quaternions.
+
+    Args:
+        rotation: Rotations, shape (T, 3, 3).
+
+    Returns:
+        Unit quaternions x, y, z, w, shape (T, 4).
+
+    Raises:
+        BadInput, ImproperRotation: A number is not finite, or a matrix is not a proper rotation.
+    """
+    m = frozen(rotation, np.float64, (None, 3, 3), "rotation")
+    check_rotation(m)
+    xx, yy, zz = m[:, 0, 0], m[:, 1, 1], m[:, 2, 2]
+    xy, xz, yz = m[:, 0, 1] + m[:, 1, 0], m[:, 0, 2] + m[:, 2, 0], m[:, 1, 2] + m[:, 2, 1]
+    xw, yw, zw = m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1]
+    # Four times the quaternion's outer product with itself: its row of the largest diagonal is the best conditioned.
+    outer = np.array(
+        [
+            [1 + xx - yy - zz, xy, xz, xw],
+            [xy, 1 - xx + yy - zz, yz, yw],
+            [xz, yz, 1 - xx - yy + zz, zw],
+            [xw, yw, zw, 1 + xx + yy + zz],
+        ]
+    )
+    largest = np.argmax(np.einsum("iit->it", outer), axis=0)
+    q = outer[largest, :, np.arange(len(m))]
+    q = q / np.linalg.norm(q, axis=1, keepdims=True)
+    flips = np.where(np.einsum("ti,ti->t", q[1:], q[:-1]) < 0, -1.0, 1.0)
+    q[1:] *= np.cumprod(flips)[:, None]
+    return np.asarray(q)
+
+
+def angle_between(rotation: Floats, other: Floats) -> Floats:
+    """Return the angle of the turn from one rotation to another.
+
+    Args:
+        rotation: Rotations, shape (T, 3, 3).
+        other: Rotations, shape (T, 3, 3).
+
+    Returns:
+        Angles in rad, 0 to pi, shape (T,).
+    """
+    q = quaternion_of(np.swapaxes(rotation, -1, -2) @ other)
+    return np.asarray(2 * np.arctan2(np.linalg.norm(q[:, :3], axis=1), np.abs(q[:, 3])))

@@ -1,0 +1,349 @@
+"""Compiled loops of learning: ordinary Python functions, compiled by numba under the names `*_compiled`.
+
+They take arrays and numbers, allocate nothing and raise nothing. The plain function and the compiled one agree to the
+last bit; a test checks it.
+
+Random bits come from xorshift64 (Marsaglia 2003), whose state, `rng`, is one nonzero uint64, shape (1,); an action is
+drawn from the low half of 64 bits, the decision to explore or to slip from the high half.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from skills.compiled import compiled, inner
+
+UNKNOWN, OFF_GRID = -2, -1  # in a model: never tried; would have left the grid, so the arm stays
+# Unsigned integers, because numba makes a float of a uint64 and a Python integer.
+NONE, ONE, THREE, SEVEN, NINE, THIRTEEN, SEVENTEEN = (np.uint64(n) for n in (0, 1, 3, 7, 9, 13, 17))
+SCATTER = np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio (Knuth 6.4): spreads similar bits over the table
+ACTIONS, HALF, LOW_HALF = np.uint64(27), np.uint64(32), np.uint64(0xFFFFFFFF)
+
+
+@inner
+def next_random(x: Any) -> Any:
+    """Return the next 64 random bits.
+
+    Args:
+        x: The previous bits, uint64, not 0.
+
+    Returns:
+        The next bits, uint64, not 0.
+    """
+    x ^= x << THIRTEEN
+    x ^= x >> SEVEN
+    x ^= x << SEVENTEEN
+    return x
+
+
+@inner
+def any_action(bits: Any) -> Any:
+    """Return one of the 27 actions, drawn uniformly.
+
+    Args:
+        bits: Random bits, uint64; the low half decides.
+
+    Returns:
+        The action, 0 to 26, uint64.
+    """
+    return ((bits & LOW_HALF) * ACTIONS) >> HALF
+
+
+def run_episodes(
+    q: Any,  # (n_states * 27,) float64, learnt in place
+    value: Any,  # (n_states,) float64: the largest Q value of each state, kept up to date
+    best: Any,  # (n_states,) int8: the action of that Q value, the first of equals
+    rewards: Any,  # (n_states,) float64: Algorithm 1
+    shape: Any,  # (3,) uint64
+    starts: Any,  # (E,) uint64: the state that each episode starts in
+    epsilons: Any,  # (E,) float64: the probability of exploring in each episode
+    off_grid: float,  # the reward of a move off the grid
+    alpha: float,
+    gamma: float,
+    max_steps: int,
+    goal: Any,  # uint64
+    rng: Any,
+    tally: Any,  # (3,) int64: counts of steps, of finished episodes, and of episodes that ran out of steps; added to
+) -> None:
+    """Learn Q values in the paper's cell state by Eq. 1, one episode for each start.
+
+    Integers are unsigned, so that numba does not test each index for being negative; x, y and z count from 1, so that a
+    move to -1 is 0 and not a wrapped number.
+    """
+    nx, ny, nz = shape[0], shape[1], shape[2]
+    before_first = (ny + ONE) * nz + ONE
+    random = rng[0]
+    steps = 0
+    for episode in range(len(starts)):
+        state = starts[episode]
+        x = state // (ny * nz) + ONE
+        y = state // nz % ny + ONE
+        z = state % nz + ONE
+        explores = np.uint64(epsilons[episode] * 4294967296.0)
+        finished = False
+        for _ in range(max_steps):
+            random = next_random(random)
+            action = any_action(random) if random >> HALF < explores else np.uint64(best[state])
+            to_x = x + action // NINE - ONE
+            to_y = y + action // THREE % THREE - ONE
+            to_z = z + action % THREE - ONE
+            after = state
+            if (to_x != NONE) & (to_x <= nx) & (to_y != NONE) & (to_y <= ny) & (to_z != NONE) & (to_z <= nz):
+                x, y, z = to_x, to_y, to_z
+                after = (x * ny + y) * nz + z - before_first
+                target = rewards[after]
+                finished = after == goal
+                if not finished:
+                    target += gamma * value[after]
+            else:
+                target = off_grid + gamma * value[state]
+            row = state * ACTIONS
+            new = target
+            if alpha < 1:
+                new = (1 - alpha) * q[row + action] + alpha * target
+            q[row + action] = new
+            # Only where the best action itself became worse have all 27 values to be compared.
+            if new > value[state]:
+                value[state] = new
+                best[state] = action
+            elif action == np.uint64(best[state]):
+                if new < value[state]:
+                    top = NONE
+                    for other in range(1, 27):
+                        if q[row + np.uint64(other)] > q[row + top]:
+                            top = np.uint64(other)
+                    best[state] = top
+                    value[state] = q[row + top]
+            elif new == value[state] and action < np.uint64(best[state]):
+                best[state] = action
+            state = after
+            steps += 1
+            if finished:
+                break
+        tally[1] += finished
+        tally[2] += not finished
+    tally[0] += steps
+    rng[0] = random
+
+
+def explore(
+    model: Any,  # (n_states, 27) int32: the state that each action led to, `OFF_GRID` or `UNKNOWN`
+    shape: Any,  # (3,) int64
+    first: int,  # start state of the first episode times 27, plus its first action; the others follow in order
+    slip: float,  # probability that one of the 27 moves, drawn uniformly, is made instead
+    max_steps: int,
+    goal: int,
+    rng: Any,
+    tally: Any,  # as for `run_episodes`
+) -> None:
+    """Move in the grid and record the result of each action: one episode for every pair of state and action."""
+    nx, ny, nz = shape[0], shape[1], shape[2]
+    slips = np.uint64(slip * 4294967296.0)
+    random = rng[0]
+    episodes = nx * ny * nz * 27
+    for episode in range(episodes):
+        state = (first + episode) % episodes // 27
+        action = np.int64((first + episode) % 27)
+        finished = False
+        for step in range(max_steps):
+            if step > 0:
+                random = next_random(random)
+                action = np.int64(any_action(random))
+            slipped = False
+            if slips > NONE:
+                random = next_random(random)
+                slipped = random >> HALF < slips
+            made = np.int64(any_action(random)) if slipped else action
+            x = state // (ny * nz) + made // 9 - 1
+            y = state // nz % ny + made // 3 % 3 - 1
+            z = state % nz + made % 3 - 1
+            tally[0] += 1
+            if x >= 0 and x < nx and y >= 0 and y < ny and z >= 0 and z < nz:
+                after = (x * ny + y) * nz + z
+                model[state, action] = after
+                state = after
+                finished = after == goal
+            else:
+                model[state, action] = state if slipped else OFF_GRID
+            if finished:
+                break
+        tally[1] += finished
+        tally[2] += not finished
+    rng[0] = random
+
+
+def sweep(
+    q: Any,  # (rows, 27) float64, learnt in place
+    value: Any,  # (rows,) float64: the largest Q value of each row
+    model: Any,  # as for `explore`
+    states: Any,  # (rows,) int64: the state of each row
+    live: Any,  # (rows,) bool: whether Q values are learnt in this row
+    stays: Any,  # (rows,) bool: whether the phase stays the same on entering this state
+    worth: Any,  # (n_states,) float64: reward and discounted value of entering each state in the phase, updated
+    first: int,  # row of the phase
+    last: int,  # row of the phase, exclusive
+    backwards: bool,  # whether rows are processed from the last to the first
+    other: float,  # the reward for entering a state without a change of phase
+    off_grid: float,
+    alpha: float,
+    gamma: float,
+    tolerance: float,
+) -> Any:
+    """Apply Eq. 1 once to every action of a phase that was tried.
+
+    Returns:
+        The number of Q values whose relative change was greater than the tolerance.
+    """
+    changed = 0
+    for i in range(last - first):
+        row = last - 1 - i if backwards else first + i
+        if not live[row]:
+            continue
+        state = states[row]
+        top = -np.inf
+        for action in range(27):
+            to = model[state, action]
+            new = q[row, action]
+            if to != UNKNOWN:
+                target = off_grid + gamma * value[row]
+                if to != OFF_GRID:
+                    target = worth[to]
+                old = new
+                new = (1 - alpha) * old + alpha * target
+                q[row, action] = new
+                if abs(new - old) > tolerance * abs(new):
+                    changed += 1
+            if new > top:
+                top = new
+        value[row] = top
+        if stays[row]:
+            worth[state] = other + gamma * top
+    return changed
+
+
+def settle(
+    best: Any,  # (n_states,) float64: the value of the best move in each state, iterated in place
+    worth: Any,  # (n_states,) float64: reward and discounted value of entering each state, updated
+    rewards: Any,  # (n_states,) float64: Algorithm 1
+    stays: Any,  # (n_states,) bool: whether entering it neither changes the phase nor finishes
+    shape: Any,  # (3,) int64
+    goal: int,
+    off_grid: float,
+    gamma: float,
+    tolerance: float,
+    max_sweeps: int,
+) -> Any:
+    """Iterate values over the grid, forwards and backwards in turn, until no relative change is above the tolerance.
+
+    Returns:
+        True if the values settled within `max_sweeps`.
+    """
+    nx, ny, nz = shape[0], shape[1], shape[2]
+    for number in range(max_sweeps):
+        changed = 0
+        for i in range(len(best)):
+            state = i if number % 2 == 0 else len(best) - 1 - i
+            if state == goal:
+                continue
+            x = state // (ny * nz)
+            y = state // nz % ny
+            z = state % nz
+            top = -np.inf
+            if x == 0 or y == 0 or z == 0 or x == nx - 1 or y == ny - 1 or z == nz - 1:
+                top = off_grid + gamma * best[state]
+            for to_x in range(max(x - 1, 0), min(x + 2, nx)):
+                for to_y in range(max(y - 1, 0), min(y + 2, ny)):
+                    for to_z in range(max(z - 1, 0), min(z + 2, nz)):
+                        there = worth[(to_x * ny + to_y) * nz + to_z]
+                        if there > top:
+                            top = there
+            if not abs(top - best[state]) <= tolerance * abs(top):
+                changed += 1
+            best[state] = top
+            if stays[state]:
+                worth[state] = rewards[state] + gamma * top
+        if changed == 0:
+            return True
+    return False
+
+
+def spread_distances(
+    distance: Any,  # (nx, ny, nz) int64: 0 at the places to measure from, elsewhere more than any; filled in place
+) -> None:
+    """Count the fewest moves from each cell (Chebyshev), in one pass forwards and one back (Rosenfeld and Pfaltz 1966).
+
+    Args:
+        distance: Shape (nx, ny, nz): 0 at the cells to measure from, elsewhere at least the longest distance; changed
+            in place.
+    """
+    nx, ny, nz = distance.shape
+    for way in range(2):
+        for i in range(nx):
+            x = i if way == 0 else nx - 1 - i
+            for j in range(ny):
+                y = j if way == 0 else ny - 1 - j
+                for k in range(nz):
+                    z = k if way == 0 else nz - 1 - k
+                    fewest = distance[x, y, z]
+                    for to_x in range(max(x - 1, 0), min(x + 2, nx)):
+                        for to_y in range(max(y - 1, 0), min(y + 2, ny)):
+                            for to_z in range(max(z - 1, 0), min(z + 2, nz)):
+                                fewest = min(fewest, distance[to_x, to_y, to_z] + 1)
+                    distance[x, y, z] = fewest
+
+
+def warp(distance: Any, cost: Any) -> None:
+    """Fill the table of accumulated costs of dynamic time warping.
+
+    Args:
+        distance: Distance of each pair of points, shape (T, R).
+        cost: Shape (T + 1, R + 1), infinite at the edges and 0 at [0, 0]; filled in place.
+    """
+    for i in range(distance.shape[0]):
+        for j in range(distance.shape[1]):
+            cost[i + 1, j + 1] = distance[i, j] + min(cost[i, j], cost[i, j + 1], cost[i + 1, j])
+
+
+def tell_apart(
+    bits: Any,  # (N,) uint64: the bits of the numbers
+    found: Any,  # (F,) uint64: the distinct numbers in order of first appearance, filled
+    places: Any,  # (N,) uint8: index of each number in `found`, filled
+    slots: Any,  # (2^k,) int16, more than F and all -1: hash table of indices in `found`, with linear probing
+    shift: Any,  # uint64: 64 - k
+) -> Any:
+    """Find the distinct numbers of an array, compared bit by bit, and the index of each element among them.
+
+    Returns:
+        The number of distinct numbers; -1 if they are more than `found` has room for.
+    """
+    last_slot = np.uint64(len(slots) - 1)
+    count = 0
+    which = np.int64(-1)
+    before = NONE
+    for i in range(len(bits)):
+        number = bits[i]
+        if number != before or which < 0:  # equal numbers are mostly adjacent, so the table is rarely searched
+            before = number
+            slot = (number * SCATTER) >> shift
+            which = np.int64(slots[slot])
+            while which >= 0 and found[which] != number:
+                slot = (slot + ONE) & last_slot
+                which = np.int64(slots[slot])
+            if which < 0:
+                if count == len(found):
+                    return -1
+                which = np.int64(count)
+                slots[slot] = which
+                found[which] = number
+                count += 1
+        places[i] = which
+    return count
+
+
+run_episodes_compiled = compiled(run_episodes)
+explore_compiled = compiled(explore)
+sweep_compiled = compiled(sweep)
+settle_compiled = compiled(settle)
+spread_distances_compiled = compiled(spread_distances)
+warp_compiled = compiled(warp)
+tell_apart_compiled = compiled(tell_apart)

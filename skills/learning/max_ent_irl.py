@@ -1,0 +1,208 @@
+"""Maximum-entropy inverse reinforcement learning (Ziebart et al. 2008): the baseline that failed in Sec. III-C.
+
+    GridPath --recover_reward--> RecoveredReward
+
+Symbols: the demonstration enters the states w_1 ... w_T from its start w_0, so T is its number of moves. r(s) is the
+reward for entering state s, one feature per state. A trajectory of T moves from w_0 to the goal w_T has the probability
+exp(sum of its rewards) / Z; standing still is a move, a move off the grid is not. With
+
+    B_t(s)  log of the summed exp(rewards) of all trajectories from s at time t to the goal at T     (backward)
+    F_t(s)  the same of all trajectories from w_0 at 0 to s at t, the reward of s included           (forward)
+
+log Z = B_0(w_0), the expected visits of s are the sum over t = 1 ... T of exp(F_t + B_t - log Z), and the gradient of
+the demonstration's log-likelihood is its own visits minus the expected ones. Both recursions are the same sum over a
+cell and its neighbours, computed axis by axis in logarithms, so that nothing overflows or vanishes.
+
+**The reward is recovered, and does not help.** On the paper's demonstration nearly all of the highest rewards lie on
+the visited cells. But a positive reward of a *state* pays again at every step, also for standing still: that is worth
+r / (1 - gamma), more than following the path and ending at the goal. So value iteration on it walks to the best cell
+nearby and stays. The paper blames a lack of exploration; value iteration needs no exploration, and its policy here is
+the exact optimum of the wrong problem. In the model the horizon T and the given goal forbid standing still for ever; a
+policy of states has neither. The model also cannot distinguish a reward from the same reward minus a constant, since
+every trajectory has T moves: with a constant so large that all rewards are below -1, and with gamma 0.99, the goal is
+reached from everywhere (a test shows it), by cutting nearly every corner.
+"""
+
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+
+from skills.arrays import Floats, frozen
+from skills.errors import BadSettings
+from skills.gridworld.domain import Domain
+from skills.gridworld.grid import GridPath
+from skills.gridworld.reward import RewardMap
+from skills.learning.dynamic_programming import Mdp, exact_q
+
+MAX_NUMBERS = 2**24  # ours: moves x cells; B_t for all t takes 128 MiB then, and an iteration some seconds
+LOWEST = np.finfo(np.float64).min
+
+
+@dataclass(frozen=True)
+class MaxEntIRL:
+    """Settings of maximum-entropy IRL, and of value iteration on the recovered reward; the paper states none of them.
+
+    After 200 iterations the likelihood of the paper's demonstration is within 0.004 nat per move of that after 600.
+    The failure does not depend on gamma (0.1 to 0.99 were tried).
+    """
+
+    kind: ClassVar[str] = "max-ent-irl"
+    phased: ClassVar[bool] = False
+    slip: ClassVar[float] = 0.0
+
+    iterations: int = 200
+    learning_rate: float = 0.1  # of Adam
+    l2: float = 0.01  # weight of the squared rewards, which holds those of unvisited states at 0
+    gamma: float = 0.8  # of the value iteration; Algorithm 1, which certifies, pays for standing still too from 0.9 on
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.iterations <= 1000:
+            raise BadSettings("iterations must lie between 1 and 1000.", iterations=self.iterations)
+        if not 0 < self.learning_rate <= 1:
+            raise BadSettings("learning_rate must lie in (0, 1].", learning_rate=self.learning_rate)
+        if not 0 <= self.l2 <= 1:
+            raise BadSettings("l2 must lie in [0, 1].", l2=self.l2)
+        if not 0 < self.gamma <= 0.99:
+            raise BadSettings(
+                "gamma must lie in (0, 0.99]: closer to 1, value iteration takes too long to converge.",
+                gamma=self.gamma,
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class RecoveredReward:
+    """The reward for entering each state, (n_states,), and its fit to the demonstration.
+
+    Each pair is (before, after): with all rewards 0, and with the recovered ones. The negative log-likelihood is in
+    nat per move, the visit error in visits: |expected - demonstrated| summed over all states.
+    """
+
+    rewards: Floats
+    negative_log_likelihood: tuple[float, float]
+    visit_error: tuple[float, float]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "rewards", frozen(self.rewards, np.float64, (None,), "rewards"))
+
+
+def recover_reward(path: GridPath, settings: MaxEntIRL) -> RecoveredReward:
+    """Maximise the likelihood of the demonstration over the rewards, minus the penalty l2/2 |r|^2.
+
+    The same path and settings give the same bytes; nothing is drawn at random.
+
+    Args:
+        path: The demonstrated path.
+        settings: The settings of the learner.
+
+    Returns:
+        The recovered rewards and their fit.
+
+    Raises:
+        BadSettings: Moves times cells are more than `MAX_NUMBERS`.
+    """
+    if (len(path.states) - 1) * path.grid.n_states > MAX_NUMBERS:
+        raise BadSettings(
+            f"{len(path.states) - 1} moves in a grid of {path.grid.n_states} cells are too many for "
+            "maximum-entropy IRL; use larger cells or a shorter hand-off.",
+            moves=len(path.states) - 1,
+        )
+    demonstrated = np.bincount(path.states[1:], minlength=path.grid.n_states)
+    rewards = np.zeros(path.grid.n_states)
+    adam = _Adam(rewards, settings.learning_rate)
+    likelihood, visits = soft_visits(path, rewards)
+    before = likelihood, float(np.abs(visits - demonstrated).sum())
+    for _ in range(settings.iterations):
+        adam.descend(visits - demonstrated + settings.l2 * rewards)
+        likelihood, visits = soft_visits(path, rewards)
+    after = likelihood, float(np.abs(visits - demonstrated).sum())
+    return RecoveredReward(rewards, (before[0], after[0]), (before[1], after[1]))
+
+
+def soft_visits(path: GridPath, rewards: Floats) -> tuple[float, Floats]:
+    """Evaluate the model of the module's docstring for given rewards.
+
+    Args:
+        path: The demonstrated path.
+        rewards: The reward for entering each state, shape (n_states,).
+
+    Returns:
+        The negative log-likelihood of the demonstration in nat per move, and the expected number of times that each
+        state is entered, shape (n_states,); these sum to T.
+    """
+    moves, shape = len(path.states) - 1, path.grid.shape
+    entered = rewards.reshape(shape)
+    backward = np.empty((moves + 1, *shape))
+    backward[moves] = _only_at(path.goal, shape)
+    for t in range(moves - 1, -1, -1):
+        backward[t] = _log_sum_around(entered + backward[t + 1])
+    log_z = backward[0].flat[path.start]
+    forward, visits = _only_at(path.start, shape), np.zeros(shape)
+    for t in range(1, moves + 1):
+        forward = entered + _log_sum_around(forward)
+        visits += np.exp(forward + backward[t] - log_z)
+    return float(log_z - rewards[path.states[1:]].sum()) / moves, visits.reshape(-1)
+
+
+def _only_at(state: int, shape: tuple[int, int, int]) -> Floats:
+    """Return the logarithms of 1 at a state and 0 elsewhere, in the grid's shape."""
+    logs = np.full(shape, -np.inf)
+    logs.flat[state] = 0.0
+    return logs
+
+
+def _log_sum_around(logs: Floats) -> Floats:
+    """Sum over each cell and its neighbours, at most 27 cells, in logarithms; in the grid's shape."""
+    for axis in range(logs.ndim):
+        logs = _log_sum_along(logs, axis)
+    return logs
+
+
+def _log_sum_along(logs: Floats, axis: int) -> Floats:
+    """Sum over each cell and its two neighbours along an axis, in logarithms."""
+    size = logs.shape[axis]
+    edge = np.full((*logs.shape[:axis], 1, *logs.shape[axis + 1 :]), -np.inf)
+    padded = np.moveaxis(np.concatenate((edge, logs, edge), axis), axis, 0)
+    before, here, after = padded[:size], padded[1:-1], padded[2:]
+    # The lower bound is finite, because where all three are -inf, subtracting -inf would give NaN.
+    peak = np.maximum(np.maximum(np.maximum(before, here), after), LOWEST)
+    with np.errstate(divide="ignore"):
+        total = peak + np.log(np.exp(before - peak) + np.exp(here - peak) + np.exp(after - peak))
+    return np.asarray(np.moveaxis(total, 0, axis))
+
+
+class _Adam:
+    """The optimiser of Kingma and Ba (2015) with their constants; it changes `values` in place."""
+
+    def __init__(self, values: Floats, learning_rate: float) -> None:
+        self.values, self.learning_rate = values, learning_rate
+        self.mean, self.square, self.steps = np.zeros_like(values), np.zeros_like(values), 0
+
+    def descend(self, gradient: Floats) -> None:
+        """Make one step of gradient descent."""
+        self.steps += 1
+        self.mean += 0.1 * (gradient - self.mean)
+        self.square += 0.001 * (gradient**2 - self.square)
+        mean = self.mean / (1 - 0.9**self.steps)
+        square = self.square / (1 - 0.999**self.steps)
+        self.values -= self.learning_rate * mean / (np.sqrt(square) + 1e-8)
+
+
+def learn_from_recovered(reward: RewardMap, settings: MaxEntIRL) -> Floats:
+    """Recover the reward of a map's path and iterate values on it in the cell state.
+
+    Of the map itself only its path and its reward levels are used: of these the one for a move off the grid. An episode
+    ends at the goal.
+
+    Args:
+        reward: The reward map of the demonstrated path.
+        settings: The settings of the learner.
+
+    Returns:
+        Q values, shape (n_states, 27).
+
+    Raises:
+        BadSettings: As for `recover_reward`.
+    """
+    recovered = replace(reward, rewards=recover_reward(reward.path, settings).rewards)
+    return exact_q(Mdp(Domain(reward.path, settings.phased), recovered, settings.gamma))

@@ -1,0 +1,267 @@
+"""Policies: the greedy actions on the certified domain of a path, and the rollouts that follow them.
+
+    RewardMap --learn_tabular--> Policy --rollout--> Rollout
+
+The *greedy* action of a row is the first one with the largest Q value.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from math import dist
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from skills.arrays import Bytes, Floats, Ints, frozen, xyz
+from skills.errors import OutsideGrid
+from skills.gridworld import paper
+from skills.gridworld.domain import FINISHED, OUTSIDE, Domain, Moves
+from skills.gridworld.grid import GridPath, refuse_metres
+from skills.gridworld.reward import RewardLevels, RewardMap
+from skills.learning.learners import Learner, Tabular, learn_values
+from skills.learning.network import Network
+from skills.learning.q_learning import Training
+
+GUIDED_MM = 50.0  # ours: greatest distance of a start outside the grid; metres given for millimetres are further off
+
+
+@dataclass(frozen=True, eq=False)
+class Policy:
+    """A learnt policy: the Q values on the domain of a path, and the settings with which they were learnt.
+
+    Attributes:
+        path: The demonstrated path.
+        levels: The rewards of Algorithm 1.
+        learner: The settings of the learner.
+        seed: The seed.
+        training: The counts of the training.
+        q: Q values, shape (rows, 27).
+        network: The network of a network learner, from which the Q values were computed at each cell's centre; or None.
+    """
+
+    path: GridPath
+    levels: RewardLevels
+    learner: Learner
+    seed: int
+    training: Training
+    q: Floats
+    network: Network | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "q", frozen(self.q, np.float64, (self.domain.n_rows, paper.N_ACTIONS), "q"))
+
+    @cached_property
+    def domain(self) -> Domain:
+        """The certified domain."""
+        return Domain(self.path, self.learner.phased)
+
+    @cached_property
+    def greedy(self) -> Bytes:
+        """The action of each row, (rows,): 0 to 26, `FINISHED` or `OUTSIDE`."""
+        actions = self.q.argmax(axis=1)
+        actions[self.domain.terminal] = FINISHED
+        actions[~self.domain.certified] = OUTSIDE
+        return frozen(actions, np.int8, (self.domain.n_rows,), "greedy")
+
+    @cached_property
+    def confidence(self) -> Floats:
+        """The lead of the best action of each row over the second best, (rows,): 1 - Q2 / Q1, and 0 where Q1 <= 0."""
+        second, first = np.partition(self.q, -2, axis=1)[:, -2:].T
+        sure = np.where(first > 0, 1 - second / np.where(first > 0, first, 1.0), 0.0)
+        return frozen(sure, np.float64, (self.domain.n_rows,), "confidence")
+
+    @cached_property
+    def moves(self) -> Moves:
+        """The result of the greedy action of each row, (rows,); meaningless in rows without an action."""
+        return self.domain.move(np.arange(self.domain.n_rows), self.greedy.astype(np.int64).clip(0))
+
+    @cached_property
+    def replay(self) -> "Rollout":
+        """The rollout from the demonstrated start: the demonstration itself, if the policy learnt it."""
+        return rollout_from(self, self.path.start)
+
+    def table(self) -> Bytes:
+        """Return the greedy actions of all phases and states, (phases, n_states), as clients receive them."""
+        domain = self.domain
+        table = np.full((domain.phases, self.path.grid.n_states), OUTSIDE, np.int8)
+        table[domain.phase_of, domain.state_of] = self.greedy
+        return table
+
+    def row(self, phase: int, state: int) -> int | None:
+        """Return the row of a phase and state, or None outside the certified domain."""
+        cell = self.path.grid.cells_of(state)
+        return int(self.domain.rows_of(phase, cell)) if self.domain.holds(phase, cell) else None
+
+
+def learn_tabular(reward: RewardMap, learner: Tabular, seed: int = 0) -> Policy:
+    """Learn to follow a demonstration from its reward map; the same arguments give the same bytes.
+
+    `skills.deep.learn_policy` does this with the network learners as well.
+
+    Args:
+        reward: The reward map of the demonstrated path.
+        learner: The settings of the learner.
+        seed: Seed of all random numbers, 0 to 2^63 - 1.
+
+    Returns:
+        The policy.
+
+    Raises:
+        BadSettings: As for `learn_values`.
+    """
+    q, training = learn_values(reward, learner, seed)
+    return Policy(reward.path, reward.levels, learner, seed, training, q)
+
+
+@dataclass(frozen=True, eq=False)
+class Rollout:
+    """The states that the greedy policy visits from a start, (T,), the phase in each, (T,), and whether it finished."""
+
+    path: GridPath
+    states: Ints
+    phases: Ints
+    finished: bool
+
+    @property
+    def tip_mm(self) -> Floats:
+        """The rollout through the centres of its cells, (T, 3) mm."""
+        return self.path.grid.centres_mm(self.states)
+
+
+def rollout(policy: Policy, start_mm: ArrayLike) -> Rollout:
+    """Follow the greedy policy from a position to the goal.
+
+    The rollout stops unfinished where it leaves the certified domain, or when it returns to a phase and state that it
+    has visited.
+
+    Args:
+        policy: The policy.
+        start_mm: Start, shape (3,), in the demonstration's frame.
+
+    Returns:
+        The visited states and phases, the start's cell first.
+
+    Raises:
+        OutsideGrid: The start is not three finite numbers or not in the grid, or seems to be in metres.
+    """
+    start_mm = np.asarray(start_mm, float)
+    if start_mm.shape != (3,):
+        raise OutsideGrid("A start must be three numbers, x, y and z in mm.")
+    # Before the state is looked up, because that error would not mention the unit.
+    refuse_metres("The start", start_mm, policy.path.grid.centres_mm(policy.path.goal))
+    return rollout_from(policy, int(policy.path.grid.states_at(start_mm)))
+
+
+def rollout_from(policy: Policy, state: int) -> Rollout:
+    """Follow the greedy policy from a state; see `rollout`.
+
+    Args:
+        policy: The policy.
+        state: The state index of the start.
+
+    Returns:
+        The visited states and phases, the start first.
+    """
+    domain, moves = policy.domain, policy.moves
+    phase, done = domain.start(state)
+    states, phases, seen = [state], [phase], set[int]()
+    row = -1 if done else int(domain.rows_of(phase, policy.path.grid.cells_of(state)))
+    # Without `seen` a policy that goes round in circles would be followed for ever.
+    while row >= 0 and row not in seen and policy.greedy[row] >= 0:
+        seen.add(row)
+        done, after = bool(moves.finishes[row]), int(moves.row[row])
+        states.append(int(moves.state[row]))
+        phases.append(int(domain.phase_of[row if after < 0 else after]))
+        row = after
+    return Rollout(policy.path, np.array(states), np.array(phases), done)
+
+
+@dataclass(frozen=True)
+class Step:
+    """The answer of a policy for a position; computing it moves nothing.
+
+    Attributes:
+        phase: The phase after counting the position.
+        action: The action, 0 to 26; None if the task is finished or the position is outside the certified domain.
+        next_position_mm: Centre of the next cell; None without an action.
+        next_phase: The phase after moving there; None without an action.
+        done: The task is finished.
+        confidence: The lead of the action over the second best, see `Policy.confidence`; 0 without an action.
+        correction_mm: Vector from the position to the waypoint at which it should be; None if it is there.
+    """
+
+    phase: int
+    action: int | None
+    next_position_mm: tuple[float, float, float] | None
+    next_phase: int | None
+    done: bool
+    confidence: float
+    correction_mm: tuple[float, float, float] | None
+
+
+def next_step(policy: Policy, position_mm: ArrayLike, phase: int | None) -> Step:
+    """Return the policy's answer for a position reached in a phase.
+
+    Off the path the correction leads back: in phase 0 to the nearest waypoint, later to the one just passed. From there
+    the policy continues to the goal. Outside the grid there is no action, only the correction.
+
+    Args:
+        policy: The policy.
+        position_mm: Position, shape (3,), in the demonstration's frame.
+        phase: The phase before the position; None at the start of a pass.
+
+    Returns:
+        The action and the correction.
+
+    Raises:
+        BadInput: The position is not three finite numbers.
+        OutsideGrid: It is further than `GUIDED_MM` outside the grid, or there is no such phase.
+    """
+    domain, grid = policy.domain, policy.path.grid
+    here = frozen(position_mm, np.float64, (3,), "position_mm")
+    if phase is not None and not 0 <= phase < domain.phases:
+        raise OutsideGrid(f"The policy has the phases 0 to {domain.phases - 1}.", phase=phase)
+    state = _state_at(policy, here)
+    if state is None:
+        phase = 0 if phase is None else phase
+        return Step(phase, None, None, None, False, 0.0, _correction(policy, here, phase))
+    # On a closed path the goal's cell finishes when it is entered, not when it is the start.
+    phase, done = domain.start(state) if phase is None else domain.enter(phase, state)
+    on_path = state == policy.path.states[phase - 1] if phase > 0 else state in policy.path.states
+    correction = None if done or on_path else _correction(policy, here, phase)
+    row = None if done else policy.row(phase, state)
+    if row is None or policy.greedy[row] < 0:
+        done = done or (row is not None and policy.greedy[row] == FINISHED)
+        return Step(phase, None, None, None, done, 0.0, correction)
+    action = int(policy.greedy[row])
+    after = int(policy.moves.state[row])
+    next_phase, _ = domain.enter(phase, after)
+    confidence = float(policy.confidence[row])
+    return Step(phase, action, xyz(grid.centres_mm(after)), next_phase, False, confidence, correction)
+
+
+def _state_at(policy: Policy, here: Floats) -> int | None:
+    """Return the state of a position, or None outside the grid.
+
+    Raises:
+        OutsideGrid: It is further than `GUIDED_MM` outside, too far to lead a hand back.
+    """
+    grid = policy.path.grid
+    try:
+        return int(grid.states_at(here))
+    except OutsideGrid:
+        outside_mm = dist(here, np.clip(here, grid.centres_mm(0), grid.centres_mm(grid.n_states - 1)))
+        if not outside_mm <= GUIDED_MM:
+            raise OutsideGrid(
+                f"The position is {outside_mm:.4g} mm outside the grid; positions are guided back from at most "
+                f"{GUIDED_MM:g} mm. Give millimetres in the frame of the policy.",
+                outside_mm=outside_mm,
+            ) from None
+        return None
+
+
+def _correction(policy: Policy, here: Floats, phase: int) -> tuple[float, float, float]:
+    """Return the vector from a position to the waypoint just passed, or to the nearest one in phase 0."""
+    tip = policy.path.tip_mm
+    nearest = phase - 1 if phase > 0 else np.abs(tip - here).max(axis=1).argmin()
+    return xyz(tip[nearest] - here)

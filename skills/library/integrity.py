@@ -1,0 +1,155 @@
+"""Integrity of stored values: rows found by digest, and values verified against the digest of their row.
+
+    digest, in full or a prefix --find_by_digest--> row
+    row --learnt, covered, planned--> verified value, or `Corrupt`
+
+A column is protected by its own checksum (`skills.db.packed`); this module verifies values that belong together: a
+policy with its manifest, a plan with the policy that it follows. A value that does not match its digest is refused;
+nothing is substituted for it.
+"""
+
+from collections.abc import Iterable
+from dataclasses import asdict
+from typing import Any, TypeVar
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from skills.db.models import Demonstration, Plan, PolicyVersion, StoredPlayback, StoredRecording
+from skills.db.packed import digest
+from skills.demonstration.demonstration import Demo
+from skills.errors import AmbiguousDigest, Corrupt, NotFound
+from skills.gridworld.grid import GridPath
+from skills.learning.certificate import Coverage
+from skills.learning.policy import Policy
+from skills.library.cache import Kept
+from skills.packing import canonical, sha256
+from skills.planning.plan import SuturePlan
+from skills.remedies import Remedy
+
+Row = TypeVar("Row", Demonstration, Plan, PolicyVersion, StoredPlayback, StoredRecording)
+
+WHOLE = 64
+SHOWN = 5
+
+
+def find_by_digest(session: Session, table: type[Row], digest: str, what: str, *remedies: Remedy) -> Row:
+    """Return the row with this digest, or the only row that the caller may see whose digest has this prefix.
+
+    Args:
+        session: The caller's transaction.
+        table: The model of the row.
+        digest: A SHA-256 in hex, all 64 digits or a prefix.
+        what: The noun for messages, such as "plan".
+        *remedies: The remedies of a `NotFound`.
+
+    Raises:
+        NotFound: There is none; the error carries the remedies.
+        AmbiguousDigest: Several digests have this prefix; the error lists them.
+    """
+    query = select(table)
+    if len(digest) == WHOLE:
+        found = session.scalars(query.where(table.sha256 == digest)).all()
+    else:  # a range, which the index serves on both back ends; "g" is after every digit of a digest
+        begins = query.where(table.sha256 >= digest, table.sha256 < f"{digest}g")
+        found = session.scalars(begins.order_by(table.sha256).limit(SHOWN + 1)).all()
+    if not found:
+        raise NotFound(f"There is no {what} with this digest.", *remedies)
+    if len(found) > 1:
+        candidates = [row.sha256 for row in found[:SHOWN]]
+        raise AmbiguousDigest(
+            f"Several {what}s have a digest with this prefix: "
+            f"{', '.join(candidates)}{', and more' if len(found) > SHOWN else ''}.",
+            "Give more characters of the digest.",
+            candidates=candidates,
+        )
+    return found[0]
+
+
+_policies: Kept[str, tuple[dict[str, Any], Policy]] = Kept(32)  # by digest, with its manifest; a few MB each
+
+
+def learnt(version: PolicyVersion) -> Policy:
+    """Return the policy of a version, after verifying it and its manifest against the version's digest.
+
+    Raises:
+        Corrupt: They do not match the digest.
+    """
+    manifest, policy = _policies.get(version.sha256) or (None, None)
+    if policy is None or manifest != version.manifest:  # the API serves the row's manifest, so it is verified too
+        policy = version.learnt
+        if policy_identity(version.manifest, policy) != version.sha256:
+            raise Corrupt("A stored policy does not match its digest; restore it from a backup or train it again.")
+        _policies.put(version.sha256, (version.manifest, policy))
+    return policy
+
+
+def remembered() -> list[str]:
+    """List the digests of the policies in this process's cache."""
+    return [policy for policy, _ in _policies.items()]
+
+
+def forget(policies: Iterable[str]) -> None:
+    """Remove policies, by digest, from the cache: they were erased."""
+    _policies.forget(policies)
+
+
+def covered(version: PolicyVersion) -> Coverage:
+    """Return the coverage of a version whose policy was verified.
+
+    Raises:
+        Corrupt: It does not match the digest in the version's manifest.
+    """
+    coverage = version.covered
+    if digest(coverage) != version.manifest["coverage"]["sha256"]:
+        raise Corrupt("The coverage of a stored policy does not match its digest; restore it from a backup.")
+    return coverage
+
+
+def planned(plan: Plan) -> SuturePlan:
+    """Return a stored plan, after verifying it against its digest.
+
+    Raises:
+        Corrupt: It does not match; no arm should follow it.
+    """
+    if plan_identity(plan.policy.sha256, plan.plan) != plan.sha256:
+        raise Corrupt("A stored plan does not match its digest; restore it from a backup or plan again.")
+    return plan.plan
+
+
+def demo_identity(recording_sha256: str, surgeon: str, suture: str, demo: Demo, path: GridPath) -> str:
+    """Return a demonstration's digest: over its recording, its style, its segment and its grid."""
+    return sha256(canonical(what_identifies(recording_sha256, surgeon, suture, demo, path)))
+
+
+def what_identifies(recording_sha256: str, surgeon: str, suture: str, demo: Demo, path: GridPath) -> dict[str, Any]:
+    """Return the JSON of which a demonstration's digest is computed."""
+    identity: dict[str, Any] = {
+        "recording": recording_sha256,
+        "surgeon": surgeon,
+        "suture": suture,
+        "arm": demo.arm,
+        "topic": demo.topic,
+        "segment_s": [demo.start_s, demo.end_s],
+        "grid": asdict(path.grid),
+    }
+    if demo.pauses:  # older versions kept the samples of the pauses, so the same segment is another demonstration
+        identity["left_out"] = [asdict(pause) for pause in demo.pauses]
+    if path.hysteresis:  # left out when 0, so that older demonstrations keep their digests
+        identity["hysteresis"] = path.hysteresis
+    return identity
+
+
+def policy_identity(manifest: dict[str, Any], policy: Policy) -> str:
+    """Return a policy version's digest: over its manifest (all that the API says of it) and its numbers."""
+    return policy_identity_of(manifest, digest(policy))
+
+
+def policy_identity_of(manifest: dict[str, Any], numbers: str) -> str:
+    """Return a policy version's digest from its manifest and the digest of its numbers, see `policy_identity`."""
+    return sha256(canonical([manifest, numbers]))
+
+
+def plan_identity(policy_sha256: str, plan: SuturePlan) -> str:
+    """Return a plan's digest: over the policy version that it follows and its passes."""
+    return sha256(canonical([policy_sha256, digest(plan)]))

@@ -1,0 +1,223 @@
+"""Passes before they are timed: the stations and paths of both arms, and the motion of PSM_M around each hand-off.
+
+    PassPath, PsmM --ways--> Way: transfer, A1 and A2 of each pass
+    base of PSM_M, its poses at every tick --other_arm--> OtherArm
+
+A pass has three phases:
+
+    transfer   from the end of the previous pass to where A1 begins; ours, so that a plan is one motion
+    A1         PSM_A's tip moves along its polyline, the jaw held
+    A2         PSM_A's jaw turns with the tip held, and PSM_M comes in
+
+A transfer goes through *stations*, at rest in each. Between passes PSM_M goes back, then PSM_A moves to its start while
+its jaw turns back and PSM_M moves to its next stand-off. PSM_A waits until PSM_M has left, because the needle leaves
+from between its jaws. If a pass starts outside its grid world, its start is one more station.
+
+PSM_M waits at a stand-off, straight back along its approach, and comes in while PSM_A turns its jaw (A2). With
+`PsmM.enters` "start" it waits at the hand-off itself. The paper has PSM_M waiting; the way it comes in is ours.
+
+PSM_M's jaws are symmetric about their approach, so of a pose and the same pose with the hinge reversed it takes the one
+that needs less roll; all other joints are the same, except for the signs of the wrist's joints.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from skills.arrays import Floats, frozen
+from skills.errors import BadPlan, NoMotion
+from skills.kinematics import ROLL, check_rotation, matrix_of
+from skills.planning.handoff import OtherArm, PsmM, hand_off
+from skills.planning.joint_path import Ticks, solve
+from skills.planning.motion_laws import SAME_POINT_MM, Arms, Pose, Poses
+
+STAND_OFF_MM = 30.0  # ours: the needle's circle, 16.6 mm across, plus a finger of 10.2 mm, plus a little more
+_HINGE_REVERSED = np.diag([-1.0, -1.0, 1.0])
+
+
+@dataclass(frozen=True, eq=False)
+class Meeting:
+    """The poses of PSM_M around one hand-off, in the PSM_A base frame.
+
+    Attributes:
+        stand_off: Clear of PSM_A.
+        taking: Holding the needle.
+        waiting: The one of these two in which PSM_M is during A1.
+    """
+
+    stand_off: Pose
+    taking: Pose
+    waiting: Pose
+
+
+def meeting(handed: Pose, psm_m: PsmM) -> Meeting:
+    """Return the poses of PSM_M around a hand-off.
+
+    Args:
+        handed: PSM_A's pose after A2, in its base frame.
+        psm_m: PSM_M's approach, and the phase in which it enters.
+
+    Raises:
+        BadPlan: PSM_A's jaw is not turned for the hand-off.
+    """
+    tip_mm, rotation = hand_off(handed.tip_mm[None], handed.rotation[None], psm_m.approach)
+    taking = Pose(tip_mm[0], rotation[0])
+    stand_off = Pose(taking.tip_mm - STAND_OFF_MM * taking.rotation[:, 2], taking.rotation)
+    return Meeting(stand_off, taking, taking if psm_m.enters == "start" else stand_off)
+
+
+def other_arm(poses: Poses, ticks: Ticks, psm_m: PsmM) -> OtherArm:
+    """Solve the joints of PSM_M for a complete motion.
+
+    Args:
+        poses: PSM_M's tip in the PSM_A base frame, T ticks.
+        ticks: The pass and the phase of each pose.
+        psm_m: The arm, with its base.
+
+    Returns:
+        PSM_M's base, and its joints at every tick.
+
+    Raises:
+        Unreachable: The first sample that it cannot reach; `numbers` has PSM_M, pass, phase, joint, value and limit.
+    """
+    assert psm_m.base_mm is not None and psm_m.base_xyzw is not None
+    base_mm, base_xyzw = np.array(psm_m.base_mm), np.array(psm_m.base_xyzw)
+    base = matrix_of(base_xyzw[None])[0]
+    seen = Poses((poses.tip_mm - base_mm) @ base, base.T @ poses.rotation)
+    reversed_ = Poses(seen.tip_mm, seen.rotation @ _HINGE_REVERSED)
+    # Both are solved over the complete motion, because the jaws must not change sides on the way.
+    either = [solve(one, ticks, psm_m.instrument, "PSM_M") for one in (seen, reversed_)]
+    joints = min(either, key=_most_roll)
+    return OtherArm(base_mm, base_xyzw / np.linalg.norm(base_xyzw), psm_m.instrument, joints)
+
+
+def _most_roll(joints: Floats) -> float:
+    return float(np.abs(joints[:, ROLL]).max())
+
+
+FAR_MM = 1e4  # ten metres: further than any PSM reaches, and the squares do not overflow
+
+
+@dataclass(frozen=True, eq=False)
+class PassPath:
+    """One pass before it is timed.
+
+    Attributes:
+        tip_mm: Points of A1 in the PSM base frame, shape (K, 3), K >= 1; a single point means that A1 has no motion.
+        rotation: The jaw's [n o a] held during A1, shape (3, 3).
+        target_rotation: Target of the turn in A2, shape (3, 3), or None for a pass without A2.
+        start_mm: Start of the pass, shape (3,), if that is not A1's first point; a transfer leads from there.
+    """
+
+    tip_mm: Floats
+    rotation: Floats
+    target_rotation: Floats | None = None
+    start_mm: Floats | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "tip_mm", frozen(self.tip_mm, np.float64, (None, 3), "tip_mm"))
+        object.__setattr__(self, "rotation", frozen(self.rotation, np.float64, (3, 3), "rotation"))
+        check_rotation(self.rotation[None])
+        points = self.tip_mm
+        if self.start_mm is not None:
+            object.__setattr__(self, "start_mm", frozen(self.start_mm, np.float64, (3,), "start_mm"))
+            points = np.append(points, self.start_mm[None], axis=0)
+        if (np.abs(points) > FAR_MM).any():
+            raise BadPlan("A point is more than ten metres away; give millimetres in the PSM base frame.")
+        if self.target_rotation is not None:
+            target = frozen(self.target_rotation, np.float64, (3, 3), "target_rotation")
+            check_rotation(target[None])
+            object.__setattr__(self, "target_rotation", target)
+
+
+@dataclass(frozen=True, eq=False)
+class Way:
+    """The path of the arms in one pass.
+
+    Attributes:
+        transfer: Stations before A1; the last is where A1 begins.
+        line: Points of A1, no two neighbours equal, shape (K, 3).
+        handed: Poses at the end of A2; None for a pass without it.
+    """
+
+    transfer: tuple[Arms, ...]
+    line: Floats
+    handed: Arms | None
+
+    @property
+    def last(self) -> Arms:
+        """The poses at the end of the pass."""
+        return self.handed or (Pose(self.line[-1], self.transfer[-1][0].rotation), *self.transfer[-1][1:])
+
+
+def ways(passes: Sequence[PassPath], psm_m: PsmM | None) -> list[Way]:
+    """Lay out every pass, with PSM_M if its base is known.
+
+    Args:
+        passes: The passes in order.
+        psm_m: The other arm; None, or one without a base, leaves it out.
+
+    Returns:
+        One entry per pass, the poses in the PSM_A base frame.
+
+    Raises:
+        NoMotion: There is no pass, or one in which nothing moves.
+        BadPlan: A pass has no A2, but PSM_M would take the needle there.
+    """
+    if not passes:
+        raise NoMotion("A plan needs at least one pass.")
+    beside = psm_m if psm_m is not None and psm_m.base_mm is not None else None
+    found: list[Way] = []
+    before: Meeting | None = None
+    for number, one in enumerate(passes):
+        line = _polyline(one, number)
+        meets = None if beside is None else _meeting(one, number, beside)
+        stations = _stations(one, line, meets, before, found[-1].last if found else None)
+        handed = None
+        if one.target_rotation is not None:
+            handed = _arms(Pose(line[-1], one.target_rotation), None if meets is None else meets.taking)
+        found.append(Way(stations, line, handed))
+        before = meets
+    return found
+
+
+def _stations(
+    one: PassPath, line: Floats, meets: Meeting | None, before: Meeting | None, last: Arms | None
+) -> tuple[Arms, ...]:
+    """List the stations of a transfer; neighbours may be equal."""
+    first = Pose(line[0], one.rotation)
+    start = first if one.start_mm is None else Pose(one.start_mm, one.rotation)
+    waits = None if meets is None else meets.waiting
+    if last is None:
+        return _arms(start, waits), _arms(first, waits)
+    away = None if before is None else before.stand_off
+    off = None if meets is None else meets.stand_off
+    return last, _arms(last[0], away), _arms(start, off), _arms(first, off), _arms(first, waits)
+
+
+def _arms(psm_a: Pose, psm_m: Pose | None) -> Arms:
+    return (psm_a,) if psm_m is None else (psm_a, psm_m)
+
+
+def _meeting(one: PassPath, number: int, psm_m: PsmM) -> Meeting:
+    if one.target_rotation is None:
+        raise BadPlan(f"Pass {number} has no A2, so PSM_M cannot take the needle.", **{"pass": number})
+    return meeting(Pose(one.tip_mm[-1], one.target_rotation), psm_m)
+
+
+def _polyline(one: PassPath, number: int) -> Floats:
+    """Return the points of A1 without repetitions, shape (K, 3).
+
+    Raises:
+        NoMotion: Nothing moves in this pass.
+    """
+    points = one.tip_mm
+    if not len(points):
+        raise NoMotion(f"Pass {number} has no points.", **{"pass": number})
+    moves = np.linalg.norm(np.diff(points, axis=0), axis=1) > SAME_POINT_MM
+    # Of equal points the last remains, so that the pass ends exactly at its last point.
+    kept: Floats = points[np.append(moves, True)]
+    if len(kept) < 2 and one.target_rotation is None:
+        raise NoMotion(f"Pass {number} neither moves nor turns; give it two points or a target.", **{"pass": number})
+    return kept

@@ -1,0 +1,252 @@
+"""Smooth paths along the raw demonstration, where a rollout follows it, and inside the rollout's cells.
+
+    Demo, GridPath --trace--> Trace;   Rollout, Trace, start --fit_to_demo--> FittedPath
+
+The grid rounds a demonstration to the centres of its cells, half a cell away (h / 2 in 3-D) on average. The recording
+has the surgeon's actual place in each cell. All of this is ours; the paper drives from centre to centre.
+
+* A *visit* is one entry of a rollout. The tail of a rollout that visits the demonstration's last waypoints one after
+  the other is where it *follows* the demonstration; each sample of the recording belongs to the waypoint that
+  `discretize` made of it, so a path that crosses itself is followed branch by branch.
+* The *guide* is the curve that the path should follow: the start, the centres of the cells before the demonstration is
+  joined, the demonstration without tremor and rests, the goal. Start and goal are the policy's, which are centres of
+  cells, because those places are promised to clients and a plan puts the goal at its suture point; the demonstration's
+  first and last sample are elsewhere in those cells. The demonstrated part of the guide begins and ends where the
+  demonstration is nearest to them and is shifted to meet them; the shift fades over the length of one cell.
+* The path is the smoothest sequence of points near the guide, each in the cell of its visit:
+
+      minimise  sum |x_i - guide_i|^2 + STIFFNESS sum |x_(i-1) - 2 x_i + x_(i+1)|^2,  x_i in its cell, ends held
+
+A visit in which the guide advances by less than `GRAZED` is grazed, through tremor or across a corner, and gets no
+point. The remaining points still go from cell to touching cell in the rollout's order.
+"""
+
+from dataclasses import dataclass
+from itertools import pairwise
+from math import dist
+
+import numpy as np
+
+from skills.arrays import Flags, Floats, Ints, frozen
+from skills.demonstration.demonstration import Demo
+from skills.demonstration.movement import smoothed_tip
+from skills.errors import BadPlan
+from skills.gridworld.grid import GridPath
+from skills.learning.policy import Rollout
+
+TREMOR_S = 0.25  # a Hann window this wide has its zeros at 8, 12, 16 Hz and passes less than 3 % in between
+# Lengths as parts of a cell:
+STEP = 0.25  # between points: 1.25 mm in the paper's cells
+GRAZED = 0.05  # a visit that advances by less is due to tremor, or crosses a corner
+BLEND = 1.0
+MOVED = 0.02  # a hand that stays within this distance is at rest
+INSIDE = 0.001  # distance from the cell's faces, so that rounding never puts a point into the neighbouring cell
+STIFFNESS = 10.0  # halves waves that are 11 points long, 14 mm in the paper's cells; preserves longer ones
+_ROUNDS = 120
+
+
+@dataclass(frozen=True, eq=False)
+class Trace:
+    """A demonstration without tremor and rests.
+
+    Attributes:
+        path: The demonstration in its grid.
+        tip_mm: Points in the demonstration's frame, shape (N, 3).
+        waypoints: The waypoint of each point, shape (N,).
+    """
+
+    path: GridPath
+    tip_mm: Floats
+    waypoints: Ints
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "tip_mm", frozen(self.tip_mm, np.float64, (None, 3), "tip_mm"))
+        object.__setattr__(self, "waypoints", frozen(self.waypoints, np.int64, (len(self.tip_mm),), "waypoints"))
+
+
+@dataclass(frozen=True, eq=False)
+class FittedPath:
+    """A smooth path, each point in the cell of its visit.
+
+    Attributes:
+        tip_mm: Points in the demonstration's frame, shape (K, 3).
+        visits: The rollout's visit of each point, ascending, shape (K,).
+    """
+
+    tip_mm: Floats
+    visits: Ints
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "tip_mm", frozen(self.tip_mm, np.float64, (None, 3), "tip_mm"))
+        object.__setattr__(self, "visits", frozen(self.visits, np.int64, (len(self.tip_mm),), "visits"))
+
+
+def trace(demo: Demo, path: GridPath) -> Trace:
+    """Return a demonstration without tremor (8 to 12 Hz) and rests, with the waypoint of each point.
+
+    Waypoints that contain no sample get a point on the straight line between the samples around them.
+
+    Args:
+        demo: The demonstration.
+        path: The path that `discretize` made from it.
+
+    Raises:
+        BadPlan: The path was not made from this demonstration.
+        OutsideGrid: This demonstration is not inside the path's grid.
+    """
+    waypoints = _waypoints(demo.tip_mm, path)
+    seconds, tip = smoothed_tip(demo.stamps_s, demo.tip_mm, TREMOR_S)
+    calm = np.stack([np.interp(demo.stamps_s, seconds, axis) for axis in tip.T], axis=1)
+    bridged = np.setdiff1d(np.arange(len(path.states)), waypoints)
+    before = np.searchsorted(waypoints, bridged) - 1
+    share = (bridged - waypoints[before]) / (waypoints[before + 1] - waypoints[before])
+    calm = np.concatenate((calm, calm[before] + share[:, None] * (calm[before + 1] - calm[before])))
+    waypoints = np.concatenate((waypoints, bridged))
+    order = np.argsort(waypoints, kind="stable")
+    moving = order[_moving(calm[order], MOVED * path.grid.cell_mm)]
+    return Trace(path, calm[moving], waypoints[moving])
+
+
+def fit_to_demo(followed: Rollout, demonstrated: Trace, start_mm: Floats) -> FittedPath:
+    """Fit a smooth path to the demonstration that a rollout follows, within the rollout's cells.
+
+    Args:
+        followed: A rollout that reaches the goal.
+        demonstrated: The demonstration that its policy was learnt from.
+        start_mm: Start of the path in the demonstration's frame, shape (3,), in the rollout's first cell.
+
+    Returns:
+        The path from `start_mm` to the centre of the goal's cell, rounded to a nanometre.
+    """
+    assert followed.finished and np.array_equal(followed.path.states, demonstrated.path.states)
+    guide, visits = _guide(followed, demonstrated, start_mm)
+    along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(guide, axis=0), axis=1)))
+    if along[-1] == 0:
+        return FittedPath(guide[:1], visits[:1])
+    cell_mm = followed.path.grid.cell_mm
+    at, visits = _touching(*_spread(along, visits, cell_mm), followed.path.grid.cells_of(followed.states))
+    wanted = np.stack([np.interp(at, along, axis) for axis in guide.T], axis=1)
+    centres = followed.tip_mm[visits]
+    half = cell_mm * (0.5 - INSIDE)
+    low, high = centres - half, centres + half
+    # The ends are fixed, because start and goal are promised to clients.
+    low[0] = high[0] = guide[0]
+    low[-1] = high[-1] = guide[-1]
+    tip = _smoothest(wanted, low, high)
+    tip[1:-1] = tip[1:-1].round(6)  # to a nanometre, so that every machine computes the same bytes
+    return FittedPath(tip, visits)
+
+
+def _waypoints(tip_mm: Floats, path: GridPath) -> Ints:
+    """Return the waypoint of each sample, (T,), counted as in `discretize`: a jump over n cells is n waypoints."""
+    cells = path.grid.cells_along(tip_mm, path.hysteresis)
+    waypoints = np.append(0, np.cumsum(np.abs(np.diff(cells, axis=0)).max(axis=1)))
+    if waypoints[-1] != len(path.states) - 1 or (path.cells[waypoints] != cells).any():
+        raise BadPlan("The policy was not learnt from this demonstration; give the demonstration of its path.")
+    return waypoints
+
+
+def _moving(tip_mm: Floats, least_mm: float) -> Ints:
+    """Return the indices, (M,), of points at least this far from the previous one returned; the first point is one."""
+    found, places = [0], tip_mm.tolist()
+    for index, place in enumerate(places):
+        if dist(place, places[found[-1]]) >= least_mm:
+            found.append(index)
+    return np.array(found)
+
+
+def _guide(followed: Rollout, demonstrated: Trace, start_mm: Floats) -> tuple[Floats, Ints]:
+    """Return the points of the guide, (M, 3), and the visit of each, (M,)."""
+    last = len(followed.states) - 1
+    joined = last + 1 - _tail(followed)
+    goal = followed.tip_mm[-1]
+    approach = np.concatenate((start_mm[None], followed.tip_mm[1 : joined + 1]))
+    visits = demonstrated.waypoints - (len(demonstrated.path.states) - 1 - last)
+    part = np.flatnonzero((visits >= joined) & (joined < last))  # none where only the goal's cell is left
+    part = part[_nearest(demonstrated.tip_mm[part], visits[part] == joined, approach[-1]) :]
+    part = part[::-1][_nearest(demonstrated.tip_mm[part][::-1], visits[part][::-1] == last, goal) :][::-1]
+    tip, over_mm = demonstrated.tip_mm[part], BLEND * followed.path.grid.cell_mm
+    if len(part) and visits[part[0]] == joined:
+        tip = _blended(tip, approach[-1], over_mm)
+    if len(part) and visits[part[-1]] == last:
+        tip = _blended(tip[::-1], goal, over_mm)[::-1]
+    of_visit = np.concatenate((np.arange(joined + 1), visits[part], [last]))
+    return np.concatenate((approach, tip, goal[None])), of_visit
+
+
+def _tail(followed: Rollout) -> int:
+    """Count the visits at the end that are the demonstration's last waypoints, one after the other."""
+    both = min(len(followed.states), len(followed.path.states))
+    differ = np.flatnonzero(followed.states[-both:] != followed.path.states[-both:])
+    return both if len(differ) == 0 else both - 1 - int(differ[-1])
+
+
+def _nearest(tip_mm: Floats, of_visit: Flags, place_mm: Floats) -> int:
+    """Return the index of a visit's point, the first in order, nearest to a place; 0 if the visit has no points."""
+    count = int(np.count_nonzero(of_visit))
+    return int(np.linalg.norm(tip_mm[:count] - place_mm, axis=1).argmin()) if count else 0
+
+
+def _blended(tip_mm: Floats, place_mm: Floats, over_mm: float) -> Floats:
+    """Return a path, (M, 3), that begins at a place and joins the original path over a length."""
+    along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(tip_mm, axis=0), axis=1)))
+    share = np.minimum(along / over_mm, 1.0)[:, None]
+    blended: Floats = tip_mm + (place_mm - tip_mm[0]) * (1 - share * share * (3 - 2 * share))
+    return blended
+
+
+def _spread(along: Floats, visits: Ints, cell_mm: float) -> tuple[Floats, Ints]:
+    """Choose the positions of the points along the guide, (K,) mm, and the visit of each, (K,).
+
+    Every visit is divided evenly; neighbouring grazed visits are merged if together they are long enough for a point.
+    """
+    first = np.flatnonzero(np.append(True, np.diff(visits) > 0))
+    after = np.append(first[1:], len(visits))
+    edges = np.concatenate(([0.0], (along[after[:-1] - 1] + along[first[1:]]) / 2, along[-1:]))
+    grazed = np.diff(edges) < GRAZED * cell_mm
+    unit = np.append(0, np.cumsum(~(grazed[1:] & grazed[:-1])))
+    begin = np.flatnonzero(np.append(True, np.diff(unit) > 0))
+    end = np.append(begin[1:], len(first))
+    kept = edges[end] - edges[begin] >= GRAZED * cell_mm
+    begin, end = begin[kept], end[kept]
+    between = (edges[end[:-1]] + edges[begin[1:]]) / 2
+    limits = np.concatenate(([0.0], between, along[-1:]))
+    at, of_visit = [np.zeros(1)], [visits[:1]]
+    # Not strict: a path of almost no length has no visit that gets a point.
+    for (low, high), one, other in zip(pairwise(limits), begin, end, strict=False):
+        count = max(1, round((high - low) / (STEP * cell_mm)))
+        places = low + (high - low) * (np.arange(count) + 0.5) / count
+        number = np.searchsorted(edges, places, side="right") - 1
+        at.append(places)
+        of_visit.append(visits[first[number.clip(one, other - 1)]])
+    return np.concatenate([*at, along[-1:]]), np.concatenate([*of_visit, visits[-1:]])
+
+
+def _touching(at: Floats, visits: Ints, cells: Ints) -> tuple[Floats, Ints]:
+    """Insert a point for every skipped visit between cells that do not touch.
+
+    A violent movement can skip a cell, because the average of its samples lies in neither of two distant cells.
+    """
+    apart = np.flatnonzero(np.abs(np.diff(cells[visits], axis=0)).max(axis=1) > 1)
+    left_out = [np.arange(visits[i] + 1, visits[i + 1]) for i in apart]
+    places = [np.linspace(at[i], at[i + 1], len(new) + 2)[1:-1] for i, new in zip(apart, left_out, strict=True)]
+    before = np.repeat(apart + 1, [len(new) for new in left_out])
+    return np.insert(at, before, np.concatenate([[], *places])), np.insert(
+        visits, before, np.concatenate([np.empty(0, np.int64), *left_out])
+    )
+
+
+def _smoothest(wanted: Floats, low: Floats, high: Floats) -> Floats:
+    """Solve the minimisation above for points, (K, 3), within boxes, by Nesterov's accelerated projected gradient."""
+    rate = 1 / (1 + 16 * STIFFNESS)  # 1 over the largest curvature of the objective; the smallest is 1
+    push = (1 - np.sqrt(rate)) / (1 + np.sqrt(rate))
+    x = ahead = wanted.clip(low, high)
+    for _ in range(_ROUNDS):
+        bend = np.diff(ahead, 2, axis=0)
+        slope = ahead - wanted
+        slope[:-2] += STIFFNESS * bend
+        slope[1:-1] -= 2 * STIFFNESS * bend
+        slope[2:] += STIFFNESS * bend
+        x, before = (ahead - rate * slope).clip(low, high), x
+        ahead = x + push * (x - before)
+    return x

@@ -1,0 +1,405 @@
+"""Trajectories: a plan sampled in time, with the joints of both arms at every tick, and its timetable.
+
+    passes, PsmM --time_parametrise--> Trajectory --seconds_by_phase, transfers, seams--> its timetable
+
+A pass is a transfer, A1 (the tip along its polyline with the jaw held) and A2 (the jaw turning with the tip held); see
+`skills.planning.passes`. Between passes the surgeon performs M1 and M2 by hand: time passes, and the next pass
+continues from the pose in which the previous one ended. So nothing jumps within a trajectory, except the stamps between
+passes.
+
+The law of motion is ours; the paper only asks for no jerky movements:
+
+* A1 is a cubic spline through the polyline's points, at rest at both ends and slower in bends. Each point is passed
+  exactly, on a tick. Between points it leaves the straight move by at most 1.25 mm, because moves are divided until it
+  does not (`skills.planning.motion_laws`). Stopping at every point would not leave it at all, but takes longer.
+* Transfers, A2 and all motion of PSM_M are minimum-jerk moves from rest to rest (`skills.planning.motion_laws`).
+* If a joint of either arm would exceed its speed or acceleration limit, that phase of all passes is slowed until no
+  joint does.
+
+The timetable (seconds of each phase, transfers, seams) is measured on the samples, not taken from the plan. A seam is
+the place where one pass ends and the next begins: time passes there, and nothing may move.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from math import isfinite, radians, sqrt
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from skills.arrays import Bytes, Floats, Ints, frozen
+from skills.errors import BadPlan, BadSpeed, NoMotion
+from skills.fields import Count, schema
+from skills.kinematics import DEFAULT_INSTRUMENT, angle_between, instrument_of, matrix_of, quaternion_of
+from skills.planning.handoff import OtherArm, PsmM
+from skills.planning.joint_path import Ticks, solve
+from skills.planning.motion_laws import (
+    A1,
+    A2,
+    PHASES,
+    TRANSFER,
+    Pace,
+    Pose,
+    Poses,
+    check_length,
+    followed,
+    held,
+    joined,
+    move,
+)
+from skills.planning.passes import PassPath, Way, other_arm, ways
+
+__all__ = ["A1", "A2", "MAX_SPEED_MM_S", "TRANSFER", "PassPath", "Trajectory", "joint_ratios", "time_parametrise"]
+
+MAX_SPEED_MM_S = 100.0  # ours: the joints allow 139 mm/s in the paper's grid, but no needle is handed over that fast
+RATE_HZ = (10.0, 2000.0)
+PEAK_TURN_RAD_S = radians(45)
+_HEADROOM = 0.98  # each slow-down aims this far below the limits, so that a second one is rarely needed
+_ATTEMPTS = 20
+
+Paces = tuple[Pace, Pace, Pace]  # of each phase
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """All passes of a plan, sampled; the pose never jumps from one sample to the next, even where the stamps do.
+
+    Attributes:
+        rate_hz: Samples per second within a pass.
+        instrument: Number of the instrument.
+        stamps_s: Time of each sample, shape (T,); it jumps between passes.
+        tip_mm: Tip in the PSM base frame, shape (T, 3).
+        rotation_xyzw: The jaw's rotation there, unit quaternions, shape (T, 4).
+        joints: Rows of `kinematics.JOINTS`, rad and mm, shape (T, 6).
+        pass_index: Number of the pass, from 0, shape (T,).
+        phase: `TRANSFER` (to where A1 begins), `A1` or `A2`, shape (T,).
+        speed_mm_s: Speed along A1 where its path is straight, after any slow-down.
+        turn_rad_s: Peak rate of A2 after any slow-down; if PSM_M needs longer to come in, A2 turns slower still.
+        speed_ratio: Greatest joint speed, of either arm, as a part of its limit.
+        acceleration_ratio: Greatest joint acceleration, of either arm, as a part of its limit.
+        deviation_mm: Greatest distance of A1 from its straight moves.
+        psm_m: Simultaneous motion of PSM_M; None if its place is not known.
+    """
+
+    rate_hz: float
+    instrument: str
+    stamps_s: Floats
+    tip_mm: Floats
+    rotation_xyzw: Floats
+    joints: Floats
+    pass_index: Ints
+    phase: Bytes
+    speed_mm_s: float
+    turn_rad_s: float
+    speed_ratio: float
+    acceleration_ratio: float
+    deviation_mm: float
+    psm_m: OtherArm | None = None
+
+    def __post_init__(self) -> None:
+        instrument_of(self.instrument)
+        _check_rate(self.rate_hz)
+        count = len(self.stamps_s)
+        for name, dtype, shape in (
+            ("stamps_s", np.float64, (count,)),
+            ("tip_mm", np.float64, (count, 3)),
+            ("rotation_xyzw", np.float64, (count, 4)),
+            ("joints", np.float64, (count, 6)),
+            ("pass_index", np.int64, (count,)),
+            ("phase", np.int8, (count,)),
+        ):
+            object.__setattr__(self, name, frozen(getattr(self, name), dtype, shape, name))
+        if not count:
+            raise NoMotion("A trajectory needs at least one sample.")
+        if not (np.diff(self.stamps_s) > 0).all() or not np.isin(np.diff(self.pass_index), (0, 1)).all():
+            raise BadPlan("The stamps and the pass numbers of a trajectory must increase.")
+        if self.pass_index[0] != 0 or not np.isin(self.phase, (TRANSFER, A1, A2)).all():
+            raise BadPlan(
+                "The passes of a trajectory must be numbered from 0, and its phases must be 0 (transfer), 1 (A1) and "
+                "2 (A2)."
+            )
+        if self.psm_m is not None and len(self.psm_m.joints) != count:
+            raise BadPlan(f"PSM_M has {len(self.psm_m.joints)} samples and PSM_A has {count}; give equal numbers.")
+
+    def __len__(self) -> int:
+        """The number of samples."""
+        return len(self.stamps_s)
+
+    @property
+    def passes(self) -> int:
+        """The number of passes."""
+        return int(self.pass_index[-1]) + 1
+
+    @property
+    def duration_s(self) -> float:
+        """Seconds from the first sample to the last, pauses included."""
+        return float(self.stamps_s[-1] - self.stamps_s[0])
+
+    @property
+    def last_samples(self) -> Ints:
+        """Index of the last sample of each pass, shape (passes,)."""
+        return np.append(np.flatnonzero(np.diff(self.pass_index)), len(self) - 1).astype(np.int64)
+
+
+def time_parametrise(
+    passes: Sequence[PassPath],
+    *,
+    speed_mm_s: float = 20.0,
+    rate_hz: float = 240.0,
+    instrument: str = DEFAULT_INSTRUMENT,
+    pause_s: float = 1.0,
+    psm_m: PsmM | None = None,
+) -> Trajectory:
+    """Return the trajectory of passes: smooth, through every point, within the arms' limits.
+
+    The same passes give the same bytes.
+
+    Args:
+        passes: The passes in order.
+        speed_mm_s: Speed along A1 where its path is straight, and greatest speed of a transfer and of PSM_M; lower in
+            bends, and lower if the joints' limits require it.
+        rate_hz: Samples per second.
+        instrument: Number of the instrument.
+        pause_s: Seconds between passes, for M1 and M2 by hand; rounded to full ticks, at least one.
+        psm_m: The other arm; if its base is known it moves too.
+
+    Returns:
+        The samples of all passes, with the speeds after any slow-down.
+
+    Raises:
+        BadSpeed: Speed, rate or pause is NaN, not positive, or over its limit; the motion has too many samples; or no
+            speed keeps it within the joints' limits.
+        NoMotion: There is no pass, or one in which nothing moves.
+        BadPlan: PSM_M would take the needle in a pass without A2.
+        Unreachable: The first sample that an arm cannot reach; `numbers` has pass, phase, joint, value and limit.
+    """
+    if not (isfinite(speed_mm_s) and 0 < speed_mm_s <= MAX_SPEED_MM_S):
+        raise BadSpeed(f"Speed must be above 0 and at most {MAX_SPEED_MM_S:g} mm/s.", speed_mm_s=speed_mm_s)
+    _check_rate(rate_hz)
+    if not (isfinite(pause_s) and 0 <= pause_s <= 3600):
+        raise BadSpeed("The pause between passes must be 0 to 3600 s.", pause_s=pause_s)
+    routes = ways(passes, psm_m)
+    paces = (Pace(speed_mm_s, PEAK_TURN_RAD_S, rate_hz),) * 3
+    for _ in range(_ATTEMPTS):
+        motion = _solved([_sample(one, paces) for one in routes], instrument, psm_m)
+        speed, acceleration = _ratios(motion, rate_hz, instrument)
+        slower = _slowed(paces, motion.ticks.phase, speed, acceleration)
+        if slower == paces:
+            break
+        paces = slower
+    else:
+        raise BadSpeed("No speed keeps this plan within the joints' limits; move it away from the limits of the wrist.")
+    pause = max(1, round(pause_s * rate_hz))  # at least one tick, because stamps must increase
+    ticks = motion.ticks
+    return Trajectory(
+        rate_hz=rate_hz,
+        instrument=instrument,
+        stamps_s=(np.arange(len(motion.joints)) + ticks.pass_index * (pause - 1)) / rate_hz,
+        tip_mm=motion.poses.tip_mm,
+        rotation_xyzw=quaternion_of(motion.poses.rotation),
+        joints=motion.joints,
+        pass_index=ticks.pass_index,
+        phase=ticks.phase,
+        speed_mm_s=paces[A1].speed_mm_s,
+        turn_rad_s=paces[A2].turn_rad_s,
+        speed_ratio=float(speed.max()),
+        acceleration_ratio=float(acceleration.max()),
+        deviation_mm=motion.deviation_mm,
+        psm_m=motion.psm_m,
+    )
+
+
+def joint_ratios(
+    joints: ArrayLike, pass_index: ArrayLike, rate_hz: float, instrument: str = DEFAULT_INSTRUMENT
+) -> tuple[Floats, Floats]:
+    """Return the speed and the acceleration of each joint at each sample as parts of their limits.
+
+    They are differences of neighbouring samples; every pass begins and ends at rest. NaN stays NaN.
+
+    Args:
+        joints: Rows of `kinematics.JOINTS`, rad and mm, shape (T, 6).
+        pass_index: Number of the pass of each sample, shape (T,).
+        rate_hz: Samples per second.
+        instrument: Number of the instrument, whose limits count.
+
+    Returns:
+        Speed ratios and acceleration ratios, both of shape (T, 6).
+    """
+    q = np.asarray(joints, dtype=np.float64)
+    number = np.asarray(pass_index)
+    tool = instrument_of(instrument)
+    same = (np.diff(number) == 0)[:, None]
+    velocity = np.where(same, np.diff(q, axis=0) * rate_hz, 0.0)
+    before = np.concatenate([np.zeros((1, 6)), velocity])
+    after = np.concatenate([velocity, np.zeros((1, 6))])
+    speed = np.maximum(np.abs(before), np.abs(after)) / tool.speed
+    return speed, np.abs(after - before) * rate_hz / tool.acceleration
+
+
+def _check_rate(rate_hz: float) -> None:
+    low, high = RATE_HZ
+    if not (isfinite(rate_hz) and low <= rate_hz <= high):
+        raise BadSpeed(f"The rate must be {low:g} to {high:g} Hz.", rate_hz=rate_hz)
+
+
+# ---- one pass --------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Sampled:
+    """One pass in ticks: the poses of each arm, and the number of ticks of each phase."""
+
+    poses: tuple[Poses, ...]
+    counts: tuple[int, int, int]
+    deviation_mm: float
+
+
+def _sample(one: Way, paces: Paces) -> _Sampled:
+    """Sample one pass; the end of a phase and the beginning of the next are one tick, at rest."""
+    legs = [move(start, end, paces[TRANSFER]) for start, end in pairwise(one.transfer)]
+    parts = [tuple(poses[:-1] for poses in leg) for leg in legs]  # a leg's last pose is the first of the next part
+    begin = one.transfer[-1]
+    tip, deviation_mm = followed(one.line, paces[A1].speed_mm_s / paces[A1].rate_hz)
+    along = Poses(tip, np.tile(begin[0].rotation, (len(tip), 1, 1)))
+    parts.append((along, *(held(pose, len(tip)) for pose in begin[1:])))
+    before = sum(len(leg[0]) for leg in parts[:-1])
+    turning = 0
+    if one.handed is not None:
+        turned = move((Pose(one.line[-1], begin[0].rotation), *begin[1:]), one.handed, paces[A2], least_ticks=1)
+        parts.append(tuple(poses[1:] for poses in turned))
+        turning = len(turned[0]) - 1
+    poses = tuple(joined(of_arm) for of_arm in zip(*parts, strict=True))
+    return _Sampled(poses, (before, len(tip), turning), deviation_mm)
+
+
+# ---- all passes ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Motion:
+    """All passes in ticks, with their joints solved."""
+
+    poses: Poses
+    ticks: Ticks
+    joints: Floats
+    psm_m: OtherArm | None
+    deviation_mm: float
+
+
+def _solved(sampled: Sequence[_Sampled], instrument: str, psm_m: PsmM | None) -> _Motion:
+    """Concatenate the passes and solve the joints of both arms."""
+    counts = np.array([one.counts for one in sampled])
+    check_length(int(counts.sum()))
+    phase = np.repeat(np.tile(np.array([TRANSFER, A1, A2], np.int8), len(counts)), counts.ravel())
+    ticks = Ticks(np.repeat(np.arange(len(counts)), counts.sum(axis=1)), phase)
+    poses = [joined(of_arm) for of_arm in zip(*(one.poses for one in sampled), strict=True)]
+    joints = solve(poses[0], ticks, instrument)
+    other = None if psm_m is None or len(poses) == 1 else other_arm(poses[1], ticks, psm_m)
+    return _Motion(poses[0], ticks, joints, other, max(one.deviation_mm for one in sampled))
+
+
+def _ratios(motion: _Motion, rate_hz: float, instrument: str) -> tuple[Floats, Floats]:
+    """Return the greatest speed and acceleration of any joint of either arm, as parts of their limits, both (T,)."""
+    moving = [(motion.joints, instrument)]
+    if motion.psm_m is not None:
+        moving.append((motion.psm_m.joints, motion.psm_m.instrument))
+    ratios = [joint_ratios(q, motion.ticks.pass_index, rate_hz, tool) for q, tool in moving]
+    speed, acceleration = (np.max([one[i].max(axis=1) for one in ratios], axis=0) for i in (0, 1))
+    return speed, acceleration
+
+
+def _slowed(paces: Paces, phase: Bytes, speed: Floats, acceleration: Floats) -> Paces:
+    """Slow down each phase in which a joint exceeds a limit; return equal paces if none does.
+
+    Speed grows with the pace, acceleration with its square.
+    """
+    transfer, a1, a2 = (
+        _HEADROOM / worst if worst > 1.0 else 1.0
+        for worst in (
+            max(float(speed[phase == one].max(initial=0)), sqrt(float(acceleration[phase == one].max(initial=0))))
+            for one in (TRANSFER, A1, A2)
+        )
+    )
+    return paces[TRANSFER].slowed(transfer), paces[A1].slowed(a1), paces[A2].slowed(a2)
+
+
+@schema
+@dataclass(frozen=True)
+class Transfer:
+    """The motion of PSM_A to where A1 begins: length of its tip's path, and the duration, which PSM_M shares."""
+
+    length_mm: float
+    duration_s: float
+
+
+@schema
+@dataclass(frozen=True)
+class Seam:
+    """The change between the last sample of a pass and the first of the next.
+
+    `joint_leap` is the greatest change of a joint of either arm, as a part of the change that its speed limit allows in
+    one tick.
+    """
+
+    after_pass: Count
+    pause_s: float
+    leap_mm: float
+    leap_deg: float
+    joint_leap: float
+
+
+def seconds_by_phase(trajectory: Trajectory) -> dict[str, float]:
+    """Return the seconds of each phase over all passes, without pauses.
+
+    Args:
+        trajectory: The trajectory.
+
+    Returns:
+        Seconds by the names of `PHASES`.
+    """
+    return {
+        name: float(np.count_nonzero(trajectory.phase == phase) / trajectory.rate_hz)
+        for phase, name in enumerate(PHASES)
+    }
+
+
+def transfers(trajectory: Trajectory) -> list[Transfer | None]:
+    """Return the transfer of each pass; None where A1 begins at once.
+
+    Args:
+        trajectory: The trajectory, whose samples are measured.
+    """
+    steps = np.linalg.norm(np.diff(trajectory.tip_mm, axis=0), axis=1)
+    found: list[Transfer | None] = []
+    for number in range(trajectory.passes):
+        # The step after a transfer's last sample leads to A1's first one.
+        at = np.flatnonzero((trajectory.pass_index == number) & (trajectory.phase == TRANSFER))
+        found.append(Transfer(float(steps[at].sum()), len(at) / trajectory.rate_hz) if len(at) else None)
+    return found
+
+
+def seams(trajectory: Trajectory) -> list[Seam]:
+    """Return the seams between passes, one fewer than there are passes.
+
+    Args:
+        trajectory: The trajectory, whose samples are measured.
+    """
+    before = trajectory.last_samples[:-1]
+    after = before + 1
+    rotation = matrix_of(trajectory.rotation_xyzw)
+    turned = np.degrees(angle_between(rotation[before], rotation[after]))
+    moving = [(trajectory.joints, trajectory.instrument)]
+    if trajectory.psm_m is not None:
+        moving.append((trajectory.psm_m.joints, trajectory.psm_m.instrument))
+    leaps = [np.abs(q[after] - q[before]) / instrument_of(tool).speed * trajectory.rate_hz for q, tool in moving]
+    return [
+        Seam(
+            after_pass=number,
+            pause_s=float(trajectory.stamps_s[after[number]] - trajectory.stamps_s[last]),
+            leap_mm=float(np.linalg.norm(trajectory.tip_mm[after[number]] - trajectory.tip_mm[last])),
+            leap_deg=float(turned[number]),
+            joint_leap=max(float(leap[number].max()) for leap in leaps),
+        )
+        for number, last in enumerate(before.tolist())
+    ]

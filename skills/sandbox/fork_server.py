@@ -1,0 +1,180 @@
+"""The fork server: a small single-threaded process that imports its modules once and then only forks.
+
+Requests arrive on standard input, a SOCK_SEQPACKET socket, which preserves message boundaries. Each request is JSON
+with four open files attached:
+
+    given     read-only, the input of the function
+    answer    the function writes its result here
+    said      stdout and stderr of the fork, including output of C libraries
+    line      the caller's socket: it receives "begun" and then the exit code; closing it ends the fork
+
+Each fork has its own folder for temporary files, which the server removes however the fork ended. The server exits
+when its last caller has disconnected, and kills all its forks then. It imports little itself, because a call in a new
+interpreter starts one, too.
+"""
+
+import gc
+import importlib
+import json
+import os
+import resource
+import selectors
+import shutil
+import signal
+import socket
+import tempfile
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, NoReturn
+
+from skills.sandbox.limits import ProcessLimits, confine, perform
+
+MAX_REQUEST_BYTES = 16384
+BEGUN, NO_FORK = b"begun", b"no fork"
+
+
+@dataclass(frozen=True)
+class _Child:
+    pid: int
+    ended: int  # a pidfd: readable once the process has ended
+    line: socket.socket
+
+    @property
+    def folder(self) -> Path:
+        """The folder of its temporary files."""
+        return Path(tempfile.gettempdir(), str(self.pid))
+
+
+def main(folder: str, *modules: str) -> NoReturn:
+    """Run as the fork server until the last caller disconnects.
+
+    Args:
+        folder: For the temporary files of the forks; removed at the end.
+        modules: Imported before the first fork. One may be given as `module:function`: the function is called once,
+            to prepare state that every fork inherits.
+    """
+    tempfile.tempdir = folder
+    gc.disable()  # imports create no garbage, and looking for it takes a fifth of the start
+    for given in modules:
+        module, _, function = given.partition(":")
+        imported = importlib.import_module(module)
+        if function:
+            getattr(imported, function)()
+    gc.freeze()  # the collector would write to pages shared with the forks, and so copy them
+    gc.enable()
+    children: dict[int, _Child] = {}
+    try:
+        with socket.socket(fileno=0) as control, selectors.DefaultSelector() as events:
+            _serve(control, events, children)
+    finally:
+        for child in children.values():
+            _kill(child)
+            os.waitpid(child.pid, 0)  # when the server has ended, none of its forks runs any more
+        shutil.rmtree(folder, ignore_errors=True)
+    os._exit(0)  # without the interpreter's shutdown, for which a caller in `call_alone` would wait
+
+
+def _serve(control: socket.socket, events: selectors.BaseSelector, children: dict[int, _Child]) -> None:
+    """Fork, kill and report, one event at a time.
+
+    Only the first pending event is handled before selecting again, because handling it may invalidate the others.
+    """
+    events.register(control, selectors.EVENT_READ)
+    while True:
+        key, _ = events.select()[0]
+        if key.fileobj is not control:
+            act: Callable[[], None] = key.data
+            act()
+            continue
+        request, files, _, _ = socket.recv_fds(control, MAX_REQUEST_BYTES, 4)
+        if not request:
+            return
+        child = _fork(json.loads(request), *files)
+        if child is None:
+            continue
+        children[child.pid] = child
+        events.register(child.line, selectors.EVENT_READ, partial(_hung_up, child, events))
+        events.register(child.ended, selectors.EVENT_READ, partial(_ended, child, events, children))
+
+
+def _fork(request: dict[str, Any], given: int, answer: int, said: int, asker: int) -> _Child | None:
+    """Fork a process for a request; return None where the system refuses another process."""
+    server, line = os.getpid(), socket.socket(fileno=asker)
+    try:
+        pid = os.fork()
+    except OSError:
+        pid = -1
+    if pid == 0:
+        _be_child(request, given, answer, said, server)
+    for file in (given, answer, said):
+        os.close(file)
+    _tell(line, BEGUN if pid > 0 else NO_FORK)
+    if pid < 0:
+        line.close()
+        return None
+    with suppress(OSError):  # the fork does so too, and may have ended already
+        os.setpgid(pid, pid)
+    return _Child(pid, os.pidfd_open(pid), line)
+
+
+def _hung_up(child: _Child, events: selectors.BaseSelector) -> None:
+    """Kill a fork whose caller has disconnected; `_ended` cleans up after it as after any other."""
+    events.unregister(child.line)
+    _kill(child)
+
+
+def _ended(child: _Child, events: selectors.BaseSelector, children: dict[int, _Child]) -> None:
+    """Report the exit code of a fork, and remove its processes, files and sockets."""
+    _kill(child)  # its descendants, before waitpid lets the system reuse its process id
+    code = os.waitstatus_to_exitcode(os.waitpid(child.pid, 0)[1])
+    shutil.rmtree(child.folder, ignore_errors=True)
+    _tell(child.line, str(code).encode())
+    events.unregister(child.ended)
+    if child.line in events.get_map():
+        events.unregister(child.line)
+    os.close(child.ended)
+    child.line.close()
+    del children[child.pid]
+
+
+def _kill(child: _Child) -> None:
+    """Kill a process and its process group."""
+    for kill in (os.kill, os.killpg):
+        with suppress(ProcessLookupError):
+            kill(child.pid, signal.SIGKILL)
+
+
+def _tell(line: socket.socket, message: bytes) -> None:
+    with suppress(OSError):  # the caller may have disconnected
+        line.send(message)
+
+
+def _be_child(request: dict[str, Any], given: int, answer: int, said: int, server: int) -> NoReturn:
+    """Close all files but those of this request, apply the limits, call the function, exit."""
+
+    def work() -> None:
+        os.setpgid(0, 0)
+        os.dup2(given, 0)
+        os.dup2(said, 1)
+        os.dup2(said, 2)
+        os.closerange(3, answer)
+        os.closerange(answer + 1, resource.getrlimit(resource.RLIMIT_NOFILE)[0])
+        tempfile.tempdir = f"{tempfile.gettempdir()}/{os.getpid()}"
+        os.mkdir(tempfile.tempdir)
+        limits = ProcessLimits(**request["limits"])
+        # Memory on top of the inherited address space, so that the limit does not depend on the server's imports.
+        confine(ProcessLimits(**request["limits"] | {"memory_bytes": _held_bytes() + limits.memory_bytes}), server)
+        module, _, name = request["target"].partition(":")
+        function = getattr(importlib.import_module(module), name)
+        with os.fdopen(0, "rb", closefd=False) as file, os.fdopen(answer, "wb") as out:
+            function(file, out, **request["arguments"])
+
+    perform(work)
+
+
+def _held_bytes() -> int:
+    """Return the address space of this process in bytes: that of the server's imports, which every fork inherits."""
+    return int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()

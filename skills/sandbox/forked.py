@@ -1,0 +1,371 @@
+"""Function calls in forks of a server process, shared fairly among callers.
+
+`ForkServer` calls functions in forks of a server process that has imported their modules already. The server is started
+as a new interpreter (so it has no threads, none of our memory and a minimal environment) and is started again when it
+dies. It is thread-safe. Linux only.
+
+`call_alone` calls one function in a server of its own without imports, which ends with the call: a new interpreter,
+which shares no state with this process or other calls, but takes a while to import what the function needs.
+
+    def function(given: BinaryIO, answer: BinaryIO, **arguments) -> None
+
+A function reads its input from a file, which is a stranger's or a value written by `skills.packing`, and writes its
+result to another with `packing.write`. That is read as untrusted: only the classes that the caller names are built, and
+their constructors check every number.
+
+`Turns` limits the number of concurrent calls. With N workers one key holds at most N - 1 of them, so that one is free
+for other keys; a single worker is shared in time. Waiting callers are served round-robin by key, and in order of
+arrival within a key. The queue as a whole and the share of each key are bounded: beyond that a request is refused at
+once.
+"""
+
+import json
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing, contextmanager
+from dataclasses import asdict, dataclass
+from itertools import count
+from threading import Event, Lock
+from typing import IO, Any, BinaryIO, TypeVar
+
+from skills import packing
+from skills.errors import Busy, Unanswered
+from skills.packing import Known
+from skills.sandbox.fork_server import BEGUN
+from skills.sandbox.limits import ProcessLimits, check_end, environment, overdue
+
+Watch = Callable[[bytes], None]
+Answer = TypeVar("Answer")
+
+
+class Turns:
+    """A fair, bounded queue for `at_once` workers; thread-safe."""
+
+    def __init__(self, at_once: int, *, waiting: int, waiting_of_one: int) -> None:
+        """Create the queue.
+
+        Args:
+            at_once: Number of turns held concurrently.
+            waiting: Maximum number of callers that wait or hold a turn, over all keys.
+            waiting_of_one: The same for one key.
+        """
+        self._at_once = at_once
+        self._of_one = max(1, at_once - 1)
+        self._most, self._most_of_one = waiting, waiting_of_one
+        self._working: Counter[str] = Counter()
+        self._queues: dict[str, deque[Event]] = {}  # only keys with waiting callers
+        self._served: dict[str, int] = {}  # by key, the sequence number of its newest turn
+        self._turns = count(1)
+        self._lock = Lock()
+
+    @property
+    def asked(self) -> int:
+        """The number of callers that wait or hold a turn."""
+        with self._lock:
+            return self._asked()
+
+    @contextmanager
+    def turn(self, key: str) -> Iterator[None]:
+        """Wait for a turn, and hold it for the duration of the block.
+
+        Raises:
+            Busy: Too many callers are waiting already, in total or of this key.
+        """
+        begin = Event()
+        with self._lock:
+            of_key = len(self._queues.get(key, ())) + self._working[key]
+            if self._asked() >= self._most or of_key >= self._most_of_one:
+                raise Busy("Too many recordings are being read just now; try again in a moment.")
+            self._queues.setdefault(key, deque()).append(begin)
+            self._give()
+        begin.wait()
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._working[key] -= 1
+                self._give()
+
+    def _asked(self) -> int:
+        return sum(map(len, self._queues.values())) + self._working.total()
+
+    def _give(self) -> None:
+        """Grant free turns to the next callers, round-robin by key; the caller holds the lock."""
+        while self._working.total() < self._at_once:
+            keys = [key for key in self._queues if self._working[key] < self._of_one]
+            if not keys:
+                return
+            key = min(keys, key=lambda key: self._served.get(key, 0))
+            self._served[key] = next(self._turns)
+            self._working[key] += 1
+            self._queues[key].popleft().set()
+            if not self._queues[key]:
+                del self._queues[key]
+
+
+START_S = 60.0  # timeout of the imports on a busy machine; usually they take 1 s, and forking a millisecond
+WATCHED_S = 1.0  # between two calls of a `Watch`
+WATCHED_BYTES = 1000  # of the end of the output
+_NO_PROCESS = "The machine cannot start another process now; try again in a moment."
+_ENTRY = "import sys; from skills.sandbox.fork_server import main; main(*sys.argv[1:])"
+
+
+class _Dead(Exception):
+    """The server has ended, or does not respond."""
+
+
+@dataclass(frozen=True)
+class _Server:
+    process: subprocess.Popen[bytes]
+    control: socket.socket
+    folder: str  # for the temporary files of its forks
+
+    def end(self) -> None:
+        """Stop the server: it exits when its control socket closes, and kills its forks."""
+        self.control.close()
+        try:
+            self.process.wait(1.0)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+        shutil.rmtree(self.folder, ignore_errors=True)  # the server does so too, unless it was killed
+
+
+class ForkServer:
+    """A client of a fork server: runs functions in forks of a process that has imported some modules.
+
+    A module may be given as `module:function`; the function is called once before the first fork.
+    """
+
+    def __init__(self, *modules: str) -> None:
+        self._modules = modules
+        self._server: _Server | None = None
+        self._open = True
+        self._lock = Lock()
+
+    @property
+    def pid(self) -> int | None:
+        """The process id of the server, None while it is not running."""
+        return None if self._server is None else self._server.process.pid
+
+    def start(self) -> None:
+        """Start the server without waiting for its imports."""
+        self._running()
+
+    def close(self) -> None:
+        """Stop the server and all its forks; later calls of `run` raise `Busy`."""
+        with self._lock:
+            self._open = False
+            if self._server is not None:
+                self._server.end()
+                self._server = None
+
+    def call(
+        self,
+        target: str,
+        given: BinaryIO,
+        *,
+        returns: tuple[type[Answer], ...],
+        classes: Known,
+        limits: ProcessLimits,
+        arguments: Mapping[str, Any] | None = None,
+        watch: Watch | None = None,
+    ) -> Answer:
+        """Call a function in a fork, and return its result.
+
+        Args:
+            target: The function, as `module:function`; it is called with a file to read, a file to write, and
+                `arguments`.
+            given: Input: a real file, or a spooled one, which is written to disk first; the function gets its own
+                read-only file object, at the beginning.
+            returns: The classes of which the result may be.
+            classes: The classes that may occur in it, by name.
+            limits: Limits of the fork; its memory is added to the address space of the server.
+            arguments: Keyword arguments, plain JSON.
+            watch: Callback, called about every second with the end of the fork's output on stdout and stderr; an
+                exception that it raises ends the fork.
+
+        Raises:
+            Unanswered: The fork hung, crashed, ran out of memory, wrote too much, failed, or returned anything else;
+                the end of its output is added as a note of the error.
+            StorageFull: The disk had no space for its files.
+            Busy: The server died twice, is closed, or the system refuses another process.
+        """
+        with self.run(target, given, arguments or {}, limits, watch) as answer:
+            return _value(answer, returns, classes, limits.answer_bytes)
+
+    @contextmanager
+    def run(
+        self,
+        target: str,
+        given: BinaryIO,
+        arguments: Mapping[str, Any],
+        limits: ProcessLimits,
+        watch: Watch | None = None,
+    ) -> Iterator[IO[bytes]]:
+        """Call a function in a fork, and yield what it has written, a file at its beginning; as for `call`."""
+        request = json.dumps({"target": target, "arguments": arguments, "limits": asdict(limits)}).encode()
+        given_fd = _opened_again(given)
+        try:
+            for _ in range(2):  # a dead server is replaced once; a request that kills it twice is refused
+                with tempfile.TemporaryFile() as answer, tempfile.TemporaryFile() as said:
+                    server = self._running()
+                    try:
+                        code = _ask(server, request, (given_fd, answer.fileno(), said.fileno()), limits.wall_s, watch)
+                    except _Dead:
+                        self._replace(server)
+                        continue
+                    if code is None:
+                        raise overdue(said, limits)
+                    check_end(code, said, limits)
+                    answer.seek(0)
+                    yield answer
+                    return
+        finally:
+            os.close(given_fd)
+        raise Busy("The fork server of this service ends repeatedly; try again in a moment.")
+
+    def _running(self) -> _Server:
+        with self._lock:
+            if not self._open:
+                raise Busy("The service is stopping; try again when it runs again.")
+            if self._server is None:
+                try:
+                    self._server = _start(self._modules)
+                except OSError as error:
+                    raise Busy(_NO_PROCESS) from error
+            return self._server
+
+    def _replace(self, dead: _Server) -> None:
+        with self._lock:
+            if self._server is dead:  # otherwise another thread has replaced it already
+                self._server = None
+                dead.process.kill()
+                dead.end()
+
+
+def call_alone(
+    target: str,
+    request: object,
+    *,
+    returns: tuple[type[Answer], ...],
+    classes: Known,
+    limits: ProcessLimits,
+    watch: Watch | None = None,
+) -> Answer:
+    """Call a function in a new interpreter, and return its result.
+
+    Args:
+        target: As for `ForkServer.call`.
+        request: A value, which the function reads from its file.
+        returns: The classes of which the result may be.
+        classes: The classes that may occur in the request and in the result, by name.
+        limits: Limits of the process.
+        watch: As for `ForkServer.call`.
+
+    Raises:
+        Unanswered, StorageFull, Busy: As for `ForkServer.call`.
+    """
+    with tempfile.TemporaryFile() as given, closing(ForkServer()) as server:
+        packing.write(given, request, classes)
+        return server.call(target, given, returns=returns, classes=classes, limits=limits, watch=watch)
+
+
+def _value(answer: IO[bytes], returns: tuple[type[Answer], ...], classes: Known, most_bytes: int) -> Answer:
+    """Return the value that a fork has written; it is untrusted.
+
+    Raises:
+        Unanswered: It is too large, or none of the classes.
+    """
+    if (size := answer.seek(0, os.SEEK_END)) > most_bytes:
+        raise Unanswered("too much", f"returned {size >> 20} MiB, more than the limit of {most_bytes >> 20} MiB")
+    answer.seek(0)
+    try:
+        if packing.unfolded_bytes(answer) > most_bytes:  # a compressed archive may unpack to much more
+            raise ValueError(f"more than {most_bytes} bytes")
+        value = packing.read(answer, classes)
+        if not isinstance(value, returns):
+            raise TypeError(type(value).__name__)
+    except Exception as error:  # `read` raises exceptions of any class
+        raise Unanswered("nonsense", "returned unreadable data") from error
+    return value
+
+
+def _start(modules: tuple[str, ...]) -> _Server:
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    ours.settimeout(START_S)
+    folder = tempfile.mkdtemp(prefix="suture-skills-")
+    with theirs:
+        process = subprocess.Popen(  # noqa: S603 - our own interpreter and module
+            [sys.executable, "-P", "-c", _ENTRY, folder, *modules],
+            stdin=theirs.fileno(),
+            stdout=subprocess.DEVNULL,
+            env=environment(),
+            start_new_session=True,  # Ctrl-C must not reach it; it exits when our socket closes
+        )
+    return _Server(process, ours, folder)
+
+
+def _opened_again(file: BinaryIO) -> int:
+    """Return a new file descriptor for the same file: read-only, with its own position."""
+    descriptor = file.fileno()  # `fileno` makes a spooled file write itself to disk
+    file.flush()
+    return os.open(f"/proc/self/fd/{descriptor}", os.O_RDONLY)
+
+
+def _ask(
+    server: _Server, request: bytes, files: tuple[int, int, int], wall_s: float, watch: Watch | None
+) -> int | None:
+    """Send a request to the server and return the fork's exit code; None at the timeout, and the fork is killed.
+
+    Raises:
+        _Dead: The server has ended.
+        Busy: It could not fork.
+    """
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with ours:  # when this end closes, at the timeout or because `watch` raises, the server kills the fork
+        try:
+            with theirs:
+                socket.send_fds(server.control, [request], [*files, theirs.fileno()])
+        except OSError as error:
+            raise _Dead from error
+        if (begun := _told(ours, START_S)) != BEGUN:
+            raise _Dead if begun is None else Busy(_NO_PROCESS)
+        until = time.monotonic() + wall_s
+        while (left_s := until - time.monotonic()) > 0:
+            if (ended := _told(ours, left_s if watch is None else min(left_s, WATCHED_S))) is not None:
+                return int(ended)
+            if watch is not None:
+                watch(_lately(files[2]))
+    return None
+
+
+def _told(line: socket.socket, within_s: float) -> bytes | None:
+    """Return the next message of the server; None if none comes in time.
+
+    Raises:
+        _Dead: It has ended.
+    """
+    line.settimeout(within_s)
+    try:
+        message = line.recv(16)
+    except TimeoutError:
+        return None
+    except OSError as error:
+        raise _Dead from error
+    if not message:
+        raise _Dead
+    return message
+
+
+def _lately(said: int) -> bytes:
+    """Return the end of a fork's output so far."""
+    # pread, because the fork shares this file's position: seeking would change where it writes next.
+    return os.pread(said, WATCHED_BYTES, max(0, os.fstat(said).st_size - WATCHED_BYTES))

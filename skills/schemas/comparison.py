@@ -1,0 +1,288 @@
+"""Values of atlases and scores, as the library builds them and a client reads them.
+
+An atlas compares the demonstrations of a suture type with each other. A score compares motions; it says nothing about a
+surgical result and is not a credential.
+"""
+
+from datetime import datetime
+from typing import Any
+
+from pydantic import ConfigDict, Field
+
+from skills.fields import Count, Fraction, Sha256, Slug
+from skills.schemas.base import Given
+from skills.scoring.calibration import Level, Skill
+from skills.scoring.deviation import Deviation
+from skills.scoring.features import ScoreFigure
+
+# The example of the OpenAPI document.
+IDS = ["1a" * 32, "2b" * 32, "3c" * 32, "4d" * 32]
+EXAMPLE: dict[str, Any] = {
+    "suture": "simple-running",
+    "scaled": False,
+    "unit": "mm",
+    "demos": [
+        {"id": IDS[0], "surgeon": "heron", "session": "monday", "cluster": 1, "at": [-3.1, 0.4]},
+        {"id": IDS[1], "surgeon": "heron", "session": "friday", "cluster": 1, "at": [-2.7, -0.4]},
+        {"id": IDS[2], "surgeon": "kestrel", "session": "monday", "cluster": 2, "at": [2.8, 0.5]},
+        {"id": IDS[3], "surgeon": "kestrel", "session": "friday", "cluster": 2, "at": [3.0, -0.5]},
+    ],
+    "recordings": 4,
+    "left_out": {"without_consent": 1, "without_direction": [], "because": ["Left out: 1 demonstration, ..."]},
+    "distances": [[], [0.9], [6.0, 5.6], [6.2, 5.7, 1.0]],
+    "merges": [
+        {"one": 0, "other": 1, "distance": 0.9, "demos": 2},
+        {"one": 2, "other": 3, "distance": 1.0, "demos": 2},
+        {"one": 4, "other": 5, "distance": 5.875, "demos": 4},
+    ],
+    "order": [0, 1, 2, 3],
+    "clusters": [
+        {"cluster": 1, "demos": 2, "medoid": IDS[0], "spread": 0.9, "surgeons": [{"surgeon": "heron", "demos": 2}]},
+        {"cluster": 2, "demos": 2, "medoid": IDS[2], "spread": 1.0, "surgeons": [{"surgeon": "kestrel", "demos": 2}]},
+    ],
+    "clusters_chosen": "as asked",
+    "silhouette": 0.84,
+    "chart_shows": 0.97,
+    "surgeons": [
+        {"surgeon": "heron", "demos": 2, "recordings": 2, "sessions": 2, "medoid": IDS[0], "spread": 0.9},
+        {"surgeon": "kestrel", "demos": 2, "recordings": 2, "sessions": 2, "medoid": IDS[2], "spread": 1.0},
+    ],
+    "differences": [
+        {
+            "one": "heron",
+            "other": "kestrel",
+            "distance": 6.0,
+            "part": "middle third",
+            "axis": "upwards",
+            "share": 0.5,
+            "offset": -8.9,
+            "size": 9.0,
+            "said": "In the middle third, the path of heron is 8.9 mm lower than that of kestrel; ...",
+            "shares": [[0.05, 0.05, 0.1], [0.05, 0.05, 0.5], [0.05, 0.05, 0.1]],
+            "offsets": [[0.1, 0.1, -1.6], [0.2, 0.3, -8.9], [0.1, 0.1, -1.7]],
+        }
+    ],
+    "recognition": {
+        "surgeons": 2,
+        "tested": 4,
+        "right": 4,
+        "accuracy": 1.0,
+        "interval": [0.51, 1.0],
+        "chance": 0.5,
+        "log_loss": 0.02,
+        "log_loss_of_guessing": 0.693,
+        "sureness": 0.98,
+    },
+    "no_recognition_because": None,
+    "whose": {
+        "demo": IDS[3],
+        "surgeon": "kestrel",
+        "likely": [{"surgeon": "kestrel", "probability": 0.98}, {"surgeon": "heron", "probability": 0.02}],
+    },
+    "notes": ["A distance is ...", "Set-up and day are confounded with the surgeon: ..."],
+}
+
+Thirds = list[tuple[float, float, float]]
+
+
+class Place(Given):
+    """A demonstration in an atlas: its surgeon, its cluster and its position on the chart."""
+
+    id: Sha256
+    surgeon: Slug
+    session: str | None
+    cluster: int = Field(ge=1, description="Counted from 1.")
+    at: tuple[float, float] = Field(description="Its position on the chart, in `unit`.")
+
+
+class LeftOutOfAtlas(Given):
+    """Active demonstrations of the suture type that are not compared."""
+
+    without_consent: Count = Field(description="Number of those whose surgeon's consent does not cover an atlas.")
+    without_direction: list[Sha256] = Field(description="Those that end where they began.")
+    because: list[str]
+
+
+class Merge(Given):
+    """A merge in the dendrogram: a number below N is a demonstration, N + k is the result of the k-th merge."""
+
+    one: Count
+    other: Count
+    distance: float = Field(description="Between the two, averaged over their demonstrations, in `unit`.")
+    demos: Count
+
+
+class OfSurgeon(Given):
+    """The number of a surgeon's demonstrations in a cluster."""
+
+    surgeon: Slug
+    demos: Count
+
+
+class Cluster(Given):
+    """A cluster of demonstrations."""
+
+    cluster: int = Field(ge=1, description="Its number, from 1.")
+    demos: Count
+    medoid: Sha256 = Field(description="The demonstration that is nearest to all others in the cluster.")
+    spread: float | None = Field(description="Mean distance of the others to the medoid; null for a single one.")
+    surgeons: list[OfSurgeon] = Field(description="In decreasing order of `demos`.")
+
+
+class Consistency(Given):
+    """The similarity of a surgeon's demonstrations to each other."""
+
+    surgeon: Slug
+    demos: Count
+    recordings: Count = Field(description="That the demonstrations were cut from; cuts of one are not independent.")
+    sessions: Count
+    medoid: Sha256
+    spread: float | None = Field(description="Mean distance of the others to the medoid; null for a single one.")
+
+
+class Apartness(Given):
+    """The difference between the medoids of two surgeons, by thirds of the path and axes of a shape's own frame."""
+
+    one: Slug
+    other: Slug
+    distance: float
+    part: str = Field(
+        description="first third, middle third or last third: the part with the largest share of the distance."
+    )
+    axis: str = Field(description="along the way, sideways or upwards: the axis with the largest share.")
+    share: Fraction = Field(description="Of the distance, in this part along this axis.")
+    offset: float = Field(description="Mean signed offset of `one` there, in `unit`: along, to the left or upwards.")
+    size: float = Field(description="The same without signs: over twice the offset if the two paths cross.")
+    said: str
+    shares: Thirds
+    offsets: Thirds
+
+
+class Recognition(Given):
+    """The accuracy of recognising the surgeon of a demonstration, measured on sessions that were left out."""
+
+    surgeons: Count
+    tested: Count = Field(description="Number of demonstrations whose surgeon has another session.")
+    right: Count
+    accuracy: Fraction
+    interval: tuple[float, float] = Field(
+        description="Of the accuracy at 95 % (Wilson), if demonstrations were independent."
+    )
+    chance: Fraction
+    log_loss: float = Field(description="Mean of -log p of the true surgeon, in nat.")
+    log_loss_of_guessing: float
+    sureness: Fraction = Field(
+        description="Mean probability of the guesses: equal to the accuracy if the probabilities are right."
+    )
+
+
+class Likely(Given):
+    """A surgeon, and the probability that a demonstration is theirs."""
+
+    surgeon: Slug
+    probability: Fraction
+
+
+class Whose(Given):
+    """The recognised surgeons of one demonstration."""
+
+    demo: Sha256
+    surgeon: Slug = Field(description="The surgeon that it was stored under.")
+    likely: list[Likely] = Field(description="In decreasing order of probability.")
+
+
+class Atlas(Given):
+    """The demonstrations of a suture type, compared. Distances are in `unit`, about the mean difference per state."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": [EXAMPLE]})
+
+    suture: Slug
+    scaled: bool
+    unit: str = Field(description="mm, or lengths of start to goal where size does not count.")
+    demos: list[Place] = Field(description="The oldest first.")
+    recordings: Count = Field(description="That the demonstrations were cut from; cuts of one are not independent.")
+    left_out: LeftOutOfAtlas
+    distances: list[list[float]] = Field(
+        description="Those of demonstration k from the ones before it in `demos`, at index k."
+    )
+    merges: list[Merge] = Field(description="The dendrogram, in increasing order of distance.")
+    order: list[Count] = Field(description="Indices of the demonstrations, in an order in which no two merges cross.")
+    clusters: list[Cluster]
+    clusters_chosen: str = Field(description="How their number was chosen.")
+    silhouette: float | None = Field(
+        description="The mean over the demonstrations, -1 to 1; null for a single cluster."
+    )
+    chart_shows: float = Field(
+        description="1 minus the mean error of distances on the chart, divided by the mean distance."
+    )
+    surgeons: list[Consistency]
+    differences: list[Apartness] = Field(description="Of all pairs of the 40 surgeons with the most demonstrations.")
+    recognition: Recognition | None
+    no_recognition_because: str | None = None
+    whose: Whose | None = Field(
+        description="Of the demonstration `demo` of the request; null without one, or without recognition."
+    )
+    notes: list[str] = Field(description="How to read the numbers, and what they do not show.")
+
+
+class ScoredStyle(Given):
+    """The style with which a motion is compared."""
+
+    surgeon: Slug
+    suture: Slug
+
+
+class Reference(Given):
+    """The demonstration that represents the style."""
+
+    demo: Sha256
+    because: str = Field(description="The reason for this choice.")
+    is_itself: bool = Field(description="Whether it is the scored demonstration.")
+
+
+class Percentiles(Given):
+    """The percentiles of the figures among the demonstrations of the surgeons of one skill level."""
+
+    level: Level
+    demos: Count
+    surgeons: Count
+    reason: str | None = Field(description="Why there are none; null if there are.")
+    below: dict[str, Fraction | None] | None = Field(
+        description="For each figure, and `distance_mm`: share of them with a smaller value; equal values count half."
+    )
+
+
+class CurvePoint(Given):
+    """One demonstration of the scored surgeon, compared with the same reference."""
+
+    demo: Sha256
+    session: Slug | None
+    stored_at: datetime = Field(description="When its recording was stored.")
+    distance_mm: float
+    duration_s: float | None
+    log_dimensionless_jerk: float | None
+
+
+class Score(Given):
+    """A motion compared with a style's reference. Nothing of it is stored."""
+
+    demo: Sha256 | None = Field(description="null if a part of a recording was scored.")
+    recording: Sha256
+    arm: str
+    start_s: float
+    end_s: float
+    surgeon: Slug | None = Field(description="null if a part of a recording was scored.")
+    style: ScoredStyle
+    reference: Reference
+    figures: tuple[ScoreFigure, ...]
+    deviation: Deviation = Field(
+        description="Moved, turned and scaled onto the reference: x along its way, y to the left, z upwards, in its mm."
+    )
+    as_recorded: Deviation | None = Field(
+        description="Where both were recorded, in the arm's frame; null if arm or frame differ."
+    )
+    tie_break: str
+    percentiles: list[Percentiles]
+    curve: list[CurvePoint] = Field(description="The surgeon's demonstrations up to this one, in order of recording.")
+    skill: Skill
+    use: str

@@ -1,0 +1,574 @@
+"""Response models of jobs, policies and policy cards.
+
+A policy card is a document on one policy version, with its facts as numbers and as sentences. The order of its fields
+is that of the card's JSON, of whose bytes the ETag is computed.
+"""
+
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Any, Literal
+
+from pydantic import Field
+
+from skills.fields import Count, Fraction, Point, Sha256, Slug, schema, stored_schema
+from skills.gridworld.reward import RewardLevels
+from skills.learning.evaluation import Metrics, SpaceRollouts
+from skills.learning.q_learning import Training
+from skills.planning.plan import DrivenPass
+from skills.schemas.base import Given, Grid, Page, PolicyName, VersionNumber
+from skills.schemas.recordings import DemoReport
+
+
+class ServedNow(PolicyName):
+    """The policy version that a style serves."""
+
+    released_at: datetime
+
+
+class Job(Given):
+    """A job: work that was requested, its state and its result."""
+
+    id: str = Field(pattern="^[0-9a-f]{16}$")
+    kind: str = Field(description="training, retraining, playback or pictures.")
+    state: Literal["queued", "running", "succeeded", "failed", "cancelled"]
+    progress: Fraction
+    request: dict[str, Any] = Field(description="What was asked for, all defaults resolved.")
+    result: dict[str, Any] | None = Field(
+        description="What came of it. Of a training, `released` says whether its version is what the style serves "
+        "now, `was_released` whether the job released it, and where a release was asked for, `not_released_because` "
+        "and `remedy` say why not and what to do."
+    )
+    served: ServedNow | None = Field(
+        default=None, description="Of a training: what its style serves now; null where that is nothing."
+    )
+    did: str | None = Field(default=None, description="Of a POST: what the request did, in words.")
+    error: str | None
+    created_at: datetime
+    started_at: datetime | None
+    ended_at: datetime | None
+
+
+@stored_schema
+@dataclass(frozen=True, kw_only=True)
+class PolicyFigures:
+    """A policy version, and the figures of its agreement with its demonstrations.
+
+    Attributes:
+        rests_on: Number of demonstrations that it was learnt from; null in an older batch.
+        dtw_total_mm: Distance from the path that it was learnt from.
+        exact_share: Share of the path's states.
+        reaching_share: Share of all states.
+    """
+
+    version: VersionNumber
+    sha256: Sha256
+    demos: tuple[Sha256, ...]
+    rests_on: Count | None = None
+    dtw_total_mm: float
+    exact_share: Fraction
+    reaching_share: Fraction
+
+
+@schema
+@dataclass(frozen=True)
+class FitOnTheSame:
+    """DTW totals of both over all active demonstrations from which either was learnt.
+
+    Attributes:
+        demos: The demonstrations.
+        released_mm: Total of the released version; null if arms or frames differ, or there are no demonstrations.
+        trained_mm: Total of the new version; null as `released_mm`.
+    """
+
+    demos: tuple[Sha256, ...]
+    released_mm: float | None
+    trained_mm: float | None
+
+
+@stored_schema
+@dataclass(frozen=True, kw_only=True)
+class StoredComparison:
+    """A new policy version compared with the released one, as it is stored.
+
+    Attributes:
+        released: The released version; null if nothing was released.
+        on_the_same: Both on the same demonstrations; null where nothing was released, and in an older batch.
+        worse_because: The figures in which the new version is worse.
+        now_released: Whether the trained version is what the style serves now.
+        not_released_because: Why a requested release is not in force.
+    """
+
+    released: PolicyFigures | None
+    trained: PolicyFigures
+    same_demonstration: bool | None
+    on_the_same: FitOnTheSame | None = None
+    worse_because: tuple[str, ...]
+    now_released: bool
+    not_released_because: str | None
+
+
+@stored_schema
+@dataclass(frozen=True, kw_only=True)
+class StyleComparison(StoredComparison):
+    """A new policy version compared with the released one, both on the same demonstrations.
+
+    Attributes:
+        was_released: Whether the batch released it.
+        remedy: What to do about a release that is not in force.
+    """
+
+    was_released: bool = False
+    remedy: str | None = None
+
+
+class RetrainedStyle(Given):
+    """The result of one style of a batch."""
+
+    surgeon: Slug
+    suture: Slug
+    demo: Sha256
+    stale_because: list[str]
+    state: Literal["queued", "done", "failed", "cancelled"]
+    reason: str | None
+    policy_version: int | None
+    sha256: Sha256 | None
+    comparison: StyleComparison | None
+    served: ServedNow | None = Field(default=None, description="What the style serves now; null: nothing.")
+    ended_at: datetime | None
+
+
+class StyleCounts(Given):
+    """The number of styles of a batch in each state."""
+
+    queued: Count
+    done: Count
+    failed: Count
+    cancelled: Count
+
+
+class Retraining(Job, Page[RetrainedStyle]):
+    """A batch: its job, the number of styles in each state, and one page of the styles."""
+
+    styles: StyleCounts
+
+
+@schema
+@dataclass(frozen=True)
+class Coverage:
+    """The number of starts from which the policy works, out of `n_states`; the map itself is among the arrays.
+
+    Attributes:
+        starts_reaching_goal: Number of starts from which it reaches the goal.
+        starts_joining_nearest: Number of starts from which it joins the demonstration in the fewest moves.
+        n_states: Number of states, each of them a start.
+        sha256: Digest of the map.
+    """
+
+    starts_reaching_goal: Count
+    starts_joining_nearest: Count
+    n_states: Count
+    sha256: Sha256
+
+
+@stored_schema
+@dataclass(frozen=True, kw_only=True)
+class GridCertificate:
+    """The checks on the grid before a release; they do not cover the arm's accuracy.
+
+    Attributes:
+        states_checked: Number of states (phase and cell) whose action was compared with exact values.
+        states_finishing: Number of them from which the policy finishes; null in a certificate of an older version.
+        suboptimal_actions: Number of them whose action is worse than the best one.
+        demonstration_reproduced: The rollout from the demonstrated start is the demonstration.
+        refused_because: The reasons against a release.
+        gate: The gate's version; null in an older certificate, which asked the centres of cells.
+        driven: The pass as the arm drives it; null where joint limits cannot be checked, and in an older certificate.
+        note: The scope of the certificate.
+    """
+
+    states_checked: Count
+    states_finishing: Count | None = None
+    suboptimal_actions: Count
+    demonstration_reproduced: bool
+    refused_because: tuple[str, ...]
+    gate: int | None = None
+    driven: DrivenPass | None = None
+    note: str
+
+
+@schema
+@dataclass(frozen=True)
+class Combined:
+    """The combination of a policy's demonstrations into the one path that it follows (docs/combining.md).
+
+    Attributes:
+        kind: The way of combining.
+        medoid: The demonstration that is nearest to all.
+        at: The demonstration whose place, arm and time it has.
+        moved: Whether they were shown at different places, so that all were moved there.
+        apart_mm: Distance of each of `demos` from the path, averaged over the states (DTW).
+        width_mm: Distance from each of `waypoints` within which the majority of them pass it.
+        hysteresis: Hysteresis of the path, in cells.
+        bridged_cells: Number of the path's states in which no sample lies.
+    """
+
+    kind: Literal["medoid", "barycentre", "corridor"]
+    medoid: Sha256
+    at: Sha256
+    moved: bool
+    apart_mm: tuple[float, ...]
+    width_mm: tuple[float, ...]
+    hysteresis: float
+    bridged_cells: Count
+
+
+@schema
+@dataclass(frozen=True)
+class TrainingFigures(Training):
+    """The effort of learning."""
+
+
+class Version(PolicyName):
+    """A version in a style's history."""
+
+    learner: str
+    demos: list[Sha256]
+    seed: Count
+    metrics: Metrics
+    coverage: Coverage
+    releasable: bool
+    created_at: datetime
+
+
+class PolicySummary(Version):
+    """A policy version that is released."""
+
+    surgeon: Slug
+    suture: Slug
+    released_at: datetime
+    released_by: str
+
+
+class Policy(PolicyName):
+    """A policy, complete enough that a client can run it.
+
+    Action = 9a + 3b + c with a, b, c in {0, 1, 2} for -1, 0, +1 cell along x, y, z; -1: finished; -2: outside the
+    certified domain, a client stops there.
+    """
+
+    surgeon: Slug
+    suture: Slug
+    arm: str
+    frame: str
+    instrument: str
+    grid: Grid
+    start_mm: Point
+    goal_mm: Point
+    waypoints: list[int] = Field(description="State index of each, in order.")
+    phases: int = Field(ge=1)
+    learner: str
+    learner_version: int
+    settings: dict[str, Any]
+    reward_levels: RewardLevels
+    seed: Count
+    demos: list[Sha256]
+    training: TrainingFigures
+    metrics: Metrics
+    coverage: Coverage
+    grid_certificate: GridCertificate
+    combined: Combined | None = Field(default=None, description="Where it was learnt from several demonstrations.")
+    rollouts: SpaceRollouts | None = Field(default=None, description="Where it was learnt in the continuous space.")
+    created_at: datetime
+    released_at: datetime | None
+    released_by: str | None
+    actions: list[list[int]] | None = Field(description="By phase, then by state; null where there are over 10^6.")
+    arrays: str = Field(description="Where the arrays with the Q values are.")
+
+
+class Rollout(PolicyName):
+    """The path from a position to the goal."""
+
+    frame: str
+    states: list[int]
+    phases: list[int]
+    path_mm: list[Point]
+    finished: bool
+    dtw_total_mm: float
+
+
+class NextStep(PolicyName):
+    """The next step of the policy at a position."""
+
+    frame: str
+    phase: Count = Field(description="After counting this position.")
+    action: int | None = Field(description="null where the policy has finished, or does not know.")
+    next_position_mm: Point | None
+    next_phase: int | None
+    done: bool
+    confidence: float
+    correction_mm: Point | None = Field(description="The way back to the path; null on it.")
+
+
+class CardPolicy(Given):
+    """The policy version that the card describes."""
+
+    sha256: Sha256
+    version: int = Field(ge=1)
+    surgeon: Slug
+    suture: Slug
+    training: Sha256 = Field(description="Digest of the training request that it was learnt by.")
+    created_at: datetime
+    arm: str
+    frame: str
+    instrument: str
+    grid: Grid
+    start_mm: Point
+    goal_mm: Point
+    phases: int = Field(ge=1)
+    n_states: Count
+    where: str
+
+
+class CardRelease(Given):
+    """One release of the version."""
+
+    released_at: datetime
+    released_by: str
+    withdrawn_at: datetime | None
+    serving: bool
+
+
+class CardStatus(Given):
+    """The releases of the version, and the version that its style serves now."""
+
+    released_now: bool
+    served_now: PolicyName | None
+    releasable: bool
+    refused_because: list[str]
+    releases: list[CardRelease] = Field(description="The oldest first.")
+    in_words: str
+
+
+class CardSurgeon(Given):
+    """The surgeon of the style."""
+
+    pseudonym: Slug
+    skill_level: str | None
+    handedness: str | None
+    protocol: str | None
+    consent: dict[str, Any] | None
+    consent_in_words: str
+
+
+class CardSutureType(Given):
+    """The suture type of the style."""
+
+    suture: Slug
+    name: str
+    also_called: list[str]
+    family: str
+    description: str
+
+
+class CardRecording(Given):
+    """The file that a demonstration was cut out of."""
+
+    sha256: Sha256
+    format: str
+    media_type: str
+    size_bytes: Count
+    integrity: str
+    created_at: datetime
+    where: str
+
+
+class CardDemonstration(Given):
+    """A demonstration that the version was learnt from."""
+
+    sha256: Sha256
+    state: Literal["active", "withdrawn"]
+    withdrawn_at: datetime | None
+    state_in_words: str
+    arm: str
+    topic: str
+    frame: str
+    instrument: str
+    start_s: float
+    end_s: float
+    session: str | None
+    hysteresis: float = Field(description="Cells.")
+    path_states: Count
+    created_at: datetime
+    report: DemoReport
+    quality_in_words: list[str]
+    lost_in_words: str
+    where: str
+    recording: CardRecording
+
+
+@schema
+@dataclass(frozen=True)
+class CardCombined(Combined):
+    """The combination of several demonstrations into one path, also as a sentence."""
+
+    in_words: str
+
+
+class CardLearner(Given):
+    """The learner, its settings and its effort."""
+
+    kind: str
+    version: int
+    settings: dict[str, Any]
+    seed: Count
+    reward_levels: RewardLevels
+    training: TrainingFigures
+    in_words: str
+
+
+@schema
+@dataclass(frozen=True)
+class CardMetric:
+    """One metric: its value, or those along x, y and z."""
+
+    name: str
+    label: str
+    value: float | Point
+    unit: str
+    how: str
+
+
+@schema
+@dataclass(frozen=True)
+class StartCounts:
+    """The numbers of starts by how they reach the goal.
+
+    Attributes:
+        follow: Those that join the demonstration in the fewest moves and follow it.
+        reach_otherwise: Those that reach the goal in another way.
+        do_not_reach: Those that do not reach the goal.
+    """
+
+    follow: Count
+    reach_otherwise: Count
+    do_not_reach: Count
+
+
+# No subclass of `StartCounts`: `z_mm` comes first in the card's JSON, of whose bytes the ETag is computed.
+@schema
+@dataclass(frozen=True)
+class StartLayer:
+    """The starts of one layer of the grid.
+
+    Attributes:
+        z_mm: Height of the centres of its cells.
+        follow: Those that join the demonstration in the fewest moves and follow it.
+        reach_otherwise: Those that reach the goal in another way.
+        do_not_reach: Those that do not reach the goal.
+    """
+
+    z_mm: float
+    follow: Count
+    reach_otherwise: Count
+    do_not_reach: Count
+
+
+class StartShares(Given):
+    """The numbers of starts as shares of all starts."""
+
+    follow: Fraction
+    reach_otherwise: Fraction
+    do_not_reach: Fraction
+
+
+@schema
+@dataclass(frozen=True)
+class CardCoverage(StartCounts, Coverage):
+    """The starts from which the goal is reached, out of `n_states`.
+
+    Attributes:
+        layers: From the lowest z up.
+    """
+
+    shares: StartShares
+    layers: tuple[StartLayer, ...]
+    in_words: str
+
+
+class TipErrors(Given):
+    """Mean tip errors in mm, as measured elsewhere and not on this arm."""
+
+    calibrated: float
+    not_calibrated: float
+
+
+class CardLimits(Given):
+    """The limits of the version: its certified domain, and the properties that were not checked."""
+
+    certified_domain: str
+    joint_limits: str
+    tip_accuracy: str
+    tip_error_mm: TipErrors
+    not_checked: list[str]
+
+
+class CardLink(Given):
+    """One value of the lineage, and the way its digest is computed."""
+
+    what: str
+    sha256: Sha256
+    how: str
+    digest_of: Any = Field(description="The input of the digest, as canonical JSON; null if it is not JSON.")
+
+
+class RestingOnIt(Given):
+    """The plans and playbacks made from the version."""
+
+    plans: Count
+    playbacks: Count
+    feasible_playbacks: Count
+    in_words: str
+
+
+class CardLineage(Given):
+    """The chain from the recording to the policy, and the plans and playbacks made from it."""
+
+    chain: list[CardLink]
+    rests_on_it: RestingOnIt
+    verify: list[str]
+
+
+class Citation(Given):
+    """The citation of the version."""
+
+    text: str
+    bibtex: str
+
+
+class PolicyCard(Given):
+    """The policy card of one policy version, to attach to a paper; as `text/html` a document with its pictures.
+
+    Research use only. It says whether the version is released now, so its ETag changes with that.
+    """
+
+    format: int
+    written_by: str
+    title: str
+    use: str
+    what_it_is: list[str]
+    what_it_is_not: list[str]
+    policy: CardPolicy
+    status: CardStatus
+    surgeon: CardSurgeon
+    suture_type: CardSutureType
+    demonstrations: list[CardDemonstration] = Field(description="The oldest first.")
+    combined: CardCombined | None = Field(
+        description="How several demonstrations were combined into one path; null for one."
+    )
+    learner: CardLearner
+    metrics: list[CardMetric]
+    certificate: GridCertificate
+    coverage: CardCoverage
+    limits: CardLimits
+    lineage: CardLineage
+    citation: Citation

@@ -1,0 +1,243 @@
+"""Response models of recordings and demonstrations."""
+
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Literal, get_args
+
+from pydantic import Field
+
+from skills.demonstration.partner import Partner
+from skills.demonstration.quality import MotionReport
+from skills.demonstration.recording import BaseFrame, Format, Topic
+from skills.demonstration.segments import Segment, TakenSegment
+from skills.fields import Count, Point, Quaternion, Sha256, Slug, schema, stored_schema
+from skills.gridworld.path_report import PathReport
+from skills.gridworld.reward import RewardLevels
+from skills.schemas.base import ChosenGrid, Given
+
+
+@schema
+@dataclass(frozen=True)
+class Motion:
+    """One arm's motion on one topic, in one frame."""
+
+    arm: str
+    topic: str
+    frame: str
+    samples: Count
+    duplicate_stamps: Count
+
+
+@schema
+@dataclass(frozen=True)
+class Quality:
+    """The recording quality of a motion."""
+
+    arm: str
+    topic: str
+    duration_s: float
+    rate_hz: float | None
+    longest_gap_s: float
+    extent_mm: Point
+
+
+@schema
+@dataclass(frozen=True)
+class RecordingCounts:
+    """The total numbers of items in lists that may be truncated."""
+
+    segments: Count
+    labels: Count
+
+
+@schema
+@dataclass(frozen=True)
+class Label:
+    """A stage or gesture, as annotated."""
+
+    name: str
+    kind: str
+    start_s: float
+    end_s: float
+
+
+@schema
+@dataclass(frozen=True)
+class JointStates:
+    """The joints of an arm on a topic."""
+
+    arm: str
+    topic: str
+    joints: Count
+
+
+@schema
+@dataclass(frozen=True)
+class Master:
+    """A master's motion."""
+
+    arm: str
+    topic: str
+
+
+@schema
+@dataclass(frozen=True)
+class Pedal:
+    """The number of presses of a pedal, and their total duration."""
+
+    topic: str
+    presses: Count
+    pressed_s: float
+
+
+@schema
+@dataclass(frozen=True)
+class Following:
+    """The duration for which a teleoperation drove its arm."""
+
+    teleoperation: str
+    following_s: float
+
+
+@schema
+@dataclass(frozen=True)
+class Scale:
+    """The scale between a master and its arm."""
+
+    teleoperation: str
+    least: float
+    greatest: float
+
+
+@schema
+@dataclass(frozen=True)
+class LeftOut:
+    """A topic that was not read."""
+
+    topic: str
+    because: str
+
+
+class Recording(Given):
+    """A raw file as it was uploaded: its content, its quality, and the proposed hand-offs."""
+
+    id: Sha256
+    sha256: Sha256
+    size_bytes: Count
+    media_type: str
+    format: str = Field(description=f"One of {', '.join(get_args(Format))}.")
+    integrity: Literal["full", "partial", "none"] = Field(description="How much of it a checksum vouches for.")
+    duration_s: float
+    notes: dict[str, str]
+    topics: list[Topic]
+    motions: list[Motion]
+    quality: list[Quality]
+    segments: list[Segment]
+    counts: RecordingCounts
+    labels: list[Label]
+    tools: dict[str, str] = Field(description="The instrument of each arm, where the file names it.")
+    joints: list[JointStates]
+    masters: list[Master]
+    pedals: list[Pedal]
+    following: list[Following]
+    scales: list[Scale]
+    left_out: list[LeftOut]
+    base_frames: list[BaseFrame]
+    created_at: datetime
+
+
+@schema
+@dataclass(frozen=True)
+class SuturePoint:
+    """A mark of a simulator's scene, in an arm's base frame.
+
+    Attributes:
+        name: Such as "Exit1".
+        kind: The needle goes in at an entry, and comes out at an exit.
+        is_goal: Whether it is proposed as a pass's goal: an exit is.
+        position_mm: Position.
+        rotation_xyzw: Rotation, with the simulator's axes.
+        turn_xyzw: Rotation from the first mark of its kind to this one: it turns a grid world that was demonstrated
+            there so that it fits here.
+    """
+
+    name: str
+    kind: Literal["entry", "exit"]
+    is_goal: bool
+    position_mm: Point
+    rotation_xyzw: Quaternion
+    turn_xyzw: Quaternion
+
+
+class SuturePoints(Given):
+    """The marks of a scene, in the order of their numbers, entries before exits."""
+
+    arm: str | None = Field(description="null where a frame was named that is no arm's.")
+    frame: str
+    points: tuple[SuturePoint, ...]
+
+
+@stored_schema
+@dataclass(frozen=True, kw_only=True)
+class DemoReport(PathReport, MotionReport):
+    """Measurements of a demonstration, and advice; null for a measurement that an older version did not make.
+
+    Attributes:
+        duplicate_stamps: Samples of the entire recorded motion that carried the stamp of the sample before.
+        grid: The grid world of its path.
+        partner: The arm that takes the needle; null if it was not recorded.
+        advice: Sentences to the surgeon.
+    """
+
+    duplicate_stamps: Count | None = None
+    grid: ChosenGrid
+    partner: Partner | None = None
+
+
+class Demonstration(Given):
+    """One hand-off cut out of a recording, with its measurements."""
+
+    id: Sha256
+    sha256: Sha256
+    recording: Sha256
+    surgeon: Slug
+    suture: Slug
+    arm: str
+    topic: str
+    frame: str
+    instrument: str
+    start_s: float
+    end_s: float
+    segment: TakenSegment | None = Field(
+        default=None, description="Which part of the recording was taken; null of one that an older version stored."
+    )
+    session: Slug | None
+    hysteresis: float = Field(description="Cells.")
+    state: Literal["active", "withdrawn"]
+    report: DemoReport
+    created_at: datetime
+    withdrawn_at: datetime | None
+
+
+class DemoPath(Given):
+    """A demonstration as its states in the grid, and as it was recorded."""
+
+    demo: Sha256
+    frame: str
+    grid: ChosenGrid
+    hysteresis: float
+    states: list[int]
+    path_mm: list[Point] = Field(description="The centres of the states.")
+    stamps_s: list[float]
+    recorded_mm: list[Point]
+
+
+class RewardMap(Given):
+    """The rewards of a demonstration other than `other`: `rewards[k]` is that of `states[k]`."""
+
+    demo: Sha256
+    sha256: Sha256
+    grid: ChosenGrid
+    levels: RewardLevels
+    states: list[int]
+    rewards: list[float]

@@ -1,0 +1,360 @@
+"""Request bodies, and the patterns of texts in requests. Lengths are mm, angles rad.
+
+Unknown fields, NaN and infinity are refused. Every pattern has a description in words, for messages.
+"""
+
+from dataclasses import fields
+from datetime import date
+from functools import reduce
+from operator import or_
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, StrictBool, StrictInt, create_model, model_validator
+
+from skills.comparison.combining import COMBININGS, Combining
+from skills.gridworld.grid import MAX_HYSTERESIS, GridMode
+from skills.kinematics import INSTRUMENTS, JAW_TIP_MM
+from skills.learning.learners import LEARNERS, MAX_SEED, Learner, learner_of
+from skills.planning.handoff import Enters
+from skills.planning.plan import MAX_OUTSIDE_MM, MAX_PASSES, MAX_TIP_OFFSET_MM, RATE_HZ, SuturePoint
+from skills.schemas.base import Handedness, SkillLevel
+from skills.settings import Role
+
+SLUG = r"^[a-z0-9][a-z0-9_-]{0,63}$"
+DIGEST = r"^[0-9a-f]{8,64}$"  # in full, or a prefix that no other digest has
+JOB = r"^[0-9a-f]{16}$"
+KEY = r"^[0-9a-f]{8}$"
+OWNER = r"^[A-Za-z0-9][A-Za-z0-9 ._@-]{0,63}$"
+FRAME = r"^[A-Za-z0-9_./-]{1,64}$"
+LINE = r"^[^\x00-\x1f\x7f]+$"
+LINES = r"^[^\x00-\x08\x0b-\x1f\x7f]*$"
+COUNT = r"^\d{0,4}$"
+
+_IN_WORDS = {
+    SLUG: "must be 1 to 64 lower-case letters, digits, - and _, and begin with a letter or a digit",
+    DIGEST: "must be a digest: 64 of the characters 0-9 and a-f, or at least the first 8 of them",
+    JOB: "must be a job's id: 16 of the characters 0-9 and a-f",
+    KEY: "must be a key's id: the 8 characters after skills_",
+    FRAME: "must be 1 to 64 letters, digits, or _ . / -",
+    OWNER: "must be 1 to 64 letters, digits, spaces or . _ @ -, and begin with a letter or a digit",
+    LINE: "must be one line of text",
+    LINES: "must be text without control characters",
+    COUNT: "must be a whole number of at most 4 digits",
+}
+
+
+def in_words(pattern: str) -> str:
+    """Return the description of a pattern in words; every pattern of a request has one."""
+    return _IN_WORDS[pattern]
+
+
+class Schema(BaseModel):
+    """The base class of request bodies: immutable; unknown fields, NaN and infinity are refused."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, frozen=True)
+
+
+SlugField = Annotated[str, Field(pattern=SLUG)]
+DigestField = Annotated[str, Field(pattern=DIGEST)]
+Name = Annotated[str, Field(min_length=1, max_length=200, pattern=LINE)]
+Text = Annotated[str, Field(max_length=2000, pattern=LINES)]
+Whole = Annotated[StrictInt, Field(ge=0, le=2**31)]
+Number = Annotated[float, Field(strict=True)]  # strict, so that true is not accepted as a number
+Coordinate = Annotated[Number, Field(ge=-10_000, le=10_000)]
+Point = tuple[Coordinate, Coordinate, Coordinate]
+Hysteresis = Annotated[
+    float,
+    Field(
+        ge=0,
+        le=MAX_HYSTERESIS,
+        description="Cells by which a sample must be beyond a face of its cell to leave it; 0.25 keeps a tremor from "
+        "crossing a face again and again, and the report says what is lost in mm.",
+    ),
+]
+Component = Annotated[Number, Field(ge=-1e6, le=1e6)]
+
+
+def shown(*examples: dict[str, Any]) -> ConfigDict:
+    """Return a configuration with examples for the OpenAPI document; a test sends each of them."""
+    return ConfigDict(json_schema_extra={"examples": [*examples]})
+
+
+class ConsentIn(Schema):
+    """The uses that a surgeon agreed to, and their last day."""
+
+    uses: list[Literal["training", "export", "atlas"]]
+    until: date | None = None
+
+
+class KeyIn(Schema):
+    """An API key to create."""
+
+    model_config = shown({"owner": "a.laboratory", "role": "reader", "surgeons": ["kestrel"]})
+
+    owner: Annotated[str, Field(pattern=OWNER, description="Whose it is; events and releases bear this name.")]
+    role: Role
+    expires_at: AwareDatetime | None = None
+    surgeons: Annotated[list[SlugField], Field(min_length=1, max_length=1000)] | None = None
+
+
+class SurgeonIn(Schema):
+    """A surgeon, by pseudonym; never a name."""
+
+    model_config = shown(
+        {
+            "skill_level": "expert",
+            "handedness": "right",
+            "consent": {"uses": ["training", "export"], "until": "2099-12-31"},
+        },
+        {},
+    )
+
+    skill_level: SkillLevel | None = None
+    handedness: Handedness | None = None
+    protocol: Name | None = None
+    consent: ConsentIn | None = None
+
+
+class SutureTypeIn(Schema):
+    """A suture type of the catalogue."""
+
+    model_config = shown(
+        {"name": "Simple running", "also_called": ["continuous"], "family": "running", "description": "One thread."}
+    )
+
+    name: Name
+    also_called: list[Name] = Field(default_factory=list, max_length=20)
+    family: Name
+    description: Text = ""
+
+
+class DemoIn(Schema):
+    """A demonstration to cut out of a recording: the surgeon, the part, and the grid."""
+
+    model_config = shown(
+        {"surgeon": "kestrel", "suture": "simple-running"},
+        {"surgeon": "kestrel", "suture": "simple-running", "end_s": 1.1, "grid": "fit", "cell_mm": 4.0},
+    )
+
+    surgeon: SlugField
+    suture: SlugField
+    arm: Name | None = None
+    topic: Name | None = None
+    start_s: Annotated[float, Field(ge=0, le=1e9)] | None = None
+    end_s: Annotated[float, Field(ge=0, le=1e9)] | None = None
+    segment: Literal["whole"] | Annotated[int, Field(ge=1, le=1_000_000)] | None = Field(
+        default=None,
+        description="A proposed hand-off, counted from 1, or the whole recording. Left out, as are start_s and end_s: "
+        "the only proposal is taken; of several one must be named; where there is none, the whole recording is taken. "
+        "The answer says which part it was.",
+    )
+    grid: GridMode = "auto"
+    cell_mm: Annotated[float, Field(ge=0.25, le=50)] | None = None
+    hysteresis: Hysteresis = 0.0
+    session: SlugField | None = None
+
+
+def _learner(learner: type[Learner]) -> Any:
+    """Return a schema with the settings of a learner; the learner itself checks their values."""
+    settings: dict[str, Any] = {f.name: (Whole if f.type is int else Number, f.default) for f in fields(learner)}
+    # The discriminator of `LearnerIn`, without a default.
+    settings["kind"] = (Literal[learner.kind], ...)
+    return create_model(learner.__name__, __base__=Schema, __doc__=learner.__doc__, **settings)
+
+
+LearnerIn: Any = Annotated[reduce(or_, map(_learner, LEARNERS.values())), Field(discriminator="kind")]
+
+
+class CombineIn(Schema):
+    """The way several demonstrations are combined into one path (docs/combining.md)."""
+
+    kind: Literal["medoid", "barycentre", "corridor"]
+
+
+class TrainingIn(Schema):
+    """A training. Defaults: the newest active demonstration, the phase learner, seed 0, no release.
+
+    Several demonstrations are combined: as a corridor, if `combine` is left out.
+    """
+
+    model_config = shown(
+        {"surgeon": "kestrel", "suture": "simple-running", "release": True},
+        {"surgeon": "kestrel", "suture": "simple-running", "learner": {"kind": "value-iteration", "gamma": 0.1}},
+    )
+
+    surgeon: SlugField
+    suture: SlugField
+    demos: list[DigestField] | None = None
+    combine: CombineIn | None = None
+    learner: LearnerIn | None = None
+    seed: Annotated[StrictInt, Field(ge=0, le=MAX_SEED)] = 0
+    release: StrictBool = False
+
+    @property
+    def chosen(self) -> Learner | None:
+        """The learner as a value of the domain."""
+        return None if self.learner is None else learner_of(self.learner.model_dump())
+
+    @property
+    def combining(self) -> Combining | None:
+        """The way of combining as a value of the domain."""
+        return None if self.combine is None else COMBININGS[self.combine.kind]()
+
+
+class RetrainingIn(Schema):
+    """A batch of trainings. Defaults: all styles, the phase learner, no release."""
+
+    model_config = shown({}, {"surgeon": "kestrel", "only_stale": True, "release": True})
+
+    surgeon: SlugField | None = None
+    suture: SlugField | None = None
+    only_stale: StrictBool = Field(
+        default=False,
+        description="Leaves out every style whose newest version is what this would make of it: learnt from its newest "
+        "demonstration, with these settings, by this version of the learner.",
+    )
+    learner: LearnerIn | None = None
+    release: StrictBool = Field(
+        default=False, description="Releases a version that passes the gate and is not worse than the released one."
+    )
+
+    @property
+    def chosen(self) -> Learner | None:
+        """The learner as a value of the domain."""
+        return None if self.learner is None else learner_of(self.learner.model_dump())
+
+
+class ScoreIn(Schema):
+    """A score: a demonstration, or a part of a recording, and the style that it is compared with."""
+
+    model_config = shown(
+        {"surgeon": "kestrel", "suture": "simple-running", "demo": "0123456789abcdef" * 4},
+        {"surgeon": "kestrel", "suture": "simple-running", "recording": "0123456789abcdef" * 4, "end_s": 1.1},
+    )
+
+    surgeon: SlugField
+    suture: SlugField
+    demo: DigestField | None = None
+    recording: DigestField | None = None
+    arm: Name | None = None
+    topic: Name | None = None
+    start_s: Annotated[float, Field(ge=0, le=1e9)] | None = None
+    end_s: Annotated[float, Field(ge=0, le=1e9)] | None = None
+    reference: DigestField | None = Field(
+        default=None,
+        description="The demonstration of the style to compare with. Left out, the one that its released policy was "
+        "learnt from, else its newest.",
+    )
+
+    @model_validator(mode="after")
+    def _one_of_two(self) -> Self:
+        part = (self.arm, self.topic, self.start_s, self.end_s)
+        # Either both or neither of them is given.
+        if (self.demo is None) == (self.recording is None):
+            raise ValueError("give either demo or recording")
+        if self.demo is not None and any(one is not None for one in part):
+            raise ValueError("arm, topic, start_s and end_s belong to a recording; a demonstration has its own")
+        return self
+
+
+class RolloutIn(Schema):
+    """A rollout: its start in mm, in the policy's frame, and the version; without `version`, the released one."""
+
+    model_config = shown({"start_mm": [0.0, 50.0, -120.0]})
+
+    start_mm: Point
+    version: Annotated[StrictInt, Field(ge=1, le=2**31)] | None = None
+
+
+class NextIn(Schema):
+    """A position in mm, in the policy's frame, and the phase in which it was reached; null: the start of a pass."""
+
+    model_config = shown({"position_mm": [-10.0, 55.0, -135.0]}, {"position_mm": [-15.0, 55.0, -130.0], "phase": 1})
+
+    position_mm: Point
+    phase: Annotated[StrictInt, Field(ge=0, le=10**6)] | None = None
+
+
+class SuturePointIn(Schema):
+    """The position of a pass's goal, and the rotation of its grid world about this position."""
+
+    position_mm: Point
+    rotation_xyzw: tuple[Component, Component, Component, Component] = (0.0, 0.0, 0.0, 1.0)
+
+    @property
+    def value(self) -> SuturePoint:
+        """The suture point as a value of the domain."""
+        return SuturePoint(self.position_mm, self.rotation_xyzw)
+
+
+class BaseIn(Schema):
+    """The position and rotation of PSM_M's base, its remote centre, in the base frame of the demonstrated arm."""
+
+    position_mm: Point
+    rotation_xyzw: tuple[Component, Component, Component, Component]
+
+
+class PsmMIn(Schema):
+    """The arm that takes the needle, in the frame of the arm that was demonstrated."""
+
+    approach: tuple[Component, Component, Component] | None = Field(
+        default=None, description="Its direction towards the needle; left out, the demonstrated one."
+    )
+    base: BaseIn | None = Field(
+        default=None,
+        description="Left out, the demonstrated one; where that is not known, PSM_M is in no scene or bag.",
+    )
+    instrument: Annotated[str, Field(pattern=f"^({'|'.join(INSTRUMENTS)})$")] | None = None
+    enters: Enters = "after_A1"
+    source: Name | None = Field(default=None, description="Where these numbers come from; the plan repeats it.")
+
+
+class PlanIn(Schema):
+    """A plan: grid worlds of a style, stacked at suture points."""
+
+    model_config = shown(
+        {
+            "surgeon": "kestrel",
+            "suture": "simple-running",
+            "suture_points": [{"position_mm": [5.0, 55.0, -125.0]}],
+            "handoff": "none",
+        }
+    )
+
+    surgeon: SlugField
+    suture: SlugField
+    version: Annotated[StrictInt, Field(ge=1, le=2**31)] | None = None
+    suture_points: Annotated[list[SuturePointIn], Field(min_length=1, max_length=MAX_PASSES)]
+    starts_mm: Annotated[list[Point | None], Field(max_length=MAX_PASSES)] | None = Field(
+        default=None,
+        description=f"Up to {MAX_OUTSIDE_MM:g} mm outside a pass's grid world a transfer leads into it.",
+    )
+    arm: Name | None = None
+    frame: Name | None = None
+    instrument: Name | None = None
+    speed_mm_s: Annotated[Number, Field(gt=0, le=1000)] = 20.0
+    rate_hz: Annotated[Number, Field(ge=RATE_HZ[0], le=RATE_HZ[1])] = 200.0
+    tip_offset_mm: Annotated[Number, Field(ge=0, le=MAX_TIP_OFFSET_MM)] = Field(
+        default=0.0,
+        description=f"How far down the jaw's approach from its hinge suture points and starts are meant; "
+        f"{JAW_TIP_MM:g} for the finger tips.",
+    )
+    psm_m: PsmMIn | None = Field(
+        default=None, description="Left out, it is taken from the demonstration where that has PSM_M's pose."
+    )
+    realignment: StrictBool = Field(
+        default=True, description="false plans A1 alone, without A2's turn; handoff 'none' is the way to say so now."
+    )
+    handoff: Literal["none"] | None = Field(
+        default=None,
+        description="none asks for a plan that hands nothing over: A1 alone. Without it a plan is refused for which "
+        "neither psm_m nor the demonstration says where PSM_M is.",
+    )
+
+
+class PlaybackIn(Schema):
+    """A playback: the plan to play in the simulator."""
+
+    model_config = shown({"plan": "0123456789abcdef" * 4})
+
+    plan: DigestField

@@ -1,0 +1,258 @@
+"""Films of a plan: its complete trajectory in the simulator's scene, as MP4 (H.264) and as GIF.
+
+Each frame is an image of both arms, the pad and the needle, with the path of the tip: strong where it has passed, pale
+where it is still to come. Everything is done in a separate process (`film`). The encoder is a program (ffmpeg) that
+this process starts under the same limits: single-threaded and configured to leave out its name and the date, so that
+the same trajectory gives the same bytes if the versions are the same.
+
+The needle's pose comes from `skills.verification.needle`. Passes count from 0, as in reports; M1 and M2 between them
+are done by hand and not shown.
+"""
+
+import os
+import subprocess
+import tempfile
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import ArrayLike
+from PIL import Image, ImageDraw, ImageFont
+
+from skills import packing
+from skills.arrays import Ints
+from skills.errors import SimulationFailed
+from skills.kinematics import JAW_TIP_MM, quaternion_of
+from skills.planning.trajectory import A1, A2, TRANSFER, Trajectory
+from skills.sandbox.limits import ProcessLimits
+from skills.simulation import pictures, scene
+from skills.simulation.player import simulated
+from skills.verification.needle import needle_poses
+
+FRAMES = 60  # over a plan of a few passes
+FRAMES_PER_PASS, MOST_FRAMES = 12, 300
+FRAMES_PER_S = 10
+HELD_FRAMES = 10  # repetitions of the last frame
+SHOOTING_S = 600.0  # generous, because nobody waits for a film and jobs that people wait for have priority
+CREW = "skills.simulation.film:film"
+
+# Pixels; H.264 wants whole blocks of 16.
+WIDTH, HEIGHT = 480, 368
+_HEAD, _FOOT = 32, 16
+_SCALE = 1.5
+_NICENESS = 5  # on top of the worker's
+_POINTS = 120  # of the path in each pass and phase
+_NEAR = 4  # passes before and after the present one whose path is drawn: with more they could not be told apart
+_TRANSFER_COLOUR: pictures.Colour = (110, 110, 110)
+_INK, _FAINT = (20, 20, 20), (120, 120, 120)
+_ARMS = (("PSM_A", (64, 69, 77)), ("PSM_M", (66, 104, 66)))
+Asked = dict[str, Any]  # named arrays, numbers and texts
+_SAID = {
+    TRANSFER: "transfer: to the start of the pass",
+    A1: "A1: along the path of the policy",
+    A2: "A2: the jaw turns for the hand-off",
+}
+
+
+@dataclass(frozen=True)
+class Film:
+    """A film in both formats."""
+
+    mp4: bytes
+    gif: bytes
+
+
+# ---- outside the process ---------------------------------------------------------------------------------------
+
+
+def shoot(
+    trajectory: Trajectory,
+    *,
+    pad_top_mm: float,
+    samples: ArrayLike | None = None,
+    timeout_s: float = SHOOTING_S,
+    memory_bytes: int = 1 << 30,
+    target: str = CREW,
+) -> Film:
+    """Film a trajectory in a separate process.
+
+    Args:
+        trajectory: The trajectory to film.
+        pad_top_mm: Height of the suture pad's top in the PSM base frame.
+        samples: The sample that each frame shows, in order; by default `frames_of` chooses.
+        timeout_s: Wall time after which the process is killed.
+        memory_bytes: Memory limit of the process, and the same again for the encoder.
+        target: The function that makes the film, as `module:function`.
+
+    Raises:
+        SimulationFailed: PyBullet is missing, or it crashed, hung, ran out of memory or returned no film.
+    """
+    if target == CREW:
+        scene.require_pybullet()
+    at = frames_of(trajectory) if samples is None else np.asarray(samples, np.int64)
+    answer = simulated(target, _request(trajectory, at, pad_top_mm), ProcessLimits(memory_bytes, timeout_s))
+    mp4, gif = (part if isinstance(part := answer.get(name), bytes) else b"" for name in ("mp4", "gif"))
+    if mp4[4:8] != b"ftyp" or gif[:6] != b"GIF89a":
+        raise SimulationFailed(
+            "The simulator returned no film; request it again, and report it if it happens again.", cause="nonsense"
+        )
+    return Film(mp4, gif)
+
+
+def frames_of(trajectory: Trajectory) -> Ints:
+    """Choose the samples to show: evenly, and the last of every pass, where the needle is handed over."""
+    # Minus the passes, because the last sample of each is added below.
+    count = min(MOST_FRAMES, max(FRAMES, FRAMES_PER_PASS * trajectory.passes)) - trajectory.passes
+    evenly = np.linspace(0, len(trajectory) - 1, min(len(trajectory), count)).round().astype(np.int64)
+    return np.unique(np.concatenate([evenly, trajectory.last_samples]))
+
+
+def _request(trajectory: Trajectory, at: Ints, pad_top_mm: float) -> Asked:
+    place, rotation = needle_poses(trajectory, at)
+    way = _way(trajectory)
+    asked: Asked = {
+        "instrument": trajectory.instrument,
+        "rate_hz": trajectory.rate_hz,
+        "pad_top_mm": pad_top_mm,
+        "extent_mm": np.stack([trajectory.tip_mm.min(axis=0), trajectory.tip_mm.max(axis=0)]),
+        "samples": len(trajectory),
+        "at": at,
+        "stamps_s": trajectory.stamps_s[at] - trajectory.stamps_s[0],
+        "joints": trajectory.joints[at],
+        "pass_index": trajectory.pass_index[at],
+        "phase": trajectory.phase[at],
+        "pass_begins": np.append(0, trajectory.last_samples[:-1] + 1),
+        "needle_mm": place,
+        "needle_xyzw": quaternion_of(rotation),
+        "way": way,
+        "way_mm": trajectory.tip_mm[way],
+        "way_pass": trajectory.pass_index[way],
+        "way_phase": trajectory.phase[way],
+    }
+    if (m := trajectory.psm_m) is not None:
+        asked |= {"m_base_mm": m.base_mm, "m_base_xyzw": m.base_xyzw, "m_instrument": m.instrument}
+        asked["m_joints"] = m.joints[at]
+    return asked
+
+
+def _way(trajectory: Trajectory) -> Ints:
+    """Choose the samples through which the tip's path is drawn: at most `_POINTS` of each transfer and each A1."""
+    group = trajectory.pass_index * 3 + trajectory.phase
+    parts = np.split(np.arange(len(trajectory)), np.flatnonzero(np.diff(group)) + 1)
+    moving = [part for part in parts if trajectory.phase[part[0]] != A2]
+    thinned = [part[np.linspace(0, len(part) - 1, min(len(part), _POINTS)).round().astype(int)] for part in moving]
+    return np.concatenate([*thinned, np.empty(0, np.int64)]).astype(np.int64)
+
+
+# ---- inside the process ----------------------------------------------------------------------------------------
+
+
+def film(given: BinaryIO, answer: BinaryIO) -> None:
+    """Make the film that `shoot` requests."""
+    os.nice(_NICENESS)
+    asked: Asked = packing.read(given, {})
+    with scene.opened(asked["instrument"], asked["rate_hz"]) as set_up:
+        mp4, gif = encode(_frames(set_up, asked))
+    packing.write(answer, {"mp4": mp4, "gif": gif}, {})
+
+
+def encode(frames: Iterable[bytes]) -> tuple[bytes, bytes]:
+    """Encode frames, each the bytes of an RGB image: an MP4 that a browser can play while it loads, and a GIF."""
+    import imageio_ffmpeg
+
+    exact = ["-map_metadata", "-1", "-fflags", "+bitexact", "-flags:v", "+bitexact", "-threads", "1"]
+    h264 = ["-c:v", "libx264", "-preset", "medium", "-crf", "21", "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
+    # No dithering: the scene has few colours, and flickering dots would make the file three times as large.
+    palette = "split[a][b];[a]palettegen=max_colors=128[p];[b][p]paletteuse=dither=none:diff_mode=rectangle"
+    # Files without a name, so that nothing is left of them, however this process ends.
+    with tempfile.TemporaryFile() as mp4, tempfile.TemporaryFile() as gif:
+        raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{WIDTH}x{HEIGHT}", "-r", str(FRAMES_PER_S)]
+        command = [imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-y", *raw, "-i", "pipe:0"]
+        command += [*h264, *exact, "-f", "mp4", f"/proc/self/fd/{mp4.fileno()}"]
+        command += ["-filter_threads", "1", "-vf", palette, *exact, "-f", "gif", f"/proc/self/fd/{gif.fileno()}"]
+        with subprocess.Popen(  # noqa: S603 - the program in the package
+            command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, pass_fds=(mp4.fileno(), gif.fileno())
+        ) as encoder:
+            assert encoder.stdin is not None
+            for frame in frames:
+                encoder.stdin.write(frame)
+        if encoder.returncode:
+            raise RuntimeError(f"the encoder stopped with code {encoder.returncode}")
+        return mp4.read(), gif.read()
+
+
+def _frames(set_up: scene.Scene, asked: Asked) -> Iterator[bytes]:
+    """Pose the scene for one frame after the other; the last one is repeated."""
+    set_up.place_pad(asked["extent_mm"], asked["pad_top_mm"])
+    if "m_joints" in asked:
+        set_up.place_psm_m(asked["m_base_mm"], asked["m_base_xyzw"], asked["m_instrument"])
+    camera = _camera(asked)
+    frame = b""
+    for k in range(len(asked["at"])):
+        set_up.pose(asked["joints"][k])
+        if set_up.psm_m is not None:
+            set_up.pose(asked["m_joints"][k], set_up.psm_m)
+        taken = set_up.photograph(camera, (asked["needle_mm"][k], asked["needle_xyzw"][k]))
+        sheet = pictures.Sheet(taken, camera)
+        _draw_way(sheet, asked, k)
+        frame = _framed(sheet.finished(), asked, k).tobytes()
+        yield frame
+    yield from [frame] * (HELD_FRAMES - 1)
+
+
+def _camera(asked: Asked) -> pictures.Camera:
+    """Return a camera on the side opposite to PSM_M that also shows the finger tips, which are below the path."""
+    way = asked["way_mm"]
+    facing = pictures.facing(np.concatenate([way, way - [0.0, 0.0, JAW_TIP_MM]]) * scene.MM)
+    if "m_joints" in asked and asked["m_base_mm"][0] > way[:, 0].mean():
+        facing = replace(facing, yaw_deg=-facing.yaw_deg)
+    height = HEIGHT - _HEAD - _FOOT
+    return replace(facing, width=int(WIDTH * _SCALE), height=int(height * _SCALE), scale=_SCALE)
+
+
+def _draw_way(sheet: pictures.Sheet, asked: Asked, k: int) -> None:
+    now, present = int(asked["at"][k]), asked["pass_index"][k]
+    group = asked["way_pass"] * 3 + asked["way_phase"]
+    for one in np.unique(group[np.abs(asked["way_pass"] - present) <= _NEAR]):
+        mine = group == one
+        way, place, number = asked["way"][mine], asked["way_mm"][mine] * scene.MM, int(one) // 3
+        along = int(one) % 3 == A1
+        colour = pictures.colour_of(number) if along else _TRANSFER_COLOUR
+        done = int(np.searchsorted(way, now, side="right"))
+        sheet.line(place[max(0, done - 1) :], colour, 1.2, strength=0.45)
+        sheet.line(place[:done], colour, 2.4 if along else 1.2, strength=0.95)
+        if along:
+            sheet.label(place[-1], pictures.GOAL_COLOUR, str(number), 7.0)
+
+
+def _framed(view: Image.Image, asked: Asked, k: int) -> Image.Image:
+    """Return the frame: the view, with a title and time line above it and a legend below."""
+    frame = Image.new("RGB", (WIDTH, HEIGHT), pictures.WHITE)
+    frame.paste(view, (0, _HEAD))
+    pen = ImageDraw.Draw(frame)
+    large, small = ImageFont.load_default(size=15), ImageFont.load_default(size=11)
+    number, phase = int(asked["pass_index"][k]), int(asked["phase"][k])
+    pen.text((8, _HEAD // 2 - 2), f"Pass {number}   {_SAID[phase]}", fill=_INK, font=large, anchor="lm")
+    pen.text((WIDTH - 8, _HEAD // 2 - 2), f"{asked['stamps_s'][k]:.1f} s", fill=_INK, font=large, anchor="rm")
+    _draw_progress(pen, asked, int(asked["at"][k]))
+    x, y = 8.0, HEIGHT - _FOOT / 2
+    for name, colour in _ARMS[: 2 if "m_joints" in asked else 1]:
+        pen.rectangle((x, y - 4, x + 8, y + 4), fill=colour)
+        pen.text((x + 13, y), name, fill=_INK, font=small, anchor="lm")
+        x += 26 + pen.textlength(name, font=small)
+    pen.text((WIDTH - 8, y), "research use only", fill=_FAINT, font=small, anchor="rm")
+    return frame
+
+
+def _draw_progress(pen: ImageDraw.ImageDraw, asked: Asked, now: int) -> None:
+    """Draw a bar above the view, one part for each pass, filled up to the present sample."""
+    total, top = asked["samples"], _HEAD - 4
+    begins = asked["pass_begins"].tolist()
+    for number, (begin, end) in enumerate(zip(begins, [*begins[1:], total], strict=True)):
+        left, right = WIDTH * begin / total, WIDTH * end / total - 1
+        colour = pictures.colour_of(number)
+        pale: pictures.Colour = tuple(round(255 - (255 - part) * 0.3) for part in colour)  # type: ignore[assignment]
+        pen.rectangle((left, top, right, top + 3), fill=pale)
+        if now >= begin:
+            pen.rectangle((left, top, min(right, WIDTH * (now + 1) / total), top + 3), fill=colour)

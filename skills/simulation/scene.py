@@ -1,0 +1,273 @@
+"""The scene in PyBullet: PSM_A, the pad, the needle and, if its place is known, PSM_M. PyBullet's side is in metres.
+
+This is the only module that imports pybullet, and only when a scene is opened. `skills.simulation.passes` and
+`skills.simulation.film` use it.
+"""
+
+import importlib.util
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from hashlib import sha256
+from importlib.resources import as_file, files
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skills.arrays import Floats
+from skills.errors import SimulationFailed
+from skills.kinematics import INSERTION, JOINTS, InstrumentConstants, instrument_of
+from skills.planning.handoff import HELD_MM, HOLDING_RAD, OPEN_RAD
+from skills.simulation import pictures
+from skills.verification.playback import CLEARANCE_SEEN_MM, FINGERS, LINKS, pad_scale
+
+MM = 1e-3
+PLACE, TURN = 4, 5  # indices of the frame in a link's state; 0 and 1 would be its centre of mass
+EFFORT = 3  # index of the effort in a joint's state
+POSITION_GAIN, VELOCITY_GAIN = 0.3, 1.0
+FINGER_EFFORT = 0.16  # Nm
+PSM_M_COLOUR = (0.35, 0.55, 0.35, 1.0)
+
+
+def require_pybullet() -> None:
+    """Raise an error early, and without the import, if PyBullet is missing.
+
+    Raises:
+        SimulationFailed: It is not installed; the message states how to install it.
+    """
+    if importlib.util.find_spec("pybullet") is None:
+        raise SimulationFailed(
+            "PyBullet is not installed, so no plan can be played. On Python 3.11 and Linux x86-64 install it "
+            "with `pip install pybullet==3.2.7`; elsewhere build it from source.",
+            cause="not installed",
+        )
+
+
+@contextmanager
+def opened(instrument: str, rate_hz: float) -> Iterator["Scene"]:
+    """Open a fresh scene with PSM_A, and close it at the end; a fresh one gives the same numbers each time."""
+    require_pybullet()
+    import pybullet
+
+    client = pybullet.connect(pybullet.DIRECT)
+    try:
+        pybullet.setTimeStep(1.0 / rate_hz, physicsClientId=client)
+        pybullet.setGravity(0, 0, -9.81, physicsClientId=client)
+        pybullet.setPhysicsEngineParameter(deterministicOverlappingPairs=1, physicsClientId=client)
+        yield Scene(pybullet, client, instrument_of(instrument))
+    finally:
+        pybullet.disconnect(physicsClientId=client)
+
+
+@dataclass(frozen=True)
+class SceneBody:
+    """A loaded arm: its number, and the indices of its joints and links; `surfaces` are those of `playback.LINKS`."""
+
+    number: int
+    joints: tuple[int, ...]
+    fingers: tuple[int, ...]
+    tool: int
+    shaft: int
+    surfaces: tuple[int, ...]
+
+
+class Scene:
+    """One simulation. Lengths in arguments are in mm, except in `drive` and in cameras, which use PyBullet's metres."""
+
+    def __init__(self, bullet: ModuleType, client: int, tool: InstrumentConstants) -> None:
+        self.bullet: Any = bullet
+        self.client = client
+        self.tool = tool
+        self.files: dict[str, str] = {}
+        self.arm = self._load_arm(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), tool, HOLDING_RAD)
+        self.pad: int | None = None
+        self.pad_mm = np.zeros(3)
+        self.psm_m: SceneBody | None = None
+        self.needle: int | None = None
+        self._driven = [*self.arm.joints, *self.arm.fingers]
+        self._efforts = [*tool.arm.effort, FINGER_EFFORT, FINGER_EFFORT]
+        self._position_gains, self._velocity_gains = [POSITION_GAIN] * 8, [VELOCITY_GAIN] * 8
+
+    # -- contents --
+
+    def place_pad(self, tip_mm: Floats, top_mm: float) -> None:
+        """Lay the pad, large enough, under the middle of the path, with its wound along the path's longer side."""
+        low, high = tip_mm.min(axis=0), tip_mm.max(axis=0)
+        middle = (low + high) / 2
+        turned = np.pi / 2 if high[1] - low[1] > high[0] - low[0] else 0.0
+        quaternion = [0.0, 0.0, float(np.sin(turned / 2)), float(np.cos(turned / 2))]
+        self.pad_mm = np.array([middle[0], middle[1], top_mm])
+        self.pad = self._load("suture_pad.urdf", self.pad_mm, quaternion, scale=pad_scale(tip_mm))
+
+    def place_psm_m(self, base_mm: Floats, base_xyzw: Floats, instrument: str | None = None) -> None:
+        """Load PSM_M, in green and with its jaws open, by default with PSM_A's instrument.
+
+        Collisions between the arms are off, because their distance is measured instead.
+        """
+        tool = instrument_of(instrument) if instrument else self.tool
+        self.psm_m = self._load_arm(base_mm, base_xyzw, tool, OPEN_RAD)
+        links = range(-1, self.bullet.getNumJoints(self.psm_m.number, physicsClientId=self.client))
+        for link in links:
+            for own in links:
+                self.bullet.setCollisionFilterPair(
+                    self.arm.number, self.psm_m.number, own, link, 0, physicsClientId=self.client
+                )
+            self.bullet.changeVisualShape(self.psm_m.number, link, rgbaColor=PSM_M_COLOUR, physicsClientId=self.client)
+
+    def pose(self, joints: Floats, body: SceneBody | None = None) -> None:
+        """Set an arm's joints (rad, insertion mm) exactly, at rest."""
+        arm = body or self.arm
+        # One call for all joints takes a fifth of the time of one call for each.
+        self.bullet.resetJointStatesMultiDof(
+            arm.number, arm.joints, in_metres(joints)[:, None].tolist(), physicsClientId=self.client
+        )
+
+    # -- measurements and motion --
+
+    def read_joints(self) -> list[float]:
+        """Return PSM_A's joints, rad and mm."""
+        values = [float(state[0]) for state in self.joint_states()]
+        values[INSERTION] /= MM
+        return values
+
+    def joint_states(self) -> Any:
+        """Return PSM_A's joint states in PyBullet's form: position, speed, reaction, effort of each."""
+        return self.bullet.getJointStates(self.arm.number, self.arm.joints, physicsClientId=self.client)
+
+    def read_tip(self) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Return PSM_A's tool frame: position in mm and quaternion."""
+        place, quaternion = self.frame_of(self.arm, self.arm.tool)
+        return np.array(place) / MM, np.array(quaternion)
+
+    def frame_of(self, body: SceneBody, link: int) -> Any:
+        """Return the frame of a link in PyBullet's form: position in m and quaternion."""
+        state = self.bullet.getLinkState(body.number, link, 0, 1, self.client)
+        return state[PLACE], state[TURN]
+
+    def closest(self, body: int, other: int) -> Any:
+        """Return the nearest points of all links of two bodies that are near each other, in PyBullet's form."""
+        return self.bullet.getClosestPoints(body, other, CLEARANCE_SEEN_MM * MM, physicsClientId=self.client)
+
+    def pressed_n(self) -> float:
+        """Return the force of the pad on PSM_A, N."""
+        points = self.bullet.getContactPoints(self.arm.number, self.pad, physicsClientId=self.client)
+        return float(sum(point[9] for point in points))
+
+    def drive(self, start: list[float], velocity: list[float]) -> None:
+        """Let the motors move PSM_A through one time step that begins at `start`.
+
+        Args:
+            start: Joints and fingers in PyBullet's units (`in_metres`), 8 numbers.
+            velocity: Their speeds in this step.
+        """
+        self.bullet.setJointMotorControlArray(
+            self.arm.number,
+            self._driven,
+            self.bullet.POSITION_CONTROL,
+            targetPositions=start,
+            targetVelocities=velocity,
+            forces=self._efforts,
+            positionGains=self._position_gains,
+            velocityGains=self._velocity_gains,
+            physicsClientId=self.client,
+        )
+        self.bullet.stepSimulation(physicsClientId=self.client)
+
+    def photograph(self, camera: pictures.Camera, needle: tuple[Floats, Floats] | None = None) -> pictures.Photograph:
+        """Return an image of the present scene, the needle in a given pose (mm, quaternion) or between PSM_A's jaws."""
+        self._place_needle(*(needle or self._in_jaws()))
+        view = self.bullet.computeViewMatrixFromYawPitchRoll(
+            camera.target_m, camera.distance_m, camera.yaw_deg, camera.pitch_deg, 0.0, 2
+        )
+        projection = self.bullet.computeProjectionMatrixFOV(
+            camera.field_deg, camera.width / camera.height, camera.near_m, camera.far_m
+        )
+        image = self.bullet.getCameraImage(
+            camera.width,
+            camera.height,
+            view,
+            projection,
+            lightDirection=(0.3, 0.5, 1.0),
+            renderer=self.bullet.ER_TINY_RENDERER,
+            physicsClientId=self.client,
+        )
+        size = (camera.height, camera.width)
+        return pictures.Photograph(
+            rgb=np.asarray(image[2], np.uint8).reshape(*size, 4)[:, :, :3].copy(),
+            depth=np.asarray(image[3], np.float64).reshape(size),
+            view=np.array(view).reshape(4, 4).T,
+            projection=np.array(projection).reshape(4, 4).T,
+        )
+
+    def _in_jaws(self) -> tuple[Floats, Floats]:
+        tip_mm, quaternion = self.read_tip()
+        approach = np.array(self.bullet.getMatrixFromQuaternion(quaternion)).reshape(3, 3)[:, 2]
+        return tip_mm + HELD_MM * approach, quaternion
+
+    def _place_needle(self, place_mm: Floats, quaternion: Floats) -> None:
+        if self.needle is None:
+            self.needle = self._load("needle.urdf", np.zeros(3), [0.0, 0.0, 0.0, 1.0])
+        self.bullet.resetBasePositionAndOrientation(
+            self.needle, (place_mm * MM).tolist(), quaternion.tolist(), physicsClientId=self.client
+        )
+
+    # -- loading --
+
+    def _load(self, name: str, position_mm: Floats, quaternion: Sequence[float], scale: float = 1.0) -> int:
+        with as_file(files("skills") / "urdf" / name) as path:
+            self.files[name] = sha256(path.read_bytes()).hexdigest()
+            return int(
+                self.bullet.loadURDF(
+                    str(path),
+                    basePosition=(np.asarray(position_mm) * MM).tolist(),
+                    baseOrientation=list(quaternion),
+                    useFixedBase=1,
+                    globalScaling=scale,
+                    # Without it PyBullet makes cylinders into hulls, a millimetre too thick.
+                    flags=self.bullet.URDF_USE_IMPLICIT_CYLINDER,
+                    physicsClientId=self.client,
+                )
+            )
+
+    def _load_arm(
+        self, position_mm: Floats, quaternion: Floats, tool: InstrumentConstants, opening_rad: float
+    ) -> SceneBody:
+        number = self._load("psm.urdf", position_mm, np.asarray(quaternion).tolist())
+        found = [
+            self.bullet.getJointInfo(number, index, physicsClientId=self.client)
+            for index in range(self.bullet.getNumJoints(number, physicsClientId=self.client))
+        ]
+        by_joint = {info[1].decode(): int(info[0]) for info in found}
+        by_link = {info[12].decode(): int(info[0]) for info in found}
+        arm = SceneBody(
+            number=number,
+            joints=tuple(by_joint[f"outer_{name}"] for name in JOINTS),
+            fingers=tuple(by_joint[f"{name}_hinge"] for name in FINGERS),
+            tool=by_link["tool_frame"],
+            shaft=by_link["roll_link"],
+            surfaces=tuple(by_link[name] for name in LINKS),
+        )
+        self.bullet.changeDynamics(number, -1, linearDamping=0.0, angularDamping=0.0, physicsClientId=self.client)
+        lower, upper = in_metres(tool.lower).tolist(), in_metres(tool.upper).tolist()
+        for joint, index in enumerate(arm.joints):
+            # The file has the Classic's limits, a Si has others. A separate call, because with damping in the same call
+            # the limits have no effect.
+            self.bullet.changeDynamics(
+                number,
+                index,
+                jointLowerLimit=lower[joint],
+                jointUpperLimit=upper[joint],
+                physicsClientId=self.client,
+            )
+        for index in arm.fingers:
+            self.bullet.resetJointState(number, index, opening_rad, physicsClientId=self.client)
+        return arm
+
+
+def in_metres(joints: Floats) -> Floats:
+    """Return joints, shape (..., 6), in PyBullet's units: the insertion in metres."""
+    values = np.array(joints, float)
+    values[..., INSERTION] *= MM
+    return values

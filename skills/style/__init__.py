@@ -1,1 +1,0 @@
-"""The heart, pure: numbers in, numbers out. No files, clock, environment, database or log."""

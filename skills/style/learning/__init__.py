@@ -1,1 +1,0 @@
-"""Learners: how a reward map becomes Q values."""

@@ -1,0 +1,338 @@
+"""The verdict on a playback: feasible or not, with the figures on which it rests, as plain numbers.
+
+    Playback, Trajectory --judge--> PlaybackReport
+
+`judge` compares the simulator's measurements (`Playback`) with the intended motion (`Trajectory`). All of this is ours;
+the paper played its plans on the robot.
+
+A feasible verdict means that the geometry is right and free. In free space the servo's error and efforts depend on the
+simulator's gains and masses, not on the robot's, so they guard against mistakes of ours and in contact; they are no
+evidence of the hardware's accuracy. PSM_M is in the kinematic pass alone.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from skills.arrays import Floats, frozen
+from skills.errors import BadInput
+from skills.fields import Count, Figure, Sha256, schema
+from skills.kinematics import INSERTION, JOINTS, UNITS, InstrumentConstants, angle_between, matrix_of
+from skills.planning.motion_laws import A2, PHASES
+from skills.planning.trajectory import Trajectory
+from skills.verification.gates import ArmSamples, Failure, Figures, Limits, figures_of, first_failure
+from skills.verification.needle import psm_m_poses
+from skills.verification.playback import CLEARANCE_SEEN_MM, PAD, PSM_M, Playback
+
+
+@schema
+@dataclass(frozen=True)
+class JointFigures:
+    """The range of one joint in its unit, with its limits."""
+
+    name: str
+    unit: str
+    lowest: Figure
+    highest: Figure
+    lower_limit: float
+    upper_limit: float
+    margin: Figure
+    peak_speed_ratio: Figure
+    peak_acceleration_ratio: Figure
+
+
+@schema
+@dataclass(frozen=True)
+class ArmFigures:
+    """One arm: the constants of its instrument, and its joints."""
+
+    name: str
+    instrument: InstrumentConstants
+    joints: tuple[JointFigures, ...]
+
+
+@schema
+@dataclass(frozen=True)
+class Clearance:
+    """The least distance between two links in one phase of any pass.
+
+    Attributes:
+        phase: Name of the phase.
+        body: The body of the link.
+        link: Its name in the URDF.
+        other: The other body.
+        other_link: Its link.
+        least_mm: The least measured distance; pairs that were never within `seen_within_mm` are not listed.
+        sample: The sample of that measurement.
+        at_least_mm: Lower bound on the distance at every sample, including those without a measurement.
+    """
+
+    phase: str
+    body: str
+    link: str
+    other: str
+    other_link: str
+    least_mm: Figure
+    sample: Count
+    at_least_mm: Figure
+
+
+@schema
+@dataclass(frozen=True)
+class PassEnd:
+    """The end of a pass: the jaw's angles, and the errors there.
+
+    Attributes:
+        sample: Its index.
+        turn_deg: Angle by which A2 turned the jaw.
+        alignment_error_deg: Angle between the jaw's final and target rotations.
+        goal_error_mm: Distance of the servo's tip from the target.
+        n_to_a_m_deg: Angle between PSM_A's hinge axis n and PSM_M's approach a_M; None if that is not known.
+        a_to_a_m_deg: Angle between PSM_A's approach and a_M: the paper wants a right angle.
+    """
+
+    sample: Count
+    turn_deg: Figure
+    alignment_error_deg: Figure
+    goal_error_mm: Figure
+    n_to_a_m_deg: Figure
+    a_to_a_m_deg: Figure
+
+
+@schema
+@dataclass(frozen=True)
+class NeedleClearance:
+    """Least distance of the needle from the pad in one phase of any pass, negative inside: reported, but not a gate."""
+
+    phase: str
+    to_pad_mm: Figure
+    sample: Count
+
+
+@schema
+@dataclass(frozen=True)
+class PlaybackReport:
+    """The verdict and its figures: plain numbers, the same for the same trajectory on every machine.
+
+    `least_margin` is the least distance of a joint of PSM_A, `least_margin_joint`, from its limit as a part of its
+    range, and the peak ratios are PSM_A's; `arms` has every joint of both. `clearance_pad_mm` is of either arm. Between
+    two measurements a pair of links can have come nearer by `moved_between_looks_mm`, which the gates take into
+    account. `peak_effort_ratio` is over the complete servo pass, `peak_contact_effort_ratio` over the samples in which
+    the arm touches the pad.
+    """
+
+    feasible: bool
+    failure: Failure | None
+    samples: Count
+    passes: Count
+    duration_s: float
+    rate_hz: float
+    unreachable_samples: Count
+    least_margin: Figure
+    least_margin_joint: str
+    least_insertion_mm: Figure
+    peak_speed_ratio: Figure
+    peak_acceleration_ratio: Figure
+    fk_error_mm: Figure
+    fk_error_deg: Figure
+    psm_m_fk_error_mm: Figure
+    shaft_off_mm: Figure
+    tracking_max_mm: Figure
+    tracking_rms_mm: Figure
+    goal_error_mm: Figure
+    peak_contact_n: Figure
+    peak_effort_ratio: Figure
+    peak_contact_effort_ratio: Figure
+    deviation_mm: Figure
+    clearance_pad_mm: Figure
+    clearance_psm_m_mm: Figure
+    looks: Count
+    moved_between_looks_mm: Figure
+    seen_within_mm: float
+    psm_m_in_scene: bool
+    arms: tuple[ArmFigures, ...]
+    clearances: tuple[Clearance, ...]
+    needle: tuple[NeedleClearance, ...]
+    ends: tuple[PassEnd, ...]
+    pad_top_mm: Figure
+    engine: str
+    files: Mapping[str, Sha256]
+    settings: Limits
+
+
+def judge(
+    playback: Playback,
+    trajectory: Trajectory,
+    settings: Limits | None = None,
+    *,
+    approach_m: ArrayLike | None = None,
+) -> PlaybackReport:
+    """Compare the measurements with the intended motion and with the limits.
+
+    Args:
+        playback: The measurements.
+        trajectory: The trajectory that was played.
+        settings: The limits; by default `Limits()`.
+        approach_m: PSM_M's approach in the PSM_A base frame, shape (3,), if it is known and PSM_M is not in the scene;
+            if PSM_M is in the scene, its own pose counts.
+
+    Returns:
+        The verdict and its figures.
+
+    Raises:
+        BadInput: The playback has another number of samples than the trajectory, or only one of them has PSM_M.
+    """
+    _check_same(playback, trajectory)
+    limits = settings or Limits()
+    figures = figures_of(playback, trajectory)
+    failure = first_failure(figures, playback, trajectory, limits)
+    psm_a = figures.arms[0]
+    with_m = trajectory.psm_m is not None
+    touching = figures.effort[~(playback.contact_n <= 0)]  # negated, so that NaN counts as contact
+    return PlaybackReport(
+        feasible=failure is None,
+        failure=failure,
+        samples=len(trajectory),
+        passes=trajectory.passes,
+        duration_s=trajectory.duration_s,
+        rate_hz=trajectory.rate_hz,
+        # Negated, so that a NaN margin counts as unreachable.
+        unreachable_samples=int(np.count_nonzero(~(psm_a.margins >= -1e-9).all(axis=1))),
+        least_margin=float(psm_a.margins.min()),
+        least_margin_joint=JOINTS[int(np.argmin(_lowest(psm_a.margins)))],
+        least_insertion_mm=float(psm_a.joints[:, INSERTION].min()),
+        peak_speed_ratio=float(psm_a.speed.max()),
+        peak_acceleration_ratio=float(psm_a.acceleration.max()),
+        fk_error_mm=float(figures.fk_mm.max()),
+        fk_error_deg=float(figures.fk_deg.max()),
+        psm_m_fk_error_mm=float(figures.psm_m_fk_mm.max()) if with_m else None,
+        shaft_off_mm=float(playback.shaft_off_mm.max()),
+        tracking_max_mm=float(playback.tracking_mm.max()),
+        tracking_rms_mm=float(np.sqrt(np.mean(playback.tracking_mm**2))),
+        goal_error_mm=float(playback.tracking_mm[trajectory.last_samples].max()),
+        peak_contact_n=float(playback.contact_n.max()),
+        peak_effort_ratio=float(figures.effort.max()),
+        peak_contact_effort_ratio=float(touching.max(initial=0.0)),
+        deviation_mm=trajectory.deviation_mm,
+        clearance_pad_mm=_least(playback, PAD),
+        clearance_psm_m_mm=_least(playback, PSM_M) if with_m else None,
+        looks=len(playback.looked_at),
+        moved_between_looks_mm=figures.apart.moved_mm(),
+        seen_within_mm=CLEARANCE_SEEN_MM,
+        psm_m_in_scene=with_m,
+        arms=tuple(_arm_report(arm) for arm in figures.arms),
+        clearances=_clearances(playback, trajectory, figures),
+        needle=_needle(playback, trajectory, figures),
+        ends=_ends(playback, trajectory, figures, approach_m),
+        pad_top_mm=float(playback.pad_mm[2]),
+        engine=playback.engine,
+        files=dict(playback.files),
+        settings=limits,
+    )
+
+
+def _check_same(playback: Playback, trajectory: Trajectory) -> None:
+    if len(playback) != len(trajectory):
+        raise BadInput(
+            f"The playback has {len(playback)} samples, the trajectory {len(trajectory)}; play this trajectory.",
+            playback=len(playback),
+            trajectory=len(trajectory),
+        )
+    if (playback.psm_m_tip_mm is None) != (trajectory.psm_m is None):
+        raise BadInput("PSM_M is in only one of playback and trajectory; play this trajectory.")
+
+
+def _arm_report(arm: ArmSamples) -> ArmFigures:
+    rows = zip(
+        JOINTS,
+        UNITS,
+        arm.joints.min(axis=0).tolist(),
+        arm.joints.max(axis=0).tolist(),
+        arm.tool.lower.tolist(),
+        arm.tool.upper.tolist(),
+        (arm.margins.min(axis=0) * (arm.tool.upper - arm.tool.lower)).tolist(),
+        arm.speed.max(axis=0).tolist(),
+        arm.acceleration.max(axis=0).tolist(),
+        strict=True,
+    )
+    return ArmFigures(arm.name, arm.tool, tuple(JointFigures(*row) for row in rows))
+
+
+def _clearances(playback: Playback, trajectory: Trajectory, figures: Figures) -> tuple[Clearance, ...]:
+    """List every pair of links that came near in a phase, by phase and then by distance."""
+    found = []
+    phase_seen = trajectory.phase[playback.looked_at]
+    for column, pair in enumerate(playback.link_pairs):
+        links = (pair.body, pair.link, pair.other, pair.other_link)
+        apart = figures.apart.at_least_mm(column)
+        for phase, name in enumerate(PHASES):
+            seen = np.where(phase_seen == phase, playback.clearances_mm[:, column], np.inf)
+            least = int(np.argmin(seen))
+            if seen[least] >= CLEARANCE_SEEN_MM:
+                continue
+            at_least, sample = float(apart[trajectory.phase == phase].min()), int(playback.looked_at[least])
+            found.append((phase, Clearance(name, *links, float(seen[least]), sample, at_least)))
+    return tuple(one for _, one in sorted(found, key=lambda one: (one[0], one[1].least_mm)))
+
+
+def _needle(playback: Playback, trajectory: Trajectory, figures: Figures) -> tuple[NeedleClearance, ...]:
+    phase_seen = trajectory.phase[playback.looked_at]
+    found = []
+    for phase, name in enumerate(PHASES):
+        if (phase_seen == phase).any():
+            least = int(np.argmin(np.where(phase_seen == phase, figures.needle_mm, np.inf)))
+            found.append(NeedleClearance(name, float(figures.needle_mm[least]), int(playback.looked_at[least])))
+    return tuple(found)
+
+
+def _ends(
+    playback: Playback, trajectory: Trajectory, figures: Figures, approach_m: ArrayLike | None
+) -> tuple[PassEnd, ...]:
+    last = trajectory.last_samples
+    jaws = matrix_of(trajectory.rotation_xyzw)
+    approaches = _approaches(trajectory, approach_m)
+    ends = []
+    for number, end in enumerate(last.tolist()):
+        mine = np.flatnonzero((trajectory.pass_index == number) & (trajectory.phase != A2))
+        before = mine[-1] if len(mine) else end  # the jaw as it is held during A1
+        to_n, to_a = (None, None) if approaches is None else _angles_deg(approaches[number], jaws[end])
+        ends.append(
+            PassEnd(
+                sample=end,
+                turn_deg=float(np.degrees(angle_between(jaws[before][None], jaws[end][None])[0])),
+                alignment_error_deg=float(figures.fk_deg[end]),
+                goal_error_mm=float(playback.tracking_mm[end]),
+                n_to_a_m_deg=to_n,
+                a_to_a_m_deg=to_a,
+            )
+        )
+    return tuple(ends)
+
+
+def _approaches(trajectory: Trajectory, approach_m: ArrayLike | None) -> Floats | None:
+    """Return PSM_M's approach at the end of each pass, shape (passes, 3): its own, or else the given one."""
+    if trajectory.psm_m is not None:
+        return psm_m_poses(trajectory, trajectory.last_samples)[1][:, :, 2]
+    if approach_m is None:
+        return None
+    return np.tile(frozen(approach_m, np.float64, (3,), "approach_m"), (trajectory.passes, 1))
+
+
+def _angles_deg(approach: Floats, jaw: Floats) -> tuple[float, float]:
+    """Return the angles between a direction and a jaw's n and a."""
+    across = [float(np.linalg.norm(np.cross(axis, approach))) for axis in (jaw[:, 0], jaw[:, 2])]
+    along = [float(axis @ approach) for axis in (jaw[:, 0], jaw[:, 2])]
+    n, a = np.degrees(np.arctan2(across, along)).tolist()
+    return n, a
+
+
+def _least(playback: Playback, other: str) -> float:
+    columns = [k for k, pair in enumerate(playback.link_pairs) if pair.other == other]
+    return float(playback.clearances_mm[:, columns].min())
+
+
+def _lowest(margins: Floats) -> Floats:
+    """Return each joint's least margin, with NaN as the least of all."""
+    return np.asarray(np.where(np.isnan(margins), -np.inf, margins).min(axis=0))

@@ -1,0 +1,103 @@
+"""A small plan as a bag for replay, complete and as separate files."""
+
+import io
+import json
+import zipfile
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from skills.formats.replay_bag import ArmMotion, arms_of, folder_of, seal
+from skills.formats.verify import check_bag
+from skills.kinematics import forward, quaternion_of
+from skills.packing import canonical, sha256
+from skills.planning.handoff import OtherArm
+from skills.planning.trajectory import A1, A2, Trajectory
+
+RATE_HZ = 200.0
+FRAME = "PSM2_base"
+PSM2 = ("/PSM2/setpoint_js", "/PSM2/setpoint_cp", "/PSM2/jaw/setpoint_js")
+PSM1 = ("/PSM1/setpoint_js", "/PSM1/setpoint_cp", "/PSM1/jaw/setpoint_js")
+
+
+@cache
+def trajectory(*, other: bool = True) -> Trajectory:
+    """Return two passes of 0.4 s with a second between them, continuous, with PSM_M."""
+    u = np.linspace(0, 1, 81)[:, None]
+    smooth = 10 * u**3 - 15 * u**4 + 6 * u**5
+    here = np.array([-0.07, -0.4, 153.0, 0.01, 0.4, 0.07])
+    there = here + np.array([0.1, 0.02, -9.0, 0.3, 0.1, -0.2])
+    after = here + np.array([0.02, -0.05, 4.0, -0.2, 0.2, 0.1])
+    joints = np.concatenate([here + smooth * (there - here), there + smooth * (after - there)])
+    number = np.repeat([0, 1], 81)
+    tip_mm, rotation = forward(joints)
+    beside = OtherArm(
+        [160.0, 20.0, 20.0], [0.0, 0.3, 0.0, np.sqrt(1 - 0.09)], "420006", joints[::-1] * [1, 1, 1.1, 1, 1, 1]
+    )
+    return Trajectory(
+        rate_hz=RATE_HZ,
+        instrument="400006",
+        stamps_s=np.arange(162) / RATE_HZ + number * 1.0,
+        tip_mm=tip_mm,
+        rotation_xyzw=quaternion_of(rotation),
+        joints=joints,
+        pass_index=number,
+        phase=np.tile(np.repeat([A1, A2], [60, 21]), 2),
+        speed_mm_s=20.0,
+        turn_rad_s=1.0,
+        speed_ratio=0.5,
+        acceleration_ratio=0.5,
+        deviation_mm=0.0,
+        psm_m=beside if other else None,
+    )
+
+
+def papers(made: Trajectory, **changes: Any) -> dict[str, bytes]:
+    """Return the documents of a plan with this trajectory, with no more than is checked."""
+    ends = made.tip_mm[made.last_samples].tolist()
+    plan = {
+        "sha256": "1" * 64,
+        "policy": {"version": 3, "sha256": "2" * 64},
+        "arm": "PSM2",
+        "frame": FRAME,
+        "instrument": made.instrument,
+        "trajectory": {"rate_hz": made.rate_hz, "samples": len(made)},
+        "passes": [{"path_mm": [end]} for end in ends],
+        "psm_m": {"base_mm": [160.0, 20.0, 20.0], "instrument": "420006"} if made.psm_m else None,
+    } | changes.get("plan", {})
+    report = {"feasible": True, "samples": len(made)} | changes.get("report", {})
+    verdict = {
+        "sha256": sha256(canonical([plan["sha256"], report])),
+        "plan": plan["sha256"],
+        "policy": "2" * 64,
+        "feasible": True,
+        "report": report,
+    } | changes.get("verdict", {})
+    policy = {"version": 3, "sha256": "2" * 64} | changes.get("policy", {})
+    files = {"plan.json": plan, "verdict.json": verdict, "policy.json": policy}
+    return {name: json.dumps(paper).encode() for name, paper in files.items()} | {"README.txt": b"Read me.\n"}
+
+
+@cache
+def members(pass_index: int | None = None) -> dict[str, bytes]:
+    """Return the files of a complete bag, without their checksums."""
+    arms = arms_of(trajectory(), arm="PSM2", frame=FRAME, other="PSM1", jaw_rad=0.1, pass_index=pass_index)
+    folders = [folder_of(arm, "1" * 64) for arm in arms]
+    return papers(trajectory()) | folders[0] | folders[1]
+
+
+def arm(name: str = "PSM2") -> ArmMotion:
+    return next(one for one in arms_of(trajectory(), arm="PSM2", frame=FRAME, jaw_rad=0.1) if one.name == name)
+
+
+def checked(files: dict[str, bytes]) -> list[str]:
+    """Seal files with correct checksums and check them."""
+    return check_bag(io.BytesIO(seal(files)))
+
+
+def unpacked(tmp_path: Path, files: dict[str, bytes]) -> Path:
+    with zipfile.ZipFile(io.BytesIO(seal(files))) as archive:
+        archive.extractall(tmp_path)
+    return tmp_path

@@ -1,0 +1,74 @@
+"""The summary of a recording for clients: complete, in plain JSON, and of bounded size."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from skills.demonstration.recording import Joints, Label, Recording, Signal
+from skills.formats.reader_process import MOST, tell
+from tests.demonstration import sessions
+from tests.demonstration.sessions import Kind, session
+
+NS = 10**9
+
+
+@pytest.fixture(scope="module")
+def recorded() -> Recording:
+    """Return two arms with every signal that a dVRK may record."""
+    value, _ = session(Kind(seed=6, passes=2))
+    origin_ns = value.origin_ns
+    stamps_ns = origin_ns + np.array([0, 2, 5]) * NS
+    return replace(
+        value,
+        joints=(Joints("PSM2", "/PSM2/measured_js", stamps_ns, np.zeros((3, 6))),),
+        pedals=(("/footpedals/coag", Signal(stamps_ns, np.array([0.0, 1.0, 0.0]))),),
+        following=(("MTMR_PSM2", Signal(stamps_ns[:1], np.array([1.0]))),),
+        scales=(("MTMR_PSM2", Signal(stamps_ns[:2], np.array([0.2, 0.3]))),),
+        tools=(("PSM2", "LARGE_NEEDLE_DRIVER:400006"),),
+        labels=(Label("insertion", "stage", origin_ns + NS, origin_ns + 3 * NS),),
+        notes=(("surgeon", "somebody"),),
+    )
+
+
+def test_all_that_a_recording_has_is_told(recorded):
+    about = tell(recorded).about
+    assert about["joints"] == [{"arm": "PSM2", "topic": "/PSM2/measured_js", "joints": 6}]
+    assert about["pedals"] == [{"topic": "/footpedals/coag", "presses": 1, "pressed_s": 3.0}]
+    assert about["following"] == [{"teleoperation": "MTMR_PSM2", "following_s": pytest.approx(recorded.duration_s)}]
+    assert about["scales"] == [{"teleoperation": "MTMR_PSM2", "least": 0.2, "greatest": 0.3}]
+    assert about["tools"] == {"PSM2": "LARGE_NEEDLE_DRIVER:400006"}
+    assert about["labels"] == [{"name": "insertion", "kind": "stage", "start_s": 1.0, "end_s": 3.0}]
+    assert {one["arm"] for one in about["quality"]} == {"PSM1", "PSM2"}
+    assert [one["found_by"] for one in about["segments"] if one["arm"] == "PSM2"] == ["jaw", "jaw"]
+
+
+def test_where_an_arms_base_stands_in_the_camera_is_told(recorded):
+    about = tell(recorded).about
+    assert {(one["arm"], one["frame"]) for one in about["base_frames"]} == {("PSM1", "ECM"), ("PSM2", "ECM")}
+
+
+def test_it_is_plain_json(recorded):
+    about = tell(recorded).about
+    assert json.loads(json.dumps(about, allow_nan=False)) == json.loads(json.dumps(about))
+
+
+def test_a_recording_with_little_in_it_has_little_told():
+    value, _ = session(Kind(seed=6, passes=1, jaw=False, clutch=False, both_arms=False, wrist=False))
+    about = tell(value).about
+    for name in ("joints", "masters", "pedals", "following", "scales", "labels"):
+        assert about[name] == []
+    empty = Signal(np.empty(0, np.int64), np.empty(0))
+    silent = tell(replace(value, following=(("MTMR_PSM2", empty),), scales=(("MTMR_PSM2", empty),))).about
+    assert silent["following"] == [{"teleoperation": "MTMR_PSM2", "following_s": 0.0}]
+    assert silent["scales"] == []
+
+
+def test_what_a_recording_may_make_as_long_as_it_likes_is_cut_and_counted(recorded):
+    origin_ns = recorded.origin_ns
+    marks = tuple(Label("knot", "stage", origin_ns + k, origin_ns + k + 1) for k in range(3 * MOST))
+    about = tell(replace(recorded, labels=marks)).about
+    assert (len(about["labels"]), about["counts"]["labels"]) == (MOST, 3 * MOST)
+    assert about["counts"]["segments"] == len(about["segments"])
+    assert sessions.A in {one["arm"] for one in about["segments"]}

@@ -1,0 +1,152 @@
+import io
+
+import numpy as np
+import pytest
+
+from skills.demonstration.demonstration import cut_demo
+from skills.demonstration.recording import Label
+from skills.errors import BadSettings, MixedFrames, NotAQuaternion, NotFinite, NotMetres, UnreadableRecording
+from skills.formats import read_recording
+from skills.formats.jigsaws import RATE_HZ, RatedTrial, meta_line, read_meta, trials
+from tests.formats.others import zipped
+from tests.formats.trials import GESTURES, META, folder, kinematics, text, turning
+
+
+def read(data, **how):
+    return read_recording(io.BytesIO(data), **how)
+
+
+def matrices(turns):
+    x, y, z, w = turns.T
+    return np.stack(
+        [
+            1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w),
+            2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w),
+            2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y),
+        ],
+        axis=1,
+    )  # fmt: skip
+
+
+def test_each_arm_is_read_from_its_own_columns():
+    table = np.array([[float(cell) for cell in row.split()] for row in text(kinematics()).splitlines()])
+    got = read(text(kinematics()))
+    assert (got.format, got.integrity, got.arms) == ("jigsaws", "none", ("PSM_left", "PSM_right"))
+    for motion, jaw, first in ((got.motions[0], got.jaws[0][1], 38), (got.motions[1], got.jaws[1][1], 57)):
+        np.testing.assert_array_equal(motion.tip_mm, 1000.0 * table[:, first : first + 3])
+        np.testing.assert_allclose(matrices(motion.rotation_xyzw), table[:, first + 3 : first + 12], rtol=0, atol=2e-6)
+        np.testing.assert_array_equal(jaw.values, table[:, first + 18])
+    assert [motion.topic for motion in got.motions] == ["columns 39-57", "columns 58-76"]
+    assert [motion.arm for motion in got.masters] == ["MTML", "MTMR"]
+    np.testing.assert_array_equal(got.masters[1].tip_mm, 1000.0 * table[:, 19:22])
+    np.testing.assert_array_equal(dict(got.grippers)["MTML"].values, table[:, 18])
+
+
+def test_rows_are_a_thirtieth_of_a_second_apart_and_never_drift():
+    stamps = read(text(kinematics())).motion_of(arm="PSM_left").stamps_ns
+    assert stamps[0] == 0
+    assert stamps[30] == 1_000_000_000
+    assert np.abs(stamps - np.arange(300) * 1e9 / RATE_HZ).max() <= 0.5
+
+
+def test_the_frame_is_no_arms_base():
+    demo = cut_demo(read(text(kinematics())), arm="PSM_right")
+    assert demo.frame == "jigsaws"
+    assert not demo.frame.endswith("_base")
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_any_rotation_becomes_the_quaternion_that_turns_alike(seed):
+    turns = np.random.default_rng(seed).normal(size=(200, 4))
+    turns[:4] = np.eye(4)  # half turns about each axis, and the identity
+    turns /= np.linalg.norm(turns, axis=1, keepdims=True)
+    table = kinematics(200)
+    table[:, 60:69] = matrices(turns)
+    data = "\n".join(" ".join(repr(float(value)) for value in row) for row in table).encode()
+    got = read(data).motion_of(arm="PSM_right").rotation_xyzw
+    np.testing.assert_allclose(matrices(got), matrices(turns), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(got, axis=1), 1.0, rtol=0, atol=1e-14)
+    assert ((got[1:] * got[:-1]).sum(axis=1) >= -1e-12).all()  # never the far one of q and -q
+
+
+def test_gestures_become_labels_of_the_frames_they_name():
+    data = zipped({"Suturing_B001.txt": text(kinematics()), "transcriptions/Suturing_B001.txt": GESTURES.encode()})
+    labels = read(data).labels
+    assert [label.name for label in labels] == ["G1", "G6", "G4", "G11"]
+    stamps = read(data).motion_of(arm="PSM_left").stamps_ns
+    assert labels[1] == Label("G6", "gesture", int(stamps[60]), int(stamps[149]))
+
+
+def test_the_meta_file_says_how_the_trial_was_rated():
+    members = {"Suturing_B001.txt": text(kinematics()), "meta_file_Suturing.txt": META.encode()}
+    notes = dict(read(zipped(members)).notes)
+    assert (notes["skill"], notes["global rating score"], notes["time and motion"]) == ("novice", "13", "1")
+    rated = read_meta(META)
+    assert rated["Suturing_C002"] == RatedTrial("Suturing_C002", "expert", 27, (5, 4, 5, 4, 5, 4))
+    assert all(sum(one.parts) == one.score for one in rated.values())
+    assert read_meta(meta_line(rated["Suturing_B001"])) == {"Suturing_B001": rated["Suturing_B001"]}
+
+
+def test_the_trials_of_a_folder_are_found_with_what_belongs_to_them(tmp_path):
+    root = folder(tmp_path)
+    (root / "Suturing" / "transcriptions" / "Suturing_C002.txt").unlink()
+    (root / "Suturing" / "kinematics" / "AllGestures" / "notes.txt").write_text("hello")
+    for start in (root, root / "Suturing"):
+        one, other = trials(start)
+        assert (one.name, one.user, one.rated.skill) == ("Suturing_B001", "B", "novice")
+        assert one.transcription is not None
+        assert (other.name, other.transcription, other.rated.score) == ("Suturing_C002", None, 27)
+
+
+def changed(row, column, value):
+    lines = text(kinematics(40)).decode().splitlines()
+    cells = lines[row - 1].split()
+    cells[column - 1 : column] = [value] if value is not None else []
+    lines[row - 1] = " ".join(cells)
+    return "\n".join(lines).encode()
+
+
+@pytest.mark.parametrize(
+    ("data", "error", "message"),
+    [
+        (changed(7, 40, "hello"), UnreadableRecording, "Row 7, column 40"),
+        (changed(7, 40, None), UnreadableRecording, "Row 7 has 75 cells"),
+        (changed(7, 40, "0 0"), UnreadableRecording, "Row 7 has 77 cells"),
+        (changed(7, 40, "nan"), NotFinite, "Row 7, column 40"),
+        (changed(7, 52, "inf"), NotFinite, "Row 7, column 52"),
+        (changed(7, 40, "55.0"), NotMetres, "55 m"),
+        (changed(7, 42, "2.0"), NotAQuaternion, "Row 7: the matrix of PSM_left"),
+        (text(np.hstack([kinematics(5)[:, 10:], kinematics(5)[:, :10]])), NotAQuaternion, "order of JIGSAWS"),
+    ],
+)
+def test_kinematics_that_cannot_be_meant_are_refused_with_their_place(data, error, message):
+    with pytest.raises(error, match=message):
+        read(data)
+
+
+def test_a_reflection_is_no_rotation():
+    table = kinematics(5)
+    table[:, 60:69] = -turning(np.zeros(5)).reshape(5, 9)
+    with pytest.raises(NotAQuaternion):
+        read(text(table))
+
+
+@pytest.mark.parametrize("line", ["61 9999 G6", "0 5 G6", "9 5 G6", "five 6 G6", "61 150", "61 150 G6 G7"])
+def test_a_gesture_that_is_none_is_refused(line):
+    members = {"t.txt": text(kinematics(40)), "g.txt": f"1 4 G1\n{line}\n".encode()}
+    with pytest.raises(UnreadableRecording, match="Line 2"):
+        read(zipped(members))
+
+
+def test_two_trials_in_one_archive_are_refused_with_what_to_do():
+    with pytest.raises(UnreadableRecording, match="one trial"):
+        read(zipped({"a.txt": text(kinematics(40)), "b.txt": text(kinematics(40))}))
+    with pytest.raises(UnreadableRecording, match="one trial with its transcription at a time"):
+        read(zipped({f"{k}.txt": b"x" for k in range(20)}))
+
+
+def test_neither_a_rate_nor_another_frame_is_taken():
+    with pytest.raises(BadSettings, match="JIGSAWS"):
+        read(text(kinematics(5)), rate_hz=30.0)
+    with pytest.raises(MixedFrames, match="jigsaws"):
+        read(text(kinematics(5)), frame="PSM1_base")

@@ -1,0 +1,299 @@
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from skills.errors import BadSettings
+from skills.gridworld.grid import MOVES, GridPath, GridWorld
+from skills.gridworld.reward import RewardLevels, sparse_reward
+from skills.learning.certificate import certify
+from skills.learning.dynamic_programming import ValueIteration
+from skills.learning.learners import MAX_SEED
+from skills.learning.policy import learn_tabular, rollout_from
+from skills.learning.q_learning import CellQLearning, PhaseQLearning
+from tests.gridworld.paths import follow, joins_nearest, named_path, random_path
+
+REWARD = sparse_reward(named_path("a figure of eight"))
+STAY, OFF_GRID_PAYS = 13, -1.0
+both_learners = pytest.mark.parametrize("learner", [CellQLearning(), PhaseQLearning()], ids=["cell", "phase"])
+
+
+# ---- arbitrary paths --------------------------------------------------------------------------------------------
+
+
+def test_the_random_paths_close_oscillate_and_cross_their_goal_early():
+    paths = [random_path(seed) for seed in range(50)]
+    goal_visits = [int((path.states == path.goal).sum()) for path in paths]
+    assert all(path.revisits > 0 for path in paths)
+    assert sum(path.start == path.goal for path in paths) >= 20
+    assert sum(path.start != path.goal and n > 1 for path, n in zip(paths, goal_visits, strict=True)) >= 10
+    assert sum(path.start == path.goal and n > 2 for path, n in zip(paths, goal_visits, strict=True)) >= 10
+    oscillate = [
+        any(s[i : i + 2] * 3 == s[i : i + 6] for i in range(len(s))) for s in (p.states.tolist() for p in paths)
+    ]
+    assert sum(oscillate) >= 10
+    assert len({path.grid.shape for path in paths}) > 25
+
+
+def check_path(path, seeds):
+    """Check that the demonstration is exact, every start joins by the nearest way, and every action is optimal."""
+    for seed in seeds:
+        policy = learn_tabular(sparse_reward(path), PhaseQLearning(), seed)
+        assert policy.training.settled
+        assert rollout_from(policy, path.start).states.tolist() == path.states.tolist()
+        certificate, _ = certify(policy)
+        assert certificate.every_action_optimal
+        assert certificate.demonstration_reproduced
+        assert certificate.starts_reaching == certificate.starts_joining_nearest == path.grid.n_states
+        assert certificate.finishing == certificate.checked  # from every certified state
+        actions, waypoints = policy.table(), path.states.tolist()
+        for start in range(path.grid.n_states):  # confirmed by a client that knows the interface's text alone
+            states, finished = follow(actions, path.grid.shape, waypoints, start)
+            assert finished
+            assert joins_nearest(path, states)
+
+
+@pytest.mark.parametrize("number", range(50))
+def test_on_each_of_50_self_crossing_paths_every_state_and_every_start(number):
+    check_path(random_path(number), seeds=(number, number + 100))
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("number", range(200))
+def test_200_self_crossing_paths_are_learnt_exactly_on_20_seeds(number):
+    check_path(random_path(1_000_000 + number), seeds=range(20))
+
+
+@pytest.mark.parametrize("settings", [{"max_steps": 100}, {"max_steps": 7}], ids=str)
+def test_longer_episodes_learn_the_same_policy(settings):
+    short = learn_tabular(REWARD, PhaseQLearning())
+    long = learn_tabular(REWARD, PhaseQLearning(**settings))
+    assert long.training.steps > long.training.episodes
+    assert long.training.settled
+    assert long.q.max(axis=1) == pytest.approx(short.q.max(axis=1), rel=1e-9, abs=0)
+    assert vars(certify(long)[0]) == vars(certify(short)[0])
+
+
+def test_a_sweep_cap_that_is_too_low_is_told():
+    assert not learn_tabular(REWARD, PhaseQLearning(max_sweeps=1)).training.settled
+
+
+def test_a_learner_tells_how_it_is_called():
+    assert (CellQLearning.kind, PhaseQLearning.kind) == ("cell-q-learning", "phase-q-learning")
+    published = CellQLearning.published()
+    assert (published.alpha, published.gamma, published.epsilon_falls_over) == (0.1, 0.01, 0.5)
+    assert (published.epsilon_start, published.epsilon_end, published.episodes) == (1.0, 0.0, 5000)
+
+
+# ---- slipping moves ---------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def slipping():
+    """Return the exact policy of a world in which one move in ten slips, and the rows that have a move to choose."""
+    policy = learn_tabular(REWARD, ValueIteration(slip=0.1))
+    return policy, policy.domain.certified & ~policy.domain.terminal
+
+
+def outcomes(policy):
+    """Return each action's target and reward from each row without a slip, both (rows, 27); -1: no target."""
+    domain, rewards = policy.domain, REWARD.rewards
+    after, pays = np.zeros((domain.n_rows, 27), int), np.zeros((domain.n_rows, 27))
+    for row in range(domain.n_rows):
+        phase, here = int(domain.phase_of[row]), domain.cell_of[row]
+        for action, step in enumerate(MOVES):
+            cell = here + step
+            if not policy.path.grid.holds(cell):
+                after[row, action], pays[row, action] = row, OFF_GRID_PAYS
+                continue
+            state = int(policy.path.grid.states_of(cell))
+            then, ends = domain.enter(phase, state)
+            place = None if ends else policy.row(then, state)
+            after[row, action] = -1 if place is None else place
+            pays[row, action] = rewards[state] if phase == 0 else 10.0 if ends else float(then > phase)
+    return after, pays
+
+
+def learn_slipping(alpha, sweeps, seed=0):
+    return learn_tabular(REWARD, PhaseQLearning(alpha=alpha, slip=0.1, max_sweeps=sweeps), seed)
+
+
+def test_exact_values_of_a_world_that_slips_are_those_of_a_second_method(slipping):
+    """The values of its greedy policy solve a system of linear equations."""
+    exact, live = slipping
+    domain, slip, gamma = exact.domain, 0.1, exact.learner.gamma
+    after, pays = outcomes(exact)
+    n, greedy = domain.n_rows, exact.greedy.astype(int).clip(0)
+    anywhere_pays, chances = np.zeros(n), np.zeros((n, n + 1))
+    for action in range(27):
+        off = pays[:, action] == OFF_GRID_PAYS
+        np.add.at(chances, (np.arange(n), np.where(off, after[:, STAY], after[:, action])), slip / 27)
+        anywhere_pays += np.where(off, pays[:, STAY], pays[:, action]) / 27
+    made = after[np.arange(n), greedy]
+    np.add.at(chances, (np.arange(n), made), 1 - slip)
+    reward = (1 - slip) * pays[np.arange(n), greedy] + slip * anywhere_pays
+    chances[~live], reward[~live] = 0.0, 0.0
+    values = np.linalg.solve(np.eye(n) - gamma * chances[:, :n], reward)
+    assert exact.q.max(axis=1)[live] == pytest.approx(values[live], rel=1e-9, abs=0)
+
+
+def test_learning_rates_below_1_approach_the_exact_values_and_1_does_not(slipping):
+    exact, live = slipping
+    best = exact.q[live].max(axis=1)
+    apart = {
+        alpha: float(np.median(np.abs(learn_slipping(alpha, sweeps).q[live].max(axis=1) / best - 1)))
+        for alpha, sweeps in ((1.0, 100), (0.3, 100), (0.1, 200), (0.02, 1000))
+    }
+    assert apart[1.0] > 0.15
+    assert apart[1.0] > apart[0.3] > apart[0.1] > apart[0.02]
+    assert apart[0.02] < 0.05
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_is_learnt_while_moves_slip_follows_from_everywhere(seed):
+    certificate, _ = certify(learn_slipping(0.02, 1000, seed))
+    assert certificate.demonstration_reproduced
+    assert certificate.finishing == certificate.checked
+    assert certificate.starts_reaching == certificate.starts_joining_nearest == certificate.starts
+    assert certify(learn_slipping(1.0, 100, seed))[0].finishing < certificate.checked
+
+
+def test_slip_makes_near_ties_so_only_the_exact_policy_passes(slipping):
+    exact, live = slipping
+    assert certify(exact)[0].every_action_optimal
+    learnt = learn_slipping(0.02, 1000)
+    certificate, _ = certify(learnt)
+    assert 0 < certificate.suboptimal < certificate.checked
+    rows = np.flatnonzero(live)
+    lost = 1 - exact.q[rows, learnt.greedy[rows].astype(int)] / exact.q[rows].max(axis=1)
+    assert lost.max() < 0.15
+
+
+# ---- repeatability ----------------------------------------------------------------------------------------------
+
+
+@both_learners
+def test_the_same_seed_learns_the_same_bytes(learner):
+    first, second = (learn_tabular(REWARD, learner, seed=3) for _ in range(2))
+    assert first.q.tobytes() == second.q.tobytes()
+    assert first.training == second.training
+
+
+@both_learners
+def test_two_threads_learn_the_same_bytes_as_one(learner):
+    alone = [learn_tabular(REWARD, learner, seed).q.tobytes() for seed in range(6)]
+    with ThreadPoolExecutor(2) as threads:
+        together = threads.map(lambda seed: learn_tabular(REWARD, learner, seed).q.tobytes(), range(6))
+        assert list(together) == alone
+
+
+def test_another_seed_learns_other_bytes():
+    learner = CellQLearning(episodes=50)
+    assert len({learn_tabular(REWARD, learner, seed).q.tobytes() for seed in (0, 1, 2, MAX_SEED)}) == 4
+
+
+# ---- refused ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", [True, False, 1.0, -1, MAX_SEED + 1, "1", None, np.float64(1)], ids=repr)
+def test_a_seed_that_is_no_whole_number_from_0_is_refused(seed):
+    with pytest.raises(BadSettings, match="seed must be an integer"):
+        learn_tabular(REWARD, CellQLearning(), seed)
+
+
+@pytest.mark.parametrize("learner", [CellQLearning, PhaseQLearning])
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("gamma", [0.0, 1.5, -0.1, np.nan, np.inf]),
+        ("alpha", [0.0, 1.01, -1.0, np.nan]),
+        ("max_steps", [0, -5, 1_000_001, np.nan]),
+        ("max_episode_s", [0.0, 0.2, np.nan, np.inf]),
+        ("step_s", [0.0, -1.0, np.nan, np.inf]),
+    ],
+)
+def test_settings_that_cannot_be_meant_are_refused(learner, name, values):
+    for value in values:
+        with pytest.raises(BadSettings, match=name):
+            learner(**{name: value})
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["epsilon_start", "epsilon_end", "epsilon_falls_over"],
+)
+def test_an_epsilon_that_is_no_share_is_refused(name):
+    for value in (-0.1, 1.1, np.nan):
+        with pytest.raises(BadSettings, match="epsilon"):
+            CellQLearning(**{name: value})
+
+
+@pytest.mark.parametrize("learner", [PhaseQLearning, ValueIteration])
+@pytest.mark.parametrize("slip", [-0.1, 1.0, np.nan])
+def test_a_slip_that_is_no_chance_is_refused(learner, slip):
+    with pytest.raises(BadSettings, match="slip"):
+        learner(slip=slip)
+
+
+def test_numbers_of_episodes_and_sweeps_are_bounded():
+    for episodes in (0, 10_000_001):
+        with pytest.raises(BadSettings, match="episodes"):
+            CellQLearning(episodes=episodes)
+    for sweeps in (0, 100_001):
+        with pytest.raises(BadSettings, match="max_sweeps"):
+            PhaseQLearning(max_sweeps=sweeps)
+
+
+@pytest.mark.parametrize(
+    ("learner", "gib"), [(PhaseQLearning(), "6.8"), (CellQLearning(), "6.8"), (ValueIteration(slip=0.1), "27.2")]
+)
+def test_a_grid_too_large_for_memory_is_refused_before_allocation(learner, gib):
+    grid = GridWorld((0.0, 0.0, 0.0), 1.0, (230, 230, 230))
+    reward = sparse_reward(GridPath(grid, np.array([0, 1, 2])))
+    with pytest.raises(BadSettings, match=f"12167000 cells needs about {gib} GiB .* at most 4 GiB"):
+        learn_tabular(reward, learner)
+
+
+def test_a_loop_that_pays_more_than_arriving_is_refused_with_what_it_pays():
+    with pytest.raises(BadSettings, match=r"is worth 20 in the long run, arriving only 10: .* gamma below 0\.9"):
+        learn_tabular(REWARD, CellQLearning(gamma=0.95))
+    with pytest.raises(BadSettings, match="is worth 10 in the long run, arriving only 10"):
+        learn_tabular(REWARD, CellQLearning(gamma=0.9))
+    with pytest.raises(BadSettings, match="gamma below 1"):
+        learn_tabular(REWARD, CellQLearning(gamma=1.0))
+
+
+def test_in_the_phase_state_no_loop_pays_so_any_gamma_below_1_is_learnt():
+    policy = learn_tabular(REWARD, PhaseQLearning(gamma=0.95))
+    certificate, _ = certify(policy)
+    assert certificate.every_action_optimal
+    assert certificate.demonstration_reproduced
+    assert certificate.starts_reaching == certificate.starts
+
+
+@pytest.mark.parametrize("levels", [RewardLevels(0, -1, -2, -2), RewardLevels(10, -1, -1.5, -2)], ids=str)
+def test_if_every_move_costs_arriving_pays_even_without_discount(levels):
+    reward = sparse_reward(named_path("an angle"), levels)
+    policy = learn_tabular(reward, CellQLearning(gamma=1.0))
+    certificate, _ = certify(policy)
+    assert certificate.every_action_optimal
+    assert certificate.starts_reaching == certificate.starts
+
+
+def test_in_the_phase_state_moves_that_advance_nothing_must_pay_nothing():
+    reward = sparse_reward(named_path("an angle"), RewardLevels(other=-0.5))
+    with pytest.raises(BadSettings, match="`other` must be 0"):
+        learn_tabular(reward, PhaseQLearning())
+
+
+def test_a_huge_episode_time_leaves_the_step_limit_as_the_only_one():
+    learner = CellQLearning(episodes=20, max_episode_s=1e300, step_s=1e-300)
+    training = learn_tabular(REWARD, learner).training
+    assert training == learn_tabular(REWARD, CellQLearning(episodes=20)).training
+
+
+def test_a_time_of_one_step_ends_every_episode_after_it():
+    learner = replace(CellQLearning(episodes=40), max_episode_s=0.25)
+    training = learn_tabular(REWARD, learner).training
+    assert (training.steps, training.finished + training.out_of_time, training.out_of_steps) == (40, 40, 0)

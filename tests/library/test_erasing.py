@@ -1,0 +1,214 @@
+"""Erasure: concurrent measurements, recordings without a demonstration, and surgeons with very many jobs."""
+
+import secrets
+import time
+from typing import Any
+
+import pytest
+from sqlalchemy import event, insert, select
+
+from skills.db import base
+from skills.db.models import Demonstration, MeasuredShape, RecordingChunk, StoredRecording, Surgeon
+from skills.db.service_tables import Job
+from skills.db.session import Database
+from skills.errors import Conflict, NotAllowed, NotFound
+from skills.library import distances
+from skills.library.atlas import atlas_of
+from skills.library.backup import back_up, erasures_of, restore
+from skills.library.catalogue import put_surgeon
+from skills.library.demos import add_demo, withdraw_demo
+from skills.library.erasure import delete_recording, erase_demo, erase_surgeon
+from skills.library.recordings import store_recording
+from skills.schemas.requests import DemoIn
+from tests import backends
+from tests.comparison.cohort import cohort
+from tests.library import cases, cohorts
+
+
+def test_cached_distances_to_erased_demos_outside_the_atlas_are_deleted(
+    database: Database, monkeypatch: pytest.MonkeyPatch
+):
+    """A cached row also has distances from demonstrations outside of the atlas, such as those without consent now."""
+
+    def agrees(surgeon: int, to: list[str]) -> None:
+        with database.writing() as session:
+            put_surgeon(session, cohorts.name(surgeon), {"consent": {"uses": to, "until": None}}, "test")
+
+    cohorts.add_cohort(database, cohort(1, surgeons=3, sessions=1))
+    agrees(1, [])
+    atlas_of(database, cases.SUTURE)  # the first now has a distance from the third
+    agrees(1, ["atlas"])
+    agrees(2, [])
+    really = distances.distances_of
+
+    def erase_first(shapes, pairs):
+        with database.writing() as session:
+            if session.scalar(select(Surgeon).where(Surgeon.slug == cohorts.name(2))):
+                erase_surgeon(session, cohorts.name(2), "test")
+        return really(shapes, pairs)
+
+    monkeypatch.setattr(distances, "distances_of", erase_first)
+    atlas_of(database, cases.SUTURE)
+    with database.reading() as session:
+        there = set(session.scalars(select(Demonstration.row)))
+        kept = session.scalars(select(MeasuredShape)).all()
+    assert {row for one in kept for row in one.measured.others.tolist()} <= there
+    monkeypatch.setattr(distances, "distances_of", really)
+    atlas_of(database, cases.SUTURE)
+    with database.reading() as session:
+        assert len(session.scalars(select(MeasuredShape)).all()) == 2
+
+
+# ---- recordings without a demonstration ----------------------------------------------------------------------------
+
+
+def stored(database: Database, shift: float = 0.0, actor: str = "anna", surgeon: str | None = None) -> str:
+    return store_recording(database, cases.upload(cases.hand_off((shift, 0.0, 0.0))), actor, surgeon=surgeon)[0].sha256
+
+
+def recordings(database: Database) -> list[str]:
+    with database.reading() as session:
+        found = list(session.scalars(select(StoredRecording.sha256).order_by(StoredRecording.row)))
+        assert (len(session.scalars(select(RecordingChunk.recording)).all()) > 0) == bool(found)
+    return found
+
+
+def test_a_recording_is_deleted_by_whoever_sent_it_or_by_an_admin(database: Database):
+    mine, others = stored(database), stored(database, 2.5, "bert")
+    with database.writing() as session:
+        with pytest.raises(NotAllowed, match="Another user"):
+            delete_recording(session, others, "anna", anybodys=False)
+        delete_recording(session, mine, "anna", anybodys=False)
+        with pytest.raises(NotFound):
+            delete_recording(session, mine, "anna", anybodys=False)
+    assert recordings(database) == [others]
+    with database.writing() as session:
+        delete_recording(session, others, "local", anybodys=True)
+    assert recordings(database) == []
+    assert set(erasures_of(database).ended["recordings"]) == {mine, others}
+
+
+def test_a_recording_that_somebody_else_sent_as_well_stays_theirs(database: Database):
+    sent = stored(database, actor="anna")
+    assert stored(database, actor="bert") == sent
+    with database.writing() as session:
+        delete_recording(session, sent, "anna", anybodys=False)
+    assert recordings(database) == [sent]
+    with database.writing() as session, pytest.raises(NotAllowed):
+        delete_recording(session, sent, "anna", anybodys=False)
+    with database.writing() as session:
+        delete_recording(session, sent, "bert", anybodys=False)
+    assert recordings(database) == []
+
+
+def test_a_recording_with_demos_is_kept_until_its_last_demo_is_erased(database: Database):
+    sent = stored(database)
+    cuts = [DemoIn(surgeon="kestrel", suture=cases.SUTURE, end_s=end) for end in (0.9, 1.0)]
+    demos = [add_demo(database, sent, cut, "anna")[0].sha256 for cut in cuts]
+    with database.writing() as session:
+        withdraw_demo(session, demos[0], "test")
+        with pytest.raises(Conflict, match="depend on this recording"):
+            delete_recording(session, sent, "anna", anybodys=True)
+        erase_demo(session, demos[0], "test")
+    assert recordings(database) == [sent]
+    with database.writing() as session:
+        erase_demo(session, demos[1], "test")
+    assert recordings(database) == []
+
+
+def test_erasing_a_surgeon_removes_recordings_uploaded_for_them_alone(database: Database):
+    cases.add_surgeon(database, "plover")
+    stored(database, surgeon="kestrel")
+    both = stored(database, 2.5, surgeon="kestrel")
+    assert stored(database, 2.5, surgeon="plover") == both
+    cut = stored(database, 5.0, surgeon="kestrel")
+    add_demo(database, cut, DemoIn(surgeon="plover", suture=cases.SUTURE), "anna")
+    nobodys = stored(database, 7.5)
+    with database.writing() as session:
+        erase_surgeon(session, "kestrel", "test")
+    assert recordings(database) == [both, cut, nobodys]
+    with database.writing() as session:
+        erase_surgeon(session, "plover", "test")
+    assert recordings(database) == [nobodys]
+    with pytest.raises(NotFound, match="nobody"):
+        stored(database, 9.0, surgeon="nobody")
+
+
+def test_erasing_anothers_demo_keeps_the_recording_of_its_stated_owner(database: Database):
+    cases.add_surgeon(database, "plover")
+    sent = stored(database, surgeon="plover")
+    demo = add_demo(database, sent, DemoIn(surgeon="kestrel", suture=cases.SUTURE), "anna")[0].sha256
+    with database.writing() as session:
+        erase_demo(session, demo, "test")
+    assert recordings(database) == [sent]
+
+
+def test_a_deleted_recording_does_not_come_back_with_a_backup(database: Database, tmp_path):
+    gone, kept = stored(database), stored(database, 2.5)
+    back_up(database, tmp_path / "b.zip")
+    with database.writing() as session:
+        delete_recording(session, gone, "anna", anybodys=False)
+    restored = Database(backends.blank("sqlite", tmp_path))
+    assert restore(restored, tmp_path / "b.zip", erasures_of(database)).recordings_deleted == 1
+    assert recordings(restored) == [kept]
+    restored.close()
+
+
+# ---- very many rows ------------------------------------------------------------------------------------------------
+
+
+def many_jobs(database: Database, count: int) -> None:
+    """Add jobs of kestrel, one of them running."""
+    at = base.now()
+    with database.writing() as session:
+        row = session.scalars(select(Surgeon.row).where(Surgeon.slug == "kestrel")).one()
+        jobs = [
+            {"id": secrets.token_hex(16), "kind": "training", "identity": secrets.token_hex(32), "state": state}
+            | {
+                "request": {},
+                "surgeon_row": row,
+                "progress": 0.0,
+                "attempt": 1,
+                "asked_by": "t",
+                "created_at": at,
+            }
+            for state in ("running", *["failed"] * (count - 1))
+        ]
+        session.execute(insert(Job), jobs)
+
+
+def test_erasing_binds_no_more_parameters_for_more_rows(database: Database, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(base, "PARAMETERS", 7)
+    most: list[int] = []
+
+    def count(_connection: Any, _cursor: Any, _statement: str, parameters: Any, _context: Any, many: bool) -> None:
+        most.append(0 if many else len(parameters))
+
+    demos = [cases.add_demo(database, cases.hand_off((0.5 * n, 0.0, 0.0))).sha256 for n in range(12)]
+    many_jobs(database, 60)
+    with database.writing() as session:
+        for job in session.scalars(select(Job)):
+            job.request = {"demos": demos[:1]}
+    event.listen(database.engine, "before_cursor_execute", count)
+    with database.writing() as session:
+        assert len(erase_demo(session, demos[0], "test")) == 1
+        assert len(session.scalars(select(Job)).all()) == 0
+    many_jobs(database, 60)
+    with database.writing() as session:
+        assert len(erase_surgeon(session, "kestrel", "test")) == 1
+    event.remove(database.engine, "before_cursor_execute", count)
+    assert 3 < max(most) <= 16
+    with database.reading() as session:
+        assert [session.scalars(select(kind)).all() for kind in (Job, Demonstration, StoredRecording)] == [[], [], []]
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("count", [20_000, 70_000])
+def test_a_surgeon_with_very_many_jobs_is_erased(database: Database, count: int):
+    many_jobs(database, count)
+    began_s, worked_s = time.perf_counter(), time.process_time()
+    with database.writing() as session:
+        assert len(erase_surgeon(session, "kestrel", "test")) == 1
+    took_s, worked_s = time.perf_counter() - began_s, time.process_time() - worked_s
+    print(f"{database.engine.dialect.name}, {count} jobs: {took_s:.2f} s, {worked_s:.2f} s of this process")
+    assert worked_s < 20

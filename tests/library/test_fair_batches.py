@@ -1,0 +1,165 @@
+"""Comparison in a batch: trained and released policy on the same demonstrations, of which the number is kept."""
+
+from math import nan
+from typing import Any
+
+import numpy as np
+import pytest
+
+from skills.db.models import PolicyVersion
+from skills.db.session import Database
+from skills.fields import as_json
+from skills.library import batch_work, policies, releases
+from skills.library.demos import withdraw_demo
+from skills.library.releases import fit_of_versions, not_worse
+from skills.schemas.policies import FitOnTheSame
+from skills.schemas.requests import DemoIn
+from tests.library import cases
+from tests.library.styles import retrain, styles_of
+
+SWERVES_MM = (0.0, 3.0, 14.0)  # the newest is the outlier
+
+
+def demos(database: Database, *swerves_mm: float) -> list[str]:
+    """Store the hand-off with swerves of different sizes; a shift alone would be removed by the alignment."""
+    straight = cases.points_mm()
+    bend = np.sin(np.linspace(0, np.pi, len(straight)))[:, None] * np.array([0.0, 1.0, 0.3])
+    return [cases.add_demo(database, cases.table(straight + mm * bend)).sha256 for mm in swerves_mm]
+
+
+def compared(database: Database, **asked: Any) -> dict[str, Any]:
+    """Train and release kestrel's style in a batch, and return its comparison."""
+    (style,) = styles_of(database, retrain(database, surgeon="kestrel", release=True, **asked))
+    assert style.state == "done", style.reason
+    return style.comparison
+
+
+def served(database: Database) -> PolicyVersion:
+    with database.reading() as session:
+        return policies.policy_of(session, "kestrel", cases.SUTURE).policy
+
+
+def test_a_policy_of_three_demos_is_retrained_on_the_newest_three(database: Database):
+    three = demos(database, *SWERVES_MM)
+    cases.train(database, demos=three, release=True)
+    (newest,) = demos(database, 5.0)
+    comparison = compared(database)
+    assert comparison["trained"]["demos"] == [*three[1:], newest]
+    assert (comparison["released"]["rests_on"], comparison["trained"]["rests_on"]) == (3, 3)
+    assert comparison["on_the_same"]["demos"] == [*three, newest]
+    with database.reading() as session:
+        trained = policies.find_by_digest(session, comparison["trained"]["sha256"])
+        before = policies.find_by_digest(session, comparison["released"]["sha256"])
+        assert trained.manifest["combined"]["kind"] == before.manifest["combined"]["kind"] == "corridor"
+        found = fit_of_versions(session, before, trained)
+    assert comparison["on_the_same"] == as_json(found)
+    assert comparison["now_released"] == not_worse(found) == (served(database).sha256 == trained.sha256)
+
+
+def test_a_policy_of_the_newest_alone_does_not_replace_one_of_three(
+    database: Database, monkeypatch: pytest.MonkeyPatch
+):
+    """This is a batch that was running when somebody released a policy of three."""
+    three = demos(database, *SWERVES_MM)
+    commit = batch_work._commit
+
+    def released_before(*given: Any) -> bool:
+        monkeypatch.setattr(batch_work, "_commit", commit)
+        cases.train(database, demos=three, release=True)
+        return commit(*given)
+
+    monkeypatch.setattr(batch_work, "_commit", released_before)
+    comparison = compared(database)
+    assert (comparison["released"]["rests_on"], comparison["trained"]["rests_on"]) == (3, 1)
+    assert comparison["on_the_same"]["demos"] == three
+    assert comparison["on_the_same"]["trained_mm"] > comparison["on_the_same"]["released_mm"] > 0
+    assert comparison["trained"]["dtw_total_mm"] == 0, "against its own it is always the nearest"
+    assert not comparison["now_released"]
+    assert "on the same 3 demonstrations" in comparison["not_released_because"]
+    assert "it was learnt from 1 of them, the released one from 3" in comparison["not_released_because"]
+    assert len(served(database).manifest["demos"]) == 3
+
+
+def test_one_released_while_the_comparison_was_computed_is_compared_anew(
+    database: Database, monkeypatch: pytest.MonkeyPatch
+):
+    three = demos(database, *SWERVES_MM)
+    cases.train(database, demos=three[:1], release=True)
+    measure = batch_work._measured
+
+    def released_after(*given: Any) -> Any:
+        found = measure(*given)
+        monkeypatch.setattr(batch_work, "_measured", measure)
+        cases.train(database, demos=three, release=True)
+        return found
+
+    monkeypatch.setattr(batch_work, "_measured", released_after)
+    comparison = compared(database)
+    assert (comparison["released"]["rests_on"], comparison["now_released"]) == (3, False)
+
+
+def test_an_equally_distant_newer_demo_replaces_the_older_one(database: Database):
+    older, newer = demos(database, *SWERVES_MM[:2])
+    cases.train(database, demos=[older], release=True)
+    comparison = compared(database)
+    same = comparison["on_the_same"]
+    assert same["demos"] == [older, newer]
+    assert same["trained_mm"] == pytest.approx(same["released_mm"], abs=1e-6) and same["trained_mm"] > 0
+    assert comparison["now_released"]
+
+
+def test_a_style_whose_demos_cannot_be_combined_fails_and_stays_served(database: Database):
+    three = demos(database, *SWERVES_MM)
+    cases.train(database, demos=three, release=True)
+    other = cases.upload_demo(
+        database,
+        cases.upload(cases.bag("PSM1"), "application/vnd.mcap"),
+        DemoIn(surgeon="kestrel", suture=cases.SUTURE),
+        "test",
+    )[0]
+    assert other.arm == "PSM1"
+    version = served(database).version
+    (style,) = styles_of(database, retrain(database, surgeon="kestrel", release=True))
+    assert style.state == "failed"
+    assert "only demonstrations of one arm" in style.reason
+    assert served(database).version == version
+
+
+@pytest.mark.parametrize("totals_mm", [(1.0, nan), (nan, 1.0), (nan, nan), (1.0, 1.1)])
+def test_what_cannot_be_compared_is_worse(totals_mm: tuple[float, float]):
+    assert not not_worse(FitOnTheSame(("a",), *totals_mm))
+
+
+def test_in_another_frame_nothing_is_compared():
+    path = releases.GridPath(releases.GridWorld((0.0, 0.0, 0.0), 5.0, (3, 3, 3)), releases.np.array([0, 1, 2]))
+    ways = [releases.PolicyWay(path.tip_mm, ("PSM2", frame)) for frame in ("PSM2_base", "jigsaws")]
+    one = releases.Taught("a" * 64, ("PSM2", "PSM2_base"), path)
+    found = releases.fit_of(*ways, [one])
+    assert (not_worse(found), found.released_mm, found.trained_mm) == (False, None, None)
+    assert not_worse(releases.fit_of(ways[0], ways[0], [one]))
+    assert not not_worse(releases.fit_of(ways[0], ways[0], []))
+
+
+def test_the_gate_of_a_cell_policy_compares_on_the_same_demonstrations_too(database: Database):
+    """A cell policy that follows its own demonstration well may be far from the released policy's one."""
+    three = demos(database, *SWERVES_MM)
+    cases.train(database, demos=three, release=True)
+    trained = cases.train(database, demos=three[:1], learner=cases.PUBLISHED)
+    with database.writing() as session:
+        version = policies.find_by_digest(session, trained.sha256)
+        found = fit_of_versions(session, policies.policy_of(session, "kestrel", cases.SUTURE).policy, version)
+        assert found.demos == tuple(three)
+        with pytest.raises(releases.Conflict) as refused:
+            releases.release(session, version, "test")
+    worse = f"({found.trained_mm:g} against {found.released_mm:g} mm on the same 3)"
+    assert (worse in str(refused.value)) == (not not_worse(found))
+
+
+def test_a_demonstration_that_was_withdrawn_is_not_compared_with(database: Database):
+    three = demos(database, *SWERVES_MM)
+    first, second = cases.train(database, demos=three[:1]), cases.train(database, demos=three[1:2])
+    with database.writing() as session:
+        withdraw_demo(session, three[0], "test")
+    with database.reading() as session:
+        versions = [policies.find_by_digest(session, one.sha256) for one in (first, second)]
+        assert fit_of_versions(session, *versions).demos == (three[1],)

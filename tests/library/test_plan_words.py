@@ -1,0 +1,75 @@
+"""Headlines of plans: they name omissions, and are green only if the hand-over is probable enough."""
+
+from typing import Any
+
+import pytest
+
+from skills.library.plans import hands_over, plan_in_words
+from skills.library.playbacks import headline
+
+NAN = float("nan")
+PSM_M = {"approach": [-1.0, 0.0, 0.0]}
+
+
+def about(passes: int = 5, psm_m: dict[str, Any] | None = None, moves: bool = False) -> dict[str, Any]:
+    return {"arm": "PSM1", "passes": [{}] * passes, "psm_m": psm_m, "trajectory": {"psm_m_moves": moves}}
+
+
+FULL = about(psm_m=PSM_M, moves=True)
+
+
+def told(of: dict[str, Any], lower: float | None, count: int = 990, feasible: object = True) -> dict[str, Any]:
+    upper = None if lower is None else min(1.0, count / 1000 + 0.03)
+    whole = {"count": count, "of": 1000, "probability": count / 1000, "lower": lower, "upper": upper}
+    report = {"feasible": feasible, "failure_in_words": "Pass 0, A1, sample 3: no.", "doubt": {"under": []}}
+    report["doubt"]["under"].append({"tip_error_mm": 0.65, "plan": whole})
+    return headline(of, report, tip_error_mm=0.65, lower_bound=0.95)
+
+
+@pytest.mark.parametrize(
+    ("of", "words"),
+    [
+        (about(), "Moves PSM1 along 5 passes; no hand-off: no PSM_M, no A2."),
+        (about(1), "Moves PSM1 along 1 pass; no hand-off: no PSM_M, no A2."),
+        (about(2, PSM_M), "has no motion of PSM_M"),
+        (FULL, "hands the needle to PSM_M at the end of each"),
+    ],
+)
+def test_a_plan_says_what_it_does_and_leaves_out(of: dict[str, Any], words: str):
+    assert words in plan_in_words(of)
+    assert hands_over(of) == (of["psm_m"] is not None)
+
+
+def test_a_plan_that_hands_over_and_succeeds_surely_is_good():
+    line = told(FULL, 0.98)
+    assert (line["level"], line["word"]) == ("good", "Likely to succeed")
+    assert "in 990 of 1000 worlds: 99.0 % (98.0 % to 100.0 %, 95 %)" in line["text"]
+    assert "tip error of 0.65 mm" in line["text"]
+
+
+@pytest.mark.parametrize(
+    ("of", "lower", "count", "feasible", "level", "word"),
+    [
+        (FULL, 0.286, 315, True, "bad", "Likely to fail"),
+        (FULL, 0.90, 920, True, "caution", "Uncertain"),
+        (FULL, 0.45, 480, True, "caution", "Uncertain"),
+        (about(), 0.99, 995, True, "caution", "No hand-off"),
+        (about(2, PSM_M), 0.99, 995, True, "caution", "Incomplete"),
+        (FULL, 0.99, 995, False, "bad", "Not feasible"),
+        (FULL, 0.99, 995, None, "bad", "Not feasible"),
+        (FULL, None, 995, True, "caution", "Uncertain"),
+        (FULL, NAN, 995, True, "caution", "Uncertain"),
+    ],
+)
+def test_nothing_else_is_good(of, lower, count, feasible, level, word):
+    line = told(of, lower, count, feasible)
+    assert (line["level"], line["word"]) == (level, word)
+    assert line["text"].startswith(f"{word}: ")
+    assert plan_in_words(of) in line["text"]
+
+
+def test_an_error_that_was_not_judged_is_said_and_not_good():
+    report = {"feasible": True, "doubt": None}
+    line = headline(FULL, report, tip_error_mm=1.0, lower_bound=0.95)
+    assert (line["level"], line["probability"]) == ("caution", None)
+    assert "was not judged" in line["text"]

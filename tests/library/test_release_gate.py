@@ -1,0 +1,96 @@
+"""The release gate's check of the arm: the demonstrated pass must be drivable within the joint limits.
+
+With the jaw straight down and the tip in the plane x = 0 the arm's pitch is worked by hand: the wrist is 9.1 mm above
+the tip, so |pitch| = atan2(y, -(z + 9.1)), and its limit is 53 degrees.
+"""
+
+from itertools import pairwise
+from math import atan2, radians
+
+import numpy as np
+import pytest
+
+from skills.errors import Conflict
+from skills.library import releases, retraining, training
+from tests.formats.bags import sample_folder
+from tests.library import cases
+from tests.library.styles import ask_retraining, styles_of
+
+LIMIT_RAD = radians(53)
+Z_MM = -112.4  # at the lower edge of the cells whose centres are at -110 mm
+
+
+def pitch_rad(place_mm: tuple[float, float, float]) -> float:
+    _, y, z = place_mm
+    return atan2(y, -(z + 9.1))
+
+
+def reaching(y_mm: float) -> bytes:
+    """Record a walk out to y and then down, in the plane x = 0, at 10 mm/s."""
+    corners = np.array([[0, 100, Z_MM], [0, y_mm, Z_MM], [0, y_mm, -140]], dtype=float)
+    legs = [np.linspace(a, b, round(np.linalg.norm(b - a) / 10 * cases.RATE_HZ)) for a, b in pairwise(corners)]
+    return cases.bag(tip=np.concatenate(legs))
+
+
+def trained(database, data: bytes, **how):
+    cases.add_surgeon(database)
+    upload = cases.upload(data, "application/vnd.mcap", **how)
+    cases.store(database, upload)
+    return cases.train(database)
+
+
+def test_a_real_bag_whose_samples_are_all_within_the_limits_is_released(database):
+    data = (sample_folder() / "rosbag2" / "rosbag2.mcap").read_bytes()
+    version = trained(database, data, vouched=True)
+    assert version.manifest["grid_certificate"]["refused_because"] == []
+    driven = version.manifest["grid_certificate"]["driven"]
+    assert (driven["path"], driven["frame"], driven["beyond"]) == ("fitted", "PSM2_base", 0)
+    assert driven["cell_centres_beyond"] == 1  # reported, because a rollout names them; no arm follows them in a plan
+    with database.writing() as session:
+        releases.release(session, session.merge(version), "test")
+
+
+def test_a_pass_within_limits_is_accepted_despite_cell_centres_beyond_them(database):
+    assert pitch_rad((0, 135, Z_MM)) < LIMIT_RAD < pitch_rad((0, 135, -110))
+    version = trained(database, reaching(135))
+    certificate = version.manifest["grid_certificate"]
+    assert certificate["refused_because"] == []
+    assert certificate["driven"]["cell_centres_beyond"] > 0
+    nearest = certificate["driven"]["nearest_limit"]
+    assert (nearest["joint"], nearest["unit"], nearest["limit"]) == ("pitch", "rad", pytest.approx(-LIMIT_RAD))
+    assert nearest["margin"] == pytest.approx(LIMIT_RAD - pitch_rad(nearest["tip_mm"]), abs=1e-9)
+    assert nearest["margin"] == pytest.approx(LIMIT_RAD - pitch_rad((0, 135, Z_MM)), abs=radians(0.3))
+
+
+def test_a_pass_beyond_a_limit_is_refused_with_place_joint_and_amount(database):
+    version = trained(database, reaching(138.5))
+    certificate = version.manifest["grid_certificate"]
+    nearest = certificate["driven"]["nearest_limit"]
+    np.testing.assert_allclose(nearest["tip_mm"], (0, 138.5, Z_MM), atol=1.0)  # mm
+    beyond = pitch_rad(nearest["tip_mm"]) - LIMIT_RAD
+    assert nearest["margin"] == pytest.approx(-beyond, abs=1e-9)
+    assert 0.001 < beyond < 0.006  # by hand: 53.28 degrees at the corner
+    (reason,) = certificate["refused_because"]
+    x, y, z = nearest["tip_mm"]
+    assert f"({x:.1f}, {y:.1f}, {z:.1f}) mm in PSM2_base" in reason
+    assert f"pitch -{LIMIT_RAD + beyond:.4f} rad, {beyond:.4f} rad beyond" in reason
+    assert "fitted path" in reason
+    assert not version.releasable
+    with database.writing() as session, pytest.raises(Conflict, match="pitch"):
+        releases.release(session, session.merge(version), "test")
+
+
+def test_a_batch_of_stale_styles_takes_what_an_older_gate_refused(database, monkeypatch):
+    trained(database, reaching(138.5))
+    assert styles_of(database, ask_retraining(database, only_stale=True)) == []
+    monkeypatch.setattr(retraining, "GATE_VERSION", retraining.GATE_VERSION + 1)
+    (style,) = styles_of(database, ask_retraining(database, only_stale=True))
+    assert style.stale == ["refused by an older gate"]
+
+
+def test_a_release_refused_by_an_older_gate_is_learnt_again_on_request(database, monkeypatch):
+    """A training under today's gate has another job identity, so that the old refusal is not returned for it."""
+    monkeypatch.setattr(training, "GATE_VERSION", training.GATE_VERSION - 1)
+    old = trained(database, reaching(135))
+    monkeypatch.undo()
+    assert cases.train(database).version == old.version + 1

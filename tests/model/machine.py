@@ -1,0 +1,716 @@
+"""An installation under random actions of its users, compared with `tests.model.invariant` after every step.
+
+A step is a tuple: the action and its arguments. Between any two transactions of a job, and of the atlas while it
+measures, another action may happen: such a step contains another one, `(4, ("agree", ...))` being the action before
+its fourth transaction. Results that the service alone decides (digests, numbers of versions, whether a version passes
+the gate, whether a batch finds it worse) are taken from its responses; the expected state comes from the model.
+
+The calls go over HTTP to the application in this process; the machine is the worker, and does the command line's part
+for backups. Three things are replaced: the date, the reader of uploads (in this process instead of a confined one),
+and the job engine, which may miss any notification and here misses all of them.
+"""
+
+import shutil
+import tempfile
+import uuid
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from copy import copy
+from datetime import date, datetime, timedelta
+from functools import cache
+from pathlib import Path
+from typing import Any, BinaryIO, ClassVar
+
+import numpy as np
+import pytest
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
+from sqlalchemy import LargeBinary, make_url, select
+from sqlalchemy.orm import Session
+
+import skills.api.app
+import skills.db.base
+from skills.comparison.distances import distances_of, shape_of
+from skills.db.base import Base
+from skills.db.models import Demonstration, MeasuredShape
+from skills.db.packed import Packed
+from skills.db.service_tables import Job as JobRow
+from skills.db.session import Database
+from skills.demonstration.demonstration import Recording, cut_demo
+from skills.errors import NotFound, SkillsError
+from skills.formats import read_recording
+from skills.formats.reader_process import read_told
+from skills.jobs.workflows import Work
+from skills.library import perform_job, retraining
+from skills.library.atlas import atlas_of
+from skills.library.backup import back_up, keep_erasures, read_erasures, restore
+from skills.library.jobs import BATCH, PART
+from skills.library.keys import create_key
+from skills.packing import sha256
+from skills.settings import Settings
+from tests import backends
+from tests.api.service import CSV, Service
+from tests.library import cases
+from tests.model.invariant import ALL_USES, Consent, Demo, Job, Key, Model, Style, Version
+
+SURGEONS = ("kestrel", "heron", "lark", "wren")
+SUTURES = (cases.SUTURE, "horizontal-mattress")
+FILES = [cases.table(cases.points_mm((0.0, 2.5 * shift, 0.0), samples=4)) for shift in range(4)]
+NAMES = {sha256(data): data for data in FILES}
+FIRST_DAY = date(2026, 3, 1)
+ACTIVE = ("queued", "running")
+ADMIN = "admin"
+MOST_BACKUPS = 3
+
+Step = tuple[Any, ...]
+Meanwhile = tuple[int, Step] | None
+
+
+# ---- the steps ---------------------------------------------------------------------------------------------------
+
+
+def step(name: str, *asked: Any) -> Any:
+    return st.tuples(st.just(name), *asked)
+
+
+INDEX, SEED = st.integers(0, 5), st.integers(0, 1)  # an index is taken modulo the number of existing objects
+FLAG = st.sampled_from([True, True, True, False])
+SURGEON = st.sampled_from(SURGEONS[:2] * 5 + SURGEONS)
+SUTURE = st.sampled_from(SUTURES[:1] * 5 + SUTURES)
+FILE = st.integers(0, len(FILES) - 1)
+USES = st.sampled_from([None, None, None, frozenset(ALL_USES), frozenset({"training"}), frozenset({"atlas", "export"})])
+DAYS = st.sampled_from([None, None, None, None, 0, 1, -1])  # the number of days from today that a consent covers
+DEMOS = st.sampled_from(["newest", "oldest", "all"])
+
+AGREE = step("agree", SURGEON, USES, DAYS)
+ADD_DEMO = step("add_demo", SURGEON, SUTURE, FILE)
+WITHDRAW_DEMO, ERASE_DEMO = step("withdraw_demo", INDEX), step("erase_demo", INDEX)
+ERASE_SURGEON = step("erase_surgeon", st.sampled_from(SURGEONS), st.integers(0, 3))
+RELEASE, WITHDRAW, CANCEL = step("release", INDEX), step("withdraw", INDEX), step("cancel", INDEX)
+PASS_A_DAY, BACK_UP = step("pass_a_day"), step("back_up")
+ELSEWHERE = (AGREE, ADD_DEMO, WITHDRAW_DEMO, ERASE_DEMO, ERASE_SURGEON, RELEASE, WITHDRAW, CANCEL, PASS_A_DAY, BACK_UP)
+MEANWHILE = st.none() | st.tuples(st.integers(1, 8), st.one_of(*ELSEWHERE, AGREE, ERASE_DEMO))
+TRAIN = step("train", SURGEON, SUTURE, DEMOS, SEED, FLAG, MEANWHILE)
+PLAN = step("plan", SURGEON, MEANWHILE)
+ERASED = st.tuples(st.integers(3, 7), ERASE_DEMO)  # while distances are measured
+ATLAS = step("atlas", SUTURE, st.one_of(MEANWHILE, ERASED))
+STEPS = (
+    *ELSEWHERE,
+    TRAIN,
+    TRAIN,
+    TRAIN,  # more often, because all else needs a learnt policy
+    step("ask_training", SURGEON, SUTURE, DEMOS, SEED, FLAG),
+    step("retrain", st.none() | SURGEON, st.booleans(), FLAG, MEANWHILE),
+    step("ask_retraining", st.none() | SURGEON, st.booleans(), FLAG),
+    step("work", INDEX, MEANWHILE),
+    PLAN,
+    ATLAS,
+    ATLAS,
+    ADD_DEMO,
+    ADD_DEMO,
+    step("add_recording", FILE, st.none() | SURGEON),
+    step("delete_recording", FILE),
+    step("export", INDEX),
+    step("make_key", st.none() | SURGEON, st.none() | st.integers(0, 1)),
+    step("revoke", INDEX),
+    step("use_key", INDEX),
+    step("write_list"),
+    step("restore", INDEX),
+)
+
+
+class Installation(RuleBasedStateMachine):
+    """The state machine of all user actions; two surgeons have a demonstration each at the beginning."""
+
+    backend: ClassVar[str]
+    without: ClassVar[frozenset[str]] = frozenset()  # steps that are skipped, in order to look past a known defect
+    steps: ClassVar[list[Step]] = []  # of the last installation
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.folder = Path(tempfile.mkdtemp(prefix="installation-", dir=backends.migrated_file().parent))
+        self.model = Model(FIRST_DAY)
+        Clock.day = FIRST_DAY
+        self.backups: list[tuple[Path, Model]] = []
+        self.digests: dict[tuple[str, Style], str] = {}  # of demonstrations, by recording and style
+        self.styles: set[Style] = set()  # styles that were ever learnt
+        type(self).steps = []
+        self.url, self.admin = settled(self.backend, self.folder)
+        self._open()
+        for surgeon in SURGEONS[:2]:
+            self._agree(surgeon)
+            self._add_demo(surgeon, SUTURES[0], 0)
+
+    def teardown(self) -> None:
+        self._close()
+        shutil.rmtree(self.folder)
+
+    def _open(self) -> None:
+        self.service = Service(self.url, key_requests_per_s=1e6)
+        self.service.http.__enter__()
+        self.service.http.headers["X-API-Key"] = self.admin
+        self.worker = copy(self.service.database)  # with the same connections, so that its commits are visible at once
+        self.worker.__class__ = Interruptible
+
+    def _close(self) -> None:
+        self.service.http.__exit__(None, None, None)
+        backends.drop(self.url)
+
+    @rule(step=st.one_of(*STEPS))  # one rule: with several, hypothesis would leave some out of each run
+    def take(self, step: Step) -> None:
+        self.steps.append(step)
+        self._do(step)
+
+    def _do(self, step: Step) -> None:
+        if step[0] not in self.without:
+            getattr(self, f"_{step[0]}")(*step[1:])
+
+    @classmethod
+    def play(cls, *steps: Step) -> None:
+        """Take some steps from the beginning."""
+        machine = cls()
+        try:
+            machine.check()
+            for one in steps:
+                machine.take(one)
+                machine.check()
+        finally:
+            machine.teardown()
+
+    def call(self, method: str, path: str, *expected: int, **how: Any) -> Any:
+        """Call the service, check the status and conformance of the response, and return its content."""
+        answer = self.service.http.request(method, path, **how)
+        said = f"{method} {path}: {answer.status_code}, not {expected}: {answer.text[:300]}"
+        assert answer.status_code in expected, said
+        return answer.json() if answer.content and "json" in answer.headers["content-type"] else None
+
+    def _unknown(self, surgeon: str) -> int:
+        return 410 if surgeon in self.model.erased else 404
+
+    # ---- surgeons, recordings, demonstrations ----
+
+    def _agree(self, surgeon: str, uses: frozenset[str] | None = None, days: int | None = None) -> None:
+        until = None if days is None else self.model.today + timedelta(days=days)
+        consent = Consent(frozenset(ALL_USES) if uses is None and until else uses, until)
+        if surgeon in self.model.erased:
+            self.call("PUT", f"/surgeons/{surgeon}", 410, json={"consent": consent.written})
+        else:
+            self.call("PUT", f"/surgeons/{surgeon}", 200, 201, json={"consent": consent.written})
+            self.model.agree(surgeon, consent)
+
+    def _pass_a_day(self) -> None:
+        self.model.today += timedelta(days=1)
+        Clock.day = self.model.today
+
+    def _add_demo(self, surgeon: str, suture: str, file: int) -> None:
+        query = {"surgeon": surgeon, "suture": suture}
+        how = {"params": query, "content": FILES[file], "headers": {"Content-Type": CSV}}
+        known = self.model.demos.get(self.digests.get((sha256(FILES[file]), (surgeon, suture)), ""))
+        if surgeon not in self.model.surgeons:
+            self.call("POST", "/demos", self._unknown(surgeon), **how)
+        elif known is not None and known.withdrawn:
+            self.call("POST", "/demos", 409, **how)
+        else:
+            said = self.call("POST", "/demos", 201 if known is None else 200, **how)
+            demo = Demo(said["sha256"], (said["surgeon"], said["suture"]), said["recording"])
+            assert self.digests.setdefault((demo.recording, demo.style), demo.sha256) == demo.sha256
+            self.model.add_demo(demo)
+
+    def _add_recording(self, file: int, surgeon: str | None = None) -> None:
+        of = {} if surgeon is None else {"surgeon": surgeon}
+        how = {"params": of, "content": FILES[file], "headers": {"Content-Type": CSV}}
+        if surgeon is not None and surgeon not in self.model.surgeons:
+            self.call("POST", "/recordings", self._unknown(surgeon), **how)
+        else:
+            self.model.add_recording(self.call("POST", "/recordings", 200, 201, **how)["sha256"], surgeon)
+
+    def _delete_recording(self, file: int) -> None:
+        recording = sha256(FILES[file])
+        if recording not in self.model.recordings:
+            self.call("DELETE", f"/recordings/{recording}", 404)
+        elif self.model.cut_from(recording):
+            self.call("DELETE", f"/recordings/{recording}", 409)
+        else:
+            self.call("DELETE", f"/recordings/{recording}", 204)
+            self.model.delete_recording(recording)
+
+    def _withdraw_demo(self, index: int) -> None:
+        if (demo := pick(self.model.demos, index)) is not None:
+            self.call("DELETE", f"/demos/{demo}", 204)
+            self.model.withdraw_demo(demo)
+
+    def _erase_demo(self, index: int) -> None:
+        if (demo := pick(self.model.demos, index)) is not None:
+            self.call("DELETE", f"/demos/{demo}?erase=true", 204)
+            self.model.erase_demo(demo)
+
+    def _erase_surgeon(self, surgeon: str, doubts: int = 0) -> None:
+        if doubts:
+            return  # nobody is added again, so all would soon be gone
+        if surgeon in self.model.surgeons:
+            self.call("DELETE", f"/surgeons/{surgeon}", 204)
+            self.model.erase_surgeon(surgeon)
+        else:
+            self.call("DELETE", f"/surgeons/{surgeon}", self._unknown(surgeon))
+
+    def _export(self, index: int) -> None:
+        if (demo := pick(self.model.demos, index)) is not None:
+            may = self.model.may_export(self.model.demos[demo].recording)
+            self.call("GET", f"/demos/{demo}/recording", 200 if may else 409)
+
+    # ---- releases ----
+
+    def _release(self, index: int) -> None:
+        if (name := pick(self.model.versions, index)) is None:
+            return
+        version = self.model.versions[name]
+        path = f"/policies/{'/'.join(version.style)}/versions/{version.number}/release"
+        if self.model.may_learn(version.demos) and version.releasable:
+            assert self.call("POST", path, 200)["sha256"] == name
+            self.model.release(version)
+        else:
+            self.call("POST", path, 409)
+
+    def _withdraw(self, index: int) -> None:
+        if (style := pick(sorted({one.style for one in self.model.versions.values()}), index)) is not None:
+            there = self.model.standing(style)
+            self.call("DELETE", f"/policies/{'/'.join(style)}/release", 204 if there else 404)
+            self.model.withdraw(style)
+
+    # ---- requests for jobs ----
+
+    def _train(
+        self, surgeon: str, suture: str, which: str, seed: int, release: bool, meanwhile: Meanwhile = None
+    ) -> None:
+        """Request a training and wait for its end, as `skills train` does."""
+        if (job := self._ask_training(surgeon, suture, which, seed, release)) is not None:
+            self._wait(job, meanwhile)
+
+    def _ask_training(self, surgeon: str, suture: str, which: str, seed: int, release: bool) -> str | None:
+        body: dict[str, Any] = {"surgeon": surgeon, "suture": suture, "seed": seed, "release": release}
+        active = [one.sha256 for one in self.model.active((surgeon, suture))]
+        chosen = {"newest": active[-1:], "oldest": active[:1], "all": active}[which]
+        if which != "newest":
+            body["demos"] = chosen or None
+        if surgeon not in self.model.surgeons:
+            self.call("POST", "/trainings", self._unknown(surgeon), json=body)
+            return None
+        if not active or not self.model.may(surgeon, "training"):
+            self.call("POST", "/trainings", 409, json=body)
+            return None
+        job = self.call("POST", "/trainings", 200, 202, json=body)
+        assert job["request"]["demos"] == chosen
+        return self._asked(job, Job(job["id"], surgeon, release, frozenset(chosen), job["state"]))
+
+    def _retrain(self, surgeon: str | None, only_stale: bool, release: bool, meanwhile: Meanwhile = None) -> None:
+        """Request a batch and wait for its end, as `skills retrain` does."""
+        if (job := self._ask_retraining(surgeon, only_stale, release)) is not None:
+            self._wait(job, meanwhile)
+
+    def _ask_retraining(self, surgeon: str | None, only_stale: bool, release: bool) -> str | None:
+        body = {"surgeon": surgeon, "only_stale": only_stale, "release": release}
+        if surgeon is not None and surgeon not in self.model.surgeons:
+            self.call("POST", "/retrainings", self._unknown(surgeon), json=body)
+            return None
+        active = [one for one in self.model.demos.values() if not one.withdrawn and surgeon in (None, one.style[0])]
+        if not active:
+            self.call("POST", "/retrainings", 409, json=body)
+            return None
+        job = self.call("POST", "/retrainings", 200, 202, json=body)
+        demos = frozenset(one.sha256 for one in active)
+        return self._asked(job, Job(job["id"], surgeon, release, demos, job["state"], batch=True))
+
+    def _asked(self, said: dict[str, Any], job: Job) -> str:
+        """Record a requested job; a job that has already ended reports the state of now."""
+        known = self.model.jobs.setdefault(job.id, job)
+        assert (known.release, known.batch) == (job.release, job.batch)
+        assert said["state"] in (*ACTIVE, "succeeded"), said
+        if said["state"] == "succeeded" and job.release and not job.batch:
+            version = self.model.versions[said["result"]["sha256"]]
+            self.model.release(version)  # also if another one was released since, or it was withdrawn
+            assert said["result"]["released"], said["result"]
+        elif said["state"] == "succeeded" and job.release:
+            for one in self._styles(job.id):
+                how, served = one["comparison"], self.model.served((one["surgeon"], one["suture"]))
+                if one["state"] == "done" and one["sha256"] is not None:
+                    assert how["now_released"] == (served is not None and served.sha256 == one["sha256"]), how
+                    assert how["now_released"] or how["not_released_because"], "not released, and no reason"
+        return job.id
+
+    def _styles(self, batch: str) -> list[dict[str, Any]]:
+        styles: list[dict[str, Any]] = self.call("GET", f"/retrainings/{batch}?limit=200", 200)["items"]
+        return styles
+
+    def _cancel(self, index: int) -> None:
+        if (name := pick(self.model.jobs, index)) is None:
+            return
+        job = self.model.jobs[name]
+        self.call("DELETE", f"/jobs/{name}", 200 if job.state in (*ACTIVE, "cancelled") else 409)
+        if job.state in ACTIVE:
+            job.state = "cancelled"
+
+    # ---- work on jobs ---- ----
+
+    def _work(self, index: int, meanwhile: Meanwhile = None) -> None:
+        """Carry out one waiting job, or a part of a batch."""
+        if (one := pick(self._waiting(), index)) is not None:
+            self._perform(*one, meanwhile)
+
+    def _wait(self, job: str, meanwhile: Meanwhile) -> None:
+        """Carry out a job, or all parts of a batch."""
+        while mine := [one for one in self._waiting() if one[0] == job]:
+            self._perform(*mine[0], meanwhile)
+            meanwhile = None
+
+    def _waiting(self) -> list[tuple[str, int, int]]:
+        """List the work for a worker: the job that it belongs to, and its row and attempt."""
+        active = JobRow.state.in_(ACTIVE), JobRow.kind != BATCH
+        with self.service.database.reading() as session:
+            rows = session.scalars(select(JobRow).where(*active).order_by(JobRow.row)).all()
+            of = [row if row.kind != PART else session.get(JobRow, row.request["retraining"]) for row in rows]
+        return [("" if job is None else job.id, row.row, row.attempt) for job, row in zip(of, rows, strict=True)]
+
+    def _perform(self, job: str, row: int, attempt: int, meanwhile: Meanwhile) -> None:
+        self._doubt()
+        with self._meanwhile(meanwhile, job):
+            work = Work(self.worker, Settings(database_url=self.url), perform_job)
+            assert work.try_once(row, attempt, 0), "the job failed inside the service"
+        self._take_in(job)
+
+    @contextmanager
+    def _meanwhile(self, meanwhile: Meanwhile, job: str = "") -> Iterator[None]:
+        """Run another action before a transaction of the worker."""
+        left, other = meanwhile or (0, ())
+
+        def pause() -> None:
+            nonlocal left
+            left -= 1
+            if left == 0:
+                self._take_in(job)
+                self._do(other)
+                self._doubt()
+                self.check()
+
+        Interruptible.pause = staticmethod(pause)
+        try:
+            yield
+        finally:
+            Interruptible.pause = staticmethod(lambda: None)
+
+    def _doubt(self) -> None:
+        """Record the present obstacles of jobs."""
+        for job in self.model.jobs.values():
+            job.doubt |= {one for one in job.demos if not self.model.may_learn({one})}
+
+    def _take_in(self, name: str) -> None:
+        """Record the result of a job, and check it."""
+        if (job := self.model.jobs.get(name)) is None:
+            return
+        said = self.call("GET", f"/jobs/{name}", 200)
+        if job.batch:
+            self._take_in_styles(job)
+        elif said["state"] == "succeeded" and job.state != "succeeded":
+            made, style = said["result"], (said["request"]["surgeon"], said["request"]["suture"])
+            version = self._learnt(made["sha256"], style)
+            assert (version.number, version.demos) == (made["policy_version"], job.demos)
+            assert made["was_released"] == (job.release and version.releasable), made
+            self._released(job, version, made["was_released"], made["not_released_because"])
+        elif said["state"] == "failed" and job.state != "failed":
+            assert job.doubt, f"nothing stood in its way: {said['error']}"
+            assert said["error"]
+        job.state = said["state"]
+
+    def _take_in_styles(self, job: Job) -> None:
+        for one in self._styles(job.id):
+            if one["state"] == "queued" or one["demo"] in job.ended:
+                continue
+            job.ended.add(one["demo"])
+            if one["state"] == "done":
+                how, style = one["comparison"], (one["surgeon"], one["suture"])
+                before = self.model.standing(style)
+                version = self._learnt(one["sha256"], style)
+                assert one["demo"] in version.demos
+                if job.release and not before:
+                    assert how["was_released"] == version.releasable, how
+                self._released(job, version, how["was_released"], how["not_released_because"])
+            elif one["state"] == "failed":
+                assert job.doubt, f"nothing stood in its way: {one['reason']}"
+                assert one["reason"]
+
+    def _learnt(self, name: str, style: Style) -> Version:
+        """Record a version that a job reports as stored."""
+        said = self.call("GET", f"/policy-versions/{name}", 200)
+        assert (said["surgeon"], said["suture"]) == style
+        version = Version(
+            name, style, said["version"], frozenset(said["demos"]), not said["grid_certificate"]["refused_because"]
+        )
+        if name not in self.model.versions:
+            assert self.model.may_learn(version.demos), "stored, and consent or a withdrawal forbids it"
+            assert version.number > max(
+                (one.number for one in self.model.versions.values() if one.style == style), default=0
+            )
+            self.model.versions[name] = version
+        assert self.model.versions[name] == version
+        return version
+
+    def _released(self, job: Job, version: Version, released: bool, because: str | None) -> None:
+        """Record a job's report that it made a release, or did not."""
+        if released:
+            assert job.release
+            assert self.model.may_learn(version.demos), "released, and consent or a withdrawal forbids it"
+            self.model.release(version)
+        elif job.release:
+            assert because, "not released, and no reason"
+
+    # ---- plans and the atlas ----
+
+    def _plan(self, surgeon: str, meanwhile: Meanwhile = None) -> None:
+        served = self.model.served((surgeon, SUTURES[0])) if surgeon in self.model.surgeons else None
+        plan, refused = None, None
+        with self._meanwhile(meanwhile):
+            try:
+                plan = cases.add_plan(self.worker, surgeon)
+            except SkillsError as error:
+                refused = error
+        if plan is not None:
+            self.model.add_plan(plan.sha256, plan.policy.sha256)
+        else:
+            assert served is None or not self.model.may_learn(served.demos), f"nothing stood in its way: {refused}"
+
+    def _atlas(self, suture: str, meanwhile: Meanwhile = None) -> None:
+        with self._meanwhile(meanwhile), suppress(NotFound):
+            atlas_of(self.worker, suture)
+        self.check()
+        members = self.model.in_atlas(suture)
+        said = self.call("GET", f"/styles/{suture}/atlas", 200 if members else 404)
+        assert {one["id"] for one in said["demos"]} == members if members else True
+
+    # ---- keys ----
+
+    def _make_key(self, surgeon: str | None, days: int | None) -> None:
+        last = None if days is None else self.model.today + timedelta(days=days)
+        end = None if last is None else f"{last + timedelta(days=1)}T00:00:00Z"
+        of = None if surgeon is None else [surgeon]
+        body = {"owner": "anna", "role": "reader", "expires_at": end, "surgeons": of}
+        if surgeon is not None and surgeon not in self.model.surgeons:
+            self.call("POST", "/keys", self._unknown(surgeon), json=body)
+        else:
+            made = self.call("POST", "/keys", 201, json=body)
+            self.model.keys[made["key"]] = Key(made["secret"], surgeon, last)
+
+    def _revoke(self, index: int) -> None:
+        if (name := pick(self.model.keys, index)) is not None:
+            self.call("DELETE", f"/keys/{name}", 200)
+            self.model.revoke(name)
+
+    def _use_key(self, index: int) -> None:
+        if (name := pick(self.model.keys, index)) is None:
+            return
+        key = self.model.keys[name]
+        with_it = {"headers": {"X-API-Key": key.secret}}
+        if not self.model.lets_in(key):
+            self.call("GET", "/surgeons", 401, **with_it)
+            return
+        seen = {one["surgeon"] for one in self.call("GET", "/surgeons", 200, **with_it)["items"]}
+        assert seen == {one for one in self.model.surgeons if key.surgeon in (None, one)}
+
+    # ---- backups ----
+
+    def _back_up(self) -> None:
+        if len(self.backups) < MOST_BACKUPS:
+            file = self.folder / f"{len(self.backups)}.zip"
+            back_up(self.service.database, file)
+            self.backups.append((file, self.model.snapshot()))
+
+    def _write_list(self) -> None:
+        keep_erasures(self.service.database, self.folder / "list.json")
+
+    def _restore(self, index: int) -> None:
+        """Write the list, and continue with a backup in place of the database."""
+        if (chosen := pick(self.backups, index)) is None:
+            return
+        file, backup = chosen
+        self._write_list()
+        self._close()
+        self.url = backends.blank(self.backend, self.folder)
+        database = Database(self.url)
+        restore(database, file, read_erasures(str(self.folder / "list.json")))
+        database.close()
+        self._open()
+        self.model = self.model.restored(backup)
+
+    # ---- the invariant ----
+
+    @invariant()
+    def check(self) -> None:
+        """Compare the served and stored objects with the model."""
+        self._check_served()
+        self._check_answers()
+        stored = self._rows()
+        self._check_library(stored)
+        self._check_books(stored)
+        self._check_distances()
+        for table, rows in stored.items():
+            said = str(rows)
+            assert not any(surgeon in said for surgeon in self.model.erased), f"'{table}' names an erased surgeon"
+
+    def _check_served(self) -> None:
+        model = self.model
+        self.styles |= {one.style for one in model.versions.values()}
+        due = {style: model.served(style) for style in self.styles}
+        listed = self.call("GET", "/policies", 200)["items"]
+        assert {(one["surgeon"], one["suture"]): one["sha256"] for one in listed} == {
+            style: version.sha256 for style, version in due.items() if version is not None
+        }, "what is listed as served"
+        for style, version in due.items():
+            said = self.call("GET", f"/policies/{'/'.join(style)}", 200 if version else self._unknown(style[0]))
+            assert version is None or (said["sha256"], said["version"]) == (version.sha256, version.number)
+
+    def _check_answers(self) -> None:
+        """Check that every training reports whether its version is the served one."""
+        for one in self.call("GET", "/jobs?kind=training&state=succeeded&limit=200", 200)["items"]:
+            served = self.model.served((one["request"]["surgeon"], one["request"]["suture"]))
+            made = one["result"]
+            assert made["released"] == (served is not None and served.sha256 == made["sha256"]), made
+
+    def _check_library(self, stored: dict[str, Any]) -> None:
+        model = self.model
+        assert {one.slug: one.consent for one in stored["surgeons"]} == {
+            surgeon: consent.written for surgeon, consent in model.surgeons.items()
+        }
+        assert {one.sha256 for one in stored["recordings"]} == set(model.recordings)
+        assert {one.recording for one in stored["recording_chunks"]} == {one.row for one in stored["recordings"]}
+        assert {one.sha256: one.withdrawn_at is not None for one in stored["demonstrations"]} == {
+            one.sha256: one.withdrawn for one in model.demos.values()
+        }
+        slugs = {one.row: one.slug for one in stored["surgeons"]}
+        assert {(one.sha256, slugs[one.surgeon_row], one.suture, one.version) for one in stored["policy_versions"]} == {
+            (one.sha256, *one.style, one.number) for one in model.versions.values()
+        }
+        versions = {one.row: one.sha256 for one in stored["policy_versions"]}
+        assert Counter(
+            (versions[one.policy_row], one.withdrawn_at is not None) for one in stored["releases"]
+        ) == Counter((one.version.sha256, one.withdrawn) for one in model.releases)
+
+    def _check_books(self, stored: dict[str, Any]) -> None:
+        model = self.model
+        assert {one.id: one.revoked_at is not None for one in stored["keys"] if one.owner != ADMIN} == {
+            name: key.revoked for name, key in model.keys.items()
+        }
+        jobs = {one.id: one.state for one in stored["jobs"] if one.kind != PART}
+        assert {name for name, state in jobs.items() if state in ACTIVE} == {
+            one.id for one in model.jobs.values() if one.state in ACTIVE
+        }
+
+    def _rows(self) -> dict[str, Any]:
+        """Read all tables, without packed values."""
+        with self.service.database.engine.connect() as connection:
+            return {name: connection.execute(query).all() for name, query in _plain_columns().items()}
+
+    def _check_distances(self) -> None:
+        """Check that each cached distance of the atlas is between two stored demonstrations, and correct."""
+        with self.service.database.reading() as session:
+            files = {one.row: one.recording.sha256 for one in session.scalars(select(Demonstration))}
+            kept = session.execute(select(MeasuredShape.demonstration_row, MeasuredShape.measured)).all()
+        for row, measured in kept:
+            assert row in files
+            for other, mm in zip(measured.others.tolist(), measured.apart_mm.tolist(), strict=True):
+                assert other in files, "a distance from an erased demonstration is kept"
+                assert np.isclose(mm, distance_mm(files[row], files[other])), "a distance is another demonstration's"
+
+
+def pick(some: Any, index: int) -> Any:
+    """Choose an item by index modulo their number, or None if there is none."""
+    return list(some)[index % len(some)] if some else None
+
+
+@cache
+def distance_mm(one: str, other: str) -> float:
+    """Measure the distance of two recordings anew."""
+    shapes = [shape_of(cut_demo(read_recording(cases.upload(NAMES[name]).file))) for name in (one, other)]
+    return float(distances_of(np.array(shapes), np.array([(0, 1)]))[0])
+
+
+@cache
+def _plain_columns() -> dict[str, Any]:
+    packed = (LargeBinary, Packed)
+    tables = Base.metadata.tables.items()
+    return {name: select(*(c for c in table.c if not isinstance(c.type, packed))) for name, table in tables}
+
+
+# ---- replaced parts ------------------------------------------------------------------------------------------------
+
+
+class Clock(datetime):
+    """A clock with the simulated date and the real time of day."""
+
+    day: ClassVar[date] = FIRST_DAY
+
+    @classmethod
+    def now(cls, tz: Any = None) -> datetime:  # type: ignore[override]
+        return datetime.now(tz).replace(year=cls.day.year, month=cls.day.month, day=cls.day.day)
+
+
+class Interruptible(Database):
+    """A database with a callback before each of its transactions."""
+
+    pause: ClassVar[Callable[[], None]] = staticmethod(lambda: None)
+
+    def reading(self) -> AbstractContextManager[Session]:
+        self.pause()
+        return super().reading()
+
+    def writing(self) -> AbstractContextManager[Session]:
+        self.pause()
+        return super().writing()
+
+
+class Deaf:
+    """A job engine that misses every notification."""
+
+    def tell(self, *_job: object) -> None: ...
+
+    def cancel(self, *_job: object) -> None: ...
+
+    def close(self) -> None: ...
+
+
+def read_here(file: BinaryIO, *, rate_hz: float | None, frame: str | None, **_who: object) -> Recording:
+    return read_recording(file, rate_hz=rate_hz, frame=frame)
+
+
+read_here.tell = lambda file, *, key="", **how: read_told(file, **how)  # type: ignore[attr-defined]
+
+
+@contextmanager
+def in_our_hands() -> Iterator[None]:
+    """Replace the clock, the reader and the engine; and put several styles into a part of a batch."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(skills.db.base, "datetime", Clock)
+        patch.setattr(skills.api.app, "confined_reader", lambda _settings: nullcontext(read_here))
+        patch.setattr(skills.api.app, "Engine", lambda _settings: Deaf())
+        patch.setattr(retraining, "FEWEST_PARTS", 2)
+        yield
+
+
+def settled(backend: str, folder: Path) -> tuple[str, str]:
+    """Copy a database with a catalogue and an admin's key; return its URL, and the key."""
+    template, key = _settled(backend)
+    if backend == "sqlite":
+        return f"sqlite:///{shutil.copy(template, folder / 'settled.sqlite')}", key
+    name = f"i{uuid.uuid4().hex[:12]}"
+    backends.on_server(f"CREATE DATABASE {name} TEMPLATE {template}")
+    return backends.server_url(name), key
+
+
+@cache
+def _settled(backend: str) -> tuple[str, str]:
+    """Make that database, once; return its file or name, and the key."""
+    url = backends.fresh(backend, backends.migrated_file().parent)
+    database = Database(url)
+    skills.api.app.prepare_database(database)
+    with database.writing() as session:
+        key = create_key(session, ADMIN, "admin", "local")[1]
+    database.close()
+    return url.removeprefix("sqlite:///") if backend == "sqlite" else str(make_url(url).database), key

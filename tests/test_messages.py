@@ -1,0 +1,191 @@
+"""Messages in the words of their interface: none shows those of another one, a class name or a regular expression."""
+
+import ast
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+import skills
+from skills import errors
+from skills.api.problems import answer_to
+from skills.cli import app
+from skills.client import Client, Problem
+from skills.remedies import Action, Door, Remedy, did_you_mean, read_remedies
+from skills.schemas.requests import in_words
+from skills.settings import settings
+
+ROOT = Path(skills.__file__).parent
+HTTP_WORDS = re.compile(r"\b(GET|PUT|POST|DELETE|PATCH) (/|\.\.\./)|Authorization|X-API-Key|openapi")
+COMMAND_WORDS = re.compile(
+    r"\bskills (add|show|surgeon|suture|demo|train|retrain|policy|plan|play|export|migrate|worker|seed|keys|calibrate"
+    r"|verify|jigsaws|recording|job|serve|backup|restore|erasures|score|atlas)\b|SKILLS_API_KEY"
+)
+PYTHON_WORDS = re.compile(r"\bclient\.\w+|\bskills\.\w+\(|Client\(|\bhelp\(")
+CLASS_NAMES = re.compile(r"\b(" + "|".join(name for name in vars(errors) if re.search("[a-z][A-Z]", name)) + r")\b")
+REGULAR_EXPRESSION = re.compile(r"\[a-z|\[0-9|\\x00|\^\[|\]\{")
+STRANGE = {
+    Door.HTTP: (COMMAND_WORDS, PYTHON_WORDS, CLASS_NAMES, REGULAR_EXPRESSION),
+    Door.COMMAND: (HTTP_WORDS, PYTHON_WORDS, CLASS_NAMES, REGULAR_EXPRESSION),
+    Door.PYTHON: (HTTP_WORDS, COMMAND_WORDS, CLASS_NAMES, REGULAR_EXPRESSION),
+}
+
+
+def foreign(door: Door, text: str) -> list[str]:
+    return [found[0] for pattern in STRANGE[door] if (found := pattern.search(text)) is not None]
+
+
+@pytest.mark.parametrize("door", Door)
+@pytest.mark.parametrize("action", Action)
+def test_an_action_is_worded_by_every_door_in_its_own_words(action: Action, door: Door):
+    remedy = Remedy(action, **dict.fromkeys(action.fields, "it"))
+    words = remedy.words(door)
+    assert words and "{" not in words
+    assert foreign(door, words) == []
+    assert read_remedies([remedy.as_json()]) == [remedy]
+
+
+def calls() -> Iterator[tuple[str, ast.Call]]:
+    for file in sorted(ROOT.rglob("*.py")):
+        for node in ast.walk(ast.parse(file.read_text())):
+            if isinstance(node, ast.Call):
+                yield f"{file.relative_to(ROOT)}:{node.lineno}", node
+
+
+def called(node: ast.Call) -> str:
+    return node.func.id if isinstance(node.func, ast.Name) else getattr(node.func, "attr", "")
+
+
+def test_every_remedy_in_the_source_has_the_values_that_its_words_name():
+    seen = 0
+    for where, node in calls():
+        if called(node) == "Remedy" and isinstance(node.args[0], ast.Attribute):
+            named = {one.arg for one in node.keywords}
+            assert named == Action[node.args[0].attr].fields, where
+            seen += 1
+    assert seen > 20
+
+
+def texts(node: ast.expr) -> Iterator[str]:
+    for part in ast.walk(node):
+        if isinstance(part, ast.Constant) and isinstance(part.value, str):
+            yield part.value
+
+
+def test_no_message_in_the_source_has_the_words_of_a_door():
+    """Common messages and remedies have no words of an interface; the interfaces add their own."""
+    kinds = {name for name, kind in vars(errors).items() if isinstance(kind, type) and issubclass(kind, Exception)}
+    found = []
+    seen = 0
+    for where, node in calls():
+        if called(node) not in kinds:
+            continue
+        seen += 1
+        for argument in node.args:
+            if isinstance(argument, ast.Call) and called(argument) == "Remedy":
+                continue
+            for text in texts(argument):
+                patterns = (HTTP_WORDS, CLASS_NAMES, REGULAR_EXPRESSION)
+                patterns += () if where.startswith("cli/") else (COMMAND_WORDS,)  # only commands raise these
+                found += [(where, hit[0]) for pattern in patterns if (hit := pattern.search(text))]
+    assert seen > 400
+    assert found == []
+
+
+def test_remedies_of_another_version_are_left_out_and_sentences_are_kept():
+    said = ["Do it.", {"action": "fly"}, {"action": "add-surgeon"}, {"action": "list-demos"}, 3]
+    assert read_remedies(said) == ["Do it.", Remedy(Action.LIST_DEMOS)]
+    assert read_remedies("no list") == []
+    with pytest.raises(TypeError):
+        Remedy(Action.ADD_SURGEON, suture="wrong")
+
+
+def test_a_value_stays_one_word_at_every_door():
+    remedy = Remedy(Action.ADD_JIGSAWS, folder="a b'; rm -rf /")
+    assert remedy.words(Door.COMMAND).endswith("""skills jigsaws add 'a b'"'"'; rm -rf /'""")
+    assert Remedy(Action.ADD_SURGEON, surgeon="a/../b?c").words(Door.HTTP) == "PUT /surgeons/a%2F..%2Fb%3Fc adds one."
+
+
+def test_an_error_is_worded_by_each_door():
+    error = errors.NotFound("There is no surgeon 'wren'.", "Look.", Remedy(Action.ADD_SURGEON, surgeon="wren"))
+    assert str(error) == "There is no surgeon 'wren'. Look. Add one: client.put_surgeon('wren')."
+    assert error.words() == "There is no surgeon 'wren'. Look."
+    said = json.loads(answer_to(error).body)
+    assert said["detail"] == "There is no surgeon 'wren'. Look. PUT /surgeons/wren adds one."
+    assert said["reason"] == "There is no surgeon 'wren'."
+    assert said["remedies"] == ["Look.", {"action": "add-surgeon", "surgeon": "wren"}]
+    assert str(Problem(404, said)) == str(error)
+
+
+def test_near_misses_are_suggested_and_others_are_not():
+    assert did_you_mean("kestral", ["kestrel", "wren"]) == ["Did you mean 'kestrel'?"]
+    assert did_you_mean("zebra", ["kestrel", "wren"]) == []
+
+
+def patterns_of(document: object) -> Iterator[str]:
+    if isinstance(document, dict):
+        yield from (value for name, value in document.items() if name == "pattern" and isinstance(value, str))
+        for value in document.values():
+            yield from patterns_of(value)
+    elif isinstance(document, list):
+        for value in document:
+            yield from patterns_of(value)
+
+
+@pytest.fixture
+def door(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Client]:
+    """Yield the client of a separate service; the commands use the same database."""
+    from skills.connection import connect
+
+    monkeypatch.setenv("SKILLS_DATABASE_URL", f"sqlite:///{tmp_path / 'skills.sqlite'}")
+    monkeypatch.delenv("SKILLS_SERVER", raising=False)
+    settings.cache_clear()
+    with connect(settings()) as client:
+        yield client
+    settings.cache_clear()
+
+
+def test_every_form_of_a_text_in_a_request_has_its_words(door: Client):
+    document = door.get_json("/openapi.json")
+    asked = [document["paths"], *(model for name, model in document["components"]["schemas"].items() if "In" in name)]
+    parameters = [
+        one for calls in document["paths"].values() for call in calls.values() for one in call.get("parameters", ())
+    ]
+    found = set(patterns_of(parameters)) | set(patterns_of(asked[1:]))
+    assert len(found) >= 5
+    for pattern in found:
+        assert re.fullmatch(r"\^\([\w|-]+\)\$", pattern) or in_words(pattern)
+
+
+def test_a_refusal_reads_in_the_words_of_service_client_and_command(door: Client):
+    door.put_surgeon("kestrel")
+    with pytest.raises(Problem) as refused:
+        door.surgeon("kestral")
+    said = str(refused.value)
+    assert said == ("There is no surgeon 'kestral'. Did you mean 'kestrel'? Add one: client.put_surgeon('kestral').")
+    assert "PUT /surgeons/kestral adds one." in refused.value.body["detail"]
+    result = CliRunner().invoke(app, ["surgeon", "show", "kestral"])
+    assert result.stderr.splitlines() == [
+        "There is no surgeon 'kestral'.",
+        "Did you mean 'kestrel'?",
+        "Add one: skills surgeon put kestral",
+    ]
+
+
+def test_a_refused_argument_is_named_with_value_and_limit_at_each_door(door: Client):
+    far = {"position_mm": (5, 55, 99_999)}
+    with pytest.raises(Problem) as refused:
+        door.plan("Kestrel", "simple-running", [far])
+    assert str(refused.value).splitlines() == [
+        "surgeon must be 1 to 64 lower-case letters, digits, - and _, and begin with a letter or a digit; "
+        "'Kestrel' was given",
+        "suture_points.0.position_mm.2 must be at most 10000; 99999 was given",
+    ]
+    assert "Kestrel" not in json.dumps(refused.value.body)
+    result = CliRunner().invoke(app, ["plan", "kestrel", "simple-running", "--point", "5,55,99999"])
+    assert result.stderr.splitlines()[0] == "--point must be at most 10000; 99999 was given"
+    with pytest.raises(TypeError, match=r"no argument 'point'\. Did you mean 'suture_points'"):
+        door.plan("kestrel", "simple-running", point=[far])  # type: ignore[call-arg]

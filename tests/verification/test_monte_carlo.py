@@ -1,0 +1,347 @@
+"""Monte Carlo variations of a plan: the draws, the failures, and the counts."""
+
+import json
+import subprocess
+import sys
+from dataclasses import asdict, replace
+from math import erf, nan, radians, sqrt
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import skills
+from skills.errors import BadInput, BadSettings
+from skills.kinematics import JAW_TIP_MM, POINTING_DOWN
+from skills.planning.handoff import NEEDLE_RADIUS_MM, OtherArm, PsmM, realign
+from skills.planning.trajectory import PassPath, Trajectory, time_parametrise
+from skills.verification import monte_carlo
+from skills.verification.clearance import FINGER_RADIUS_MM, WRIST_RADIUS_MM, clearance_to_pad, links_of
+from skills.verification.gates import Limits
+from skills.verification.monte_carlo import Doubt, DoubtSettings, TipDoubt, doubt, draw, looked_at, scene_of
+from skills.verification.needle import NEEDLE_FREE_RAD, NEEDLE_THICK_MM
+from tests.verification.test_catch import APPROACH, OPENING_RAD, PLANNED
+
+PAD_TOP_MM = -150.0  # 5 mm under the lowest finger tips
+BASE_MM = (160.0, 20.0, 20.0)
+BASE_XYZW = (0.0, float(np.sin(np.radians(17.5))), 0.0, float(np.cos(np.radians(17.5))))
+PSM_M = PsmM(APPROACH, BASE_MM, BASE_XYZW)
+PATH_MM = np.array([[-10, 55, -135], [-20, 60, -130], [-10, 55, -120], [5, 55, -125]], dtype=float)
+NO_DOUBT = DoubtSettings(variations=40, tip_errors_mm=(0.0,), suture_point_mm=0.0, needle_rad=0.0)
+FEW = DoubtSettings(variations=200)
+
+
+def pass_path(shift_mm: float = 0.0, with_a2: bool = True) -> PassPath:
+    target = realign(POINTING_DOWN, APPROACH).rotation if with_a2 else None
+    return PassPath(PATH_MM + np.array([shift_mm, 0.0, 0.0]), POINTING_DOWN, target)
+
+
+def motion(passes: int = 1, psm_m: PsmM | None = None, with_a2: bool = True) -> Trajectory:
+    paths = [pass_path(6.0 * k, with_a2) for k in range(passes)]
+    return time_parametrise(paths, rate_hz=100.0, psm_m=psm_m)
+
+
+ROOT = Path(skills.__file__).parents[1]
+ALONE = motion(2)
+BESIDE = motion(2, PSM_M)
+
+
+def judged(trajectory: Trajectory = ALONE, approach=APPROACH, pad_top_mm: float = PAD_TOP_MM, **given) -> Doubt:
+    return doubt(trajectory, approach_m=approach, pad_top_mm=pad_top_mm, **{"settings": FEW, **given})
+
+
+def under(found: Doubt, k: int = 0) -> TipDoubt:
+    return found.under[k]
+
+
+@pytest.mark.parametrize("tip_error_mm", [0.65, 3.0])
+def test_catching_is_as_likely_as_the_integral_over_all_offsets(tip_error_mm):
+    # Without any turn the place is y = e_y and z = 7 + e_z + r (1 - sin phi), where r cos phi = -e_x.
+    sigma = tip_error_mm / sqrt(8 / np.pi) * sqrt(2)
+    e = np.linspace(-5, 5, 161)
+    weight = np.exp(-(e**2) / 2)
+    weight /= weight.sum()
+    x, y, z = np.meshgrid(*[e * sigma] * 3, indexing="ij")
+    phi = np.arccos(np.clip(-x / NEEDLE_RADIUS_MM, -1, 1))
+    depth = 7.0 + z + NEEDLE_RADIUS_MM * (1 - np.sin(phi))
+    rho, half = np.hypot(y, depth), NEEDLE_THICK_MM / 2
+    beside = FINGER_RADIUS_MM / NEEDLE_RADIUS_MM
+    good = (np.abs(x) < NEEDLE_RADIUS_MM) & (phi >= beside) & (phi <= NEEDLE_FREE_RAD - beside)
+    good &= (rho >= WRIST_RADIUS_MM + half) & (rho <= JAW_TIP_MM - half)
+    good &= np.abs(y) * np.cos(OPENING_RAD) + half <= depth * np.sin(OPENING_RAD)
+    good &= np.abs(x) <= NEEDLE_RADIUS_MM * np.sin(radians(15))
+    expected = np.einsum("ijk,i,j,k", good.astype(float), weight, weight, weight)
+    settings = DoubtSettings(variations=4000, tip_errors_mm=(tip_error_mm,), needle_rad=0.0)
+    caught = under(judged(motion(1), settings=settings)).passes[0].caught
+    assert caught.lower - 0.01 <= expected <= caught.upper + 0.01  # the grid's own error is a few thousandths
+
+
+# ---- a whole plan ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("trajectory", [ALONE, BESIDE], ids=["alone", "beside PSM_M"])
+def test_without_any_doubt_a_clear_plan_succeeds_for_certain(trajectory):
+    found = judged(trajectory, settings=NO_DOUBT)
+    (only,) = found.under
+    assert (only.plan.count, only.plan.of, only.plan.probability) == (40, 40, 1.0)
+    assert only.plan.lower == pytest.approx(1 / (1 + 1.959964**2 / 40))  # Wilson's bound of all of n, by hand
+    assert all(one.caught.probability == 1.0 for one in only.passes)
+    assert (found.with_psm_m, found.hand_offs) == (trajectory is BESIDE, 2)
+    assert only.passes[0].faults.arms == (0 if trajectory is BESIDE else None)
+
+
+def test_a_plan_into_the_pad_never_succeeds_though_every_needle_is_caught():
+    (only,) = judged(pad_top_mm=-140.0, settings=NO_DOUBT).under
+    assert (only.plan.count, only.passes[0].clear.count, only.passes[0].caught.count) == (0, 0, 40)
+    assert (only.passes[0].faults.pad, only.passes[0].faults.reach) == (40, 0)
+
+
+def test_psm_m_in_the_way_is_found_in_every_variation():
+    # It stands in PSM_A's place, 3 mm to its side, and moves as it does.
+    same = OtherArm(np.array([3.0, 0.0, 0.0]), np.array([0.0, 0, 0, 1]), "400006", ALONE.joints)
+    (only,) = judged(replace(ALONE, psm_m=same), settings=NO_DOUBT).under
+    assert (only.passes[0].faults.arms, only.passes[0].faults.pad, only.plan.count) == (40, 0, 0)
+
+
+def wrong(scene, **given) -> dict[str, list[bool]]:
+    """Return the failures in four variations, in which all but the given numbers are zero, at a tip error of 1 mm."""
+    nothing = replace(draw(0, 0, 4, 0.0, 0.0), offset_a=np.zeros((4, 3)), offset_m=np.zeros((4, 3)))
+    drawn = replace(nothing, **{name: np.array(rows, dtype=float) for name, rows in given.items()})
+    found = monte_carlo.spoiled(scene, drawn, np.array([1.0]), Limits())
+    return {name: one[0].tolist() for name, one in found.items()}
+
+
+def test_an_arm_offset_down_nears_the_pad_and_a_pass_shifted_down_does_not():
+    scene = looked_at(scene_of(BESIDE, 0, PAD_TOP_MM, OPENING_RAD), 20)
+    spare = float(clearance_to_pad(scene.arms[0].links(scene.arms[0].joints), PAD_TOP_MM).min()) - 1.0
+    down = [[0, 0, -spare + 0.01], [0, 0, -spare - 0.01], [9, 9, 0], [0, 0, spare]]
+    assert wrong(scene, offset_a=down)["pad"] == [False, True, False, False]
+    assert wrong(scene, shift_mm=down)["pad"] == [False] * 4
+    other = float(clearance_to_pad(scene.arms[1].links(scene.arms[1].joints), PAD_TOP_MM).min()) - 1.0
+    down = [[0, 0, -other + 0.01], [0, 0, -other - 0.01], [0, 0, 0], [0, 0, 9]]
+    assert wrong(scene, offset_m=down)["pad"] == [False, True, False, False]
+
+
+def test_each_arm_comes_nearer_to_the_other_by_its_own_offset():
+    # PSM_M moves as PSM_A does, 20 mm beside it along x: more than 8 mm of shafts and the limit.
+    beside = OtherArm(np.array([20.0, 0.0, 0.0]), np.array([0.0, 0, 0, 1]), "400006", ALONE.joints)
+    scene = looked_at(scene_of(replace(ALONE, psm_m=beside), 0, PAD_TOP_MM, 0.06), 20)
+    along = [[0, 0, 0], [13, 0, 0], [-13, 0, 0], [0, 13, 0]]
+    assert wrong(scene, offset_a=along)["arms"] == [False, True, False, False]
+    assert wrong(scene, offset_m=along)["arms"] == [False, False, True, False]
+    assert wrong(scene, offset_a=along, offset_m=along)["arms"] == [False] * 4
+    assert wrong(scene, shift_mm=along)["arms"] == [False] * 4
+
+
+def test_elsewhere_is_the_same_way_for_both_arms_whatever_their_bases():
+    shift = np.array([[3.0, -4.0, 5.0]])
+    for arm in looked_at(scene_of(BESIDE, 0, PAD_TOP_MM, OPENING_RAD), 5).arms:
+        moved, planned = arm.links(arm.shifted(shift)), arm.links(arm.joints)
+        np.testing.assert_allclose(moved.end_mm[:, 1:] - planned.end_mm[:, 1:] - shift, 0, atol=1e-6)
+
+
+def test_the_pad_is_cleared_as_often_as_the_error_function_says():
+    settings = DoubtSettings(variations=4000, suture_point_mm=0.0)
+    whole = scene_of(ALONE, 0, -148.0, 0.06).arms[0]
+    spare = float(clearance_to_pad(whole.links(whole.joints), -148.0).min()) - 1.0
+    for one in judged(pad_top_mm=-148.0, settings=settings).under:
+        clear, sigma = one.passes[0].clear, one.tip_error_mm / sqrt(8 / np.pi)
+        expected = (1 + erf(spare / sigma / sqrt(2))) / 2
+        assert clear.lower - 0.005 <= expected <= clear.upper + 0.005
+
+
+def test_only_fingers_may_touch_and_only_at_the_hand_off():
+    scene = scene_of(BESIDE, 0, PAD_TOP_MM, OPENING_RAD)
+    assert np.flatnonzero(scene.handing_over).tolist() == [len(scene.phase) - 1]
+    assert not scene_of(motion(1, with_a2=False), 0, PAD_TOP_MM, OPENING_RAD).handing_over.any()
+    # Two arms 20 mm apart, the fingers of one drawn over to the other.
+    arm = links_of(ALONE.joints[:1])
+    other = arm.moved(np.array([[20.0, 0.0, 0.0]]))
+    reached = arm.end_mm.copy()
+    reached[:, 2:] = other.end_mm[:, 2:]
+    over = replace(arm, end_mm=reached)
+    assert monte_carlo._apart(over, other, np.array([False])) < 0 < monte_carlo._apart(over, other, np.array([True]))
+
+
+def test_a_pass_far_enough_elsewhere_is_out_of_reach():
+    far = replace(FEW, suture_point_mm=150.0)
+    faults = under(judged(settings=far)).passes[0].faults
+    assert faults.reach > 20
+    assert faults.limits >= faults.reach
+    near = under(judged(settings=replace(FEW, suture_point_mm=5.0))).passes[0].faults
+    assert (near.reach, near.limits) == (0, 0)
+
+
+def test_stricter_limits_of_the_playback_are_kept():
+    strict = judged(limits=Limits(joint_margin=0.3)).under[0].passes[0].faults
+    assert (strict.reach, strict.limits) == (0, 200)
+    deep = judged(limits=Limits(insertion_mm=200.0)).under[0].passes[0].faults
+    assert (deep.reach, deep.limits) == (0, 200)
+
+
+def test_a_jaw_that_was_not_realigned_hands_nothing_on():
+    askew = realign(POINTING_DOWN, (-0.3, 0.9, -0.3)).rotation
+    path = replace(pass_path(), target_rotation=askew)
+    turned = time_parametrise([path], rate_hz=100.0)
+    beside = motion(1, PSM_M)
+    other = OtherArm(
+        np.array(BASE_MM), np.array(BASE_XYZW), "400006", np.repeat(beside.psm_m.joints[-1:], len(turned), 0)
+    )
+    assert under(judged(replace(turned, psm_m=other), settings=NO_DOUBT)).passes[0].caught.count == 0
+
+
+def test_it_counts_which_arm_is_off_which_way(monkeypatch):
+    out = 3.0 * PLANNED.jaw_m[:, 2]  # there are 2.87 mm to the tips of PSM_M's fingers, and 3.07 to its wrist
+    nothing = replace(draw(0, 0, 40, 0.0, 0.0), offset_a=np.zeros((40, 3)), offset_m=np.zeros((40, 3)))
+    settings = replace(NO_DOUBT, tip_errors_mm=(1.0,))
+    for given, caught in (
+        ({"offset_a": out}, 0),
+        ({"offset_a": -out}, 40),
+        ({"offset_m": out}, 40),
+        ({"offset_m": -out}, 0),
+        ({"offset_a": out, "offset_m": out}, 40),
+    ):
+        drawn = replace(nothing, **{name: np.tile(value, (40, 1)) for name, value in given.items()})
+        monkeypatch.setattr("skills.verification.monte_carlo.draw", lambda *_, drawn=drawn: drawn)
+        assert under(judged(settings=settings)).passes[0].caught.count == caught
+
+
+def test_a_needle_that_is_nowhere_near_is_at_no_angle():
+    faults = under(judged(settings=replace(FEW, tip_errors_mm=(1e6,)))).passes[0].faults
+    assert (faults.place, faults.angle) == (200, 200)
+
+
+def test_without_an_approach_success_means_only_being_clear():
+    for found in (judged(approach=None), judged(motion(1, with_a2=False))):
+        one = under(found).passes[0]
+        assert (found.hand_offs, one.caught, one.faults.place, one.faults.angle) == (0, None, None, None)
+        assert one.succeeds == one.clear
+
+
+def test_psm_m_beside_catches_what_its_wanted_pose_alone_catches():
+    beside, alone = judged(BESIDE, approach=None), judged(ALONE)
+    for k in range(2):
+        assert [one.caught for one in under(beside, k).passes] == [one.caught for one in under(alone, k).passes]
+
+
+def test_more_error_never_helps_where_nothing_else_is_in_doubt():
+    errors = (0.0, 0.3, 0.65, 1.0, 2.0, 3.0, 5.0)
+    settings = DoubtSettings(variations=500, tip_errors_mm=errors, suture_point_mm=0.0, needle_rad=0.0)
+    counts = [one.plan.count for one in judged(BESIDE, settings=settings).under]
+    assert counts == sorted(counts, reverse=True)
+    assert counts[0] == 500 and counts[-1] < 100
+
+
+def test_a_plan_of_two_passes_succeeds_about_as_often_as_both_of_them():
+    found = under(judged(settings=DoubtSettings(variations=1000)))
+    one, other = (each.succeeds.probability for each in found.passes)
+    assert found.plan.probability == pytest.approx(one * other, abs=0.04)  # they are drawn independently
+    assert found.plan.count <= min(each.succeeds.count for each in found.passes)
+
+
+def test_a_fault_is_counted_in_every_variation_that_has_it():
+    for one in judged(BESIDE, settings=DoubtSettings(variations=400)).under[1].passes:
+        faults = asdict(one.faults)
+        missed, on_the_way = one.caught.of - one.caught.count, one.clear.of - one.clear.count
+        assert max(faults["place"], faults["angle"]) <= missed <= faults["place"] + faults["angle"]
+        way = [faults[name] for name in ("limits", "pad", "arms")]
+        assert max(way) <= on_the_way <= sum(way)
+
+
+# ---- the choice of poses -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("enters", ["after_A1", "start"])
+def test_between_the_poses_looked_at_nothing_comes_much_nearer(enters):
+    whole = scene_of(motion(1, replace(PSM_M, enters=enters)), 0, PAD_TOP_MM, OPENING_RAD)
+    thin = looked_at(whole, DoubtSettings().stretches)
+    assert len(thin.phase) < 70 < len(whole.phase) / 5
+    drawn = draw(5, 0, 20, 5.0, 0.0)
+    every, some = (nearest_mm(scene, drawn) for scene in (whole, thin))
+    assert (some[:2] - every[:2]).max() < 0.01  # to the pad, of either arm
+    assert (some[2] - every[2]).max() < 0.25  # between the arms, each up to 3 mm off
+
+
+def test_the_lowest_pose_is_looked_at_wherever_on_the_way_it_is():
+    dip = PassPath(PATH_MM - [[0, 0, 0], [0, 0, 9], [0, 0, 0], [0, 0, 0]], POINTING_DOWN)
+    whole = scene_of(time_parametrise([dip], rate_hz=100.0), 0, PAD_TOP_MM, OPENING_RAD)
+    thin = looked_at(whole, 1)
+    assert len(thin.phase) < 8
+    assert thin.arms[0].tip_mm[:, 2].min() == whole.arms[0].tip_mm[:, 2].min() < -138
+
+
+def nearest_mm(scene, drawn) -> np.ndarray:
+    count, links = len(drawn.shift_mm), [arm.links(arm.shifted(drawn.shift_mm)) for arm in scene.arms]
+    top = PAD_TOP_MM + np.repeat(drawn.shift_mm[:, 2], len(scene.phase))
+    apart = np.repeat(3.0 * (drawn.offset_a - drawn.offset_m), len(scene.phase), axis=0)
+    meets = np.tile(scene.handing_over, count)
+    found = [*(clearance_to_pad(one, top) for one in links), monte_carlo._apart(links[0].moved(apart), links[1], meets)]
+    return np.array([one.reshape(count, -1).min(axis=1) for one in found])
+
+
+# ---- one seed, one answer ----------------------------------------------------------------------------------------
+
+
+def test_the_same_seed_gives_the_same_answer_and_another_another():
+    assert judged(BESIDE) == judged(BESIDE)
+    assert judged(BESIDE, seed=1) != judged(BESIDE)
+
+
+def test_the_answer_does_not_depend_on_the_chunk_size(monkeypatch):
+    before = judged(BESIDE)
+    monkeypatch.setattr(monte_carlo, "_CHUNK", 7)
+    assert judged(BESIDE) == before
+
+
+def test_another_process_gives_the_same_bytes():
+    script = (
+        "from tests.verification.test_monte_carlo import *; print(json.dumps(asdict(judged(BESIDE)), allow_nan=False))"
+    )
+    ran = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert ran.stdout.strip() == json.dumps(asdict(judged(BESIDE)), allow_nan=False)
+
+
+def test_a_pass_draws_what_it_draws_whatever_passes_there_are_beside_it():
+    assert under(judged(motion(1))).passes[0] == under(judged(motion(3))).passes[0]
+
+
+def test_what_is_drawn_is_even_about_nothing_and_within_its_bounds():
+    drawn = draw(0, 0, 50_000, 5.0, radians(10))
+    assert np.abs(drawn.shift_mm).max() <= 5.0
+    assert drawn.shift_mm.std(axis=0) == pytest.approx(5.0 / sqrt(3), abs=0.02)
+    angle = np.arccos(np.clip((np.einsum("nii", drawn.turned) - 1) / 2, -1, 1))
+    assert angle.max() <= radians(10) + 1e-9 and angle.mean() == pytest.approx(radians(5), abs=1e-3)
+    axes = np.stack([drawn.turned[:, i, j] - drawn.turned[:, j, i] for i, j in ((2, 1), (0, 2), (1, 0))])
+    assert np.abs(axes.mean(axis=1)).max() < 0.003
+    both = np.concatenate([drawn.offset_a, drawn.offset_m], axis=1)
+    np.testing.assert_allclose(np.corrcoef(both.T), np.eye(6), atol=0.02)
+
+
+# ---- invalid numbers -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["joint_margin", "insertion_mm", "clearance_pad_mm", "clearance_psm_m_mm"])
+def test_a_limit_that_is_not_a_number_is_kept_by_no_variation(name):
+    found = judged(BESIDE, settings=NO_DOUBT, limits=Limits(**{name: nan}))
+    assert (under(found).plan.count, under(found).passes[0].clear.count) == (0, 0)
+
+
+def test_joints_that_are_not_numbers_go_wrong_everywhere():
+    whole = scene_of(BESIDE, 0, PAD_TOP_MM, OPENING_RAD)
+    drawn = replace(draw(0, 0, 3, 5.0, 0.0), shift_mm=np.array([[0.0, 0, 0], [nan, 0, 0], [0, 0, 0]]))
+    wrong = monte_carlo.spoiled(looked_at(whole, 5), drawn, np.array([0.0]), Limits())
+    assert list(wrong) == ["reach", "limits", "pad", "arms"]
+    assert [one[0].tolist() for one in wrong.values()] == [[False, True, False]] * 4
+
+
+def test_doubts_that_cannot_be_meant_are_refused():
+    for wrong in ({"variations": 0}, {"stretches": 0}, {"tip_errors_mm": ()}):
+        with pytest.raises(BadSettings, match="at least one"):
+            DoubtSettings(**wrong)
+    for wrong in ({"tip_errors_mm": (0.65, nan)}, {"needle_rad": -0.1}, {"stated_rad": nan}):
+        with pytest.raises(BadSettings, match="finite"):
+            DoubtSettings(**wrong)
+    with pytest.raises(BadInput, match="height"):
+        judged(pad_top_mm=nan)
+    with pytest.raises(BadSettings, match="seed"):
+        judged(seed=-1)

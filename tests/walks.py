@@ -1,0 +1,97 @@
+"""Three walks through the code, as lists of functions with their files, taken from a trace of real calls.
+
+    python -m tests.walks        bytes to demonstration, request to served policy, suture point to replay bag
+
+A station is a public function that is called from another room, at its first call. Methods, the client, the start of
+the service and the modules that every room uses (`COMMON`) are left out.
+"""
+
+import io
+import sys
+import tempfile
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import CodeType, FrameType
+from typing import Any
+
+import skills
+from skills.formats.reader_process import read_told
+from tests import backends
+from tests.api.service import CSV, GOAL_MM, KESTREL, MCAP, POLICY, serving
+from tests.library import cases
+
+PACKAGE = str(Path(skills.__file__).parent)
+COMMON = ("errors", "remedies", "settings", "logs", "arrays", "fields", "packing", "compiled", "kinematics")
+COMMON += ("db/", "client/", "api/app", "jobs/engine", "library/catalogue.py", "library/keys.py")
+
+
+def room(file: str) -> str:
+    """Return the folder, or the module, directly inside the package."""
+    return file.removeprefix(f"{PACKAGE}/").partition("/")[0]
+
+
+class Trace:
+    """A record of the calls between rooms of the package, in their order."""
+
+    def __init__(self) -> None:
+        self.stations: dict[CodeType, str] = {}
+
+    def __call__(self, frame: FrameType, event: str, _argument: Any) -> None:
+        """Record a call; a profile function of `sys.setprofile`."""
+        code = frame.f_code
+        if event != "call" or code in self.stations or not code.co_filename.startswith(PACKAGE):
+            return
+        file = code.co_filename.removeprefix(f"{PACKAGE}/")
+        if "." in code.co_qualname or code.co_name.startswith(("_", "<")) or file.startswith(COMMON):
+            return
+        caller = frame.f_back
+        while caller is not None and not caller.f_code.co_filename.startswith(PACKAGE):
+            caller = caller.f_back
+        if caller is None or room(caller.f_code.co_filename) != room(code.co_filename):
+            self.stations[code] = f"{code.co_qualname}  {file}"
+
+
+@contextmanager
+def tracing(title: str) -> Iterator[None]:
+    """Print the stations of the calls that are made inside, in this thread and in those that it starts."""
+    trace = Trace()
+    threading.setprofile(trace)
+    sys.setprofile(trace)
+    try:
+        yield
+    finally:
+        sys.setprofile(None)
+        threading.setprofile(None)
+    files = {station.split()[1] for station in trace.stations.values()}
+    print(f"\n{title}: {len(trace.stations)} stations in {len(files)} files")
+    for number, station in enumerate(trace.stations.values(), start=1):
+        print(f"{number:4} {station}")
+
+
+def main() -> None:
+    """Take the three walks on a new SQLite database, as HTTP calls and the jobs that they start."""
+    with tempfile.TemporaryDirectory() as folder:
+        url = backends.fresh("sqlite", Path(folder))
+        with serving(url) as service:  # what is loaded and compiled at a first call is loaded and compiled here
+            service.client.put_surgeon("kestrel")
+            service.client.add_demo(cases.hand_off(), media_type=CSV, **KESTREL)
+            service.train()
+        data = cases.bag()
+        with tracing("bytes to demonstration"):
+            read_told(io.BytesIO(data))  # in the service this runs in a process of its own, where no trace reaches
+            with serving(url) as service:
+                service.client.add_demo(data, media_type=MCAP, **KESTREL)
+        with tracing("request to served policy"), serving(url) as service:
+            service.train(release=True)
+            service.http.get(POLICY)
+        with tracing("suture point to replay bag"), serving(url, replay_lower_bound=0.0) as service:
+            plan = service.client.plan(**KESTREL, suture_points=[GOAL_MM], handoff="none")
+            service.client.play(plan["id"])
+            service.work()
+            service.http.get(f"/plans/{plan['id']}/trajectory?handoff=none", headers={"Accept": "application/zip"})
+
+
+if __name__ == "__main__":
+    main()
