@@ -135,6 +135,7 @@ class Links(HTMLParser):
 def test_the_calls_are_shown_on_a_page_without_an_outside_address(still: Service):
     answer = still.http.get("/docs")
     assert answer.status_code == 200
+    assert "Loading the calls" in answer.text  # until Swagger UI, which is large, has been loaded
     policy = answer.headers["content-security-policy"]
     assert "script-src 'self'; style-src 'self';" in policy
     assert "unsafe" not in policy and "http" not in policy

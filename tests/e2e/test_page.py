@@ -348,6 +348,7 @@ def test_a_call_is_tried_out_on_the_page_of_the_calls(browser: Browser, url: str
     with visiting(browser, url, phone="phone" in name, dark="dark" in name) as tab:
         tab.open("/docs")
         answer = try_out(tab, "list_surgeons")
+        expect(tab.page.get_by_text("Loading the calls")).to_have_count(0)
         expect(answer.locator(".response-col_status")).to_contain_text("200")
         expect(answer).to_contain_text(f'"surgeon": "{SAMPLE.surgeon}"')
         assert tab.too_wide() == 0
