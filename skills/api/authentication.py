@@ -40,13 +40,13 @@ from skills.library.keys import (
     SHAPE,
     Holder,
     Lasts,
-    all_signed_in,
     csrf_of,
     digest_of,
     holders_of,
     is_keyless,
     is_owner,
     note_use,
+    signed_in,
 )
 from skills.remedies import Action, Remedy
 from skills.settings import Settings
@@ -106,7 +106,7 @@ class Access:
         self._wrong: Kept[str, float] = Kept(KEPT)
         self._changed = 0.0  # cache entries older than this are invalid
         self._keys = _Together(lambda keys: self._ask(holders_of, keys))
-        self._cookies = _Together(lambda cookies: self._ask(all_signed_in, cookies, self.lasts))
+        self._cookies = _Together(lambda cookies: self._ask(signed_in, cookies, self.lasts))
         self._lookups = CapacityLimiter(LOOKUPS)
         self._keyless = not settings.beyond_loopback and settings.proxy_header is None
         self._keyless_until = 0.0

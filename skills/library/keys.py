@@ -148,13 +148,11 @@ def refuse_without_keys(session: Session) -> None:
         )
 
 
-def holder_of(session: Session, text: str) -> Holder | None:
-    """Return the holder of a key that is not revoked, None otherwise; the caller checks whether it has expired."""
-    return holders_of(session, [text]).get(text)
-
-
 def holders_of(session: Session, texts: Iterable[str]) -> dict[str, Holder]:
-    """Return the holders of several keys, as `holder_of`, with one query for each `KEYS_AT_ONCE` of them."""
+    """Return the holders of those keys that are not revoked, with one query for each `KEYS_AT_ONCE` of them.
+
+    The caller checks whether a key has expired.
+    """
     found: dict[str, Holder] = {}
     shapes = [shape for shape in map(SHAPE.fullmatch, texts) if shape is not None]
     for at in range(0, len(shapes), KEYS_AT_ONCE):
@@ -230,20 +228,18 @@ def sign_in(session: Session, key_id: str, lasts: Lasts) -> str:
     return cookie
 
 
-def signed_in(session: Session, cookie: str, lasts: Lasts) -> tuple[Holder, bool] | None:
-    """Return the holder signed in with a cookie, and whether `note_use` is due; None if the sign-in has ended."""
-    return all_signed_in(session, [cookie], lasts).get(cookie)
+def signed_in(session: Session, cookies: Iterable[str], lasts: Lasts) -> dict[str, tuple[Holder, bool]]:
+    """Return the holders signed in with several cookies, and whether `note_use` is due, without sign-ins that ended.
 
-
-def all_signed_in(session: Session, cookies: Iterable[str], lasts: Lasts) -> dict[str, tuple[Holder, bool]]:
-    """Return the holders signed in with several cookies, as `signed_in`, with one query for each `KEYS_AT_ONCE`."""
+    There is one query for each `KEYS_AT_ONCE` cookies.
+    """
     standing: dict[str, tuple[Holder, bool]] = {}
     by_digest = {digest_of(cookie): cookie for cookie in cookies}
     digests, at = list(by_digest), now()
     for first in range(0, len(digests), KEYS_AT_ONCE):
         for found in session.scalars(select(SignIn).where(SignIn.digest.in_(digests[first : first + KEYS_AT_ONCE]))):
             idle_s, age_s = (at - found.used_at).total_seconds(), (at - found.created_at).total_seconds()
-            # The key's own expiry is left to the caller, as in `holder_of`.
+            # The key's own expiry is left to the caller, as in `holders_of`.
             if found.key.revoked_at is None and idle_s < lasts.idle_s and age_s < lasts.most_s:
                 standing[by_digest[found.digest]] = held(found.key), idle_s > NOTED_S
     return standing

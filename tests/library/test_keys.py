@@ -4,6 +4,7 @@ from datetime import timedelta
 
 import pytest
 from sqlalchemy import select, text, update
+from sqlalchemy.orm import Session
 
 from skills.db.base import Base, now
 from skills.db.models import Surgeon
@@ -12,12 +13,13 @@ from skills.db.session import Database
 from skills.errors import BadInput, Conflict, NotFound
 from skills.library.erasure import erase_surgeon
 from skills.library.keys import (
+    Holder,
     Lasts,
     about_key,
     create_key,
     csrf_of,
     digest_of,
-    holder_of,
+    holders_of,
     is_keyless,
     list_keys,
     note_use,
@@ -30,6 +32,14 @@ from skills.library.keys import (
 from tests.library import cases
 
 LASTS = Lasts(idle_s=3600, most_s=12 * 3600)
+
+
+def holder_of(session: Session, key: str) -> Holder | None:
+    return holders_of(session, [key]).get(key)
+
+
+def sign_in_of(session: Session, cookie: str) -> tuple[Holder, bool] | None:
+    return signed_in(session, [cookie], LASTS).get(cookie)
 
 
 def make(database: Database, owner: str = "anna", role: str = "reader", **how: object) -> str:
@@ -148,19 +158,19 @@ def test_a_sign_in_is_known_by_its_cookie_and_over_with_its_key(database: Databa
     with database.writing() as session:
         cookie, other = sign_in(session, key, LASTS), sign_in(session, key, LASTS)
     with database.reading() as session:
-        found = signed_in(session, cookie, LASTS)
+        found = sign_in_of(session, cookie)
         assert found is not None
         assert (found[0].owner, found[1]) == ("anna", False)
-        assert signed_in(session, cookie[:-1] + "!", LASTS) is None
+        assert sign_in_of(session, cookie[:-1] + "!") is None
         assert cookie not in str(session.execute(text("SELECT * FROM sign_ins")).all())
     assert csrf_of(cookie) != csrf_of(other)
     assert len(csrf_of(cookie)) == 64
     with database.writing() as session:
         sign_out(session, other)
-        assert signed_in(session, other, LASTS) is None
-        assert signed_in(session, cookie, LASTS) is not None
+        assert sign_in_of(session, other) is None
+        assert sign_in_of(session, cookie) is not None
         revoke_key(session, key, "local")
-        assert signed_in(session, cookie, LASTS) is None
+        assert sign_in_of(session, cookie) is None
 
 
 def test_a_sign_in_is_over_when_it_was_not_used_and_when_it_is_old(database: Database):
@@ -174,7 +184,7 @@ def test_a_sign_in_is_over_when_it_was_not_used_and_when_it_is_old(database: Dat
         with database.writing() as session:
             session.execute(update(SignIn).values(**ago))
         with database.reading() as session:
-            found = signed_in(session, cookie, LASTS)
+            found = sign_in_of(session, cookie)
             return found is not None, found is not None and found[1]
 
     assert aged(5, 5) == (True, False)
@@ -186,7 +196,7 @@ def test_a_sign_in_is_over_when_it_was_not_used_and_when_it_is_old(database: Dat
     with database.writing() as session:
         note_use(session, cookie)
     with database.reading() as session:
-        found = signed_in(session, cookie, LASTS)
+        found = sign_in_of(session, cookie)
         assert found is not None
         assert not found[1]
     aged(3601, 3601)
