@@ -17,9 +17,8 @@ from skills.api.metrics import Observed, ServiceMetrics
 from skills.api.openapi import complete
 from skills.api.policy_cache import AtHand, PolicyCache
 from skills.api.problems import TOO_LARGE, answer_refusals
-from skills.api.responses import Encoded
-from skills.api.routes import catalogue, comparison, demos, jobs, operating, pages, plans, policies, sign_in
-from skills.api.streams import DOWNLOADS_READ, Watching
+from skills.api.responses import DOWNLOADS_READ, Encoded, Watching
+from skills.api.routes import catalogue, comparison, demos, operating, pages, plans, policies
 from skills.db.session import Database
 from skills.formats.reader_process import ConfinedReader
 from skills.jobs.engine import Engine
@@ -76,13 +75,13 @@ def create_app(settings: Settings) -> FastAPI:
         catalogue.router,
         demos.uploads,
         demos.router,
-        jobs.router,
+        policies.job_router,
         policies.router,
         plans.router,
         plans.trajectory_router,
         plans.suture_point_router,
         plans.picture_router,
-        jobs.retraining_router,
+        policies.retraining_router,
         policies.card_router,
         comparison.router,
         comparison.score_router,
@@ -90,7 +89,7 @@ def create_app(settings: Settings) -> FastAPI:
         operating.reference_router,
         pages.router,
         comparison.page_router,
-        sign_in.router,
+        operating.sign_in_router,
         catalogue.key_router,
     ):
         app.include_router(router)

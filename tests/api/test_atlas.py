@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from skills.api.pages import atlas
+from skills.api.pages import drawings
 from skills.comparison.distances import STATES
 from skills.library.atlas import _compare, _Member, _told
 from skills.schemas.comparison import Atlas, LeftOutOfAtlas
@@ -106,14 +106,14 @@ def test_a_page_that_cannot_be_drawn_says_why(compared: Service, query: str, sai
 def test_more_than_can_be_seen_is_drawn_in_groups_that_hold_all_of_it():
     shapes = np.random.default_rng(3).normal(0, 1, (70, 2))
     far = np.abs(shapes[:, None] - shapes[None, :]).sum(axis=2)
-    drawn = atlas.matrix(drawn_from(far))
-    assert drawn.count("<title>") == atlas.MOST_GROUPS**2
-    groups = atlas._leaves(drawn_from(far))
+    drawn = drawings.matrix(drawn_from(far))
+    assert drawn.count("<title>") == drawings.MOST_GROUPS**2
+    groups = drawings._leaves(drawn_from(far))
     assert sorted(one for group in groups for one in group.members) == list(range(70))
-    means = atlas._between(far, groups)
+    means = drawings._between(far, groups)
     np.testing.assert_allclose(means[0, 5], far[np.ix_(groups[0].members, groups[5].members)].mean())
     tree = re.search(r'class="tree" d="([^"]*)"', drawn)
-    assert tree is not None and tree[1].count("V") == atlas.MOST_GROUPS - 1
+    assert tree is not None and tree[1].count("V") == drawings.MOST_GROUPS - 1
 
 
 def drawn_from(far: np.ndarray) -> Atlas:

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from skills.api.pages import policy_card
+from skills.api.pages import drawings
 from skills.gridworld.grid import GridPath, GridWorld
 from skills.learning.certificate import Coverage
 
@@ -17,10 +17,10 @@ def path_in(shape: tuple[int, int, int]) -> GridPath:
 
 def drawn(coverage: Coverage, path: GridPath) -> dict[str, float]:
     """Measure, in tiles, how much area of the layers each kind of start takes."""
-    area = dict.fromkeys(policy_card.KINDS, 0.0)
-    for _, svg in policy_card.layers(coverage, path):
+    area = dict.fromkeys(drawings.KINDS, 0.0)
+    for _, svg in drawings.layers(coverage, path):
         for kind, width in re.findall(r'<rect class="(?!edge)(\w+)" x="\d+" y="\d+" width="(\d+)" height="10"', svg):
-            area[kind] += int(width) / policy_card.TILE
+            area[kind] += int(width) / drawings.TILE
     return area
 
 
@@ -31,7 +31,7 @@ def test_every_start_is_drawn_as_what_it_is(shape: tuple[int, int, int], random)
     reaches = np.array([random.random() < 0.7 for _ in range(n)])
     joins = reaches & np.array([random.random() < 0.5 for _ in range(n)])
     path = path_in(shape)
-    assert policy_card.block_of(path) == 1
+    assert drawings.block_of(path) == 1
     assert drawn(Coverage(reaches, joins), path) == {
         "follows": joins.sum(),
         "otherwise": (reaches & ~joins).sum(),
@@ -44,10 +44,10 @@ def test_a_large_grid_is_drawn_in_blocks_that_hide_no_failure():
     reaches = np.ones(shape, bool)
     reaches[79, 49, 29] = reaches[40, 10, 0] = False
     path = path_in(shape)
-    assert policy_card.block_of(path) == 3
+    assert drawings.block_of(path) == 3
     area = drawn(Coverage(reaches.ravel(), reaches.ravel()), path)
     assert area == {"fails": 2, "otherwise": 0, "follows": 27 * 17 * 10 - 2}
-    assert [name for name, _ in policy_card.layers(Coverage(reaches.ravel(), reaches.ravel()), path)][-1] == (
+    assert [name for name, _ in drawings.layers(Coverage(reaches.ravel(), reaches.ravel()), path)][-1] == (
         "z 135 to 145 mm"
     )
 
@@ -56,6 +56,6 @@ def test_a_layer_stands_as_its_cells_stand():
     """x points right and y up: the one failing start has the least x and the greatest y, so it is drawn top left."""
     reaches = np.ones((3, 2, 2), bool)
     reaches[0, 1, 0] = False
-    (_, lowest), (_, upper) = policy_card.layers(Coverage(reaches.ravel(), reaches.ravel()), path_in((3, 2, 2)))
+    (_, lowest), (_, upper) = drawings.layers(Coverage(reaches.ravel(), reaches.ravel()), path_in((3, 2, 2)))
     assert '<rect class="fails" x="0" y="0" width="10" height="10"/>' in lowest
     assert "fails" not in upper

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from sqlalchemy import text
 
-from skills.api.pages import policy_card
+from skills.api.pages import drawings
 from skills.api.responses import json_of
 from skills.db.session import Database
 from skills.library.cards import card_of as card_of_version
@@ -198,7 +198,7 @@ def test_the_page_shows_the_demonstration_and_every_layer_of_the_grid(still: Ser
     assert html.count('class="layer"') == 11
     assert html.count('class="from"') == html.count('class="to"') == 2, "one in the key, one where it is"
     assert {f"z {z} mm" for z in range(-140, -89, 5)} <= set(re.findall(r"z -\d+ mm", html))
-    for kind in policy_card.KINDS:
+    for kind in drawings.KINDS:
         assert f'<pattern id="{kind}"' in html
 
 

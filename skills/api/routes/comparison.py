@@ -11,7 +11,7 @@ from fastapi import APIRouter, Query, Request, Response
 from skills.api.authorisation import Asking, needs
 from skills.api.dependencies import Db, Read, Slug, Strict
 from skills.api.openapi import gives, says
-from skills.api.pages import atlas
+from skills.api.pages import drawings
 from skills.api.pages.page import render
 from skills.api.responses import Giving, say
 from skills.api.routes.pages import PageRoute
@@ -79,13 +79,13 @@ def show_atlas(
     except (Conflict, BadInput) as refused:
         raise NotFound(refused.words()) from refused  # rendered as a page that states the reason
     pairs = sorted(found.differences, key=lambda one: -one.distance)[:MOST_PAIRS]
-    marks = atlas.marks(found)
+    marks = drawings.marks(found)
     drawn = {
-        "chart": atlas.chart(found),
-        "matrix": atlas.matrix(found),
-        "marks": {surgeon: atlas.key(mark) for surgeon, mark in marks.items()},
-        "thirds": [atlas.thirds(one.shares) for one in pairs],
-        "most": atlas.MOST_GROUPS,
+        "chart": drawings.chart(found),
+        "matrix": drawings.matrix(found),
+        "marks": {surgeon: drawings.key(mark) for surgeon, mark in marks.items()},
+        "thirds": [drawings.thirds(one.shares) for one in pairs],
+        "most": drawings.MOST_GROUPS,
     }
     with db.reading() as session:
         return render(

@@ -9,11 +9,10 @@ from sqlalchemy import select
 from skills.api.authorisation import Asking, erasing_is_for_admins, needs
 from skills.api.dependencies import Actor, Db, Digest, Incoming, Jobs, Limit, RowCursor, Strict, Tell
 from skills.api.openapi import ends, gives, gives_file, gives_page, makes
-from skills.api.pages.demonstration import report_page
+from skills.api.pages.drawings import report_page
 from skills.api.pages.page import HTML, standalone_headers, wants_page
-from skills.api.responses import Condition, Giving, as_asked, names, refuse_changed, stored
+from skills.api.responses import Condition, Giving, Stream, as_asked, names, recording_pieces, refuse_changed, stored
 from skills.api.routes.policies import Accept
-from skills.api.streams import Stream, recording_pieces
 from skills.db.models import StoredRewardMap
 from skills.formats import BYTES, MEDIA_TYPES
 from skills.library import demos, erasure, recordings

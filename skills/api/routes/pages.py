@@ -12,11 +12,10 @@ from sqlalchemy.orm import Session
 from skills import errors
 from skills.api.authorisation import Asking, needs, open_to_all
 from skills.api.dependencies import Configured, Db, Digest, Limit, Read, RowCursor, Slug, SlugCursor
-from skills.api.pages import demonstration
+from skills.api.pages import drawings
 from skills.api.pages.page import assets, build, render
 from skills.api.responses import JSON
-from skills.api.routes.jobs import JobId
-from skills.api.routes.policies import Version
+from skills.api.routes.policies import JobId, Version
 from skills.formats import MEDIA_TYPES, SUFFIXES
 from skills.kinematics import INSTRUMENTS
 from skills.library import jobs, overview, policies, retraining, scores
@@ -156,10 +155,10 @@ def show_score(
     against = surgeon or next(iter(others), found.surgeon.slug)
     score = scores.score(db, ScoreIn(surgeon=against, suture=found.suture, demo=found.sha256), read)
     drawn: dict[str, Any] = {
-        "views": demonstration.deviation_views(score.deviation),
-        "along": demonstration.deviation_along(score.deviation),
-        "curve": demonstration.score_curve(score.curve, found.sha256) if len(score.curve) > 1 else None,
-        "key": demonstration.score_key(),
+        "views": drawings.deviation_views(score.deviation),
+        "along": drawings.deviation_along(score.deviation),
+        "curve": drawings.score_curve(score.curve, found.sha256) if len(score.curve) > 1 else None,
+        "key": drawings.score_key(),
     }
     return render(request, "score.html", caller, demo=found, score=score, surgeons=surgeons, **drawn)
 
