@@ -22,7 +22,6 @@ from rich.console import Console
 from rich.table import Table
 
 from skills.client import Client, JobFailed, Problem
-from skills.drawing import draw_styles
 from skills.samples import load_samples
 from skills.schemas.given import Playback, Policy
 from skills.settings import settings
@@ -164,6 +163,8 @@ def suture_points(policy: Policy) -> list[dict[str, list[float]]]:
 
 def draw_samples(client: Client, styles: list[tuple[str, str]]) -> None:
     """Draw every style with rollouts from four corners of its grid."""
+    from skills.report.drawings import draw_styles  # here, because the report is slow to import
+
     drawn = []
     for surgeon, suture in styles:
         policy = client.policy(surgeon, suture)

@@ -35,7 +35,7 @@ from skills.client import Client
 from skills.compiled import check_wanted
 from skills.db.session import Database
 from skills.errors import BadSettings, SkillsError
-from skills.jobs.warm_up import align_once, warm_up
+from skills.jobs.readiness import align_once, warm_up
 from skills.library.backup import keep_erasures, keep_up_erasures
 from skills.library.keys import refuse_without_keys
 from skills.remedies import Action, Remedy

@@ -42,7 +42,9 @@ def compile_loops() -> None:
     for loops in PACKAGE.rglob("_kernels.py"):
         kept = [file.stat().st_mtime for file in loops.parent.glob("__pycache__/_kernels.*.nbi")]
         if not kept or min(kept) < loops.stat().st_mtime:
-            code = "import skills.jobs.warm_up as w, skills.formats.reader_process as c; w.learn_once(); c.get_ready()"
+            code = (
+                "import skills.jobs.readiness as w, skills.formats.reader_process as c; w.learn_once(); c.get_ready()"
+            )
             subprocess.run([sys.executable, "-c", code], check=True, cwd=PACKAGE.parent)
             return
 

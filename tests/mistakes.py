@@ -90,7 +90,7 @@ def collecting(folder: Path) -> Iterator[None]:
 
 def without_learners(folder: Path) -> Iterator[None]:
     """Simulate an installation without the extra `deep`."""
-    with patch("skills.deep.learning.find_spec", return_value=None):
+    with patch("skills.deep.find_spec", return_value=None):
         yield
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from skills.deep.learning import NEEDED
+from skills.deep import NEEDED
 
 REQUIRED = "TESTS_REQUIRE"
 

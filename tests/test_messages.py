@@ -138,7 +138,7 @@ def patterns_of(document: object) -> Iterator[str]:
 @pytest.fixture
 def door(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Client]:
     """Yield the client of a separate service; the commands use the same database."""
-    from skills.connection import connect
+    from skills.cli.shell import connect
 
     monkeypatch.setenv("SKILLS_DATABASE_URL", f"sqlite:///{tmp_path / 'skills.sqlite'}")
     monkeypatch.delenv("SKILLS_SERVER", raising=False)

@@ -13,7 +13,7 @@ import json
 import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, contextmanager, nullcontext, suppress
 from datetime import datetime
 from functools import reduce, wraps
 from pathlib import Path
@@ -96,6 +96,7 @@ def _stored(listing: str) -> list[str]:
 if TYPE_CHECKING:
     from skills.client import Client, Progress
     from skills.schemas.given import Job
+    from skills.settings import Settings
 
 out = Console(highlight=False, width=None if sys.stdout.isatty() else 160)  # in a pipe, wide enough not to wrap digests
 err = Console(stderr=True, highlight=False)
@@ -232,11 +233,41 @@ def _problem(error: SkillsError, detail: str) -> dict[str, Any]:
 @contextmanager
 def service(*, works: bool = False) -> Iterator["Client"]:
     """Connect to the service, or to the application in this process."""
-    from skills.connection import connect
     from skills.settings import settings
 
     with connect(settings(), works=works) as client:
         yield client
+
+
+@contextmanager
+def connect(settings: "Settings", *, works: bool = False) -> Iterator["Client"]:
+    """Connect to the service at SKILLS_SERVER, or else to the application in this process.
+
+    In-process, jobs need a worker: `works` runs one while the connection is open.
+    """
+    from skills.client import Client
+
+    if settings.server:
+        shown = "" if settings.api_key is None else settings.api_key.get_secret_value()
+        with Client(settings.server, api_key=shown) as client:
+            yield client
+        return
+    from starlette.testclient import TestClient
+
+    from skills.api.app import create_app
+    from skills.library.backup import keep_up_erasures
+    from skills.serving import working
+
+    app = create_app(settings)
+    # no check of a key is needed: the caller has access to the database anyway
+    key = {"X-API-Key": app.state.access.own_key}
+    in_process = TestClient(app, base_url="http://localhost", headers=key)
+    with in_process as http, working(settings) if works else nullcontext():
+        try:
+            yield Client(http)
+        finally:
+            if settings.erasures_file is not None:
+                keep_up_erasures(app.state.database, settings.erasures_file)
 
 
 def show(answer: Any, as_json: bool, columns: Sequence[str]) -> None:

@@ -9,7 +9,7 @@ Responses are the models of `skills.schemas.given`; unknown fields are ignored, 
 as plain JSON. An error that the service returns is raised as `Problem`.
 """
 
-from skills.client.problems import JobFailed, JobTakesLonger, NotReached, NotUnderstood, Problem, UnprotectedKey
+from skills.client.connection import JobFailed, JobTakesLonger, NotReached, NotUnderstood, Problem, UnprotectedKey
 from skills.client.service import AsyncClient, Client
 from skills.client.transport import Progress, Retrying
 

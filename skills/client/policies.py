@@ -1,16 +1,209 @@
-"""Calls of policies (versions, releases, cards, rollouts), of atlases of a suture type, and of scores."""
+"""Calls of trainings and jobs, of policies (versions, releases, cards, rollouts), of atlases, and of scores.
 
+A downloaded policy is verified: the service sends the policy and its metadata, the policy is rebuilt from them, and
+their digest is computed again. Whoever changed a number, in transit or in the store, would have to change the digest
+too, and the digest is the one that is cited.
+"""
+
+import io
 import json
-from collections.abc import Sequence
+from collections.abc import AsyncGenerator, Callable, Mapping, Sequence
+from contextlib import aclosing, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Literal
 
-from skills.client.connection import Connection, at, call, given
+import httpx2 as httpx
+
+from skills.client.connection import (
+    Connection,
+    JobFailed,
+    JobTakesLonger,
+    NotReached,
+    NotUnderstood,
+    Problem,
+    at,
+    call,
+    given,
+)
 from skills.client.transport import keep
-from skills.errors import BadInput
-from skills.schemas.given import Atlas, NextStep, Policy, PolicyCard, PolicySummary, Rollout, Score, Version
+from skills.errors import BadInput, Corrupt
+from skills.schemas.given import (
+    Atlas,
+    Job,
+    NextStep,
+    Policy,
+    PolicyCard,
+    PolicySummary,
+    RetrainedStyle,
+    Retraining,
+    Rollout,
+    Score,
+    Version,
+)
 
+if TYPE_CHECKING:
+    from skills.learning.policy import Policy as LearntPolicy
+
+State = Literal["queued", "running", "succeeded", "failed", "cancelled"]
+Kind = Literal["training", "retraining", "playback", "pictures"]
+Combining = Literal["medoid", "barycentre", "corridor"]
+Watcher = Callable[[Job], None]
+
+ENDED = ("succeeded", "failed", "cancelled")
+PAUSES_S = (0.05, 0.5)  # between two polls of a job: the first pause, and the longest
+EVENTS = "text/event-stream"
 JSON, NPZ = "application/json", "application/x-npz"
+# Fields of a version or of its response, which the digest of a policy does not cover.
+OF_THE_VERSION = ("version", "sha256", "created_at", "released_at", "released_by", "actions", "arrays")
+
+
+class Jobs(Connection):
+    """Calls of trainings and jobs."""
+
+    @call
+    async def train(
+        self,
+        surgeon: str,
+        suture: str,
+        *,
+        demos: Sequence[str] | None = None,
+        combine: Combining | None = None,
+        learner: Mapping[str, Any] | None = None,
+        seed: int = 0,
+        release: bool = False,
+    ) -> Job:
+        """Request the training of a style; an equal request returns the same job.
+
+        The job's `did` states the effect of the request. With `release`, the request is not retried after a lost
+        connection, because somebody may have decided otherwise in between.
+
+        Args:
+            surgeon: The surgeon's pseudonym.
+            suture: The suture type.
+            demos: Digests of the demonstrations to learn from; default: the newest active one.
+            combine: Method that combines several demonstrations into one path; default: a corridor.
+            learner: Its `kind` and settings; default: Q-learning in the phase state.
+            seed: Seed of the exploration.
+            release: Release the version if it passes the gate; also if an equal training is done already and its
+                version is
+                not the one that the style serves now.
+        """
+        asked = {"surgeon": surgeon, "suture": suture, "seed": seed, "release": release}
+        how = None if combine is None else {"kind": combine}
+        asked |= given({"demos": demos, "combine": how, "learner": learner})
+        return await self._ask(Job, "POST", at("trainings"), asked, harmless=not release)
+
+    @call
+    async def retrain(
+        self,
+        *,
+        surgeon: str | None = None,
+        suture: str | None = None,
+        only_stale: bool = False,
+        learner: Mapping[str, Any] | None = None,
+        release: bool = False,
+    ) -> Job:
+        """Request the training of styles again, as one job: all, or those of a surgeon or of a suture type.
+
+        With `release`, the request is not retried after a lost connection, as with `train`.
+        """
+        asked = {"surgeon": surgeon, "suture": suture, "only_stale": only_stale, "learner": learner, "release": release}
+        return await self._ask(Job, "POST", at("retrainings"), given(asked), harmless=not release)
+
+    @call
+    async def retraining(self, job: str) -> Retraining:
+        """Return a batch: its job, and in `styles` the number of styles in each state."""
+        return await self._get(Retraining, at("retrainings", job), limit=1)
+
+    @call
+    async def retrained(
+        self, job: str, state: Literal["queued", "done", "failed", "cancelled"] | None = None
+    ) -> list[RetrainedStyle]:
+        """List the styles of a batch, all or those of one state."""
+        return await self._all(RetrainedStyle, at("retrainings", job), state=state)
+
+    @call
+    async def job(self, job: str) -> Job:
+        """Return a job."""
+        return await self._get(Job, at("jobs", job))
+
+    @call
+    async def jobs(self, state: State | None = None, kind: Kind | None = None) -> list[Job]:
+        """List jobs, the newest first."""
+        return await self._all(Job, at("jobs"), state=state, kind=kind)
+
+    @call
+    async def cancel(self, job: str) -> Job:
+        """Cancel a job."""
+        return await self._ask(Job, "DELETE", at("jobs", job))
+
+    @call
+    async def wait(self, job: Job | str, timeout_s: float = 600.0, progress: Watcher | None = None) -> Job:
+        """Wait until a job has ended, and return it.
+
+        Changes are received as server-sent events; if the stream fails, the job is polled instead.
+
+        Args:
+            job: The job, or its id.
+            timeout_s: Longest time to wait.
+            progress: Called with the job at each change.
+
+        Raises:
+            JobTakesLonger: It has not ended in time.
+            JobFailed: It failed or was cancelled.
+        """
+        deadline_s = self._clock() + timeout_s
+        told: Job | None = None
+        async with aclosing(self._seen(job if isinstance(job, str) else job.id, deadline_s)) as looks:
+            async for seen in looks:
+                if progress is not None and seen != told:
+                    progress(seen)
+                told = seen
+                if seen.state == "succeeded":
+                    return seen
+                if seen.state in ENDED:
+                    raise JobFailed(seen)
+        assert told is not None
+        raise JobTakesLonger(told, timeout_s)
+
+    async def _seen(self, job: str, deadline_s: float) -> AsyncGenerator[Job, None]:
+        """Yield the state of a job now, and again whenever it may have changed, until the deadline."""
+        yield await self._get(Job, at("jobs", job))
+        streams, pause_s = self._streams, PAUSES_S[0]
+        while True:
+            left_s = deadline_s - self._clock()
+            if left_s <= 0:
+                return
+            if streams:
+                try:
+                    async with aclosing(self._events(job, left_s)) as events:
+                        async for seen in events:
+                            yield seen
+                except httpx.ReadTimeout:
+                    pass  # no event within the timeout
+                except (Problem, NotUnderstood, ValueError, httpx.TransportError):
+                    streams = False
+            await self._transport.sleep(min(pause_s, max(0.0, deadline_s - self._clock())))
+            pause_s = min(PAUSES_S[1], pause_s * 1.3)
+            with suppress(NotReached):  # the service answered before, so it is restarting, and the job goes on
+                yield await self._get(Job, at("jobs", job))
+
+    async def _events(self, job: str, left_s: float) -> AsyncGenerator[Job, None]:
+        """Yield the job of each server-sent event, until the stream or the time ends."""
+        over_s = self._clock() + left_s
+        patience_s = min(self._timeout_s, left_s)
+        async with self._opened("GET", at("jobs", job, "events"), timeout_s=patience_s) as answer:
+            if not answer.headers.get("content-type", "").startswith(EVENTS):
+                return
+            async with aclosing(self._transport.lines(answer)) as lines:
+                async for line in lines:
+                    if line.startswith("data:"):  # the service writes each event's data on one line
+                        yield self._read(Job, json.loads(line.removeprefix("data:")))
+                    if self._clock() >= over_s:  # heartbeats may continue for ever
+                        return
+
+
+# ---- policies, atlases and scores ----------------------------------------------------------------------------------
 
 
 class Atlases(Connection):
@@ -68,9 +261,6 @@ class Scores(Connection):
         }
         return await self._ask(Score, "POST", at("scores"), given(body))
 
-
-if TYPE_CHECKING:
-    from skills.learning.policy import Policy as LearntPolicy
 
 Position = Sequence[float]
 
@@ -178,8 +368,6 @@ class Policies(Connection):
 
     async def _verified(self, surgeon: str, suture: str, version: int | None) -> tuple[bytes, bytes, "LearntPolicy"]:
         """Return a policy's JSON, its arrays, and the policy rebuilt from them and verified."""
-        from skills.client.verification import rebuilt  # the learning core, slow to import
-
         said = await self._bytes(_path(surgeon, suture, version), JSON)
         about = json.loads(said)
         arrays = await self._bytes(at("policy-versions", about["sha256"]), NPZ)
@@ -190,3 +378,48 @@ class Policies(Connection):
 def _path(surgeon: str, suture: str, version: int | None) -> str:
     which = () if version is None else ("versions", version)
     return at("policies", surgeon, suture, *which)
+
+
+def rebuilt(about: dict[str, Any], arrays: bytes, demo: dict[str, Any]) -> "LearntPolicy":
+    """Return a policy, rebuilt from its JSON, its arrays, and the demonstration that it follows.
+
+    Raises:
+        Corrupt: It does not match its digest.
+    """
+    from skills.library.integrity import policy_identity  # here, because the library is slow to import
+
+    try:
+        policy = _policy(about, arrays, demo)
+        manifest = {name: value for name, value in about.items() if name not in OF_THE_VERSION}
+        whole = policy_identity(manifest, policy) == about["sha256"]
+        told = about["actions"] is None or about["actions"] == policy.table().tolist()
+    except Exception as error:  # data of another kind can raise any class
+        raise Corrupt("This version of the client cannot verify the received policy; update the client.") from error
+    if not (whole and told):
+        raise Corrupt("The received policy does not match its digest. Do not use it; fetch it again.")
+    return policy
+
+
+def _policy(about: dict[str, Any], arrays: bytes, demo: dict[str, Any]) -> "LearntPolicy":
+    import numpy as np
+
+    from skills.gridworld.domain import Domain
+    from skills.gridworld.grid import GridPath, GridWorld
+    from skills.gridworld.reward import RewardLevels
+    from skills.learning.learners import learner_of
+    from skills.learning.network import Network
+    from skills.learning.policy import Policy as LearntPolicy
+    from skills.learning.q_learning import Training
+
+    grid = GridWorld(**{name: about["grid"][name] for name in ("origin_mm", "cell_mm", "shape")})
+    shown = about.get("combined") or demo["report"] | {"hysteresis": demo["hysteresis"]}
+    bridged, hysteresis = shown.get("bridged_cells") or 0, shown["hysteresis"]
+    path = GridPath(grid, np.array(about["waypoints"]), bridged=bridged, hysteresis=hysteresis)
+    learner = learner_of({"kind": about["learner"], **about["settings"]})
+    domain = Domain(path, learner.phased)
+    q = np.zeros((domain.n_rows, 27))
+    with np.load(io.BytesIO(arrays), allow_pickle=False) as sent:
+        q[domain.certified] = sent["q"]
+        network = Network(sent["network"].tobytes()) if "network" in sent else None
+    levels, training = RewardLevels(**about["reward_levels"]), Training(**about["training"])
+    return LearntPolicy(path, levels, learner, about["seed"], training, q, network)

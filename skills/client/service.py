@@ -12,11 +12,9 @@ from typing import Any, Literal, Self
 
 import httpx2 as httpx
 
-from skills.client.connection import Connection, Later, Now, at, call, given
-from skills.client.jobs import Jobs
+from skills.client.connection import Connection, Later, Now, UnprotectedKey, at, call, given
 from skills.client.plans import Plans
-from skills.client.policies import Atlases, Policies, Scores
-from skills.client.problems import UnprotectedKey
+from skills.client.policies import Atlases, Jobs, Policies, Scores
 from skills.client.recordings import Catalogue, Recordings
 from skills.client.transport import Awaited, Blocking, Retrying, Transport
 from skills.errors import BadSettings

@@ -1,9 +1,131 @@
-"""Network learners: Gymnasium environments, and training with torch in a separate process.
+"""Learning with any learner: tabular in this process, with a network in a process of its own.
 
-`learn_policy` learns with any learner. torch is the extra `deep`: it is imported only in the process that trains, so
-that a service starts without it, and serves policies that were learnt elsewhere.
+    RewardMap --learn_policy--> Policy
+
+The libraries that train networks (the extra `deep`) seed the random numbers and set the threads of the whole process,
+so they are imported only in a separate process. Two trainings do not disturb each other, a cancelled training ends at
+once, and its memory is returned to the system. A service starts without them, and serves policies that were learnt
+elsewhere. `skills.deep.training` is that process; `skills.deep.environments` has its Gymnasium
+environments.
 """
 
-from skills.deep.learning import learn_policy, require_installed
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.util import find_spec
 
-__all__ = ["learn_policy", "require_installed"]
+from skills.errors import LearnerNotInstalled, LearningFailed, Unanswered
+from skills.gridworld.grid import GridPath, GridWorld
+from skills.gridworld.reward import RewardLevels, RewardMap
+from skills.learning import policy as table
+from skills.learning.deep_settings import DDPG, DQN, TRPO, Deep, network_q
+from skills.learning.learners import Learner, check_learnable
+from skills.learning.network import Network
+from skills.learning.policy import Policy
+from skills.learning.q_learning import Training
+from skills.packing import known
+from skills.sandbox.forked import call_alone
+from skills.sandbox.limits import ProcessLimits
+
+NEEDED = ("torch", "stable_baselines3", "sb3_contrib", "gymnasium")
+TARGET = "skills.deep.training:train"
+TIMEOUT_S = 3600.0  # ours: the default budgets take ten minutes on one core
+MEMORY_BYTES = 6 << 30  # ours, of address space: torch alone reserves 3 GiB, and uses a tenth of it
+PROGRESS = re.compile(rb"progress (\d\.\d+)\n")
+_ADVICE = {
+    "hung": "request fewer steps, or allow more time",
+    "crashed": "train again, and report it if it happens again",
+    "out of memory": "request fewer steps or a smaller batch, or allow more",
+    "too much": "which no training does; report it",
+    "failed": "its last output is in the log",
+    "nonsense": "train again",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class NetworkLesson:
+    """The request: the reward map, the settings of the learner and the seed."""
+
+    reward: RewardMap
+    learner: Deep
+    seed: int
+
+
+@dataclass(frozen=True, eq=False)
+class LearntNetwork:
+    """The response: the trained network, and the counts of the training."""
+
+    network: Network
+    training: Training
+
+
+KNOWN = known(
+    NetworkLesson, LearntNetwork, RewardMap, RewardLevels, GridPath, GridWorld, DQN, DDPG, TRPO, Network, Training
+)
+
+
+Tell = Callable[[float], None]
+
+
+def require_installed(learner: Learner) -> None:
+    """Refuse a learner whose libraries are not installed, before any work.
+
+    Raises:
+        LearnerNotInstalled: It needs the extra `deep`.
+    """
+    # `find_spec` does not import torch, which this process is to do without.
+    if isinstance(learner, DQN | DDPG | TRPO) and (missing := [name for name in NEEDED if find_spec(name) is None]):
+        raise LearnerNotInstalled(
+            f"The learner '{learner.kind}' needs {', '.join(missing)}, which is not installed here. Install the "
+            "extra 'deep' for the service and its workers (`make deep`, or `pip install 'suture-skills[deep]'`), "
+            "or choose another learner.",
+            missing=missing,
+        )
+
+
+def learn_policy(
+    reward: RewardMap,
+    learner: Learner,
+    seed: int = 0,
+    *,
+    tell: Tell | None = None,
+    timeout_s: float = TIMEOUT_S,
+    memory_bytes: int = MEMORY_BYTES,
+) -> Policy:
+    """Learn to follow a demonstration from its reward map; the same arguments give the same bytes on one machine.
+
+    Args:
+        reward: The reward map of the demonstrated path.
+        learner: The settings of the learner; those of `skills.learning.deep_settings` are trained in a separate
+            process.
+        seed: Seed of all random numbers.
+        tell: Callback for the progress, from 0 to 1, about every second; an exception that it raises ends the training.
+        timeout_s: Seconds of wall time after which the separate process is killed.
+        memory_bytes: Limit of the separate process's address space.
+
+    Returns:
+        The policy.
+
+    Raises:
+        BadSettings: The seed, the levels or the settings are out of range.
+        LearnerNotInstalled: The learner needs the extra `deep`.
+        LearningFailed: The separate process crashed, or exceeded its time or memory.
+    """
+    if not isinstance(learner, DQN | DDPG | TRPO):
+        return table.learn_tabular(reward, learner, seed)
+    check_learnable(reward, learner, seed)
+    require_installed(learner)
+    learnt = _learn_aside(NetworkLesson(reward, learner, seed), tell, ProcessLimits(memory_bytes, timeout_s))
+    q = network_q(reward, learner, learnt.network)
+    return Policy(reward.path, reward.levels, learner, seed, learnt.training, q, learnt.network)
+
+
+def _learn_aside(lesson: NetworkLesson, tell: Tell | None, limits: ProcessLimits) -> LearntNetwork:
+    def watch(said: bytes) -> None:
+        if tell is not None and (steps := PROGRESS.findall(said)):
+            tell(min(float(steps[-1]), 1.0))
+
+    try:
+        return call_alone(TARGET, lesson, returns=(LearntNetwork,), classes=KNOWN, limits=limits, watch=watch)
+    except Unanswered as error:
+        raise error.translated(LearningFailed, "The learning process", _ADVICE) from error.__cause__

@@ -19,8 +19,8 @@ from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from skills import packing
+from skills.deep import KNOWN, LearntNetwork, NetworkLesson
 from skills.deep.environments import GRID, SPACE
-from skills.deep.learning import KNOWN, LearntNetwork, NetworkLesson
 from skills.learning.deep_settings import DDPG, DQN, TRPO, Deep
 from skills.learning.network import Network
 from skills.learning.q_learning import Training

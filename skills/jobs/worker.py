@@ -30,8 +30,7 @@ from skills.db.service_tables import Job
 from skills.db.session import Database, refuse_other_tables
 from skills.errors import SkillsError
 from skills.jobs.engine import BATCHES, JOBS, POLLING_S, QUEUES, configuration, connect
-from skills.jobs.watch import Leases, Watch
-from skills.jobs.workflows import Perform, Work, register
+from skills.jobs.workflows import Leases, Perform, Watch, Work, register
 from skills.logs import job_id, told
 from skills.settings import Settings
 
@@ -151,7 +150,7 @@ def _go_round(watch: Watch, over: Callable[[], bool]) -> None:
 
 def _library() -> Perform:
     """Return the library's `perform_job`, and start the warm-up for it."""
-    from skills.jobs.warm_up import learn_once, warm_up  # imported late, because they import everything else
+    from skills.jobs.readiness import learn_once, warm_up  # imported late, because they import everything else
     from skills.library import perform_job
 
     warm_up(learn_once)

@@ -14,7 +14,7 @@ from sqlalchemy.orm import Session
 from skills.db.base import rfc3339
 from skills.db.models import Demonstration, PolicyVersion, Surgeon, SutureType
 from skills.db.service_tables import Job, StyleToRetrain
-from skills.deep.learning import require_installed
+from skills.deep import require_installed
 from skills.errors import Conflict, NotFound
 from skills.learning.learners import LEARNER_VERSION, describe_learner
 from skills.learning.q_learning import PhaseQLearning

@@ -18,7 +18,7 @@ from skills.db.models import Demonstration, PolicyDemonstration, PolicyVersion, 
 from skills.db.packed import seal, unpack_as
 from skills.db.service_tables import Job
 from skills.db.session import Database
-from skills.deep.learning import Tell, learn_policy, require_installed
+from skills.deep import Tell, learn_policy, require_installed
 from skills.demonstration.demonstration import Demo
 from skills.errors import BadInput, BadPlan, Conflict, NotFound, SkillsError
 from skills.fields import as_json

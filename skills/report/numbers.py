@@ -1,46 +1,455 @@
-"""All numbers of the report, computed from a source: Table I, the figures and the rivals.
+"""All numbers of the report, computed from a source: the paper's Figures 5 to 9, Table I and the rivals.
 
-The paper compares "the average of the three learnt trajectories" with the user's: its numbers are those of all pairs of
-the three alignments together. Many alignments are equally short, and each splits the same total over x, y and z
-differently; so the mean along an axis is meaningful only together with the tie-break that selects one alignment. The
-range of its sum over all of them needs no tie-break.
+A source is a shipped sample, or the paper's data if it is available. The paper's data has no licence, so it is not in
+this package; `SKILLS_PAPER_DATA` names its folder. It contains the user's path through the grid, the greedy actions of
+three published policies, and a raw recording of the study that belongs to another path. The user's own recording was
+not published. A published policy is a greedy action for each state, without values.
+
+    Fig. 5   the reward that maximum-entropy IRL recovers from a demonstration, and the sparse reward of Algorithm 1
+    Fig. 6   a recorded motion and its discretisation to the grid, with the error of the discretisation
+    Fig. 7   one policy, its grid world stacked at five suture points
+    Fig. 8   three policies of one demonstration: in the paper's state, in ours, and those that the authors published;
+             and two rivals that learn no policy: the demonstration replayed, and a dynamic movement primitive
+    Fig. 9   one policy from ten other starts, in the range that the paper prints
+
+In Table I the paper compares "the average of the three learnt trajectories" with the user's: its numbers are those of
+all pairs of the three alignments together. Many alignments are equally short, and each splits the same total over x, y
+and z differently; so the mean along an axis is meaningful only together with the tie-break that selects one alignment.
+The range of its sum over all of them needs no tie-break.
 
 Nothing here draws or writes.
 """
 
+import os
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
+from io import BytesIO
+from itertools import product
+from pathlib import Path
 
 import numpy as np
 
+from skills.arrays import Floats, Ints
+from skills.demonstration.demonstration import cut_demo
+from skills.demonstration.segments import propose_segments
+from skills.errors import BadInput, BadPath
+from skills.formats import read_recording
 from skills.gridworld import paper
-from skills.gridworld.reward import sparse_reward
-from skills.learning.evaluation import dtw
-from skills.learning.max_ent_irl import MaxEntIRL
-from skills.learning.policy import Rollout, learn_tabular
+from skills.gridworld.grid import MOVES, PAPER_GRID, GridPath, discretize, fit_grid
+from skills.gridworld.path_report import discretisation_rmse
+from skills.gridworld.reward import RewardMap, sparse_reward
+from skills.learning.certificate import coverage
+from skills.learning.evaluation import dtw, measure
+from skills.learning.max_ent_irl import MaxEntIRL, recover_reward
+from skills.learning.policy import Policy, Rollout, learn_tabular, rollout, rollout_from
 from skills.learning.q_learning import CellQLearning, PhaseQLearning
-from skills.report.figures import (
-    ArrivingStarts,
-    Discretised,
-    FigureSource,
-    LearntStyle,
-    OtherStart,
-    RewardFunctions,
-    Stacked,
-    Tried,
-    arriving,
-    compare_path,
-    compare_rewards,
-    other_starts,
-    stack_passes,
-    three_policies,
-    try_seeds,
-    two_rivals,
-)
+from skills.learning.slip import replay
+from skills.planning.plan import SuturePoint, stack
+from skills.report import rivals
 from skills.report.rivals import Disturbed, disturb, learn_primitive
+from skills.seeds.recordings import sample_recordings
 
+SAMPLE = "wren-simple-running"  # it crosses its own path, as the paper's user does
+USER_PATH = "user_path_grid11.csv"
+RAW = "psm_poses_500hz.csv"
+POLICIES = tuple(f"published_policy_{number}.npy" for number in range(1, paper.N_POLICIES + 1))
+ABSENT = (
+    "THE PAPER'S DATA IS MISSING: everything is drawn from the shipped sample alone. Set SKILLS_PAPER_DATA to "
+    "the folder of the data to include the paper's user and the published policies."
+)
+
+
+N_PASSES = 5
+SPACING_MM = (0.0, -15.0, 0.0)  # ours: wider than stitches are, so that five passes can be distinguished in a picture
+SEEDS = tuple(range(paper.N_POLICIES))
+PUBLISHED, CELL, PHASE = "published by the authors", "the paper's state: cell", "ours: phase and cell"
+REPLAY, PRIMITIVE = "rival: shortest way, then replay", "rival: dynamic movement primitive"
+PUBLISHED_PARAMETERS = "the paper's state, the authors' parameters"
+N_STARTS = 10
+IN_TURN = 7  # every seventh of the range's 30 grid points, cyclically: ten that spread over all three axes
 Triple = tuple[float, float, float]
 PAPER_PAIRS = 3 * 28  # each of the user's 28 states is paired with a state of each of three shorter rollouts
+
+
+@dataclass(frozen=True, eq=False)
+class Recorded:
+    """A recorded motion, shape (T, 3) in mm, and its path through a grid."""
+
+    tip_mm: Floats
+    path: GridPath
+
+
+@dataclass(frozen=True, eq=False)
+class FigureSource:
+    """A demonstration with everything that the figures need.
+
+    Attributes:
+        name: Part of file names.
+        title: The demonstrator, for readers.
+        path: The path through the paper's grid.
+        recorded: The raw motion of Fig. 6; for the paper's data a motion other than `path`.
+        published: The published policies: an action for each state, shape (n_states,) each; empty for a sample.
+    """
+
+    name: str
+    title: str
+    path: GridPath
+    recorded: Recorded
+    published: tuple[Ints, ...] = ()
+
+    @property
+    def recorded_elsewhere(self) -> bool:
+        """Return whether `recorded` is a motion other than `path`."""
+        return self.recorded.path is not self.path
+
+
+def sample_source() -> FigureSource:
+    """Return wren's hand-off, cut as the service would propose it."""
+    sample = next(one for one in sample_recordings() if one.name == SAMPLE)
+    recording = read_recording(BytesIO(sample.data))
+    segment = propose_segments(recording)[0]
+    demo = cut_demo(recording, start_s=segment.start_s, end_s=segment.end_s)
+    path = discretize(demo.tip_mm, PAPER_GRID)
+    return FigureSource("sample", "wren, a synthetic surgeon", path, Recorded(demo.tip_mm, path))
+
+
+def paper_source(folder: Path | None) -> FigureSource | None:
+    """Return the paper's user and the published policies; None if no folder is named.
+
+    Raises:
+        BadInput: The folder does not hold the data.
+    """
+    if folder is None or folder == Path():  # an empty SKILLS_PAPER_DATA counts as unset
+        return None
+    missing = [name for name in (USER_PATH, RAW, *POLICIES) if not (folder / name).is_file()]
+    if missing:
+        raise BadInput(f"SKILLS_PAPER_DATA={folder} has no {', '.join(missing)}; correct it or unset it.")
+    try:
+        # the files are in metres
+        path = discretize(1000 * _table(folder / USER_PATH)[:, :3], PAPER_GRID)
+        raw_mm = 1000 * _table(folder / RAW, header_rows=1)[:, 3:6]
+        recorded = Recorded(raw_mm, discretize(raw_mm, fit_grid(raw_mm)))
+        published = tuple(_actions(folder / name) for name in POLICIES)
+    except (ValueError, BadPath) as error:
+        raise BadInput(f"SKILLS_PAPER_DATA={folder} does not contain the paper's data: {error}") from error
+    return FigureSource("paper", "the paper's user", path, recorded, published)
+
+
+def _table(file: Path, header_rows: int = 0) -> Floats:
+    table = np.loadtxt(file, delimiter=",", skiprows=header_rows, ndmin=2)
+    if table.shape[1] != 6:
+        raise ValueError(f"{file.name} should have 6 columns.")
+    return table
+
+
+def _actions(file: Path) -> Ints:
+    actions = np.load(file)
+    if actions.shape != (PAPER_GRID.n_states,) or not np.isin(actions, range(paper.N_ACTIONS)).all():
+        raise ValueError(f"{file.name} should have an action from 0 to 26 for each of {PAPER_GRID.n_states} states.")
+    return np.asarray(actions, np.int64)
+
+
+def follow(actions: Ints, path: GridPath, start: int) -> Rollout:
+    """Follow a published policy from a state to the path's goal; it stops unfinished when a state repeats."""
+    after = steps_of(actions, path)
+    states = [start]
+    while states[-1] != path.goal and states[-1] not in states[:-1]:
+        states.append(int(after[states[-1]]))
+    return Rollout(path, np.array(states), np.zeros(len(states), np.int64), finished=states[-1] == path.goal)
+
+
+def starts_reaching(actions: Ints, path: GridPath) -> int:
+    """Return the number of states from which a published policy reaches the path's goal."""
+    after = steps_of(actions, path)
+    for _ in range(len(after).bit_length()):
+        after = after[after]  # doubles the number of moves
+    return int(np.count_nonzero(after == path.goal))
+
+
+def steps_of(actions: Ints, path: GridPath) -> Ints:
+    """Return the next state of each state, shape (n_states,): itself at the goal, and for a move off the grid."""
+    grid, here = path.grid, np.arange(path.grid.n_states)
+    cells = grid.cells_of(here) + MOVES[actions]
+    on_grid = grid.holds(cells)
+    after = here.copy()
+    after[on_grid] = grid.states_of(cells[on_grid])
+    after[path.goal] = path.goal
+    return after
+
+
+@dataclass(frozen=True, eq=False)
+class RewardFunctions:
+    """The recovered and the sparse reward of every state, and the result of planning on the recovered one.
+
+    Attributes:
+        recovered: Recovered reward of entering each state, shape (n_states,).
+        sparse: The reward of Algorithm 1, same shape.
+        visited: Number of distinct states that the demonstration visits.
+        found: How many of the `visited` highest recovered rewards lie on visited states.
+        nats: Negative log-likelihood of the demonstration per move, with all rewards 0 and with the recovered ones.
+        iterations: Iterations of IRL.
+        starts_reaching: Starts from which value iteration on the recovered reward leads to the goal.
+        walk: Its rollout from the demonstrated start.
+    """
+
+    recovered: Floats
+    sparse: Floats
+    visited: int
+    found: int
+    nats: tuple[float, float]
+    iterations: int
+    starts_reaching: int
+    walk: Rollout
+
+
+def compare_rewards(path: GridPath, iterations: int) -> RewardFunctions:
+    """Recover a reward by IRL, run value iteration on it, and compare it with Algorithm 1's. Nothing is random."""
+    learner, reward = MaxEntIRL(iterations=iterations), sparse_reward(path)
+    recovered, policy = recover_reward(path, learner), learn_tabular(reward, learner)
+    visited = np.unique(path.states)
+    # stable, so that equal rewards have the same order on every machine
+    highest = np.argsort(-recovered.rewards, kind="stable")[: len(visited)]
+    return RewardFunctions(
+        recovered=recovered.rewards,
+        sparse=reward.rewards,
+        visited=len(visited),
+        found=int(np.isin(highest, visited).sum()),
+        nats=recovered.negative_log_likelihood,
+        iterations=iterations,
+        starts_reaching=int(coverage(policy).reaches.sum()),
+        walk=rollout_from(policy, path.start),
+    )
+
+
+@dataclass(frozen=True)
+class Discretised:
+    """The path of a recorded motion; the RMSE is of the samples against the centres of their cells."""
+
+    samples: int
+    states: int
+    revisits: int
+    bridged: int
+    cell_mm: float
+    rmse_mm: tuple[float, float, float]
+
+
+def compare_path(recorded: Recorded) -> Discretised:
+    """Compare a recorded motion with its path in the grid."""
+    path = recorded.path
+    return Discretised(
+        samples=len(recorded.tip_mm),
+        states=len(path.states),
+        revisits=path.revisits,
+        bridged=path.bridged,
+        cell_mm=path.grid.cell_mm,
+        rmse_mm=discretisation_rmse(recorded.tip_mm, path.grid),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Stacked:
+    """Passes, each of shape (K, 3) in mm, and their suture points, shape (N, 3) in mm.
+
+    `worst_miss_mm` is the largest difference, along any axis, between a pass and the demonstration moved to its point.
+    """
+
+    points_mm: Floats
+    passes_mm: tuple[Floats, ...]
+    worst_miss_mm: float
+
+
+def stack_passes(policy: Policy) -> Stacked:
+    """Stack a policy at five points from its own goal on, each pass from the demonstrated start moved with its grid."""
+    path = policy.path
+    goal_mm = path.grid.centres_mm(path.goal)
+    points_mm = goal_mm + np.arange(N_PASSES)[:, None] * SPACING_MM
+    points = [SuturePoint((x, y, z)) for x, y, z in points_mm.tolist()]
+    plan = stack(policy, points, arm="PSM", frame="PSM_base", instrument="any", rotation=None)
+    passes = tuple(one.tip_mm for one in plan.passes)
+    moved = [path.tip_mm + (point - goal_mm) for point in points_mm]
+    misses = [_miss_mm(one, demonstrated) for one, demonstrated in zip(passes, moved, strict=True)]
+    return Stacked(points_mm, passes, round(max(misses), 9))
+
+
+def _miss_mm(tip_mm: Floats, demonstrated_mm: Floats) -> float:
+    same = tip_mm.shape == demonstrated_mm.shape
+    return float(np.abs(tip_mm - demonstrated_mm).max()) if same else float("inf")
+
+
+@dataclass(frozen=True, eq=False)
+class LearntStyle:
+    """The rollout of a policy or rival from the demonstrated start, its DTW alignment with the demonstration as pairs,
+    shape (K, 2), and the number of starts that reach the goal.
+    """
+
+    by: str
+    which: str
+    rollout: Rollout
+    pairs: Ints
+    dtw_total_mm: float
+    exact_states: int
+    starts_reaching: int
+
+
+@dataclass(frozen=True)
+class Tried:
+    """The number of seeds with which a learner reaches the goal from the demonstrated start, and follows it exactly."""
+
+    by: str
+    seeds: int
+    reached: int
+    exact: int
+
+
+def three_policies(source: FigureSource) -> tuple[LearntStyle, ...]:
+    """Return the rollouts of the published policies, if there are any, and of seeds 0, 1 and 2 in either state."""
+    start = source.path.start
+    theirs = [
+        _learnt(
+            PUBLISHED,
+            f"policy {number}",
+            follow(actions, source.path, start),
+            starts_reaching(actions, source.path),
+        )
+        for number, actions in enumerate(source.published, start=1)
+    ]
+    cell, phase = learn_three(source, CellQLearning()), learn_three(source, PhaseQLearning())
+    learnt = [
+        _learnt(by, f"seed {policy.seed}", rollout_from(policy, start), int(coverage(policy).reaches.sum()))
+        for by, policies in ((CELL, cell), (PHASE, phase))
+        for policy in policies
+    ]
+    return (*theirs, *learnt)
+
+
+def two_rivals(source: FigureSource, primitive: rivals.Primitive) -> tuple[LearntStyle, ...]:
+    """Return the rollouts of the two rivals without slips; nothing is random."""
+    path, everywhere = source.path, np.arange(source.path.grid.n_states)
+    replays = [replay(path, state) for state in everywhere.tolist()]
+    passes = rivals.rollouts(primitive, everywhere)
+    basis = f"{primitive.weights.shape[1]} basis functions"
+    return tuple(
+        _learnt(by, which, ways[path.start], sum(way.finished for way in ways))
+        for by, which, ways in ((REPLAY, "as recorded", replays), (PRIMITIVE, basis, passes))
+    )
+
+
+def learn_three(source: FigureSource, learner: CellQLearning | PhaseQLearning) -> list[Policy]:
+    """Learn the policies of seeds 0, 1 and 2."""
+    return [learn_tabular(sparse_reward(source.path), learner, seed) for seed in SEEDS]
+
+
+def _learnt(by: str, which: str, followed: Rollout, starts_reaching: int) -> LearntStyle:
+    metrics = measure(followed)
+    pairs = dtw(followed.tip_mm, followed.path.tip_mm).pairs
+    return LearntStyle(by, which, followed, pairs, metrics.dtw_total_mm, metrics.exact_states, starts_reaching)
+
+
+def try_seeds(source: FigureSource, seeds: int) -> tuple[Tried, ...]:
+    """Learn with the seeds from 0 on, in a thread per processor: more evidence than the paper's three policies."""
+    learners: dict[str, CellQLearning | PhaseQLearning] = {
+        PUBLISHED_PARAMETERS: CellQLearning.published(),
+        CELL: CellQLearning(),
+        PHASE: PhaseQLearning(),
+    }
+    reward = sparse_reward(source.path)
+    with ThreadPoolExecutor(os.cpu_count()) as threads:  # the compiled loops release the GIL
+        return tuple(
+            _count(by, list(threads.map(partial(_try, reward, learner), range(seeds))))
+            for by, learner in learners.items()
+        )
+
+
+def _try(reward: RewardMap, learner: CellQLearning | PhaseQLearning, seed: int) -> Rollout:
+    return rollout_from(learn_tabular(reward, learner, seed), reward.path.start)
+
+
+def _count(by: str, rollouts: Sequence[Rollout]) -> Tried:
+    exact = [one.finished and np.array_equal(one.states, one.path.states) for one in rollouts]
+    return Tried(by, len(rollouts), sum(one.finished for one in rollouts), sum(exact))
+
+
+@dataclass(frozen=True, eq=False)
+class OtherStart:
+    """The rollout from another start, and those of the published policies and of the rivals from there.
+
+    `joins_at` is the index of the demonstration's state, from 0, from which on ours follows the demonstration.
+    """
+
+    start_mm: tuple[float, float, float]
+    ours: Rollout
+    joins_at: int
+    dtw_total_mm: float
+    published: tuple[Rollout, ...]
+    replayed: Rollout
+    primitive: Rollout
+
+
+@dataclass(frozen=True)
+class ArrivingStarts:
+    """The number of grid points in the printed range from which a policy reaches the goal."""
+
+    by: str
+    starts: int
+    arriving: int
+
+
+def range_mm() -> list[tuple[float, float, float]]:
+    """Return the grid points of the printed range, in mm."""
+    axes = [np.arange(min(ends), max(ends) + 1, paper.CELL_MM).tolist() for ends in paper.FIG9_START_RANGE_MM]
+    return list(product(*axes))
+
+
+def starts_mm() -> list[tuple[float, float, float]]:
+    """Return ten of them; the paper does not list its own."""
+    points = range_mm()
+    return [points[IN_TURN * number % len(points)] for number in range(N_STARTS)]
+
+
+def other_starts(source: FigureSource, policy: Policy, primitive: rivals.Primitive) -> tuple[OtherStart, ...]:
+    """Return the rollouts of a policy, of the published ones and of the rivals from each of the ten starts."""
+    return tuple(_from(start_mm, source, policy, primitive) for start_mm in starts_mm())
+
+
+def arriving(source: FigureSource, policy: Policy, primitive: rivals.Primitive) -> tuple[ArrivingStarts, ...]:
+    """Count the starts of the complete range that reach the goal, for the published policies, ours and the rivals."""
+    starts = source.path.grid.states_at(range_mm())
+    states = starts.tolist()
+    theirs = [[follow(actions, source.path, state) for state in states] for actions in source.published]
+    ours = [rollout_from(policy, state) for state in states]
+    named = [
+        *((f"published policy {number}", ways) for number, ways in enumerate(theirs, 1)),
+        ("ours, seed 0", ours),
+        (REPLAY, [replay(source.path, state) for state in states]),
+        (PRIMITIVE, rivals.rollouts(primitive, starts)),
+    ]
+    return tuple(ArrivingStarts(by, len(ways), sum(way.finished for way in ways)) for by, ways in named)
+
+
+def _from(
+    start_mm: tuple[float, float, float], source: FigureSource, policy: Policy, primitive: rivals.Primitive
+) -> OtherStart:
+    ours, state = rollout(policy, start_mm), int(source.path.grid.states_at(start_mm))
+    return OtherStart(
+        start_mm,
+        ours,
+        _joins_at(ours),
+        measure(ours).dtw_total_mm,
+        tuple(follow(actions, source.path, state) for actions in source.published),
+        replay(source.path, state),
+        rivals.rollouts(primitive, np.array([state]))[0],
+    )
+
+
+def _joins_at(followed: Rollout) -> int:
+    """Return the index of the waypoint at which the phase is first above 0; the last one if it never is."""
+    joined = followed.phases[followed.phases > 0]
+    return int(joined[0]) - 1 if len(joined) else len(followed.path.states) - 1
+
+
+# ---- Table I, and all numbers together -----------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

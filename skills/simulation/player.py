@@ -18,7 +18,7 @@ from skills.simulation import scene
 from skills.verification.needle import psm_m_poses
 from skills.verification.playback import Playback, link_pairs
 
-SIMULATOR = "skills.simulation.passes:simulate"
+SIMULATOR = "skills.simulation.scene:simulate"
 PAD_BELOW_MM = 5.0  # ours: height of the finger tips above a pad whose height is not given
 CLEARANCE_EVERY = 4  # samples: 0.33 mm of the tip's path at 20 mm/s and 240 Hz, for which the bounds on distances allow
 Plain = TypeVar("Plain", bytes, str, float, dict[Any, Any])

@@ -5,7 +5,7 @@ from typing import get_args, get_type_hints
 import pytest
 
 import skills
-from skills.client import Client, jobs
+from skills.client import Client, policies
 from skills.comparison.combining import COMBININGS
 from skills.schemas.policies import Combined
 from skills.schemas.requests import CombineIn
@@ -79,4 +79,4 @@ def test_one_demonstration_is_not_combined(trained: Service):
 
 def test_whoever_asks_may_choose_among_all_ways_that_there_are():
     asked = get_args(CombineIn.model_fields["kind"].annotation)
-    assert asked == get_args(jobs.Combining) == get_args(get_type_hints(Combined)["kind"]) == tuple(COMBININGS)
+    assert asked == get_args(policies.Combining) == get_args(get_type_hints(Combined)["kind"]) == tuple(COMBININGS)

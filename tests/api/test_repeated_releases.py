@@ -6,7 +6,7 @@ import httpx2 as httpx
 import pytest
 
 from skills.client import Client, Retrying
-from skills.client.problems import NotReached
+from skills.client.connection import NotReached
 from tests.api.service import CSV, KESTREL, POLICY, Service, assert_problem
 from tests.library import cases
 from tests.library.styles import add_styles

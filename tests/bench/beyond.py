@@ -23,7 +23,7 @@ from rich.table import Table
 from skills import packing
 from skills.db import models  # noqa: F401 - declares what is stored
 from skills.db.packed import pack, unpack_as
-from skills.deep.learning import KNOWN, NEEDED, NetworkLesson
+from skills.deep import KNOWN, NEEDED, NetworkLesson
 from skills.gridworld.grid import GridPath, GridWorld
 from skills.gridworld.reward import RewardMap, sparse_reward
 from skills.learning import policy as table_policy
@@ -33,7 +33,7 @@ from skills.learning.evaluation import check_in_space, measure
 from skills.learning.learners import LEARNERS, Learner
 from skills.learning.policy import Policy, rollout_from
 from skills.learning.slip import replay
-from skills.report.figures import paper_source, sample_source
+from skills.report.numbers import paper_source, sample_source
 from skills.settings import Settings
 from tests.demonstration.synthetic import winding_path
 from tests.measured import TWO_CELLS, measured, peak_mib

@@ -16,7 +16,7 @@ from skills.learning.evaluation import dtw
 from skills.learning.learners import Learner
 from skills.learning.policy import learn_tabular
 from skills.learning.q_learning import CellQLearning, PhaseQLearning
-from skills.report.figures import paper_source
+from skills.report.numbers import paper_source
 from skills.seeds.recordings import sample_recordings
 from skills.settings import Settings
 from tests.bench.plain_c import plain_c

@@ -10,7 +10,7 @@ from rich.table import Table
 
 from skills.planning.handoff import HOLDING_RAD, PsmM
 from skills.planning.trajectory import Trajectory, time_parametrise
-from skills.simulation import passes, player, scene
+from skills.simulation import player, scene
 from skills.verification.playback import CLEARANCE_SEEN_MM
 from skills.verification.verdict import judge
 from tests.bench.timing import gain, in_turn
@@ -66,10 +66,10 @@ def measure(asked: dict[str, Any]) -> None:
     with scene.opened(instrument, rate_hz) as one:
         one.place_pad(asked["tip_mm"], float(asked["pad_top_mm"]))
         one.place_psm_m(asked["m_base_mm"], asked["m_base_xyzw"], instrument)
-        passes.kinematic_pass(one, asked)
+        scene.kinematic_pass(one, asked)
     with scene.opened(instrument, rate_hz) as one:
         one.place_pad(asked["tip_mm"], float(asked["pad_top_mm"]))
-        passes.servo_pass(one, asked)
+        scene.servo_pass(one, asked)
 
 
 def plain(asked: dict[str, Any], at_once: bool = False) -> None:

@@ -18,7 +18,7 @@ from skills.api.responses import JSON, NPZ, Encoded
 from skills.db.models import Demonstration
 from skills.db.service_tables import Job
 from skills.db.session import Database
-from skills.jobs.watch import Leases, Watch
+from skills.jobs.workflows import Leases, Watch
 from skills.library import catalogue, demos, jobs, policies
 from skills.library.jobs import BATCH
 from skills.library.overview import condition_of

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 import skills
 from skills.client import Client
-from skills.client.verification import rebuilt
+from skills.client.policies import rebuilt
 from skills.errors import BadInput, Corrupt
 from tests.api.service import KESTREL, POLICY
 from tests.library import cases

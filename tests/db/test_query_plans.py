@@ -10,7 +10,7 @@ from sqlalchemy import event, text
 from sqlalchemy.orm import Session
 
 from skills.db.session import Database
-from skills.jobs.watch import Leases, Watch
+from skills.jobs.workflows import Leases, Watch
 from skills.library import batch_work, catalogue, demos, jobs, policies, retraining, training
 from skills.library.overview import condition_of
 from skills.schemas.requests import RetrainingIn, TrainingIn

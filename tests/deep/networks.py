@@ -6,7 +6,7 @@ from typing import BinaryIO
 import numpy as np
 
 from skills import packing
-from skills.deep.learning import KNOWN, LearntNetwork
+from skills.deep import KNOWN, LearntNetwork
 from skills.gridworld.grid import GridWorld
 from skills.learning.network import Network
 from skills.learning.q_learning import Training

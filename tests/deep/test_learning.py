@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 import skills
+from skills import deep
 from skills.db.models import PolicyVersion
-from skills.deep import learning
-from skills.deep.learning import NetworkLesson
+from skills.deep import NetworkLesson
 from skills.errors import Conflict, LearningFailed
 from skills.gridworld.grid import GridPath, GridWorld
 from skills.gridworld.reward import sparse_reward
@@ -98,7 +98,7 @@ def test_a_learner_that_takes_too_long_or_too_much_is_ended_with_advice():
 
 
 def test_nonsense_from_the_process_is_no_policy(monkeypatch):
-    monkeypatch.setattr(learning, "TARGET", "builtins:bytes")
+    monkeypatch.setattr(deep, "TARGET", "builtins:bytes")
     with pytest.raises(LearningFailed):
         skills.learn_policy(REWARD, DQN(steps=1000))
 

@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 import skills
+from skills import deep
 from skills.cli import app
-from skills.deep import learning
-from skills.deep.learning import NEEDED
+from skills.deep import NEEDED
 from skills.errors import LearningFailed
 from skills.gridworld.grid import GridPath, GridWorld
 from skills.gridworld.reward import sparse_reward
@@ -38,11 +38,11 @@ def absent(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 @pytest.fixture
 def trained_by(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Policy]:
     """Return a function that learns with another training process, given as `module:function`."""
-    monkeypatch.setattr(learning, "require_installed", lambda learner: None)
+    monkeypatch.setattr(deep, "require_installed", lambda learner: None)
     path = GridPath(GridWorld((0.0, 0.0, 0.0), 5.0, (3, 3, 3)), [0, 1, 2])
 
     def learn(target: str) -> Policy:
-        monkeypatch.setattr(learning, "TARGET", target)
+        monkeypatch.setattr(deep, "TARGET", target)
         return skills.learn_policy(sparse_reward(path), DDPG(steps=800, width=32, batch=32), 7)
 
     return learn

@@ -16,7 +16,7 @@ from tests.learning.test_kernel_cache import start, told
 
 WARM = """
 from threading import enumerate as threads
-from skills.jobs.warm_up import align_once, learn_once, warm_up
+from skills.jobs.readiness import align_once, learn_once, warm_up
 from skills.packing import palette_of
 def finish():
     [thread.join() for thread in threads() if thread.name == "warm-up"]

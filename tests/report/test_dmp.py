@@ -6,7 +6,7 @@ from movement_primitives.dmp import DMP
 
 from skills.gridworld.grid import MOVES, discretize
 from skills.learning.slip import STEADY, draw_slips, judge
-from skills.report.figures import sample_source
+from skills.report.numbers import sample_source
 from skills.report.rivals import REST_TICKS, STEPS, learn_primitive, rollouts, walk_primitive
 
 PATH = sample_source().path

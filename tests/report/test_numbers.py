@@ -7,9 +7,8 @@ from skills.errors import BadInput
 from skills.gridworld import paper
 from skills.gridworld.grid import MOVES, PAPER_GRID, GridPath, GridWorld
 from skills.learning.policy import Rollout
-from skills.report import figures
-from skills.report.figures import follow, stack_passes, starts_reaching
-from skills.report.numbers import as_printed, axis_bounds_mm, pooled
+from skills.report import numbers
+from skills.report.numbers import as_printed, axis_bounds_mm, follow, pooled, stack_passes, starts_reaching
 from tests.gridworld.paths import learnt, named_path
 
 LINE = GridWorld((0.0, 0.0, 0.0), 5.0, (6, 2, 2))
@@ -95,7 +94,7 @@ def test_the_printed_row_is_the_papers_and_its_total_430_mm():
 
 
 def test_the_ten_starts_differ_span_the_range_and_include_the_failing_one():
-    starts = figures.starts_mm()
+    starts = numbers.starts_mm()
     assert len(set(starts)) == 10
     assert (-25.0, 50.0, -135.0) in starts
     assert paper.USER_START_MM not in starts
@@ -117,31 +116,31 @@ def folder(tmp_path):
     """Return a folder in the form of the paper's data, with none of it."""
     path = named_path("an angle")
     tip_m = PAPER_GRID.centres_mm(PAPER_GRID.states_of(path.cells)) / 1000
-    np.savetxt(tmp_path / figures.USER_PATH, np.hstack((tip_m, np.zeros_like(tip_m))), delimiter=",")
-    np.savetxt(tmp_path / figures.RAW, np.hstack((np.zeros_like(tip_m), tip_m)), delimiter=",", header="r,p,y,X,Y,Z")
-    for name in figures.POLICIES:
+    np.savetxt(tmp_path / numbers.USER_PATH, np.hstack((tip_m, np.zeros_like(tip_m))), delimiter=",")
+    np.savetxt(tmp_path / numbers.RAW, np.hstack((np.zeros_like(tip_m), tip_m)), delimiter=",", header="r,p,y,X,Y,Z")
+    for name in numbers.POLICIES:
         np.save(tmp_path / name, np.full(PAPER_GRID.n_states, 13.0))
     return tmp_path
 
 
 def test_data_in_the_papers_form_is_read_in_mm(folder):
-    source = figures.paper_source(folder)
+    source = numbers.paper_source(folder)
     assert source is not None
     assert source.path.cells.tolist() == named_path("an angle").cells.tolist()
     assert source.recorded_elsewhere
     assert [actions.tolist() for actions in source.published] == [[13] * 1331] * 3
 
 
-@pytest.mark.parametrize("nowhere", [None, figures.Path("")])
+@pytest.mark.parametrize("nowhere", [None, numbers.Path("")])
 def test_no_folder_is_no_source(nowhere):
-    assert figures.paper_source(nowhere) is None
+    assert numbers.paper_source(nowhere) is None
 
 
-@pytest.mark.parametrize("name", [figures.USER_PATH, figures.RAW, *figures.POLICIES])
+@pytest.mark.parametrize("name", [numbers.USER_PATH, numbers.RAW, *numbers.POLICIES])
 def test_a_missing_file_is_named(folder, name):
     (folder / name).unlink()
     with pytest.raises(BadInput, match=name):
-        figures.paper_source(folder)
+        numbers.paper_source(folder)
 
 
 BAD_ARRAYS = {
@@ -154,29 +153,29 @@ BAD_ARRAYS = {
 
 @pytest.mark.parametrize("actions", BAD_ARRAYS.values(), ids=BAD_ARRAYS)
 def test_actions_that_are_none_are_refused(folder, actions):
-    np.save(folder / figures.POLICIES[1], actions)
+    np.save(folder / numbers.POLICIES[1], actions)
     with pytest.raises(BadInput, match="action from 0 to 26"):
-        figures.paper_source(folder)
+        numbers.paper_source(folder)
 
 
 @pytest.mark.parametrize(
     ("name", "text"),
     [
-        (figures.USER_PATH, "not,a,number"),
-        (figures.USER_PATH, "1,2"),
-        (figures.USER_PATH, ""),
-        (figures.RAW, "h\n1,2,3"),
+        (numbers.USER_PATH, "not,a,number"),
+        (numbers.USER_PATH, "1,2"),
+        (numbers.USER_PATH, ""),
+        (numbers.RAW, "h\n1,2,3"),
     ],
 )
 @pytest.mark.filterwarnings("ignore:loadtxt")
 def test_a_damaged_table_is_refused(folder, name, text):
     (folder / name).write_text(text)
     with pytest.raises(BadInput, match="does not contain the paper's data"):
-        figures.paper_source(folder)
+        numbers.paper_source(folder)
 
 
 def test_metres_taken_for_millimetres_lie_outside_the_grid_and_are_refused(folder):
-    table = np.loadtxt(folder / figures.USER_PATH, delimiter=",")
-    np.savetxt(folder / figures.USER_PATH, 1000 * table, delimiter=",")
+    table = np.loadtxt(folder / numbers.USER_PATH, delimiter=",")
+    np.savetxt(folder / numbers.USER_PATH, 1000 * table, delimiter=",")
     with pytest.raises(BadInput, match="outside the grid"):
-        figures.paper_source(folder)
+        numbers.paper_source(folder)

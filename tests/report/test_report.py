@@ -14,7 +14,7 @@ from skills.gridworld.reward import sparse_reward
 from skills.learning.evaluation import measure
 from skills.learning.policy import learn_tabular, rollout_from
 from skills.learning.q_learning import CellQLearning
-from skills.report.figures import sample_source
+from skills.report.numbers import sample_source
 from skills.report.page import SECTIONS
 from skills.report.rivals import SLIPS
 from skills.settings import settings
