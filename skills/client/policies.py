@@ -407,7 +407,7 @@ def _policy(about: dict[str, Any], arrays: bytes, demo: dict[str, Any]) -> "Lear
     from skills.gridworld.grid import GridPath, GridWorld
     from skills.gridworld.reward import RewardLevels
     from skills.learning.learners import learner_of
-    from skills.learning.network import Network
+    from skills.learning.networks import Network
     from skills.learning.policy import Policy as LearntPolicy
     from skills.learning.q_learning import Training
 

@@ -18,9 +18,8 @@ from skills.errors import LearnerNotInstalled, LearningFailed, Unanswered
 from skills.gridworld.grid import GridPath, GridWorld
 from skills.gridworld.reward import RewardLevels, RewardMap
 from skills.learning import policy as table
-from skills.learning.deep_settings import DDPG, DQN, TRPO, Deep, network_q
 from skills.learning.learners import Learner, check_learnable
-from skills.learning.network import Network
+from skills.learning.networks import DDPG, DQN, TRPO, Deep, Network, network_q
 from skills.learning.policy import Policy
 from skills.learning.q_learning import Training
 from skills.packing import known
@@ -96,7 +95,7 @@ def learn_policy(
 
     Args:
         reward: The reward map of the demonstrated path.
-        learner: The settings of the learner; those of `skills.learning.deep_settings` are trained in a separate
+        learner: The settings of the learner; those of `skills.learning.networks` are trained in a separate
             process.
         seed: Seed of all random numbers.
         tell: Callback for the progress, from 0 to 1, about every second; an exception that it raises ends the training.

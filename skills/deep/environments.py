@@ -4,7 +4,7 @@
     gymnasium.make("skills.deep.environments:SutureSpace-v0", reward=sparse_reward(path), gamma=0.95)
 
 The rewards of the grid are those of Algorithm 1; those of the space are defined, with their reasons, in
-`skills.learning.deep_settings`. An episode starts anywhere but in the goal's cell, or at the position of
+`skills.learning.networks`. An episode starts anywhere but in the goal's cell, or at the position of
 `options={"start_mm": (x, y, z)}`; it ends at the goal, or after the paper's 100 steps.
 """
 
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from skills.gridworld import paper
 from skills.gridworld.grid import MOVES
 from skills.gridworld.reward import RewardMap
-from skills.learning.deep_settings import Space
+from skills.learning.networks import Space
 
 GRID, SPACE = "SutureGrid-v0", "SutureSpace-v0"
 Info = dict[str, Any]

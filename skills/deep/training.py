@@ -21,8 +21,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from skills import packing
 from skills.deep import KNOWN, LearntNetwork, NetworkLesson
 from skills.deep.environments import GRID, SPACE
-from skills.learning.deep_settings import DDPG, DQN, TRPO, Deep
-from skills.learning.network import Network
+from skills.learning.networks import DDPG, DQN, TRPO, Deep, Network
 from skills.learning.q_learning import Training
 
 REMEMBERED = 400_000  # the latest moves: 100 MB, and each cell of the paper's grid three hundred times

@@ -22,8 +22,7 @@ from skills.errors import EmptyPath
 from skills.fields import Count, Point, schema
 from skills.gridworld import paper
 from skills.learning import _kernels
-from skills.learning.deep_settings import DDPG, TRPO, InSpace, Space, asked_step
-from skills.learning.network import Network
+from skills.learning.networks import DDPG, TRPO, InSpace, Network, Space, asked_step
 from skills.learning.policy import Policy, Rollout
 
 TIE_BREAK = "of equally short alignments: both paths together first, then along the path, then along the reference"

@@ -11,9 +11,9 @@ from skills.errors import BadSettings
 from skills.gridworld.domain import Domain
 from skills.gridworld.grid import GridPath
 from skills.gridworld.reward import RewardLevels, RewardMap
-from skills.learning.deep_settings import DDPG, DQN, TRPO
 from skills.learning.dynamic_programming import ValueIteration, iterate_values
 from skills.learning.max_ent_irl import MaxEntIRL, learn_from_recovered
+from skills.learning.networks import DDPG, DQN, TRPO
 from skills.learning.q_learning import CellQLearning, PhaseQLearning, Training, learn_q
 
 Tabular = PhaseQLearning | CellQLearning | ValueIteration | MaxEntIRL

@@ -19,7 +19,7 @@ from skills.gridworld.domain import FINISHED, OUTSIDE, Domain, Moves
 from skills.gridworld.grid import GridPath, refuse_metres
 from skills.gridworld.reward import RewardLevels, RewardMap
 from skills.learning.learners import Learner, Tabular, learn_values
-from skills.learning.network import Network
+from skills.learning.networks import Network
 from skills.learning.q_learning import Training
 
 GUIDED_MM = 50.0  # ours: greatest distance of a start outside the grid; metres given for millimetres are further off

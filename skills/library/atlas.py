@@ -16,8 +16,21 @@ from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from skills.arrays import Floats, Ints
-from skills.comparison.clusters import WORTH, Dendrogram, chart, dendrogram, how_many, silhouette
-from skills.comparison.distances import LEAST_MM, STATES, Difference, difference, in_lengths, medoid, spread
+from skills.comparison.distances import (
+    LEAST_MM,
+    STATES,
+    WORTH,
+    Dendrogram,
+    Difference,
+    chart,
+    dendrogram,
+    difference,
+    how_many,
+    in_lengths,
+    medoid,
+    silhouette,
+    spread,
+)
 from skills.comparison.recognition import Validated, recognise, validate
 from skills.db.models import Demonstration, Surgeon, SutureType
 from skills.db.session import Database
@@ -84,7 +97,7 @@ def atlas_of(
         database: The database, restricted to the rows that the caller may see.
         suture: The suture type.
         scaled: Scale all shapes so that start and goal coincide; sizes are then ignored.
-        clusters: The number of clusters; None: as many as `skills.comparison.clusters` finds.
+        clusters: The number of clusters; None: as many as `skills.comparison.distances` finds.
         demo: The digest of a demonstration in the atlas whose surgeon is to be recognised.
 
     Raises:

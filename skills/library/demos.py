@@ -24,8 +24,7 @@ from skills.demonstration.segments import TakenSegment
 from skills.errors import BadSegment, Conflict, SegmentNotNamed
 from skills.fields import as_json
 from skills.formats.reader_process import MOST, Told, read_told
-from skills.gridworld.grid import PAPER_GRID, GridPath, choose_grid, discretize
-from skills.gridworld.path_report import describe_path
+from skills.gridworld.grid import PAPER_GRID, GridPath, choose_grid, describe_path, discretize
 from skills.gridworld.reward import RewardMap, sparse_reward
 from skills.library import consent
 from skills.library.catalogue import find_surgeon, find_suture_type

@@ -22,7 +22,7 @@ from skills.deep import Tell, learn_policy, require_installed
 from skills.demonstration.demonstration import Demo
 from skills.errors import BadInput, BadPlan, Conflict, NotFound, SkillsError
 from skills.fields import as_json
-from skills.gridworld.path_report import discretisation_rmse
+from skills.gridworld.grid import discretisation_rmse
 from skills.gridworld.reward import RewardMap, sparse_reward
 from skills.kinematics import instrument_of
 from skills.learning.certificate import Certificate, certify

@@ -33,7 +33,6 @@ from skills.errors import BadPlan, BadSpeed, NoMotion
 from skills.fields import Count, schema
 from skills.kinematics import DEFAULT_INSTRUMENT, angle_between, instrument_of, matrix_of, quaternion_of
 from skills.planning.handoff import OtherArm, PsmM
-from skills.planning.joint_path import Ticks, solve
 from skills.planning.motion_laws import (
     A1,
     A2,
@@ -48,7 +47,7 @@ from skills.planning.motion_laws import (
     joined,
     move,
 )
-from skills.planning.passes import PassPath, Way, other_arm, ways
+from skills.planning.passes import PassPath, Ticks, Way, other_arm, solve, ways
 
 __all__ = ["A1", "A2", "MAX_SPEED_MM_S", "TRANSFER", "PassPath", "Trajectory", "joint_ratios", "time_parametrise"]
 

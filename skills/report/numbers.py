@@ -37,8 +37,7 @@ from skills.demonstration.segments import propose_segments
 from skills.errors import BadInput, BadPath
 from skills.formats import read_recording
 from skills.gridworld import paper
-from skills.gridworld.grid import MOVES, PAPER_GRID, GridPath, discretize, fit_grid
-from skills.gridworld.path_report import discretisation_rmse
+from skills.gridworld.grid import MOVES, PAPER_GRID, GridPath, discretisation_rmse, discretize, fit_grid
 from skills.gridworld.reward import RewardMap, sparse_reward
 from skills.learning.certificate import coverage
 from skills.learning.evaluation import dtw, measure

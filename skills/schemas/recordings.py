@@ -11,7 +11,7 @@ from skills.demonstration.quality import MotionReport
 from skills.demonstration.recording import BaseFrame, Format, Topic
 from skills.demonstration.segments import Segment, TakenSegment
 from skills.fields import Count, Point, Quaternion, Sha256, Slug, schema, stored_schema
-from skills.gridworld.path_report import PathReport
+from skills.gridworld.grid import PathReport
 from skills.gridworld.reward import RewardLevels
 from skills.schemas.base import ChosenGrid, Given
 

@@ -5,7 +5,7 @@ where it is still to come. Everything is done in a separate process (`film`). Th
 this process starts under the same limits: single-threaded and configured to leave out its name and the date, so that
 the same trajectory gives the same bytes if the versions are the same.
 
-The needle's pose comes from `skills.verification.needle`. Passes count from 0, as in reports; M1 and M2 between them
+The needle's pose comes from `skills.verification.clearance`. Passes count from 0, as in reports; M1 and M2 between them
 are done by hand and not shown.
 """
 
@@ -28,7 +28,7 @@ from skills.planning.trajectory import A1, A2, TRANSFER, Trajectory
 from skills.sandbox.limits import ProcessLimits
 from skills.simulation import pictures, scene
 from skills.simulation.player import simulated
-from skills.verification.needle import needle_poses
+from skills.verification.clearance import needle_poses
 
 FRAMES = 60  # over a plan of a few passes
 FRAMES_PER_PASS, MOST_FRAMES = 12, 300

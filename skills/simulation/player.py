@@ -15,7 +15,7 @@ from skills.planning.trajectory import Trajectory
 from skills.sandbox.forked import call_alone
 from skills.sandbox.limits import ProcessLimits
 from skills.simulation import scene
-from skills.verification.needle import psm_m_poses
+from skills.verification.clearance import psm_m_poses
 from skills.verification.playback import Playback, link_pairs
 
 SIMULATOR = "skills.simulation.scene:simulate"

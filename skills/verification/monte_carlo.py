@@ -44,9 +44,17 @@ from skills.kinematics import INSERTION, forward, instrument_of, joint_margins, 
 from skills.learning.slip import wilson
 from skills.planning.handoff import HOLDING_RAD, OPEN_RAD, hand_off
 from skills.planning.trajectory import A2, Trajectory
-from skills.verification.clearance import FINGERS, Links, clearance_between, clearance_to_pad, links_of, travel_mm
-from skills.verification.gates import Limits
-from skills.verification.needle import HandOff, catch
+from skills.verification.clearance import (
+    FINGERS,
+    HandOff,
+    Links,
+    catch,
+    clearance_between,
+    clearance_to_pad,
+    links_of,
+    travel_mm,
+)
+from skills.verification.verdict import Limits
 
 _MEAN_LENGTH = sqrt(8 / pi)  # of a vector of three standard normal numbers
 _CHUNK = 64  # variations computed at once, so that they stay in the processor's cache; the results do not depend on it

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skills.comparison.clusters import MANY, chart
+from skills.comparison.distances import MANY, chart
 
 
 def apart(points: np.ndarray) -> np.ndarray:
@@ -25,7 +25,7 @@ def test_many_are_placed_as_few_are_and_always_alike(monkeypatch):
     points = np.random.default_rng(3).normal(0, 1, (MANY + 20, 5)) * [9, 5, 2, 1, 1]
     places, right = chart(apart(points))
     assert (chart(apart(points))[0] == places).all()
-    monkeypatch.setattr("skills.comparison.clusters.MANY", 1000)
+    monkeypatch.setattr("skills.comparison.distances.MANY", 1000)
     few, the_same = chart(apart(points))
     np.testing.assert_allclose(places, few, atol=1e-7)
     assert right == pytest.approx(the_same)

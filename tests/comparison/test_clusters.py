@@ -7,8 +7,7 @@ from hypothesis import strategies as st
 from sklearn.cluster import AgglomerativeClustering
 from sklearn.metrics import adjusted_rand_score, silhouette_score
 
-from skills.comparison.clusters import WORTH, dendrogram, how_many, silhouette
-from skills.comparison.distances import distances, shape_of
+from skills.comparison.distances import WORTH, dendrogram, distances, how_many, shape_of, silhouette
 from skills.errors import BadInput
 from tests.comparison.cohort import cohort
 

@@ -23,9 +23,9 @@ from skills.formats import read_recording
 from skills.gridworld.grid import PAPER_GRID, GridWorld, discretize
 from skills.gridworld.reward import RewardLevels, RewardMap, sparse_reward
 from skills.learning.certificate import certify
-from skills.learning.deep_settings import DDPG, DQN, TRPO
 from skills.learning.dynamic_programming import ValueIteration
 from skills.learning.max_ent_irl import MaxEntIRL
+from skills.learning.networks import DDPG, DQN, TRPO
 from skills.learning.policy import learn_tabular
 from skills.learning.q_learning import CellQLearning, PhaseQLearning
 from skills.planning.handoff import PsmM

@@ -8,7 +8,7 @@ import numpy as np
 from skills import packing
 from skills.deep import KNOWN, LearntNetwork
 from skills.gridworld.grid import GridWorld
-from skills.learning.network import Network
+from skills.learning.networks import Network
 from skills.learning.q_learning import Training
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from skills.gridworld.grid import MOVES, PAPER_GRID, GridPath
 from skills.gridworld.reward import sparse_reward
-from skills.learning.deep_settings import DDPG, Space
+from skills.learning.networks import DDPG, Space
 
 pytestmark = [pytest.mark.usefixtures("extra"), pytest.mark.filterwarnings("default")]
 PATH = GridPath(PAPER_GRID, PAPER_GRID.states_of([[1, 1, 1], [2, 1, 1], [3, 1, 1], [3, 2, 1], [3, 3, 1]]))

@@ -11,7 +11,7 @@ from skills.errors import Conflict, LearningFailed
 from skills.gridworld.grid import GridPath, GridWorld
 from skills.gridworld.reward import sparse_reward
 from skills.learning.certificate import certify
-from skills.learning.deep_settings import DDPG, DQN, TRPO
+from skills.learning.networks import DDPG, DQN, TRPO
 from skills.learning.policy import rollout
 from skills.library.integrity import learnt
 from tests.api.conftest import service, trained  # noqa: F401 - fixtures

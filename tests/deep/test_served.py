@@ -16,11 +16,10 @@ from skills.demonstration.demonstration import Demo
 from skills.errors import Conflict
 from skills.gridworld.domain import Domain
 from skills.gridworld.reward import RewardMap
-from skills.learning.deep_settings import DDPG, DQN, Deep, network_q
 from skills.learning.dynamic_programming import Mdp, exact_q
 from skills.learning.evaluation import SpaceRollouts
 from skills.learning.learners import LEARNER_VERSION, describe_learner
-from skills.learning.network import Network
+from skills.learning.networks import DDPG, DQN, Deep, Network, network_q
 from skills.learning.policy import Policy, rollout
 from skills.learning.q_learning import Training
 from skills.library import releases

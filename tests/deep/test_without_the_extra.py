@@ -16,7 +16,7 @@ from skills.deep import NEEDED
 from skills.errors import LearningFailed
 from skills.gridworld.grid import GridPath, GridWorld
 from skills.gridworld.reward import sparse_reward
-from skills.learning.deep_settings import DDPG
+from skills.learning.networks import DDPG
 from skills.learning.policy import Policy
 from tests.api.conftest import service, still, trained  # noqa: F401 - fixtures
 from tests.api.service import KESTREL, Service, assert_problem

@@ -4,8 +4,7 @@ import pytest
 from skills.demonstration.demonstration import Demo, Pause, cut_demo
 from skills.demonstration.quality import describe
 from skills.demonstration.recording import Signal
-from skills.gridworld.grid import PAPER_GRID, discretize, fit_grid
-from skills.gridworld.path_report import describe_path
+from skills.gridworld.grid import PAPER_GRID, describe_path, discretize, fit_grid
 from tests.demonstration.strokes import RATE, along_x, line, motion, recording
 
 # ---- the motion -------------------------------------------------------------------------------------------------

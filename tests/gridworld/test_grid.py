@@ -7,8 +7,16 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from skills.errors import BadInput, BadSettings, EmptyPath, NeverLeavesGoal, OutsideGrid
-from skills.gridworld.grid import MARGIN_CELLS, PAPER_GRID, GridPath, GridWorld, choose_grid, discretize, fit_grid
-from skills.gridworld.path_report import discretisation_rmse
+from skills.gridworld.grid import (
+    MARGIN_CELLS,
+    PAPER_GRID,
+    GridPath,
+    GridWorld,
+    choose_grid,
+    discretisation_rmse,
+    discretize,
+    fit_grid,
+)
 
 ORIGIN = (0.0, 0.0, 0.0)
 LINE = GridWorld(ORIGIN, 1.0, (9, 1, 1))

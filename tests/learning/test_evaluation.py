@@ -5,8 +5,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from skills.errors import BadInput, EmptyPath
-from skills.gridworld.grid import PAPER_GRID, GridWorld
-from skills.gridworld.path_report import discretisation_rmse
+from skills.gridworld.grid import PAPER_GRID, GridWorld, discretisation_rmse
 from skills.learning.evaluation import TIE_BREAK, dtw, measure
 from skills.learning.policy import Rollout
 from tests.gridworld.paths import named_path

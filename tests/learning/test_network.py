@@ -12,7 +12,7 @@ from safetensors.numpy import save
 from skills.db import models  # noqa: F401 - declares what is stored
 from skills.db.packed import digest, pack, unpack
 from skills.errors import BadInput
-from skills.learning.network import Network
+from skills.learning.networks import Network
 
 SMALL = Network.of([([[1.0, -1.0], [2.0, 0.5]], [0.0, -1.0]), ([[1.0, 3.0]], [0.25])])
 

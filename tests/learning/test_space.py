@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from skills.gridworld.grid import PAPER_GRID, GridPath
 from skills.gridworld.reward import RewardLevels
-from skills.learning.deep_settings import DRIFT, Space
+from skills.learning.networks import DRIFT, Space
 
 CORNER = GridPath(PAPER_GRID, PAPER_GRID.states_of([[1, 1, 1], [2, 1, 1], [3, 1, 1], [3, 2, 1], [3, 3, 1]]))
 CROSSED = GridPath(PAPER_GRID, PAPER_GRID.states_of([[1, 1, 1], [2, 1, 1], [2, 2, 1], [1, 2, 1], [1, 1, 1], [0, 0, 1]]))

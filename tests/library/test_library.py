@@ -20,8 +20,7 @@ from skills.db.service_tables import Event, Job
 from skills.db.session import Database
 from skills.demonstration import segments
 from skills.errors import Conflict, Corrupt, Erased
-from skills.gridworld.grid import PAPER_GRID, discretize
-from skills.gridworld.path_report import discretisation_rmse
+from skills.gridworld.grid import PAPER_GRID, discretisation_rmse, discretize
 from skills.learning.dynamic_programming import ValueIteration
 from skills.learning.max_ent_irl import MaxEntIRL
 from skills.library import jobs, releases

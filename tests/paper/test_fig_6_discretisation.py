@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from skills.errors import OutsideGrid
-from skills.gridworld.grid import PAPER_GRID, choose_grid, discretize, fit_grid
-from skills.gridworld.path_report import discretisation_rmse
+from skills.gridworld.grid import PAPER_GRID, choose_grid, discretisation_rmse, discretize, fit_grid
 
 
 @pytest.fixture(scope="module")

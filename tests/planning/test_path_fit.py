@@ -19,8 +19,7 @@ from hypothesis import strategies as st
 from skills.demonstration.demonstration import Demo, cut_demo, propose_segments
 from skills.errors import BadPlan
 from skills.formats import read_recording
-from skills.gridworld.grid import PAPER_GRID, GridPath, GridWorld, discretize
-from skills.gridworld.path_report import discretisation_rmse
+from skills.gridworld.grid import PAPER_GRID, GridPath, GridWorld, discretisation_rmse, discretize
 from skills.gridworld.reward import sparse_reward
 from skills.kinematics import POINTING_DOWN
 from skills.learning.evaluation import dtw

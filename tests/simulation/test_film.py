@@ -17,7 +17,7 @@ from skills.kinematics import POINTING_DOWN, matrix_of
 from skills.planning.handoff import NEEDLE_RADIUS_MM, TAKEN_MM, PsmM
 from skills.planning.trajectory import A1, A2, TRANSFER, PassPath, Trajectory, time_parametrise
 from skills.simulation import film, pictures
-from skills.verification.needle import needle_poses, psm_m_poses
+from skills.verification.clearance import needle_poses, psm_m_poses
 from tests.planning.motions import PSM_M, hand_off, small_trajectory
 
 needs_simulator = pytest.mark.needs("simulator")

@@ -25,8 +25,7 @@ from skills.planning.trajectory import A1, PassPath, Trajectory, time_parametris
 from skills.schemas.requests import DemoIn
 from skills.settings import Settings
 from skills.simulation.player import play
-from skills.verification.gates import Limits
-from skills.verification.verdict import PlaybackReport, judge
+from skills.verification.verdict import Limits, PlaybackReport, judge
 from tests import backends
 from tests.bench.playing import stacked
 from tests.library import cases

@@ -8,9 +8,15 @@ import pytest
 
 from skills.kinematics import JAW_TIP_MM, POINTING_DOWN
 from skills.planning.handoff import HELD_MM, NEEDLE_RADIUS_MM, hand_off, realign
-from skills.verification.clearance import FINGER_RADIUS_MM, WRIST_RADIUS_MM
+from skills.verification.clearance import (
+    FINGER_RADIUS_MM,
+    NEEDLE_FREE_RAD,
+    NEEDLE_THICK_MM,
+    WRIST_RADIUS_MM,
+    HandOff,
+    catch,
+)
 from skills.verification.monte_carlo import draw
-from skills.verification.needle import NEEDLE_FREE_RAD, NEEDLE_THICK_MM, HandOff, catch
 
 APPROACH = (-0.94, 0.10, -0.33)
 OPENING_RAD = radians(30)

@@ -16,10 +16,16 @@ from skills.kinematics import JAW_TIP_MM, POINTING_DOWN
 from skills.planning.handoff import NEEDLE_RADIUS_MM, OtherArm, PsmM, realign
 from skills.planning.trajectory import PassPath, Trajectory, time_parametrise
 from skills.verification import monte_carlo
-from skills.verification.clearance import FINGER_RADIUS_MM, WRIST_RADIUS_MM, clearance_to_pad, links_of
-from skills.verification.gates import Limits
+from skills.verification.clearance import (
+    FINGER_RADIUS_MM,
+    NEEDLE_FREE_RAD,
+    NEEDLE_THICK_MM,
+    WRIST_RADIUS_MM,
+    clearance_to_pad,
+    links_of,
+)
 from skills.verification.monte_carlo import Doubt, DoubtSettings, TipDoubt, doubt, draw, looked_at, scene_of
-from skills.verification.needle import NEEDLE_FREE_RAD, NEEDLE_THICK_MM
+from skills.verification.verdict import Limits
 from tests.verification.test_catch import APPROACH, OPENING_RAD, PLANNED
 
 PAD_TOP_MM = -150.0  # 5 mm under the lowest finger tips

@@ -8,7 +8,7 @@ import pytest
 from skills.kinematics import POINTING_DOWN, quaternion_of
 from skills.planning.handoff import NEEDLE_RADIUS_MM
 from skills.planning.trajectory import TRANSFER, PassPath, time_parametrise
-from skills.verification.needle import needle_poses, needle_to_pad_mm
+from skills.verification.clearance import needle_poses, needle_to_pad_mm
 from tests.bench.playing import stacked
 
 PAD_MM = np.array([0.0, 55.0, -150.0])

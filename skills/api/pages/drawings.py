@@ -30,8 +30,7 @@ from skills.demonstration.demonstration import Demo
 from skills.demonstration.movement import smoothed_speed
 from skills.demonstration.quality import pieces_of, times_in_words
 from skills.gridworld import paper
-from skills.gridworld.grid import GridPath
-from skills.gridworld.path_report import discretisation_rmse
+from skills.gridworld.grid import GridPath, discretisation_rmse
 from skills.learning.certificate import Coverage
 from skills.library.cards import Card
 from skills.schemas.comparison import CurvePoint
