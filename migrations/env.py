@@ -3,8 +3,10 @@
 from alembic import context
 from sqlalchemy.schema import SchemaItem
 
-from skills.db import service_tables  # noqa: F401 - declares all tables, with those of the library
-from skills.db.base import Base
+from skills.db import (
+    Base,
+    service_tables,  # noqa: F401 - declares all tables, with those of the library
+)
 
 
 def ours(_item: SchemaItem, name: str | None, kind: str, _reflected: bool, _compared: SchemaItem | None) -> bool:

@@ -24,7 +24,7 @@ from skills.formats.reader_process import ConfinedReader
 from skills.jobs.engine import Engine
 from skills.library.catalogue import seed_catalogue
 from skills.logs import request_id
-from skills.sandbox.limits import ProcessLimits
+from skills.sandbox import ProcessLimits
 from skills.settings import Settings
 
 DESCRIPTION = (

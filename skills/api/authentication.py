@@ -32,10 +32,10 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from skills.api.authorisation import LOCAL, Caller
 from skills.api.problems import answer_to
 from skills.api.rate_limits import RateLimits
-from skills.db.base import now
+from skills.db import now
+from skills.db.changes import Kept
 from skills.db.session import Database
 from skills.errors import Busy, NotAllowed, NotSignedIn, SkillsError, TooMany, WrongHost
-from skills.library.cache import Kept
 from skills.library.keys import (
     SHAPE,
     Holder,

@@ -16,7 +16,7 @@ from typing import Any
 from fastapi import Response
 
 from skills.api.authentication import is_open
-from skills.schemas.base import Given
+from skills.schemas import Given
 from skills.schemas.given import Job, Problem
 
 PROBLEM = "application/problem+json"

@@ -19,11 +19,10 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from skills.api.authorisation import Needs
 from skills.api.responses import KEPT_BYTES, Body, Encoded, answer, negotiate
-from skills.db.changes import Unasked, changes_of
+from skills.db.changes import Kept, Unasked, changes_of
 from skills.db.session import Database
 from skills.errors import SkillsError, UnknownFormat
 from skills.library import consent, integrity, policies
-from skills.library.cache import Kept
 from skills.library.releases import STANDS
 
 Style = tuple[str, str, str]  # surgeon, suture type, and media type of the response

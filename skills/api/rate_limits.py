@@ -9,8 +9,8 @@ the full rate; `skills serve` is one process. Jobs are counted in the database, 
 import time
 from collections.abc import Callable
 
+from skills.db.changes import Kept
 from skills.errors import TooMany
-from skills.library.cache import Kept
 from skills.settings import Settings
 
 BURST_S = 2.0  # a web page sends all of its requests at once

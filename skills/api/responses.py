@@ -31,18 +31,16 @@ from pydantic import BaseModel
 from sqlalchemy.orm import Session
 from starlette.types import Send
 
-from skills.db.changes import Changes
+from skills.db.changes import Changes, Kept
 from skills.db.models import PolicyVersion, Release
 from skills.db.service_tables import Job
 from skills.db.session import Database
 from skills.errors import PreconditionFailed, SkillsError, TooMany, UnknownFormat
 from skills.formats import BYTES
 from skills.library import policies
-from skills.library.cache import Kept
-from skills.library.demos import exported_chunk, exported_recording
+from skills.library.demos import damaged, exported_chunk, exported_recording
 from skills.library.integrity import learnt
 from skills.library.jobs import ACTIVE, find_job, find_jobs, job_json
-from skills.library.recordings import damaged
 from skills.library.releases import outcomes_of
 from skills.settings import MEBIBYTE, Settings
 

@@ -260,7 +260,7 @@ def create(
     as_json: AsJson = False,
 ) -> None:
     """Create a key, and print its secret, which is shown only this once."""
-    from skills.db.base import now
+    from skills.db import now
     from skills.library.keys import about_key, create_key
 
     with _database() as database, database.writing() as session:

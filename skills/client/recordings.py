@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from skills.client.connection import Connection, at, call, given
 from skills.client.transport import Progress
-from skills.schemas.base import Handedness, SkillLevel
+from skills.schemas import Handedness, SkillLevel
 from skills.schemas.given import Demonstration, DemoPath, Recording, RewardMap, Surgeon, SutureType
 
 

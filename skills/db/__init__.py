@@ -1,11 +1,89 @@
 """The database: tables whose rows label values, sessions and transactions, serialisation, and backups.
 
-base             column types and names that all tables share
+Here are the definitions that all tables share: names of constraints, UTC timestamps, digests, row numbers.
+
 models           the tables of the library
-service_tables   the tables of the service: jobs, workers, keys, sign-ins, events
+service_tables   the tables of the service: jobs, workers, keys, sign-ins, the audit log
 session          opening the database; sessions and their errors; a full and a failed disk; migrations
 packed           values in one column, and the archive format that they are stored in
 row_visibility   rules that restrict a caller's queries to some surgeons
-changes          change detection for caches, without reading a table
+changes          a cache, and change detection for caches, without reading a table
 archive          backups
 """
+
+from collections.abc import Iterator, Sequence
+from datetime import UTC, datetime
+from typing import Annotated, Any
+
+from sqlalchemy import BigInteger, DateTime, Dialect, Integer, MetaData, String
+from sqlalchemy.orm import DeclarativeBase, mapped_column
+from sqlalchemy.types import JSON, TypeDecorator
+
+NAMES = {
+    "ix": "ix_%(column_0_label)s",
+    "uq": "uq_%(table_name)s_%(column_0_name)s",
+    "ck": "ck_%(table_name)s_%(constraint_name)s",
+    "fk": "fk_%(table_name)s_%(column_0_name)s",
+    "pk": "pk_%(table_name)s",
+}
+
+PARAMETERS = 10_000  # ours: per statement, well below the limit of either database
+
+
+class Moment(TypeDecorator[datetime]):
+    """A column of UTC timestamps on every database.
+
+    A timestamp without time zone is a programming error, which is asserted: SQLite would store it unchecked.
+    """
+
+    impl = DateTime(timezone=True)
+    cache_ok = True
+
+    def process_bind_param(self, value: datetime | None, dialect: Dialect) -> datetime | None:
+        """Convert to UTC before storing."""
+        if value is None:
+            return None
+        assert value.tzinfo is not None, "times must have a time zone"
+        return value.astimezone(UTC)
+
+    def process_result_value(self, value: datetime | None, dialect: Dialect) -> datetime | None:
+        """Return the timestamp in UTC; SQLite returns it without its time zone."""
+        return value if value is None else value.replace(tzinfo=UTC) if value.tzinfo is None else value.astimezone(UTC)
+
+
+class Base(DeclarativeBase):
+    """The declarative base class of all tables."""
+
+    metadata = MetaData(naming_convention=NAMES)
+    type_annotation_map = {  # noqa: RUF012 - SQLAlchemy reads it from the class
+        datetime: Moment,
+        dict[str, Any]: JSON,
+        list[Any]: JSON,
+        str: String(200),
+    }
+
+
+RowId = Annotated[
+    int, mapped_column(BigInteger().with_variant(Integer, "sqlite"), primary_key=True, autoincrement=True)
+]
+Sha256 = String(64)
+Slug = String(64)
+
+
+def in_parts(rows: Sequence[int]) -> Iterator[Sequence[int]]:
+    """Split row numbers into batches of at most `PARAMETERS` for `IN` clauses.
+
+    A statement has at most 32,766 parameters on SQLite and 65,535 on PostgreSQL.
+    """
+    for at in range(0, len(rows), PARAMETERS):
+        yield rows[at : at + PARAMETERS]
+
+
+def now() -> datetime:
+    """Return the current time in UTC."""
+    return datetime.now(UTC)
+
+
+def rfc3339(moment: datetime | None) -> str | None:
+    """Return a timestamp in UTC as RFC 3339 text; None for None."""
+    return None if moment is None else moment.isoformat().replace("+00:00", "Z")

@@ -37,7 +37,7 @@ from sqlalchemy import (
 )
 from sqlalchemy.types import NullType, TypeEngine
 
-from skills.db.base import Base, Moment, now, rfc3339
+from skills.db import Base, Moment, now, rfc3339
 from skills.db.packed import Packed
 from skills.db.service_tables import Executor, SignIn
 from skills.db.session import revision_of, revisions, upgrade

@@ -22,7 +22,7 @@ from sqlalchemy import (
 from sqlalchemy.orm import Mapped, mapped_column, relationship
 
 from skills.comparison.distances import Measured
-from skills.db.base import Base, RowId, Sha256, Slug, now
+from skills.db import Base, RowId, Sha256, Slug, now
 from skills.db.packed import Packed, stored
 from skills.demonstration.demonstration import Demo, Partner, Pause
 from skills.gridworld.grid import GridPath, GridWorld

@@ -13,7 +13,7 @@ from typing import Any
 from sqlalchemy import ColumnElement, and_, event, exists, or_, select
 from sqlalchemy.orm import ORMExecuteState, Session, with_loader_criteria
 
-from skills.db.base import Base
+from skills.db import Base
 from skills.db.models import (
     Demonstration,
     MeasuredShape,

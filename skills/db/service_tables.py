@@ -1,16 +1,20 @@
-"""The tables of the service's own state: jobs and workers, keys and sign-ins, and events.
+"""The tables of the service's own state: jobs and workers, keys and sign-ins, and the audit log.
 
-Events are append-only. Revoked keys are not deleted; a sign-in is deleted when it ends.
+An event of the audit log has an actor, an action, an object and a time; surgeons appear only by the random subject of
+their row. Events are append-only. Revoked keys are not deleted; a sign-in is deleted when it ends.
 """
 
+import secrets
+from collections.abc import Sequence
 from datetime import datetime
-from typing import Any
+from typing import Any, cast
 
-from sqlalchemy import CheckConstraint, ForeignKey, Index, String, UniqueConstraint, text
-from sqlalchemy.orm import Mapped, mapped_column, relationship
+from sqlalchemy import CheckConstraint, ForeignKey, Index, String, Table, UniqueConstraint, insert, text
+from sqlalchemy.orm import Mapped, Session, mapped_column, relationship
 
-from skills.db.base import Base, RowId, Sha256, now
+from skills.db import Base, RowId, Sha256, now
 from skills.db.models import Demonstration, PolicyVersion, Surgeon
+from skills.packing import canonical, sha256
 
 LONGEST_REASON = 2000  # characters
 
@@ -157,3 +161,41 @@ class Event(Base):
     object_kind: Mapped[str]
     object_id: Mapped[str]
     subject: Mapped[str | None] = mapped_column(String(32), index=True)
+
+
+# ---- the audit log -------------------------------------------------------------------------------------------------
+
+
+def record_event(
+    session: Session, actor: str, action: str, object_kind: str, object_id: str, surgeon: Surgeon | None = None
+) -> None:
+    """Add an event to the caller's transaction."""
+    record_events(session, actor, action, object_kind, [(object_id, surgeon)])
+
+
+def record_events(
+    session: Session, actor: str, action: str, object_kind: str, objects: Sequence[tuple[str, Surgeon | None]]
+) -> None:
+    """Add one event for each of several objects of one kind, each with its surgeon, to the caller's transaction."""
+    if objects:
+        at = now()
+        add = insert(cast(Table, Event.__table__))
+        # One statement on the bare table for all of them: a batch adds many events at once.
+        session.execute(add, [_event(at, actor, action, object_kind, *one) for one in objects])
+
+
+def _event(
+    at: datetime, actor: str, action: str, object_kind: str, object_id: str, surgeon: Surgeon | None
+) -> dict[str, Any]:
+    subject = surgeon.subject if surgeon else None
+    # The random part makes the digests of two equal events at one moment different.
+    identity = [at.isoformat(), actor, action, object_kind, object_id, subject, secrets.token_hex(8)]
+    return {
+        "sha256": sha256(canonical(identity)),
+        "at": at,
+        "actor": actor,
+        "action": action,
+        "object_kind": object_kind,
+        "object_id": object_id,
+        "subject": subject,
+    }

@@ -23,8 +23,8 @@ from skills.learning.networks import DDPG, DQN, TRPO, Deep, Network, network_q
 from skills.learning.policy import Policy
 from skills.learning.q_learning import Training
 from skills.packing import known
+from skills.sandbox import ProcessLimits
 from skills.sandbox.forked import call_alone
-from skills.sandbox.limits import ProcessLimits
 
 NEEDED = ("torch", "stable_baselines3", "sb3_contrib", "gymnasium")
 TARGET = "skills.deep.training:train"

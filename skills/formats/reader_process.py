@@ -33,8 +33,8 @@ from skills.fields import as_json
 from skills.formats import read_recording, write_mcap
 from skills.formats.mcap import _kernels
 from skills.remedies import read_remedies
+from skills.sandbox import ProcessLimits
 from skills.sandbox.forked import ForkServer, Turns
-from skills.sandbox.limits import ProcessLimits
 from skills.schemas import recordings as described
 
 MOST = 200  # entries of each list of unlimited length; `counts` has the full numbers of segments and labels
@@ -303,7 +303,7 @@ def answered(read: Callable[..., Recording | Told], file: BinaryIO, answer: Bina
         value: Recording | Told | Refusal = read(file, **how)
     except SkillsError as error:
         value = Refusal.of(error)
-    except MemoryError:  # `skills.sandbox.limits.perform` reports it by its exit code
+    except MemoryError:  # `skills.sandbox.perform` reports it by its exit code
         raise
     except Exception as error:  # a bug: its message may quote the file, and must not be logged
         raise RuntimeError(type(error).__name__).with_traceback(error.__traceback__) from None

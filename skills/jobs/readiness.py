@@ -19,7 +19,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from skills.comparison._kernels import warp_pairs_compiled
 from skills.compiled import check_kept, kept_in, make_ready
-from skills.db.base import now
+from skills.db import now
 from skills.db.models import SutureType
 from skills.db.service_tables import Executor
 from skills.db.session import Database, revision_of, revisions

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 from dbos import DBOS, DBOSClient, WorkflowStatus
 from sqlalchemy import delete, func, select, update
 
-from skills.db.base import now
+from skills.db import now
 from skills.db.service_tables import LONGEST_REASON, Executor, Job
 from skills.db.session import Database
 from skills.errors import Busy, SkillsError

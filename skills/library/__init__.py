@@ -12,11 +12,10 @@ from typing import Any
 
 from sqlalchemy import update
 
-from skills.db.base import now
-from skills.db.service_tables import Job
+from skills.db import now
+from skills.db.service_tables import Job, record_event
 from skills.db.session import Database
 from skills.library.batch_work import retrain_part
-from skills.library.events import record
 from skills.library.jobs import PART, Store
 from skills.library.playbacks import check_playback, draw_pictures
 from skills.library.training import train_style
@@ -60,4 +59,4 @@ def perform_job(database: Database, row: int, attempt: int, settings: Settings) 
             return  # cancelled during the computation, or another attempt was faster
         job = session.get_one(Job, row)
         job.result = store(session, job.asked_by)
-        record(session, "worker", "finish", f"job-{kind}", job.id)
+        record_event(session, "worker", "finish", f"job-{kind}", job.id)

@@ -24,17 +24,15 @@ from sqlalchemy import Select, exists, func, inspect, select, tuple_, update
 from sqlalchemy.orm import Session
 
 from skills import __version__
-from skills.db import archive
+from skills.db import Base, archive, rfc3339
 from skills.db.archive import Manifest
-from skills.db.base import Base, rfc3339
 from skills.db.models import Demonstration, Erasure, PolicyVersion, Release, StoredRecording, Surgeon
-from skills.db.service_tables import Event, Job, Key
+from skills.db.service_tables import Event, Job, Key, record_event
 from skills.db.session import Database
 from skills.errors import Conflict, Corrupt
 from skills.library.catalogue import put_surgeon, salted
 from skills.library.demos import withdraw_demo
 from skills.library.erasure import delete_recording, erase_demo, erase_surgeon
-from skills.library.events import record
 from skills.library.jobs import ACTIVE
 from skills.library.keys import revoke_key
 from skills.library.releases import withdraw_policies
@@ -181,7 +179,7 @@ def restore(database: Database, source: Path, erasures: Erasures = NOTHING, told
             told("erasures")
             restored = _end_again(session, manifest, erasures)
             session.execute(update(Job).where(Job.state.in_(ACTIVE)).values(told_at=None))
-            record(session, "local", "restore", "installation", manifest.created_at)
+            record_event(session, "local", "restore", "installation", manifest.created_at)
     database.forget()
     return restored
 

@@ -22,7 +22,7 @@ from sqlalchemy import JSON, Table, bindparam, select, union_all, update
 from sqlalchemy.orm import Session
 
 from skills.comparison.combining import Combining
-from skills.db.base import now
+from skills.db import now
 from skills.db.models import Demonstration, PolicyDemonstration, PolicyVersion, Release, Surgeon
 from skills.db.packed import unpack_as
 from skills.db.service_tables import LONGEST_REASON, Job, StyleToRetrain
@@ -31,9 +31,9 @@ from skills.errors import Busy, Conflict, SkillsError
 from skills.fields import as_json
 from skills.learning.policy import Policy
 from skills.library import integrity, jobs, releases
-from skills.library.combined import Recipe, newest_demos, recipes_of, refuse_unlike
 from skills.library.consent import refusal
 from skills.library.jobs import PartRequest, RetrainingRequest, Store, TrainingRequest
+from skills.library.policies import Recipe, newest_demos, recipes_of, refuse_unlike
 from skills.library.releases import fit_of, not_worse, shown_mm, taught, way_of
 from skills.library.training import Learnt, Lesson, Stored, combined_lesson, learn_style, lessons, store_styles
 from skills.schemas.policies import FitOnTheSame, PolicyFigures, StoredComparison

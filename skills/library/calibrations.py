@@ -21,11 +21,11 @@ from sqlalchemy.orm import Session
 from skills import __version__
 from skills.arrays import Floats
 from skills.db.models import StoredCalibration
+from skills.db.service_tables import record_event
 from skills.demonstration.demonstration import Demo, Recording, cut_demo, propose_segments
 from skills.errors import BadInput, BadRecording, BadSegment, Corrupt, NotMetres
 from skills.formats import jigsaws
 from skills.formats.jigsaws import Trial
-from skills.library.events import record
 from skills.packing import canonical, sha256
 from skills.remedies import Action, Remedy
 from skills.scoring import calibration
@@ -157,7 +157,7 @@ def keep(session: Session, about: dict[str, Any], actor: str) -> tuple[StoredCal
     stored = StoredCalibration(sha256=digest, about=about)
     session.add(stored)
     session.flush()
-    record(session, actor, "add", "calibration", digest)
+    record_event(session, actor, "add", "calibration", digest)
     return stored, True
 
 

@@ -36,12 +36,12 @@ from skills.learning.certificate import Coverage
 from skills.library import card_words as words
 from skills.library import consent, releases
 from skills.library.catalogue import find_suture_type
-from skills.library.combined import combined_of, learnt_from
 from skills.library.demos import full_report
 from skills.library.inspection import AGREES
 from skills.library.integrity import covered, learnt, what_identifies
+from skills.library.policies import combined_of, learnt_from
 from skills.remedies import Action, Remedy
-from skills.schemas.base import PolicyName
+from skills.schemas import PolicyName
 from skills.schemas.policies import (
     CardCombined,
     CardCoverage,

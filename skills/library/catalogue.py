@@ -10,13 +10,13 @@ from typing import Any
 from sqlalchemy import Select, func, or_, select
 from sqlalchemy.orm import InstrumentedAttribute, Session
 
-from skills.db.base import rfc3339
+from skills.db import rfc3339
 from skills.db.changes import announce
 from skills.db.models import Erasure, Surgeon, SutureType
+from skills.db.service_tables import record_event
 from skills.errors import Erased, NotFound
 from skills.library import releases
 from skills.library.consent import may
-from skills.library.events import record
 from skills.remedies import Action, Remedy, did_you_mean
 
 NEAR = 500  # the most names that are compared with an unknown one for "did you mean"
@@ -35,14 +35,14 @@ def put_surgeon(session: Session, slug: str, about: dict[str, Any], actor: str) 
         _refuse_erased(session, slug)
         surgeon = Surgeon(slug=slug, subject=secrets.token_hex(16), **about)
         session.add(surgeon)
-        record(session, actor, "add", "surgeon", surgeon.subject, surgeon)
+        record_event(session, actor, "add", "surgeon", surgeon.subject, surgeon)
         session.flush()
         return surgeon, True
     # Before the fields are overwritten, because the decision below needs the old consent.
     covered, before = may(surgeon, "training"), surgeon.consent
     for name, value in about.items():
         setattr(surgeon, name, value)
-    record(session, actor, "change", "surgeon", surgeon.subject, surgeon)
+    record_event(session, actor, "change", "surgeon", surgeon.subject, surgeon)
     if surgeon.consent != before:
         session.flush()
         if not (covered and may(surgeon, "training")):  # also if it had expired: serving needs a new release
@@ -101,7 +101,7 @@ def put_suture_type(session: Session, slug: str, about: dict[str, Any], actor: s
     else:
         for name, value in about.items():
             setattr(suture, name, value)
-    record(session, actor, "add" if created else "change", "suture-type", slug)
+    record_event(session, actor, "add" if created else "change", "suture-type", slug)
     return suture, created
 
 

@@ -15,7 +15,7 @@ from typing import Any, Literal, Protocol
 
 from sqlalchemy import ColumnElement, Text, and_, cast, or_
 
-from skills.db.base import now
+from skills.db import now
 from skills.db.models import Surgeon
 from skills.errors import Conflict
 

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from sqlalchemy import ColumnElement, Select, delete, func, select
 from sqlalchemy.orm import Session
 
-from skills.db.base import in_parts
+from skills.db import in_parts
 from skills.db.changes import announce
 from skills.db.models import (
     Demonstration,
@@ -32,14 +32,12 @@ from skills.db.models import (
     Surgeon,
 )
 from skills.db.row_visibility import EVERYBODYS
-from skills.db.service_tables import Job
+from skills.db.service_tables import Job, record_event
 from skills.errors import Conflict, NotAllowed
 from skills.library.catalogue import find_surgeon, salted
-from skills.library.demos import find_demo
-from skills.library.events import record
+from skills.library.demos import find_demo, find_recording
 from skills.library.jobs import ACTIVE as NOT_ENDED
 from skills.library.jobs import UNSYNCHRONISED, forget_styles
-from skills.library.recordings import find_recording
 from skills.library.releases import withdraw_resting_on
 from skills.remedies import Action, Remedy
 
@@ -61,7 +59,7 @@ def erase_surgeon(session: Session, slug: str, actor: str) -> Dropped:
     session.execute(delete(Job).where(theirs), **UNSYNCHRONISED)
     named = session.scalars(select(RecordingSurgeon.recording_row).where(RecordingSurgeon.surgeon_row == surgeon.row))
     _erase(session, of_surgeon, surgeon, {*named})
-    record(session, actor, "erase", "surgeon", surgeon.subject, surgeon)
+    record_event(session, actor, "erase", "surgeon", surgeon.subject, surgeon)
     # A salted digest recognises the pseudonym if somebody uses it again, and cannot be read back.
     salt = secrets.token_hex(32)
     session.add(Erasure(salt=salt, digest=salted(salt, slug)))
@@ -96,7 +94,7 @@ def erase_demo(session: Session, demo_sha256: str, actor: str) -> Dropped:
     for some in in_parts([row for row, _, _ in jobs]):
         forget_styles(session, None, some)
         session.execute(delete(Job).where(Job.row.in_(some)), **UNSYNCHRONISED)
-    record(session, actor, "erase", "demonstration", demo_sha256, demo.surgeon)
+    record_event(session, actor, "erase", "demonstration", demo_sha256, demo.surgeon)
     _erase(session, of_demo, demo.surgeon, set())
     return [(row, attempt) for row, attempt, active in jobs if active]
 
@@ -128,7 +126,7 @@ def delete_recording(session: Session, recording_sha256: str, actor: str, *, any
         mine = (RecordingUpload.recording_row == stored.row, RecordingUpload.actor == actor)
         session.execute(delete(RecordingUpload).where(*mine), **UNSYNCHRONISED)
         return
-    record(session, actor, "erase", "recording", recording_sha256)
+    record_event(session, actor, "erase", "recording", recording_sha256)
     _delete_recordings(session, [stored.row])
 
 

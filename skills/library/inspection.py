@@ -15,7 +15,7 @@ from typing import Any
 from sqlalchemy import Column, Table, exists, func, select, text, tuple_
 from sqlalchemy.orm import Mapper, Session, defer, object_session
 
-from skills.db.base import Base
+from skills.db import Base
 from skills.db.models import (
     Demonstration,
     Plan,
@@ -33,10 +33,10 @@ from skills.db.session import Database, revision_of, revisions
 from skills.errors import Busy, SkillsError
 from skills.gridworld.reward import sparse_reward
 from skills.library.calibrations import read_calibration
-from skills.library.combined import path_of
+from skills.library.demos import recording_bytes
 from skills.library.integrity import covered, demo_identity, planned, policy_identity
 from skills.library.jobs import identity_of
-from skills.library.recordings import recording_bytes
+from skills.library.policies import path_of
 from skills.packing import canonical, sha256
 
 ROWS_AT_ONCE = 100

@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
+from skills.db.changes import Kept
 from skills.db.models import Demonstration, Plan, PolicyVersion, StoredPlayback, StoredRecording
 from skills.db.packed import digest
 from skills.demonstration.demonstration import Demo
@@ -22,7 +23,6 @@ from skills.errors import AmbiguousDigest, Corrupt, NotFound
 from skills.gridworld.grid import GridPath
 from skills.learning.certificate import Coverage
 from skills.learning.policy import Policy
-from skills.library.cache import Kept
 from skills.packing import canonical, sha256
 from skills.planning.plan import SuturePlan
 from skills.remedies import Remedy

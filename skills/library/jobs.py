@@ -19,12 +19,11 @@ from typing import Any, NamedTuple, NotRequired, TypedDict
 from sqlalchemy import ColumnElement, Select, delete, exists, func, select, update
 from sqlalchemy.orm import Session
 
-from skills.db.base import now, rfc3339
+from skills.db import now, rfc3339
 from skills.db.models import Demonstration, PolicyVersion, Release, Surgeon
 from skills.db.row_visibility import EVERYBODYS
-from skills.db.service_tables import Job, StyleToRetrain
+from skills.db.service_tables import Job, StyleToRetrain, record_event
 from skills.errors import Conflict, NotFound, TooMany
-from skills.library.events import record
 from skills.library.releases import Outcome, is_served
 from skills.packing import canonical, sha256
 from skills.remedies import Action, Remedy
@@ -117,7 +116,7 @@ def settle(session: Session, batch: int) -> None:
     mine = (Job.row == batch, Job.state.in_(ACTIVE))
     job = session.scalar(update(Job).where(*mine).values(**ended).returning(Job.id))
     if job is not None:
-        record(session, "worker", "finish", f"job-{BATCH}", job)
+        record_event(session, "worker", "finish", f"job-{BATCH}", job)
 
 
 def forget_styles(session: Session, demonstrations: Rows | None, batches: Rows | None) -> None:
@@ -223,7 +222,7 @@ def ask(
     )
     session.add(job)
     session.flush()
-    record(session, actor, "ask", f"job-{kind}", job.id, surgeon)
+    record_event(session, actor, "ask", f"job-{kind}", job.id, surgeon)
     return job, True
 
 
@@ -308,7 +307,7 @@ def cancel(session: Session, job_id: str, actor: str) -> Job:
     if job.kind == BATCH:
         cancel_parts(session, job.row)
     session.refresh(job)
-    record(session, actor, "cancel", f"job-{job.kind}", job.id)
+    record_event(session, actor, "cancel", f"job-{job.kind}", job.id)
     return job
 
 

@@ -25,12 +25,11 @@ from typing import Any
 from sqlalchemy import delete, or_, select, update
 from sqlalchemy.orm import Session
 
-from skills.db.base import now, rfc3339
+from skills.db import now, rfc3339
 from skills.db.row_visibility import Only
-from skills.db.service_tables import Key, SignIn
+from skills.db.service_tables import Key, SignIn, record_event
 from skills.errors import BadInput, Conflict, NotFound
 from skills.library.catalogue import find_surgeon
-from skills.library.events import record
 from skills.remedies import Action, Remedy
 from skills.schemas.requests import OWNER
 from skills.settings import Role
@@ -106,7 +105,7 @@ def create_key(
         expires_at=expires_at,
     )
     session.add(key)
-    record(session, actor, "create", "key", key_id)
+    record_event(session, actor, "create", "key", key_id)
     session.flush()
     return key, text
 
@@ -122,7 +121,7 @@ def revoke_key(session: Session, key_id: str, actor: str) -> Key:
         raise NotFound("There is no key with this id.", Remedy(Action.LIST_KEYS))
     if key.revoked_at is None:
         key.revoked_at = now()
-        record(session, actor, "revoke", "key", key_id)
+        record_event(session, actor, "revoke", "key", key_id)
     return key
 
 
@@ -224,7 +223,7 @@ def sign_in(session: Session, key_id: str, lasts: Lasts) -> str:
     cookie = secrets.token_urlsafe(SECRET_BYTES)
     key = session.scalars(select(Key).where(Key.id == key_id)).one()
     session.add(SignIn(digest=digest_of(cookie), key_row=key.row, created_at=at, used_at=at))
-    record(session, key.owner, "sign-in", "key", key_id)
+    record_event(session, key.owner, "sign-in", "key", key_id)
     return cookie
 
 

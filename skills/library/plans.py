@@ -11,8 +11,9 @@ from typing import Any
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from skills.db.base import rfc3339
+from skills.db import rfc3339
 from skills.db.models import Plan
+from skills.db.service_tables import record_event
 from skills.db.session import Database
 from skills.demonstration.partner import Partner
 from skills.errors import BadPlan, BadSpeed, NoApproach, NoHandOff
@@ -21,10 +22,9 @@ from skills.gridworld.grid import refuse_metres
 from skills.kinematics import DEFAULT_INSTRUMENT
 from skills.learning.policy import Policy
 from skills.library import policies
-from skills.library.combined import learnt_from
-from skills.library.events import record
+from skills.library.demos import Reader, Upload, read_upload
 from skills.library.integrity import find_by_digest, learnt, plan_identity, planned
-from skills.library.recordings import Reader, Upload, read_upload
+from skills.library.policies import learnt_from
 from skills.planning.handoff import PsmM
 from skills.planning.plan import SuturePlan, pose_xyzw, stack
 from skills.planning.trajectory import Trajectory, seams, seconds_by_phase, time_parametrise, transfers
@@ -92,7 +92,7 @@ def plan_sutures(database: Database, request: PlanIn, actor: str) -> tuple[Plan,
             return known, False
         stored = Plan(sha256=identity, policy=policy, plan=plan, about=about)
         session.add(stored)
-        record(session, actor, "plan", "plan", identity, policy.surgeon)
+        record_event(session, actor, "plan", "plan", identity, policy.surgeon)
         session.flush()
         return stored, True
 

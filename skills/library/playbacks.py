@@ -22,13 +22,12 @@ from typing import Any, Literal
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from skills.db.base import rfc3339
+from skills.db import rfc3339
 from skills.db.models import StoredPictures, StoredPlayback
-from skills.db.service_tables import Job
+from skills.db.service_tables import Job, record_event
 from skills.db.session import Database
 from skills.errors import BadPlan, Conflict, NotDrawnYet
 from skills.library import jobs, releases
-from skills.library.events import record
 from skills.library.integrity import find_by_digest, planned
 from skills.library.jobs import PicturesRequest, PlaybackRequest
 from skills.library.plans import find_plan, hands_over, plan_in_words, psm_m_moves, trajectory_of
@@ -165,7 +164,7 @@ def check_playback(
                 sha256=identity, plan=plan, feasible=verdict.feasible, report=report, measured=measured
             )
             session.add(known)
-            record(session, actor, "play", "playback", identity, plan.policy.surgeon)
+            record_event(session, actor, "play", "playback", identity, plan.policy.surgeon)
             session.flush()
             request_pictures(session, known, actor)
         return {"playback": known.sha256, "feasible": known.feasible}
@@ -262,7 +261,7 @@ def draw_pictures(
         # A retry of the job must not store the pictures twice.
         if session.scalar(of_playback) is None:
             session.add(StoredPictures(playback_row=playback.row, drawn=drawn))
-            record(session, actor, "draw", KIND, playback.sha256, playback.plan.policy.surgeon)
+            record_event(session, actor, "draw", KIND, playback.sha256, playback.plan.policy.surgeon)
         return {"playback": playback.sha256}
 
     return store

@@ -29,17 +29,16 @@ from sqlalchemy import ColumnElement, String, and_, bindparam, exists, select, t
 from sqlalchemy.orm import Session, aliased
 
 from skills.arrays import Floats
-from skills.db.base import now, rfc3339
+from skills.db import now, rfc3339
 from skills.db.changes import announce
 from skills.db.models import Demonstration, PolicyVersion, Release, Surgeon
-from skills.db.service_tables import Job, StyleToRetrain
+from skills.db.service_tables import Job, StyleToRetrain, record_event
 from skills.errors import Conflict, NotFound
 from skills.gridworld.grid import GridPath, GridWorld
 from skills.learning.evaluation import dtw
 from skills.learning.policy import Policy
 from skills.library import consent
 from skills.library.consent import refusal
-from skills.library.events import record
 from skills.library.integrity import learnt
 from skills.schemas.policies import FitOnTheSame
 
@@ -221,7 +220,7 @@ def release(session: Session, policy: PolicyVersion, actor: str) -> Release:
         raise Conflict(f"Version {policy.version} cannot be released: {'; '.join(reasons)}.", reasons=reasons)
     released = Release(policy=policy, surgeon_row=policy.surgeon_row, suture=policy.suture, released_by=actor)
     session.add(released)
-    record(session, actor, "release", "policy-version", policy.sha256, policy.surgeon)
+    record_event(session, actor, "release", "policy-version", policy.sha256, policy.surgeon)
     session.flush()
     announce(session)
     return released
@@ -283,7 +282,7 @@ def _with_superseded(releases: Sequence[Release], ending: list[Release]) -> list
 def _withdraw(session: Session, releases: Sequence[Release], actor: str) -> None:
     for one in releases:
         one.withdrawn_at = now()
-        record(session, actor, "withdraw", "policy-version", one.policy.sha256, one.policy.surgeon)
+        record_event(session, actor, "withdraw", "policy-version", one.policy.sha256, one.policy.surgeon)
     session.flush()
     announce(session)
 

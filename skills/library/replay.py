@@ -30,11 +30,11 @@ from skills.formats.replay_bag import (
 from skills.formats.verify import PLAN, POLICY, README, VERDICT
 from skills.learning.evaluation import TIE_BREAK, dtw
 from skills.library import consent, policies, releases
-from skills.library.combined import learnt_from
 from skills.library.demos import find_demo
 from skills.library.integrity import learnt, planned
 from skills.library.plans import describe_plan, find_plan, plan_in_words, trajectory_of
 from skills.library.playbacks import trajectory_digest
+from skills.library.policies import learnt_from
 from skills.packing import canonical, sha256
 from skills.planning.trajectory import Trajectory
 from skills.remedies import Action, Remedy

@@ -11,7 +11,7 @@ from typing import Any
 from sqlalchemy import ColumnElement, func, insert, select
 from sqlalchemy.orm import Session
 
-from skills.db.base import rfc3339
+from skills.db import rfc3339
 from skills.db.models import Demonstration, PolicyVersion, Surgeon, SutureType
 from skills.db.service_tables import Job, StyleToRetrain
 from skills.deep import require_installed
@@ -20,8 +20,8 @@ from skills.learning.learners import LEARNER_VERSION, describe_learner
 from skills.learning.q_learning import PhaseQLearning
 from skills.library import jobs
 from skills.library.catalogue import find_surgeon, find_suture_type
-from skills.library.combined import Recipe, newest_demos, recipes_of
 from skills.library.jobs import BATCH, PART, Asked, PartRequest, RetrainingRequest, did_nothing
+from skills.library.policies import Recipe, newest_demos, recipes_of
 from skills.library.releases import Outcome
 from skills.library.training import GATE_VERSION
 from skills.packing import canonical, sha256

@@ -16,7 +16,7 @@ from sqlalchemy.orm import Session
 from skills.comparison.combining import Combining, followed
 from skills.db.models import Demonstration, PolicyDemonstration, PolicyVersion, StoredRewardMap, Surgeon
 from skills.db.packed import seal, unpack_as
-from skills.db.service_tables import Job
+from skills.db.service_tables import Job, record_events
 from skills.db.session import Database
 from skills.deep import Tell, learn_policy, require_installed
 from skills.demonstration.demonstration import Demo
@@ -32,13 +32,11 @@ from skills.learning.policy import Policy
 from skills.learning.q_learning import PhaseQLearning
 from skills.library import jobs, releases
 from skills.library.catalogue import find_surgeon, find_suture_type
-from skills.library.combined import BEST, choose_demos, combining_of, describe_combined
 from skills.library.consent import refusal, require
 from skills.library.demos import find_demo
-from skills.library.events import record_each
 from skills.library.integrity import policy_identity_of
 from skills.library.jobs import QUEUED, Asked, Store, TrainingRequest, did_nothing
-from skills.library.policies import find_by_digest
+from skills.library.policies import BEST, choose_demos, combining_of, describe_combined, find_by_digest
 from skills.packing import canonical, sha256
 from skills.planning.plan import DrivenPass, driven_pass
 from skills.schemas.policies import Coverage, GridCertificate
@@ -321,7 +319,7 @@ def store_styles(session: Session, learnt: Sequence[Learnt]) -> list[Stored | Sk
     if new:
         values = [_version(one, (standing[one.lesson.row].last or 0) + 1) for one in new]
         known |= _stored(session.execute(ADD, values))
-        record_each(session, "worker", "train", "policy-version", [(one.sha256, one.lesson.surgeon) for one in new])
+        record_events(session, "worker", "train", "policy-version", [(one.sha256, one.lesson.surgeon) for one in new])
     rests_on = [
         {"policy_row": known[one.sha256].row, "demonstration_row": other} for one in new for other in one.lesson.others
     ]

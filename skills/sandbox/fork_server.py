@@ -30,7 +30,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
 
-from skills.sandbox.limits import ProcessLimits, confine, perform
+from skills.sandbox import ProcessLimits, confine, perform
 
 MAX_REQUEST_BYTES = 16384
 BEGUN, NO_FORK = b"begun", b"no fork"

@@ -38,8 +38,8 @@ from typing import IO, Any, BinaryIO, TypeVar
 from skills import packing
 from skills.errors import Busy, Unanswered
 from skills.packing import Known
+from skills.sandbox import ProcessLimits, check_end, environment, overdue
 from skills.sandbox.fork_server import BEGUN
-from skills.sandbox.limits import ProcessLimits, check_end, environment, overdue
 
 Watch = Callable[[bytes], None]
 Answer = TypeVar("Answer")

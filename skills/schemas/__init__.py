@@ -1,9 +1,80 @@
 """Schemas of everything that crosses HTTP, declared once and used by the API and the client.
 
 - `requests`: request bodies; strict, unknown fields are refused. The library takes them as they are.
-- `given`: responses. Their parts are in `recordings`, `policies`, `plans` and `comparison`, their common base in
-  `base`. A part that is a value of the domain is declared there, as a dataclass with `skills.fields.schema`.
+- `given`: responses. Their parts are in `recordings`, `policies` and `comparison`, their common base and types of
+  fields are here. A part that is a value of the domain is declared there, as a dataclass with `skills.fields.schema`.
 
 The library writes the JSON of a response, next to the use case of its noun (`plan_json` in `library/plans.py`). Rows
 store most of it as it was computed, so an older row is answered as it was, and not forced into today's fields.
+
+Lengths are mm; the frame of a position is in a field of its own.
 """
+
+from dataclasses import dataclass
+from reprlib import Repr
+from typing import Annotated, Generic, Literal, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from skills.fields import Sha256, schema
+from skills.gridworld.grid import GridWorld
+
+SHORT = Repr()
+# Limits of `repr` in a notebook.
+SHORT.maxlist, SHORT.maxtuple, SHORT.maxdict = 4, 4, 12
+SHORT.maxstring, SHORT.maxother = 100, 300
+
+
+class Given(BaseModel):
+    """The base class of responses: a client ignores fields that it does not know yet.
+
+    A schema is built at its first use, so that importing all of them is cheap.
+    """
+
+    model_config = ConfigDict(
+        extra="ignore", frozen=True, defer_build=True, validate_by_name=True, validate_by_alias=True,
+        serialize_by_alias=True,
+    )  # fmt: skip
+
+    def __repr_str__(self, join_str: str) -> str:
+        """Return the fields in a few lines: a policy has tens of thousands of actions, which would flood a notebook."""
+        return join_str.join(f"{name}={SHORT.repr(value)}" for name, value in self.__repr_args__())
+
+
+T = TypeVar("T")
+
+SkillLevel = Literal["novice", "intermediate", "expert"]
+Handedness = Literal["right", "left", "ambidextrous"]
+VersionNumber = Annotated[int, Field(ge=1)]
+
+
+class Page(Given, Generic[T]):
+    """One page of a list."""
+
+    items: list[T]
+    next: int | str | None = Field(description="The `cursor` of the next page; null where this is the last.")
+
+
+@schema
+@dataclass(frozen=True)
+class Grid(GridWorld):
+    """A grid world: the centre of the state (ix * ny + iy) * nz + iz is `origin_mm + cell_mm * (ix, iy, iz)`."""
+
+
+@schema
+@dataclass(frozen=True)
+class ChosenGrid(GridWorld):
+    """A demonstration's grid world, and whether it is the paper's or was fitted to the path.
+
+    Attributes:
+        chosen: paper or fit.
+    """
+
+    chosen: str
+
+
+class PolicyName(Given):
+    """The version number and digest of a policy version."""
+
+    version: VersionNumber
+    sha256: Sha256

@@ -10,7 +10,7 @@ from typing import Any
 from pydantic import ConfigDict, Field
 
 from skills.fields import Count, Fraction, Sha256, Slug
-from skills.schemas.base import Given
+from skills.schemas import Given
 from skills.scoring.calibration import Level, Skill
 from skills.scoring.deviation import Deviation
 from skills.scoring.features import ScoreFigure

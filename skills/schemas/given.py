@@ -1,18 +1,23 @@
 """All responses of the service, as models: routes declare them, and the client parses with them.
 
 Lengths are mm, angles rad, durations s, moments UTC; frames are named. The models depend on the standard library and
-pydantic alone. Their parts are in the modules from which they are imported here.
+pydantic alone. Those
+of plans are here, the parts of the others in the modules from which they are imported.
+
+The verdict on a plan consists of gates, figures, and Monte Carlo probabilities of success in worlds that differ from
+the plan. A figure is null if it could not be measured; a gate with such a figure has failed.
 """
 
+from dataclasses import dataclass
 from datetime import date, datetime
 from typing import Any, Literal
 
 from pydantic import ConfigDict, Field
 
-from skills.fields import Count, Slug
-from skills.schemas.base import Given, Handedness, Page, SkillLevel
+from skills.fields import Count, Point, Quaternion, Sha256, Slug, schema
+from skills.planning.trajectory import Seam, Transfer
+from skills.schemas import Given, Handedness, Page, PolicyName, SkillLevel
 from skills.schemas.comparison import Atlas, Score
-from skills.schemas.plans import Comparison, Plan, Playback, Trajectory
 from skills.schemas.policies import (
     Job,
     NextStep,
@@ -25,6 +30,8 @@ from skills.schemas.policies import (
     Version,
 )
 from skills.schemas.recordings import Demonstration, DemoPath, Recording, RewardMap, SuturePoints
+from skills.verification.monte_carlo import Doubt, Probability
+from skills.verification.verdict import PlaybackReport
 
 __all__ = [
     "Alive",
@@ -58,6 +65,173 @@ __all__ = [
     "Version",
     "WrongField",
 ]
+
+
+# ---- plans, their motion, and the verdict on it --------------------------------------------------------------------
+
+
+@schema
+@dataclass(frozen=True)
+class Verdict(PlaybackReport):
+    """The verdict and its figures; peak ratios and margins are PSM_A's, `arms` has all joints.
+
+    Attributes:
+        failure_in_words: The failure as a sentence.
+        doubt: Probabilities of success in worlds that differ from the plan.
+        plan: Digest of the plan.
+        trajectory: Digest of the stamps and joints that were checked.
+        policy: The policy version that the plan follows.
+        frame: Frame of the plan.
+    """
+
+    failure_in_words: str | None
+    doubt: Doubt
+    plan: Sha256
+    trajectory: Sha256
+    policy: PolicyName
+    frame: str
+
+
+class Sources(Given):
+    """The sources of PSM_M's values."""
+
+    approach: str
+    base: str | None
+
+
+class PsmM(Given):
+    """The arm that takes the needle, in the frame of the arm that hands it over."""
+
+    approach: Point
+    base_mm: Point | None
+    base_xyzw: Quaternion | None
+    instrument: str
+    enters: str = Field(description="start or after_A1.")
+    from_: Sources = Field(alias="from")
+
+
+class Pass(Given):
+    """One grid world of a plan: its placement, and the path in it."""
+
+    position_mm: Point
+    rotation_xyzw: Quaternion
+    start_mm: Point
+    states: list[int]
+    path_mm: list[Point]
+    jaw_xyzw: Quaternion
+    target_xyzw: Quaternion | None = Field(description="The jaw after A2; null where A1 alone is planned.")
+    transfer: Transfer | None
+
+
+class Timetable(Given):
+    """A plan as a function of time."""
+
+    rate_hz: float
+    samples: Count
+    duration_s: float
+    seconds_by_phase: dict[str, float]
+    speed_used_mm_s: float
+    peak_joint_speed_ratio: float
+    peak_joint_acceleration_ratio: float
+    deviation_mm: float
+    psm_m_moves: bool
+    seams: list[Seam]
+
+
+class Plan(Given):
+    """Grid worlds stacked at suture points."""
+
+    id: Sha256
+    sha256: Sha256
+    surgeon: Slug
+    suture: Slug
+    policy: PolicyName
+    arm: str
+    frame: str
+    instrument: str
+    orientation: str = Field(description="demonstrated, or assumed tool-down.")
+    path: str = Field(description="fitted, or cell centres.")
+    psm_m: PsmM | None
+    realignment: bool
+    speed_mm_s: float
+    tip_offset_mm: float
+    passes: list[Pass]
+    trajectory: Timetable
+    hands_over: bool = Field(default=True, description="Whether a hand-off is planned: A2 towards PSM_M.")
+    in_words: str = Field(default="", description="What the plan does and what it leaves out.")
+    created_at: datetime
+
+
+class Trajectory(Given):
+    """The motion of a plan, sampled: `rows` of `columns`, whose names contain their units."""
+
+    rate_hz: float
+    columns: list[str]
+    rows: list[list[float]]
+
+
+class StandingPolicy(PolicyName):
+    """The policy version that a plan follows, and whether it is released now."""
+
+    released: bool
+
+
+class PictureLinks(Given):
+    """Links to the pictures; all but the first are drawn after the verdict."""
+
+    picture: str
+    animation_mp4: str
+    animation_gif: str
+    joints: str
+    clearance: str
+
+
+class Headline(Given):
+    """A playback's headline: the verdict, the missing parts of the plan, and its probability of success."""
+
+    level: Literal["good", "caution", "bad"] = Field(
+        description="good: hands over, and succeeds as surely as the installation asks for a replay; bad: not "
+        "feasible, or surely succeeds in less than half of the worlds."
+    )
+    word: str = Field(description="The level in a word or two.")
+    text: str
+    tip_error_mm: float = Field(description="The stated mean error of the arm's tip, a setting of the installation.")
+    probability: Probability | None = Field(description="Of the whole plan; null where it was not judged.")
+
+
+class Playback(Given):
+    """The simulator's verdict on a plan."""
+
+    id: Sha256
+    sha256: Sha256
+    plan: Sha256
+    feasible: bool = Field(description="In an exact simulation, as far as the plan goes; read `headline`.")
+    headline: Headline | None = None
+    report: Verdict
+    picture: str
+    pictures: PictureLinks
+    created_at: datetime
+    policy: StandingPolicy
+
+
+class Comparison(Given):
+    """A recorded replay compared with a pass of its plan; triples are x, y and z."""
+
+    plan: Sha256
+    demo: Sha256
+    pass_index: Count = Field(alias="pass")
+    mean_mm: float
+    max_mm: float
+    start_mm: float = Field(description="Between the first samples.")
+    end_mm: float = Field(description="Between the last samples.")
+    dtw_mean_mm: Point
+    rmse_mm: Point
+    planned_s: float
+    recorded_s: float
+    tie_break: str
+
+
+# ---- keys, errors, surgeons, suture types, health ------------------------------------------------------------------
 
 
 class Key(Given):

@@ -15,7 +15,7 @@ from skills.gridworld.reward import RewardLevels
 from skills.learning.evaluation import Metrics, SpaceRollouts
 from skills.learning.q_learning import Training
 from skills.planning.plan import DrivenPass
-from skills.schemas.base import Given, Grid, Page, PolicyName, VersionNumber
+from skills.schemas import Given, Grid, Page, PolicyName, VersionNumber
 from skills.schemas.recordings import DemoReport
 
 

@@ -13,7 +13,7 @@ from skills.demonstration.segments import Segment, TakenSegment
 from skills.fields import Count, Point, Quaternion, Sha256, Slug, schema, stored_schema
 from skills.gridworld.grid import PathReport
 from skills.gridworld.reward import RewardLevels
-from skills.schemas.base import ChosenGrid, Given
+from skills.schemas import ChosenGrid, Given
 
 
 @schema

@@ -17,7 +17,7 @@ from skills.kinematics import INSTRUMENTS, JAW_TIP_MM
 from skills.learning.learners import LEARNERS, MAX_SEED, Learner, learner_of
 from skills.planning.handoff import Enters
 from skills.planning.plan import MAX_OUTSIDE_MM, MAX_PASSES, MAX_TIP_OFFSET_MM, RATE_HZ, SuturePoint
-from skills.schemas.base import Handedness, SkillLevel
+from skills.schemas import Handedness, SkillLevel
 from skills.settings import Role
 
 SLUG = r"^[a-z0-9][a-z0-9_-]{0,63}$"

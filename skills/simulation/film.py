@@ -25,7 +25,7 @@ from skills.arrays import Ints
 from skills.errors import SimulationFailed
 from skills.kinematics import JAW_TIP_MM, quaternion_of
 from skills.planning.trajectory import A1, A2, TRANSFER, Trajectory
-from skills.sandbox.limits import ProcessLimits
+from skills.sandbox import ProcessLimits
 from skills.simulation import pictures, scene
 from skills.simulation.player import simulated
 from skills.verification.clearance import needle_poses

@@ -12,8 +12,8 @@ from skills.arrays import Floats, Ints
 from skills.errors import BadInput, SimulationFailed, Unanswered
 from skills.kinematics import JAW_TIP_MM, matrix_of
 from skills.planning.trajectory import Trajectory
+from skills.sandbox import ProcessLimits
 from skills.sandbox.forked import call_alone
-from skills.sandbox.limits import ProcessLimits
 from skills.simulation import scene
 from skills.verification.clearance import psm_m_poses
 from skills.verification.playback import Playback, link_pairs

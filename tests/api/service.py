@@ -14,7 +14,7 @@ from starlette.testclient import TestClient
 
 from skills.api.app import create_app
 from skills.client import Client, Retrying
-from skills.db.base import Base
+from skills.db import Base
 from skills.db.service_tables import Job
 from skills.library.jobs import BATCH, PART
 from skills.settings import Settings

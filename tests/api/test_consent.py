@@ -10,7 +10,7 @@ import pytest
 
 from skills.api.authentication import REMEMBERED_S
 from skills.api.responses import NPZ
-from skills.db.base import now
+from skills.db import now
 from skills.library import consent
 from tests import backends
 from tests.api.keyed import As, copy_of_told, key

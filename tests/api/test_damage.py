@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
+from skills.db.changes import Kept
 from skills.library import integrity
-from skills.library.cache import Kept
 from tests.api.service import CSV, KESTREL, POLICY, Service, assert_problem
 from tests.library import cases
 

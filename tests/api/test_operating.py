@@ -13,7 +13,7 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 from sqlalchemy import update
 
-from skills.db.base import now
+from skills.db import now
 from skills.db.service_tables import Executor, Job
 from skills.db.session import Database
 from skills.errors import NotReady

@@ -12,7 +12,7 @@ import pytest
 from sqlalchemy import select
 from starlette.testclient import TestClient
 
-from skills.api.pages.page import BORROWED, PLOTLY, PLOTLY_MAP_STYLE, assets, build, number, share, size
+from skills.api.pages import BORROWED, PLOTLY, PLOTLY_MAP_STYLE, assets, build, number, share, size
 from skills.db.models import Demonstration, Plan, PolicyVersion, StoredRecording
 from skills.db.service_tables import Job
 from skills.learning.policy import rollout_from

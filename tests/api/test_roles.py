@@ -9,7 +9,7 @@ from fastapi import APIRouter
 
 from skills.api.authentication import is_open
 from skills.api.authorisation import Needs
-from skills.db.base import now
+from skills.db import now
 from skills.library.keys import LADDER, revoke_key
 from tests import backends
 from tests.api.keyed import As, key, routes

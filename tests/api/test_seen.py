@@ -8,7 +8,7 @@ import pytest
 from sqlalchemy import select
 
 from skills.api.authentication import is_open
-from skills.db.base import Base
+from skills.db import Base
 from skills.db.row_visibility import OF_NOBODY, Only
 from skills.db.service_tables import Job
 from skills.library.jobs import to_tell

@@ -15,11 +15,10 @@ import pytest
 from sqlalchemy import text
 
 from skills.api.responses import JSON, NPZ, Body, negotiate
-from skills.db.changes import APPLICATION, BOUND_S
+from skills.db.changes import APPLICATION, BOUND_S, Kept
 from skills.db.session import Database
 from skills.errors import UnknownFormat
 from skills.library import integrity
-from skills.library.cache import Kept
 from skills.library.catalogue import put_surgeon
 from skills.library.keys import create_key
 from tests import backends

@@ -15,7 +15,7 @@ from sqlalchemy import insert, select
 
 from skills.api.responses import json_of
 from skills.comparison.distances import THREADS, distances, shape_of
-from skills.db.base import now
+from skills.db import now
 from skills.db.models import Demonstration, StoredRecording, Surgeon
 from skills.db.packed import pack
 from skills.db.session import Database

@@ -6,7 +6,7 @@ import pytest
 from sqlalchemy import select
 from sqlalchemy.exc import StatementError
 
-from skills.db.base import now, rfc3339
+from skills.db import now, rfc3339
 from skills.db.service_tables import Executor
 from skills.db.session import Database
 

@@ -11,11 +11,10 @@ from time import monotonic
 import pytest
 from sqlalchemy import text
 
-from skills.db.base import now
+from skills.db import now
 from skills.db.changes import APPLICATION, BOUND_S, Changes, Unasked, announce, changes_of
-from skills.db.service_tables import Executor
+from skills.db.service_tables import Executor, record_event
 from skills.db.session import Database
-from skills.library.events import record
 from skills.library.releases import STANDS
 from tests import backends
 
@@ -56,7 +55,7 @@ async def until(what: Callable[[], object]) -> float:
 
 def change(database: Database) -> None:
     with database.writing() as session:
-        record(session, "test", "change", "surgeon", "nobody")
+        record_event(session, "test", "change", "surgeon", "nobody")
         announce(session)
 
 
@@ -111,7 +110,7 @@ def test_a_commit_that_is_not_finished_is_not_seen(tmp_path: Path):
     async def story(changes: Changes, another: Database) -> None:
         before = changes.version()
         with another.writing() as session:
-            record(session, "test", "change", "surgeon", "nobody")
+            record_event(session, "test", "change", "surgeon", "nobody")
             assert changes.version() == before
         assert changes.version() != before
 

@@ -8,8 +8,7 @@ from sqlalchemy import inspect, text
 from sqlalchemy.exc import DatabaseError, IntegrityError
 
 from skills.comparison.distances import STATES, Measured
-from skills.db import service_tables
-from skills.db.base import Base, now
+from skills.db import Base, now, service_tables
 from skills.db.models import (
     Erasure,
     MeasuredShape,

@@ -18,7 +18,7 @@ from skills.errors import BadColumns, BadInput, Busy, SkillsError, UnreadableRec
 from skills.formats import read_recording, reader_process, write_mcap
 from skills.formats.mcap import _kernels
 from skills.formats.reader_process import KNOWN, ConfinedReader, Refusal, Told, read_told
-from skills.sandbox.limits import ProcessLimits
+from skills.sandbox import ProcessLimits
 from tests.formats import bags
 
 LIMITS = ProcessLimits(

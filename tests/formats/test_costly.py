@@ -11,7 +11,7 @@ import pytest
 from skills.errors import SkillsError, UnreadableRecording
 from skills.formats import read_recording
 from skills.formats.reader_process import ConfinedReader
-from skills.sandbox.limits import ProcessLimits
+from skills.sandbox import ProcessLimits
 from tests.formats import costly
 
 MOST_CPU_S = 5.0  # for a file below 1 MB

@@ -12,7 +12,7 @@ from skills.formats.reader_process import ConfinedReader
 from skills.formats.suture_points import PARSE, SuturePoints, read_scene, suture_points
 from skills.formats.writer import write_messages
 from skills.kinematics import matrix_of, quaternion_of
-from skills.sandbox.limits import ProcessLimits
+from skills.sandbox import ProcessLimits
 
 START_NS = 1_760_000_000_000_000_000
 HALF = np.sqrt(0.5)

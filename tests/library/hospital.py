@@ -12,7 +12,7 @@ from typing import Any, cast
 from sqlalchemy import LargeBinary, Table, insert, select, type_coerce
 from sqlalchemy.orm import Session
 
-from skills.db.base import now
+from skills.db import now
 from skills.db.models import (
     Demonstration,
     PolicyVersion,

@@ -15,7 +15,7 @@ from skills.db.row_visibility import Only
 from skills.db.session import Database
 from skills.errors import BadInput, BadPath, Conflict, NotFound
 from skills.learning.evaluation import dtw
-from skills.library import atlas, distances
+from skills.library import atlas
 from skills.library.atlas import atlas_of
 from skills.library.catalogue import put_surgeon
 from skills.library.demos import withdraw_demo
@@ -41,13 +41,13 @@ def database(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Databas
 def measured(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Return a list that records how many pairs each call measures."""
     counted: list[int] = []
-    really = distances.distances_of
+    really = atlas.distances_of
 
     def count(shapes, pairs):
         counted.append(len(pairs))
         return really(shapes, pairs)
 
-    monkeypatch.setattr(distances, "distances_of", count)
+    monkeypatch.setattr(atlas, "distances_of", count)
     return counted
 
 
@@ -109,7 +109,7 @@ def test_the_atlas_uses_the_papers_measure_and_scaling_removes_size(database: Da
     plain, scaled = atlas_of(database, SUTURE), atlas_of(database, SUTURE, scaled=True)
     rows = select(Demonstration).order_by(Demonstration.row)
     with database.reading() as session:
-        shapes = [distances.shape_of(one.demo) for one in session.scalars(rows)]
+        shapes = [atlas.shape_of(one.demo) for one in session.scalars(rows)]
     np.testing.assert_allclose(far(plain)[0, 3], dtw(shapes[0], shapes[3]).total_mm / 100, atol=1e-4)
     one, other = (shape / shape[-1, 0] for shape in (shapes[0], shapes[3]))
     np.testing.assert_allclose(far(scaled)[0, 3], dtw(one, other).total_mm / 100, atol=1e-4)
@@ -155,7 +155,7 @@ def test_the_shape_cache_may_be_dropped_and_other_versions_are_ignored(
     with database.writing() as session:
         session.execute(text("DELETE FROM measured_shapes"))
     assert atlas_of(database, SUTURE) == first
-    monkeypatch.setattr(distances, "VERSION", 2)
+    monkeypatch.setattr(atlas, "VERSION", 2)
     assert atlas_of(database, SUTURE) == first
     assert measured == [6, 6] * 3
     with database.reading() as session:
@@ -170,8 +170,8 @@ def test_it_is_measured_in_blocks_and_kept_block_by_block(
     with database.writing() as session:
         session.execute(text("DELETE FROM measured_shapes"))
     measured.clear()
-    monkeypatch.setattr(distances, "PAIRS_AT_ONCE", 10)
-    monkeypatch.setattr(distances, "DEMOS_AT_ONCE", 2)
+    monkeypatch.setattr(atlas, "PAIRS_AT_ONCE", 10)
+    monkeypatch.setattr(atlas, "DEMOS_AT_ONCE", 2)
     assert atlas_of(database, SUTURE) == whole
     assert sum(measured) == 2 * 36 and len(measured) > 4
 
@@ -287,7 +287,7 @@ def test_erasure_leaves_nothing(database: Database, whole: bool):
 
 def test_what_is_erased_while_it_is_measured_is_not_kept(database: Database, monkeypatch: pytest.MonkeyPatch):
     names = small(database)
-    really = distances.distances_of
+    really = atlas.distances_of
 
     def erase_first(shapes, pairs):
         with database.writing() as session:
@@ -295,7 +295,7 @@ def test_what_is_erased_while_it_is_measured_is_not_kept(database: Database, mon
                 erase_surgeon(session, cohorts.name(0), "test")
         return really(shapes, pairs)
 
-    monkeypatch.setattr(distances, "distances_of", erase_first)
+    monkeypatch.setattr(atlas, "distances_of", erase_first)
     assert [one.id for one in atlas_of(database, SUTURE).demos] == names[2:]
     with database.reading() as session:
         there = {*session.scalars(select(Demonstration.row))}

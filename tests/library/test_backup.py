@@ -9,8 +9,7 @@ from typing import Any
 import pytest
 from sqlalchemy import inspect, select, text
 
-from skills.db import archive
-from skills.db.base import Base
+from skills.db import Base, archive
 from skills.db.models import Demonstration, Erasure, Surgeon
 from skills.db.service_tables import Executor, Job
 from skills.db.session import Database, alembic_config, revisions

@@ -15,13 +15,12 @@ from skills.learning.evaluation import dtw
 from skills.library import training
 from skills.library.backup import back_up, restore
 from skills.library.cards import card_of
-from skills.library.combined import learnt_from, path_of
 from skills.library.demos import upload_demo, withdraw_demo
 from skills.library.erasure import erase_demo, erase_surgeon
 from skills.library.inspection import inspect_installation
 from skills.library.integrity import learnt
 from skills.library.overview import matrix
-from skills.library.policies import find_by_digest
+from skills.library.policies import find_by_digest, learnt_from, path_of
 from skills.library.releases import release, standing
 from skills.schemas.requests import DemoIn
 from skills.settings import Settings

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from sqlalchemy import select
 
-from skills.db.base import now
+from skills.db import now
 from skills.db.models import Release
 from skills.db.service_tables import Event
 from skills.db.session import Database

@@ -7,18 +7,17 @@ from typing import Any
 import pytest
 from sqlalchemy import event, insert, select
 
-from skills.db import base
+from skills import db
 from skills.db.models import Demonstration, MeasuredShape, RecordingChunk, StoredRecording, Surgeon
 from skills.db.service_tables import Job
 from skills.db.session import Database
 from skills.errors import Conflict, NotAllowed, NotFound
-from skills.library import distances
+from skills.library import atlas
 from skills.library.atlas import atlas_of
 from skills.library.backup import back_up, erasures_of, restore
 from skills.library.catalogue import put_surgeon
-from skills.library.demos import add_demo, withdraw_demo
+from skills.library.demos import add_demo, store_recording, withdraw_demo
 from skills.library.erasure import delete_recording, erase_demo, erase_surgeon
-from skills.library.recordings import store_recording
 from skills.schemas.requests import DemoIn
 from tests import backends
 from tests.comparison.cohort import cohort
@@ -39,7 +38,7 @@ def test_cached_distances_to_erased_demos_outside_the_atlas_are_deleted(
     atlas_of(database, cases.SUTURE)  # the first now has a distance from the third
     agrees(1, ["atlas"])
     agrees(2, [])
-    really = distances.distances_of
+    really = atlas.distances_of
 
     def erase_first(shapes, pairs):
         with database.writing() as session:
@@ -47,13 +46,13 @@ def test_cached_distances_to_erased_demos_outside_the_atlas_are_deleted(
                 erase_surgeon(session, cohorts.name(2), "test")
         return really(shapes, pairs)
 
-    monkeypatch.setattr(distances, "distances_of", erase_first)
+    monkeypatch.setattr(atlas, "distances_of", erase_first)
     atlas_of(database, cases.SUTURE)
     with database.reading() as session:
         there = set(session.scalars(select(Demonstration.row)))
         kept = session.scalars(select(MeasuredShape)).all()
     assert {row for one in kept for row in one.measured.others.tolist()} <= there
-    monkeypatch.setattr(distances, "distances_of", really)
+    monkeypatch.setattr(atlas, "distances_of", really)
     atlas_of(database, cases.SUTURE)
     with database.reading() as session:
         assert len(session.scalars(select(MeasuredShape)).all()) == 2
@@ -159,7 +158,7 @@ def test_a_deleted_recording_does_not_come_back_with_a_backup(database: Database
 
 def many_jobs(database: Database, count: int) -> None:
     """Add jobs of kestrel, one of them running."""
-    at = base.now()
+    at = db.now()
     with database.writing() as session:
         row = session.scalars(select(Surgeon.row).where(Surgeon.slug == "kestrel")).one()
         jobs = [
@@ -178,7 +177,7 @@ def many_jobs(database: Database, count: int) -> None:
 
 
 def test_erasing_binds_no_more_parameters_for_more_rows(database: Database, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(base, "PARAMETERS", 7)
+    monkeypatch.setattr(db, "PARAMETERS", 7)
     most: list[int] = []
 
     def count(_connection: Any, _cursor: Any, _statement: str, parameters: Any, _context: Any, many: bool) -> None:

@@ -6,13 +6,13 @@ from pathlib import Path
 import pytest
 from sqlalchemy import select, text
 
-from skills.db.base import Base
+from skills.db import Base
 from skills.db.models import Demonstration, RecordingChunk
 from skills.db.packed import Packed
 from skills.db.service_tables import Event
 from skills.db.session import Database
 from skills.library import inspection
-from skills.library.distances import far_apart
+from skills.library.atlas import far_apart
 from skills.library.inspection import AGREES, WITH_OTHERS, inspect_installation, packed_values
 from tests import backends
 from tests.library import cases

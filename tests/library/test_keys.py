@@ -6,7 +6,7 @@ import pytest
 from sqlalchemy import select, text, update
 from sqlalchemy.orm import Session
 
-from skills.db.base import Base, now
+from skills.db import Base, now
 from skills.db.models import Surgeon
 from skills.db.service_tables import Key, SignIn
 from skills.db.session import Database

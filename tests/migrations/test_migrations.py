@@ -13,7 +13,7 @@ from alembic.script import ScriptDirectory
 from sqlalchemy import inspect, text
 from sqlalchemy.exc import DatabaseError
 
-from skills.db.base import Base
+from skills.db import Base
 from skills.db.session import Database, alembic_config, revisions
 from skills.errors import Conflict
 from skills.library.demos import find_demo, withdraw_demo

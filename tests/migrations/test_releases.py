@@ -18,7 +18,7 @@ from alembic import command
 from alembic.script import ScriptDirectory
 from sqlalchemy import make_url, text
 
-from skills.db.base import Base
+from skills.db import Base
 from skills.db.session import Database, alembic_config, revision_of
 from skills.library.inspection import inspect_installation
 from tests import backends

@@ -30,9 +30,9 @@ from sqlalchemy import LargeBinary, make_url, select
 from sqlalchemy.orm import Session
 
 import skills.api.app
-import skills.db.base
+import skills.db
 from skills.comparison.distances import distances_of, shape_of
-from skills.db.base import Base
+from skills.db import Base
 from skills.db.models import Demonstration, MeasuredShape
 from skills.db.packed import Packed
 from skills.db.service_tables import Job as JobRow
@@ -687,7 +687,7 @@ read_here.tell = lambda file, *, key="", **how: read_told(file, **how)  # type: 
 def in_our_hands() -> Iterator[None]:
     """Replace the clock, the reader and the engine; and put several styles into a part of a batch."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(skills.db.base, "datetime", Clock)
+        patch.setattr(skills.db, "datetime", Clock)
         patch.setattr(skills.api.app, "confined_reader", lambda _settings: nullcontext(read_here))
         patch.setattr(skills.api.app, "Engine", lambda _settings: Deaf())
         patch.setattr(retraining, "FEWEST_PARTS", 2)

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from skills.errors import BadInput, Unanswered
+from skills.sandbox import ProcessLimits
 from skills.sandbox.forked import call_alone
-from skills.sandbox.limits import ProcessLimits
 from tests.waiting import alive, crowded, until
 
 GIB = 1 << 30

@@ -17,8 +17,8 @@ from typing import IO, Any
 import pytest
 
 from skills.errors import Busy, Unanswered
+from skills.sandbox import ProcessLimits
 from skills.sandbox.forked import ForkServer
-from skills.sandbox.limits import ProcessLimits
 from tests.measured import peak_mib
 from tests.waiting import alive, crowded, until
 

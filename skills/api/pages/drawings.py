@@ -23,7 +23,7 @@ import numpy as np
 from markupsafe import Markup, escape
 from numpy.typing import NDArray
 
-from skills.api.pages.page import standalone
+from skills.api.pages import standalone
 from skills.arrays import Floats
 from skills.comparison.combining import Combined
 from skills.demonstration.demonstration import Demo

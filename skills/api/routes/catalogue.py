@@ -11,7 +11,7 @@ from skills.api.responses import Condition, Giving, refuse_changed, say, stored
 from skills.library import catalogue, erasure
 from skills.library.catalogue import surgeon_json, suture_json
 from skills.library.keys import about_key, create_key, list_keys, revoke_key
-from skills.schemas.base import SkillLevel
+from skills.schemas import SkillLevel
 from skills.schemas.given import Key, NewKey, Page, Surgeon, SutureType
 from skills.schemas.requests import KEY, LINE, KeyIn, SurgeonIn, SutureTypeIn
 from skills.settings import MEBIBYTE

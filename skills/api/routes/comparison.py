@@ -11,8 +11,7 @@ from fastapi import APIRouter, Query, Request, Response
 from skills.api.authorisation import Asking, needs
 from skills.api.dependencies import Db, Read, Slug, Strict
 from skills.api.openapi import gives, says
-from skills.api.pages import drawings
-from skills.api.pages.page import render
+from skills.api.pages import drawings, render
 from skills.api.responses import Giving, say
 from skills.api.routes.pages import PageRoute
 from skills.errors import BadInput, Conflict, NotFound

@@ -9,15 +9,14 @@ from sqlalchemy import select
 from skills.api.authorisation import Asking, erasing_is_for_admins, needs
 from skills.api.dependencies import Actor, Db, Digest, Incoming, Jobs, Limit, RowCursor, Strict, Tell
 from skills.api.openapi import ends, gives, gives_file, gives_page, makes
+from skills.api.pages import HTML, standalone_headers, wants_page
 from skills.api.pages.drawings import report_page
-from skills.api.pages.page import HTML, standalone_headers, wants_page
 from skills.api.responses import Condition, Giving, Stream, as_asked, names, recording_pieces, refuse_changed, stored
 from skills.api.routes.policies import Accept
 from skills.db.models import StoredRewardMap
 from skills.formats import BYTES, MEDIA_TYPES
-from skills.library import demos, erasure, recordings
-from skills.library.demos import demo_json, path_json, reward_map_json
-from skills.library.recordings import recording_json
+from skills.library import demos, erasure
+from skills.library.demos import demo_json, path_json, recording_json, reward_map_json
 from skills.schemas.given import Demonstration, DemoPath, Page, Recording, RewardMap
 from skills.schemas.requests import DIGEST, SLUG, DemoIn, Schema, SlugField
 from skills.settings import MEBIBYTE
@@ -57,7 +56,7 @@ def add_recording(
     upload: Incoming, asked: Annotated[RecordingQuery, Query()], db: Db, read: Tell, actor: Actor
 ) -> Response:
     """Store a recording, once for equal bytes, and propose the hand-offs in it."""
-    row, created = recordings.store_recording(db, upload, actor, read, asked.surgeon)
+    row, created = demos.store_recording(db, upload, actor, read, asked.surgeon)
     return stored(recording_json(row), created, f"/recordings/{row.sha256}")
 
 
@@ -71,7 +70,7 @@ def upload_demo(upload: Incoming, asked: Annotated[DemoUpload, Query()], db: Db,
 def get_recording(recording: Digest, db: Db, give: Giving) -> Response:
     """Return a recording."""
     with db.reading() as session:
-        return give(recording_json(recordings.find_recording(session, recording)))
+        return give(recording_json(demos.find_recording(session, recording)))
 
 
 @router.delete("/recordings/{recording}", dependencies=[needs("uploader")], **ends(404, 409))

@@ -12,7 +12,7 @@ from skills.api.authorisation import Asking, needs, open_to_all
 from skills.api.dependencies import Configured
 from skills.api.metrics import CONTENT_TYPE, ServiceMetrics
 from skills.api.openapi import says
-from skills.api.pages.page import render
+from skills.api.pages import render
 from skills.api.responses import say
 from skills.errors import BadInput, NotSignedIn
 from skills.jobs.readiness import refuse_unready

@@ -12,8 +12,8 @@ from sqlalchemy.orm import Session
 from skills.api.authorisation import Asking, needs, refuse_release
 from skills.api.dependencies import Actor, Db, Digest, Jobs, Limit, RowCursor, Slug, Strict, room_for_a_job
 from skills.api.openapi import ends, gives, gives_page, gives_stream, says, starts_job
+from skills.api.pages import HTML, standalone_headers, wants_page
 from skills.api.pages.drawings import card_page
-from skills.api.pages.page import HTML, standalone_headers, wants_page
 from skills.api.policy_cache import PolicyCache
 from skills.api.responses import (
     JSON,
