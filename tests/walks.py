@@ -24,7 +24,7 @@ from tests.library import cases
 
 PACKAGE = str(Path(skills.__file__).parent)
 COMMON = ("errors", "remedies", "settings", "logs", "arrays", "fields", "packing", "compiled", "kinematics")
-COMMON += ("db/", "client/", "api/app", "jobs/engine", "library/catalogue.py", "library/keys.py")
+COMMON += ("db/", "client/", "api/app", "jobs/__init__", "library/catalogue.py", "library/keys.py")
 
 
 def room(file: str) -> str:

@@ -18,10 +18,10 @@ from skills.api.openapi import complete
 from skills.api.policy_cache import AtHand, PolicyCache
 from skills.api.problems import TOO_LARGE, answer_refusals
 from skills.api.responses import DOWNLOADS_READ, Encoded, Watching
-from skills.api.routes import catalogue, comparison, demos, operating, pages, plans, policies
+from skills.api.routes import catalogue, demos, operating, pages, plans, policies
 from skills.db.session import Database
 from skills.formats.reader_process import ConfinedReader
-from skills.jobs.engine import Engine
+from skills.jobs import Engine
 from skills.library.catalogue import seed_catalogue
 from skills.logs import request_id
 from skills.sandbox import ProcessLimits
@@ -83,12 +83,12 @@ def create_app(settings: Settings) -> FastAPI:
         plans.picture_router,
         policies.retraining_router,
         policies.card_router,
-        comparison.router,
-        comparison.score_router,
+        demos.atlas_router,
+        demos.score_router,
         operating.router,
         operating.reference_router,
         pages.router,
-        comparison.page_router,
+        demos.page_router,
         operating.sign_in_router,
         catalogue.key_router,
     ):

@@ -22,7 +22,7 @@ from skills.api.rate_limits import RateLimits
 from skills.db.session import Database
 from skills.errors import TooLarge, TooSlow, UnknownFormat, UnreadableRecording
 from skills.formats import BYTES, MEDIA_TYPES, media_type_of
-from skills.jobs.engine import Engine
+from skills.jobs import Engine
 from skills.library.demos import Reader, Teller, Upload, check_digest
 from skills.library.jobs import refuse_too_many
 from skills.schemas.requests import DIGEST, FRAME, SLUG

@@ -13,7 +13,7 @@ from typing import Any
 import typer
 from typer.core import TyperGroup
 
-from skills.cli import comparison, installation, plans, policies, recordings
+from skills.cli import comparison, installation, policies, recordings
 from skills.cli.shell import err, tell
 from skills.remedies import did_you_mean
 
@@ -77,7 +77,7 @@ for commands in (  # the order of the commands in `skills --help`
     recordings.commands,
     policies.learning_commands,
     policies.commands,
-    plans.commands,
+    policies.plan_commands,
     comparison.commands,
     comparison.scoring_commands,
     comparison.report_commands,

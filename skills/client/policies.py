@@ -406,9 +406,9 @@ def _policy(about: dict[str, Any], arrays: bytes, demo: dict[str, Any]) -> "Lear
     from skills.gridworld.domain import Domain
     from skills.gridworld.grid import GridPath, GridWorld
     from skills.gridworld.reward import RewardLevels
-    from skills.learning.learners import learner_of
     from skills.learning.networks import Network
     from skills.learning.policy import Policy as LearntPolicy
+    from skills.learning.policy import learner_of
     from skills.learning.q_learning import Training
 
     grid = GridWorld(**{name: about["grid"][name] for name in ("origin_mm", "cell_mm", "shape")})

@@ -29,9 +29,8 @@ from skills.gridworld.grid import GridPath, GridWorld
 from skills.gridworld.reward import RewardLevels, RewardMap
 from skills.learning.certificate import Coverage
 from skills.learning.dynamic_programming import ValueIteration
-from skills.learning.learners import LEARNERS
 from skills.learning.networks import Network
-from skills.learning.policy import Policy
+from skills.learning.policy import LEARNERS, Policy
 from skills.learning.q_learning import PhaseQLearning, Training
 from skills.packing import added_later, few_numbers
 from skills.planning.handoff import PsmM

@@ -3,10 +3,159 @@
 The engine stores its workflows in SQLite or PostgreSQL. The row of a job in our database is authoritative; the engine
 only makes sure that a worker processes it.
 
-    engine      access to the engine for both sides; `Engine`, with which the service enqueues jobs
     workflows   the workflow of one job: try, retry, give up; and the watch, a worker's periodic tasks: leases and
                 heartbeats, enqueueing, taking over from dead workers, reading back outcomes
     readiness   checks of the database, the engine and the workers, for health checks; and the warm-up, which compiles
                 or loads the compiled loops before they are needed
     worker      the worker process; `skills.serving` starts it as a child of the service
+
+Here is the access to the engine for both sides, and `Engine`, with which the service enqueues jobs. The engine's inputs
+are the row and the attempt of a job, as plain JSON: its tables hold no personal data, and none of their contents is
+ever unpickled. Importing DBOS takes over a second, so it is imported where it is first needed.
 """
+
+import logging
+import sqlite3
+from collections.abc import Callable
+from pathlib import Path
+from queue import SimpleQueue
+from threading import Thread
+from typing import TYPE_CHECKING
+
+from sqlalchemy.engine import make_url
+
+from skills.db.session import make_private
+from skills.library.jobs import PART
+from skills.settings import Settings
+
+if TYPE_CHECKING:
+    from dbos import DBOSClient, DBOSConfig
+
+APPLICATION = "suture-skills"
+# Queues by urgency: a user waits for JOBS, somebody needs BATCHES soon, and nobody waits for ASIDE.
+JOBS, BATCHES, ASIDE = "jobs", "batches", "aside"
+# Concurrent jobs of each queue in a worker process, so that no queue blocks another. The engine stores these limits in
+# its database for all workers, so they are constants, not settings; the load of a machine is set by its number of
+# workers. Two parts of batches: one is learnt while the next one is already there (`library.batch_work`).
+QUEUES = {JOBS: 2, BATCHES: 2, ASIDE: 1}
+WORKFLOW = "perform_job"
+STEPS = "1"  # the engine's "application version": change it if and only if the sequence of steps in `workflows` changes
+# Polling interval of each queue. A poll takes 3 ms of processor time, in idle workers too; a part of a batch occupies a
+# worker for a second.
+POLLING_S = {JOBS: 0.3, BATCHES: 0.3, ASIDE: 1.0}
+FAREWELL_S = 2.0  # timeout of `Engine.close`, within which it processes its pending calls
+
+log = logging.getLogger(__name__)
+Errand = Callable[["DBOSClient"], None]
+
+
+def workflow_id(row: int, attempt: int) -> str:
+    """Return the workflow id of an attempt at a job; the engine completes a workflow of one id at most once."""
+    return f"{row}-{attempt}"
+
+
+def configuration(settings: Settings, executor: str) -> "DBOSConfig":
+    """Return the engine's configuration for one worker process."""
+    from dbos import DBOSPortableJSONSerializer
+
+    return {
+        "name": APPLICATION,
+        "system_database_url": settings.engine_url,
+        "dbos_system_schema": "dbos",
+        "serializer": DBOSPortableJSONSerializer(),  # the default is pickle, which can execute stored bytes
+        "executor_id": executor,
+        "application_version": STEPS,
+        "log_level": "WARNING",
+        "use_listen_notify": False,  # queues are polled anyway, and we send no messages
+    }
+
+
+def connect(settings: Settings) -> "DBOSClient":
+    """Return a client of the engine; it connects on first use."""
+    from dbos import DBOSClient, DBOSPortableJSONSerializer
+
+    prepare(settings)
+    return DBOSClient(
+        system_database_url=settings.engine_url,
+        dbos_system_schema="dbos",
+        serializer=DBOSPortableJSONSerializer(),
+        application_name=APPLICATION,
+        lazy=True,
+        retry_connection_errors=False,
+    )
+
+
+def prepare(settings: Settings) -> None:
+    """Create the engine's SQLite file in WAL mode, readable by this user only.
+
+    DBOS itself does not set the mode; SQLite stores it in the file. Does nothing on PostgreSQL.
+    """
+    url = make_url(settings.engine_url)
+    if url.get_backend_name() != "sqlite" or url.database is None:
+        return
+    make_private(Path(url.database))
+    connection = sqlite3.connect(url.database)
+    try:
+        connection.execute("PRAGMA journal_mode=WAL")
+    finally:
+        connection.close()
+
+
+def queue_of(kind: str) -> str:
+    """Return the name of the queue for jobs of a kind."""
+    return {PART: BATCHES, "pictures": ASIDE}.get(kind, JOBS)
+
+
+def tell(client: "DBOSClient", row: int, attempt: int, kind: str) -> None:
+    """Enqueue an attempt at a job in the engine; idempotent."""
+    client.enqueue(
+        {"queue_name": queue_of(kind), "workflow_name": WORKFLOW, "workflow_id": workflow_id(row, attempt)},
+        row,
+        attempt,
+    )
+
+
+def drop(client: "DBOSClient", row: int, attempt: int) -> None:
+    """Cancel an attempt: it does not start any more, and stops after its current step."""
+    client.cancel_workflow(workflow_id(row, attempt))
+
+
+class Engine:
+    """A client of the engine for the service: enqueues and cancels jobs in a background thread, on a best-effort basis.
+
+    Errors are logged and ignored: the row of the job is committed before, and the watch of a worker enqueues again jobs
+    that the engine does not know. So a response never waits for the engine, which on SQLite may be locked for long and
+    may not have been created yet.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
+        self._client: DBOSClient | None = None
+        self._errands: SimpleQueue[Errand | None] = SimpleQueue()
+        self._thread = Thread(target=self._run, name="engine", daemon=True)  # must not delay the exit of the process
+        self._thread.start()
+
+    def tell(self, row: int, attempt: int, kind: str) -> None:
+        """Enqueue an attempt at a job; call it after its row is committed."""
+        self._errands.put(lambda client: tell(client, row, attempt, kind))
+
+    def cancel(self, row: int, attempt: int) -> None:
+        """Cancel an attempt of a cancelled job; call it after the cancellation is committed."""
+        self._errands.put(lambda client: drop(client, row, attempt))
+
+    def close(self) -> None:
+        """Process the pending calls for up to `FAREWELL_S`, then stop."""
+        self._errands.put(None)
+        self._thread.join(FAREWELL_S)
+
+    def _run(self) -> None:
+        while (errand := self._errands.get()) is not None:
+            try:
+                self._client = self._client or connect(self._settings)
+                errand(self._client)
+            except Exception:
+                log.info("The job engine missed a message; the workers' watch will start the job.")
+                log.debug("This is why:", exc_info=True)
+        if self._client is not None:
+            self._client.destroy()
+            self._client = None

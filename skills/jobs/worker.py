@@ -29,7 +29,7 @@ from skills import logs
 from skills.db.service_tables import Job
 from skills.db.session import Database, refuse_other_tables
 from skills.errors import SkillsError
-from skills.jobs.engine import BATCHES, JOBS, POLLING_S, QUEUES, configuration, connect
+from skills.jobs import BATCHES, JOBS, POLLING_S, QUEUES, configuration, connect
 from skills.jobs.workflows import Leases, Perform, Watch, Work, register
 from skills.logs import job_id, told
 from skills.settings import Settings

@@ -22,7 +22,7 @@ from skills.db import now
 from skills.db.service_tables import LONGEST_REASON, Executor, Job
 from skills.db.session import Database
 from skills.errors import Busy, SkillsError
-from skills.jobs.engine import JOBS, QUEUES, STEPS, WORKFLOW, drop, tell, workflow_id
+from skills.jobs import JOBS, QUEUES, STEPS, WORKFLOW, drop, tell, workflow_id
 from skills.library.jobs import ACTIVE, BATCH, PART, end_part
 from skills.settings import Settings
 

@@ -239,7 +239,7 @@ def draw_pictures(
     database: Database, request: PicturesRequest, settings: Settings
 ) -> Callable[[Session, str], dict[str, Any]]:
     """Draw the film and plots of a playback; the returned function stores them."""
-    from skills.simulation import film, plots
+    from skills.simulation import film, pictures
 
     with database.reading() as session:
         playback = _playback(session, request)
@@ -251,8 +251,8 @@ def draw_pictures(
     drawn = Pictures(
         animation_mp4=shot.mp4,
         animation_gif=shot.gif,
-        joints_png=plots.png(plots.draw_joints(trajectory, measured, report)),
-        clearance_png=plots.png(plots.draw_clearance(trajectory, measured, report)),
+        joints_png=pictures.png(pictures.draw_joints(trajectory, measured, report)),
+        clearance_png=pictures.png(pictures.draw_clearance(trajectory, measured, report)),
     )
 
     def store(session: Session, actor: str) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from skills.db.models import Demonstration, PolicyVersion, Surgeon, SutureType
 from skills.db.service_tables import Job, StyleToRetrain
 from skills.deep import require_installed
 from skills.errors import Conflict, NotFound
-from skills.learning.learners import LEARNER_VERSION, describe_learner
+from skills.learning.policy import LEARNER_VERSION, describe_learner
 from skills.learning.q_learning import PhaseQLearning
 from skills.library import jobs
 from skills.library.catalogue import find_surgeon, find_suture_type

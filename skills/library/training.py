@@ -27,8 +27,7 @@ from skills.gridworld.reward import RewardMap, sparse_reward
 from skills.kinematics import instrument_of
 from skills.learning.certificate import Certificate, certify
 from skills.learning.evaluation import check_in_space, measure
-from skills.learning.learners import LEARNER_VERSION, Learner, describe_learner, learner_of, refuse_too_large
-from skills.learning.policy import Policy
+from skills.learning.policy import LEARNER_VERSION, Learner, Policy, describe_learner, learner_of, refuse_too_large
 from skills.learning.q_learning import PhaseQLearning
 from skills.library import jobs, releases
 from skills.library.catalogue import find_surgeon, find_suture_type

@@ -14,7 +14,7 @@ from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, StrictBool, St
 from skills.comparison.combining import COMBININGS, Combining
 from skills.gridworld.grid import MAX_HYSTERESIS, GridMode
 from skills.kinematics import INSTRUMENTS, JAW_TIP_MM
-from skills.learning.learners import LEARNERS, MAX_SEED, Learner, learner_of
+from skills.learning.policy import LEARNERS, MAX_SEED, Learner, learner_of
 from skills.planning.handoff import Enters
 from skills.planning.plan import MAX_OUTSIDE_MM, MAX_PASSES, MAX_TIP_OFFSET_MM, RATE_HZ, SuturePoint
 from skills.schemas import Handedness, SkillLevel

@@ -30,10 +30,9 @@ from skills.db.session import Database
 from skills.errors import BadPath
 from skills.gridworld.grid import PAPER_GRID, discretize
 from skills.gridworld.reward import RewardMap
-from skills.jobs.engine import Engine
+from skills.jobs import Engine
 from skills.learning.certificate import Certificate, Coverage, certify
-from skills.learning.learners import LEARNER_VERSION, describe_learner
-from skills.learning.policy import learn_tabular
+from skills.learning.policy import LEARNER_VERSION, describe_learner, learn_tabular
 from skills.learning.q_learning import PhaseQLearning
 from skills.library.catalogue import put_surgeon, seed_catalogue
 from skills.library.demos import upload_demo

@@ -29,9 +29,8 @@ from skills.gridworld.reward import RewardMap, sparse_reward
 from skills.learning import policy as table_policy
 from skills.learning.certificate import certify
 from skills.learning.evaluation import check_in_space, measure
-from skills.learning.learners import LEARNERS, Learner
 from skills.learning.networks import DDPG, DQN, TRPO, network_q
-from skills.learning.policy import Policy, rollout_from
+from skills.learning.policy import LEARNERS, Learner, Policy, rollout_from
 from skills.learning.slip import replay
 from skills.report.numbers import paper_source, sample_source
 from skills.settings import Settings

@@ -13,8 +13,7 @@ from skills.gridworld.reward import RewardMap, sparse_reward
 from skills.learning import _kernels
 from skills.learning.certificate import certify
 from skills.learning.evaluation import dtw
-from skills.learning.learners import Learner
-from skills.learning.policy import learn_tabular
+from skills.learning.policy import Learner, learn_tabular
 from skills.learning.q_learning import CellQLearning, PhaseQLearning
 from skills.report.numbers import paper_source
 from skills.seeds.recordings import sample_recordings

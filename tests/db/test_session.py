@@ -19,7 +19,7 @@ from skills.db import session as sessions
 from skills.db.models import SutureType
 from skills.db.session import EXIT_CODE, Database, make_private
 from skills.errors import Busy, DatabaseUnusable, StorageFull
-from skills.jobs.engine import prepare
+from skills.jobs import prepare
 from skills.settings import Settings
 from tests import backends
 from tests.waiting import END_S, crowded

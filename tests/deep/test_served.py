@@ -18,9 +18,8 @@ from skills.gridworld.domain import Domain
 from skills.gridworld.reward import RewardMap
 from skills.learning.dynamic_programming import Mdp, exact_q
 from skills.learning.evaluation import SpaceRollouts
-from skills.learning.learners import LEARNER_VERSION, describe_learner
 from skills.learning.networks import DDPG, DQN, Deep, Network, network_q
-from skills.learning.policy import Policy, rollout
+from skills.learning.policy import LEARNER_VERSION, Policy, describe_learner, rollout
 from skills.learning.q_learning import Training
 from skills.library import releases
 from skills.library.demos import find_demo

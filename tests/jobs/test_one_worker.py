@@ -10,7 +10,7 @@ from sqlalchemy import inspect, text
 
 from skills.db.service_tables import Executor
 from skills.db.session import Database
-from skills.jobs.engine import connect, drop, workflow_id
+from skills.jobs import connect, drop, workflow_id
 from skills.jobs.workflows import ENGINE_ATTEMPTS, Leases, Watch
 from tests.jobs.house import House
 from tests.waiting import until

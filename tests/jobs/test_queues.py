@@ -2,7 +2,7 @@
 
 from itertools import pairwise
 
-from skills.jobs.engine import JOBS, QUEUES
+from skills.jobs import JOBS, QUEUES
 from skills.library.jobs import PART
 from tests.jobs.house import House
 from tests.waiting import until

@@ -22,7 +22,7 @@ from skills.db.models import Demonstration, PolicyVersion
 from skills.db.service_tables import Event, Executor, Job
 from skills.db.session import RESTART_S, Database
 from skills.errors import Busy
-from skills.jobs.engine import STEPS, WORKFLOW, connect, workflow_id
+from skills.jobs import STEPS, WORKFLOW, connect, workflow_id
 from skills.packing import sha256
 from tests.backends import new_server, start
 from tests.e2e.conftest import WORKER

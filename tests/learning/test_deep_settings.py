@@ -14,9 +14,8 @@ from skills.gridworld.reward import sparse_reward
 from skills.learning.certificate import certify
 from skills.learning.dynamic_programming import Mdp, exact_q
 from skills.learning.evaluation import check_in_space
-from skills.learning.learners import check_learnable
 from skills.learning.networks import DDPG, DQN, TRPO, network_q
-from skills.learning.policy import Policy, learn_tabular, next_step, rollout
+from skills.learning.policy import Policy, check_learnable, learn_tabular, next_step, rollout
 from skills.learning.q_learning import CellQLearning, Training
 from tests.deep.networks import always, table_as_network, towards
 

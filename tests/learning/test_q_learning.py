@@ -9,8 +9,7 @@ from skills.gridworld.grid import MOVES, GridPath, GridWorld
 from skills.gridworld.reward import RewardLevels, sparse_reward
 from skills.learning.certificate import certify
 from skills.learning.dynamic_programming import ValueIteration
-from skills.learning.learners import MAX_SEED
-from skills.learning.policy import learn_tabular, rollout_from
+from skills.learning.policy import MAX_SEED, learn_tabular, rollout_from
 from skills.learning.q_learning import CellQLearning, PhaseQLearning
 from tests.gridworld.paths import follow, joins_nearest, named_path, random_path
 

@@ -5,8 +5,7 @@ from skills.errors import BadSettings
 from skills.gridworld.reward import RewardLevels, sparse_reward
 from skills.learning.certificate import certify
 from skills.learning.dynamic_programming import ValueIteration
-from skills.learning.learners import MAX_SEED
-from skills.learning.policy import learn_tabular, rollout_from
+from skills.learning.policy import MAX_SEED, learn_tabular, rollout_from
 from skills.learning.q_learning import PhaseQLearning
 from tests.gridworld.paths import WALKS, named_path, random_path
 

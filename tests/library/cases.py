@@ -12,7 +12,7 @@ from skills.db.session import Database
 from skills.demonstration.recording import Motion, Recording
 from skills.formats import write_mcap
 from skills.jobs.workflows import Work
-from skills.learning.learners import describe_learner
+from skills.learning.policy import describe_learner
 from skills.learning.q_learning import CellQLearning
 from skills.library import perform_job
 from skills.library.catalogue import put_surgeon, seed_catalogue

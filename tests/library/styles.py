@@ -8,7 +8,7 @@ from skills.db.models import PolicyVersion, SutureType
 from skills.db.service_tables import Job, StyleToRetrain
 from skills.db.session import Database
 from skills.formats.reader_process import read_told
-from skills.learning.learners import describe_learner
+from skills.learning.policy import describe_learner
 from skills.library import demos
 from skills.library.catalogue import put_surgeon, seed_catalogue
 from skills.library.demos import Made, find_recording, keep, make_demo

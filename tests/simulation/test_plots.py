@@ -14,7 +14,7 @@ from PIL import Image
 from skills.kinematics import CLASSIC, JOINTS
 from skills.planning.handoff import PsmM
 from skills.planning.trajectory import A2, TRANSFER, Trajectory, time_parametrise
-from skills.simulation import plots
+from skills.simulation import pictures
 from skills.verification.playback import PAD, PSM_A, Playback, link_pairs
 from tests.planning.motions import PSM_M, hand_off, ideal_playback, small_trajectory
 
@@ -56,7 +56,7 @@ def lines(figure: Figure, panel: int) -> dict[str, np.ndarray]:
 @pytest.mark.parametrize("joint", range(6), ids=JOINTS)
 def test_a_joint_is_drawn_in_degrees_or_mm_between_its_limits(joint: int):
     motion = both_arms()
-    figure = plots.draw_joints(motion, measured(motion), FEASIBLE)
+    figure = pictures.draw_joints(motion, measured(motion), FEASIBLE)
     scale = 1.0 if JOINTS[joint] == "insertion" else 180 / np.pi
     for name, joints in ((PSM_A, motion.joints), ("PSM_M", motion.psm_m.joints)):
         _, values = lines(figure, joint)[name]
@@ -69,7 +69,7 @@ def test_a_joint_is_drawn_in_degrees_or_mm_between_its_limits(joint: int):
 
 
 def test_time_runs_from_0_and_lines_break_between_passes():
-    times, values = lines(plots.draw_joints(ALONE, measured(ALONE), FEASIBLE), 0)[PSM_A]
+    times, values = lines(pictures.draw_joints(ALONE, measured(ALONE), FEASIBLE), 0)[PSM_A]
     assert times[0] == 0.0
     assert times[-1] == pytest.approx(ALONE.duration_s)
     [gap] = np.flatnonzero(np.isnan(values))
@@ -79,7 +79,7 @@ def test_time_runs_from_0_and_lines_break_between_passes():
 def test_the_phases_of_every_pass_are_shaded_where_they_are():
     motion = both_arms()
     times = motion.stamps_s - motion.stamps_s[0]
-    axes = plots.draw_joints(motion, measured(motion), FEASIBLE).axes[0]
+    axes = pictures.draw_joints(motion, measured(motion), FEASIBLE).axes[0]
     for shade, phase in zip(axes.collections, (TRANSFER, A2), strict=True):
         drawn = sorted((path.vertices[:, 0].min(), path.vertices[:, 0].max()) for path in shade.get_paths())
         mine = [np.flatnonzero((motion.pass_index == p) & (motion.phase == phase)) for p in range(motion.passes)]
@@ -91,15 +91,15 @@ def test_the_phases_of_every_pass_are_shaded_where_they_are():
 def test_the_nearest_links_of_each_kind_are_drawn_where_it_was_looked():
     motion = both_arms()
     playback = measured(motion)
-    figure = plots.draw_clearance(motion, playback, FEASIBLE)
+    figure = pictures.draw_clearance(motion, playback, FEASIBLE)
     times = (motion.stamps_s - motion.stamps_s[0])[playback.looked_at]
     found = lines(figure, 0) | lines(figure, 1)
     pairs = playback.link_pairs
     nearest = {  # each pair is a millimetre further apart than the one before it
         "PSM_A to the pad": next(k for k, p in enumerate(pairs) if p.other == PAD),
         "PSM_M to the pad": next(k for k, p in enumerate(pairs) if p.other == PAD and p.body == "PSM_M"),
-        plots.FINGERS_OF_BOTH: next(k for k, p in enumerate(pairs) if p.may_touch),
-        plots.OTHERS: next(k for k, p in enumerate(pairs) if p.other == "PSM_M"),
+        pictures.FINGERS_OF_BOTH: next(k for k, p in enumerate(pairs) if p.may_touch),
+        pictures.OTHERS: next(k for k, p in enumerate(pairs) if p.other == "PSM_M"),
     }
     for label, column in nearest.items():
         drawn_at, values = found[label]
@@ -111,7 +111,7 @@ def test_the_nearest_links_of_each_kind_are_drawn_where_it_was_looked():
 
 
 def test_an_arm_alone_has_its_distance_to_the_pad_only():
-    figure = plots.draw_clearance(ALONE, measured(ALONE), FEASIBLE)
+    figure = pictures.draw_clearance(ALONE, measured(ALONE), FEASIBLE)
     assert len(figure.axes) == 1
     assert set(lines(figure, 0)) == {"PSM_A to the pad", "limit"}
 
@@ -120,7 +120,7 @@ def test_the_first_sample_that_fails_is_marked_in_every_panel_and_said():
     words = "Pass 1, A1, sample 500: clearance of PSM_A finger_1 to the pad is 0.4 mm, the limit is 1."
     report = FEASIBLE | {"failure": {"sample": 500}, "failure_in_words": words}
     failed_s = ALONE.stamps_s[500] - ALONE.stamps_s[0]
-    for draw in (plots.draw_joints, plots.draw_clearance):
+    for draw in (pictures.draw_joints, pictures.draw_clearance):
         figure = draw(ALONE, measured(ALONE), report)
         assert words in figure.get_suptitle()
         for panel in range(len(figure.axes)):
@@ -131,11 +131,11 @@ def test_the_first_sample_that_fails_is_marked_in_every_panel_and_said():
 def test_the_same_playback_gives_the_same_picture_and_nothing_is_cut_off():
     motion = both_arms()
     report = FEASIBLE | {"failure": {"sample": 500}, "failure_in_words": "Pass 1 ..."}
-    for draw in (plots.draw_joints, plots.draw_clearance):
-        png = plots.png(draw(motion, measured(motion), report))
-        assert plots.png(draw(motion, measured(motion), report)) == png
+    for draw in (pictures.draw_joints, pictures.draw_clearance):
+        png = pictures.png(draw(motion, measured(motion), report))
+        assert pictures.png(draw(motion, measured(motion), report)) == png
         image = np.asarray(Image.open(io.BytesIO(png)).convert("L"))
-        assert image.shape[1] == round(plots.WIDE_INCH * plots.DPI)
+        assert image.shape[1] == round(pictures.WIDE_INCH * pictures.DPI)
         edges = np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]])
         assert (edges == 255).all()
 
