@@ -199,11 +199,11 @@ class MixedFrames(BadRecording):
 
 
 class BackwardStamps(BadRecording):
-    """Time stamps decrease."""
+    """Time stamps decrease, more often or by more than can be dropped."""
 
 
 class RepeatedStamps(BadRecording):
-    """More than half of the samples have the time stamp of the sample before: the clock stood still."""
+    """Too many samples have the time stamp of the sample before: the clock stood still."""
 
 
 class NotFinite(BadRecording):

@@ -38,9 +38,10 @@ from skills.db.session import Database
 from skills.errors import PreconditionFailed, SkillsError, TooMany, UnknownFormat
 from skills.formats import BYTES
 from skills.library import policies
-from skills.library.demos import damaged, exported_chunk, exported_recording
+from skills.library.demos import exported_chunk, exported_recording
 from skills.library.integrity import learnt
 from skills.library.jobs import ACTIVE, find_job, find_jobs, job_json
+from skills.library.recordings import damaged
 from skills.library.releases import outcomes_of
 from skills.settings import MEBIBYTE, Settings
 

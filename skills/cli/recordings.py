@@ -198,7 +198,17 @@ def _tell(stored: "Recording", as_json: bool) -> None:
     out.print(f"{stored.sha256}  {about}", soft_wrap=True)
     for name, value in stored.notes.items():
         out.print(f"{name}: {value}", markup=False, soft_wrap=True)
+    for line in _counted(stored):
+        out.print(line, markup=False, soft_wrap=True)
     show(stored.segments, False, ("arm", "start_s", "end_s", "reason"))
+
+
+def _counted(stored: "Recording") -> list[str]:
+    """Return a line for each count of samples that were dropped, or repeat the one before."""
+    repeated = [(one.duplicate_stamps, one.topic, "with a repeated stamp dropped") for one in stored.motions]
+    back = [(one.backward_stamps, one.topic, "with a stamp that went back dropped") for one in stored.dropped]
+    equal = [(one.equal_samples, one.topic, "equal to the sample before") for one in stored.quality]
+    return [f"{topic}: samples {what}: {count}" for count, topic, what in (*repeated, *back, *equal) if count]
 
 
 @demos.command("add")

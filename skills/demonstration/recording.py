@@ -10,19 +10,19 @@
 
 Motions, joints and signals are checked here, once, in their constructors: numbers are finite, time does not run
 backwards, coordinates are plausible for an arm, quaternions have length one. Data that fail are refused with topic and
-time; nothing is repaired, sorted or rescaled. The readers in `skills.formats` convert metres to millimetres before
-they construct these values.
+time; nothing is repaired, sorted or rescaled. A few samples whose stamps go back or repeat are dropped and counted
+(`forward_samples`). The readers in `skills.formats` convert metres to millimetres before they construct these values.
 """
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import islice
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from skills.arrays import Floats, Ints, frozen
+from skills.arrays import Flags, Floats, Ints, frozen
 from skills.errors import (
     BackwardStamps,
     NotAQuaternion,
@@ -139,7 +139,8 @@ def _at(stamps_ns: Ints, index: int) -> str:
 
 
 ARMS_LIMIT, MOTIONS_LIMIT = 16, 200  # ours: a da Vinci has three PSMs; every pair of arms and of motions is compared
-DUPLICATE_SHARE_LIMIT = 0.5  # ours: with more, the stamps are not the times of the samples
+DROPPED_SHARE_LIMIT = 0.01  # ours: a real bag loses 1 of 3300; with more, the stamps are not the times of the samples
+DROPPED_GAP_NS = 50_000_000  # ours: a tip at 100 mm/s moves by 5 mm in it, one cell of the paper's grid
 BASES_LIMIT = 64  # ours: pairs of motions of one arm in two frames; a dVRK's recording has one or two per arm
 PAIR_NS = 2_000_000  # ours: between two poses so near in time a tip at 100 mm/s moves by 0.2 mm
 PAIRS_LEAST = 10  # ours: from fewer pairs it cannot be concluded that a base stood still
@@ -163,6 +164,7 @@ class Motion:
         tip_mm: Positions of the tip in `frame`, shape (T, 3).
         rotation_xyzw: Orientations of the tip in `frame` as unit quaternions, shape (T, 4); None if not recorded.
         duplicate_stamps: Number of samples that were dropped because they had the stamp of the sample before.
+        backward_stamps: Number of samples that were dropped because their stamp was earlier than one before.
     """
 
     arm: str
@@ -172,6 +174,7 @@ class Motion:
     tip_mm: Floats
     rotation_xyzw: Floats | None = None
     duplicate_stamps: int = 0
+    backward_stamps: int = 0
 
     def __post_init__(self) -> None:
         count = len(self.stamps_ns)
@@ -206,11 +209,13 @@ class Signal:
         stamps_ns: Integer nanoseconds, shape (T,), never decreasing.
         values: Shape (T,): a jaw's angle in rad; or the state of a clutch, 0 released, 1 pressed, 2 a quick tap.
         topic: The source.
+        backward_stamps: Number of samples that were dropped because their stamp was earlier than one before.
     """
 
     stamps_ns: Ints
     values: Floats
     topic: str = "signal"
+    backward_stamps: int = 0
 
     def __post_init__(self) -> None:
         _set(self, "stamps_ns", frozen(self.stamps_ns, np.int64, (None,), f"stamps of {self.topic}"))
@@ -229,12 +234,14 @@ class Joints:
         topic: The source.
         stamps_ns: Integer nanoseconds, shape (T,), never decreasing.
         positions: Shape (T, J), in rad; the third joint of a PSM, its insertion, in mm.
+        backward_stamps: Number of samples that were dropped because their stamp was earlier than one before.
     """
 
     arm: str
     topic: str
     stamps_ns: Ints
     positions: Floats
+    backward_stamps: int = 0
 
     def __post_init__(self) -> None:
         _set(self, "stamps_ns", frozen(self.stamps_ns, np.int64, (None,), f"stamps of {self.topic}"))
@@ -496,10 +503,102 @@ def _unit(quaternions: Floats) -> Floats:
     return unit
 
 
+class Forward(NamedTuple):
+    """The samples that remain when those with stamps that go back or repeat are dropped.
+
+    Attributes:
+        kept: Which samples remain, shape (T,); None if all do.
+        repeated: Number of dropped samples with the stamp of the sample before.
+        backward: Number of dropped samples with an earlier stamp than one before.
+    """
+
+    kept: Flags | None
+    repeated: int
+    backward: int
+
+
+def forward_samples(topic: str, stamps_ns: Ints, values: Floats, *, equal_stamps: bool = False) -> Forward:
+    """Drop samples whose stamp is not later than all stamps before, and count them; too many are refused.
+
+    A sample that repeats stamp and values of the one before is a message that was recorded twice: nothing is lost with
+    it. All others that are dropped may be up to `DROPPED_SHARE_LIMIT` of the samples, go back by `DROPPED_GAP_NS`, and
+    leave a gap of `DROPPED_GAP_NS` in the stamps. Nothing is sorted: the order of the recording remains.
+
+    Args:
+        topic: The topic, for messages.
+        stamps_ns: Integer nanoseconds, shape (T,), in the order of the recording.
+        values: Values of the samples, shape (T,) or (T, K).
+        equal_stamps: Keep samples with equal stamps, as signals may have.
+
+    Raises:
+        BackwardStamps: Stamps go back, more often or by more than that, or leave a longer gap.
+        RepeatedStamps: Only repeated stamps are the cause.
+    """
+    if ((stamps_ns[1:] >= stamps_ns[:-1]) if equal_stamps else (stamps_ns[1:] > stamps_ns[:-1])).all():
+        return Forward(None, 0, 0)
+    latest_ns = np.maximum.accumulate(stamps_ns)
+    later = stamps_ns[1:] >= latest_ns[:-1] if equal_stamps else stamps_ns[1:] > latest_ns[:-1]
+    kept = np.concatenate([[True], later])
+    dropped = np.flatnonzero(~kept)
+    before = np.maximum.accumulate(np.where(kept, np.arange(len(kept)), 0))[dropped]  # the sample kept last
+    backward = stamps_ns[dropped] < stamps_ns[before]
+    rows = values.reshape(len(values), -1)
+    lost = backward | (rows[dropped] != rows[before]).any(axis=1)
+    if lost.any():
+        _refuse_lost(topic, stamps_ns, kept, dropped[lost], before[lost])
+    return Forward(kept, int((~backward).sum()), int(backward.sum()))
+
+
+def _refuse_lost(topic: str, stamps_ns: Ints, kept: Flags, lost: Ints, before: Ints) -> None:
+    """Refuse the recording if the samples to drop, the indices `lost`, are more than the limits allow.
+
+    Raises:
+        BackwardStamps: Stamps go back, too often or too far, or the gap is too long.
+        RepeatedStamps: Only repeated stamps are the cause.
+    """
+    remaining = np.flatnonzero(kept)
+    after = np.append(remaining, remaining[-1])[np.searchsorted(remaining, lost)]  # the last one, if none follows
+    back_ns = _apart_ns(stamps_ns[before], stamps_ns[lost])
+    gap_ns = _apart_ns(stamps_ns[after], stamps_ns[before])
+    many = len(lost) > DROPPED_SHARE_LIMIT * len(stamps_ns)
+    if not many and max(back_ns.max(), gap_ns.max()) <= DROPPED_GAP_NS:
+        return
+    limits = (
+        f"up to {DROPPED_SHARE_LIMIT:.0%} of the samples are dropped for such stamps, with gaps of at most "
+        f"{DROPPED_GAP_NS / 1e6:g} ms"
+    )
+    if (back_ns == 0).all():
+        raise RepeatedStamps(
+            f"{topic}: {len(lost)} of {len(stamps_ns)} samples repeat the stamp of the previous sample; {limits}. The "
+            "recorder's clock stood still, so record again.",
+            topic=topic,
+            duplicates=len(lost),
+            samples=len(stamps_ns),
+        )
+    first = int(np.argmax(back_ns > 0))
+    sample, step_s = int(lost[first]), float(back_ns[first]) / 1e9
+    raise BackwardStamps(
+        f"{topic}: the stamps decrease by {step_s:g} s {_at(stamps_ns, int(before[first]))} (sample {sample}), and "
+        f"{len(lost)} of {len(stamps_ns)} samples are out of order, by up to {float(back_ns.max()) / 1e6:g} ms, with "
+        f"gaps of up to {float(gap_ns.max()) / 1e6:g} ms; {limits}. The recorder's clock was set, or two recordings "
+        "were joined. Send each part separately.",
+        topic=topic,
+        sample=sample,
+        step_s=step_s,
+        dropped=len(lost),
+        samples=len(stamps_ns),
+    )
+
+
+def _apart_ns(later_ns: Ints, earlier_ns: Ints) -> Floats:
+    """Return differences that are not negative; exact also where they exceed an int64."""
+    return (later_ns - earlier_ns).view(np.uint64).astype(np.float64)
+
+
 def recorded_motion(
     *, arm: str, topic: str, frame: str, stamps_ns: Ints, tip_mm: Floats, rotation_xyzw: Floats | None
 ) -> Motion:
-    """Make a motion from samples as recorded: of samples with equal stamps the first remains, the others are counted.
+    """Make a motion from samples as recorded; those whose stamps go back or repeat are dropped and counted.
 
     Args:
         arm: The arm's name.
@@ -510,33 +609,67 @@ def recorded_motion(
         rotation_xyzw: Unit quaternions in `frame`, shape (T, 4), or None.
 
     Returns:
-        The motion, with the number of dropped samples in `duplicate_stamps`.
+        The motion, with the numbers of dropped samples in `duplicate_stamps` and `backward_stamps`.
 
     Raises:
-        BackwardStamps: A stamp is earlier than the one before it.
-        RepeatedStamps: More than half of the samples have the stamp of the sample before.
+        BackwardStamps, RepeatedStamps: As in `forward_samples`.
         NotFinite, NotMetres, NotAQuaternion: As for `Motion`.
     """
     stamps_ns = np.asarray(stamps_ns, dtype=np.int64)
-    later = stamps_ns[1:] > stamps_ns[:-1]
-    if later.all():
+    if (stamps_ns[1:] > stamps_ns[:-1]).all():
         return Motion(arm, topic, frame, stamps_ns, tip_mm, rotation_xyzw)
-    check_forwards(topic, stamps_ns)
     check_tips(topic, stamps_ns, tip_mm)  # before dropping, so that nothing wrong hides in a dropped sample
     if rotation_xyzw is not None:
         check_rotations(topic, stamps_ns, rotation_xyzw)
-    first = np.concatenate([[True], later])
-    duplicates = int((~first).sum())
-    if duplicates > DUPLICATE_SHARE_LIMIT * len(stamps_ns):
-        raise RepeatedStamps(
-            f"{topic}: {duplicates} of {len(stamps_ns)} samples repeat the stamp of the previous sample; the "
-            "recorder's clock stood still, so record again.",
-            topic=topic,
-            duplicates=duplicates,
-            samples=len(stamps_ns),
-        )
-    rotation = None if rotation_xyzw is None else rotation_xyzw[first]
-    return Motion(arm, topic, frame, stamps_ns[first], tip_mm[first], rotation, duplicates)
+    poses = tip_mm if rotation_xyzw is None else np.hstack([tip_mm, rotation_xyzw])
+    kept, repeated, backward = forward_samples(topic, stamps_ns, poses)
+    assert kept is not None
+    rotation = None if rotation_xyzw is None else rotation_xyzw[kept]
+    return Motion(arm, topic, frame, stamps_ns[kept], tip_mm[kept], rotation, repeated, backward)
+
+
+def recorded_signal(stamps_ns: Ints, values: Floats, topic: str) -> Signal:
+    """Make a signal of a continuous value, such as a jaw's angle; samples whose stamps go back are dropped and counted.
+
+    Raises:
+        BackwardStamps: As in `forward_samples`.
+        NotFinite: A value is NaN or infinite.
+    """
+    kept, _, backward = forward_samples(topic, stamps_ns, values, equal_stamps=True)
+    if kept is None:
+        return Signal(stamps_ns, values, topic)
+    check_finite(topic, stamps_ns, values)
+    return Signal(stamps_ns[kept], values[kept], topic, backward)
+
+
+def recorded_joints(arm: str, topic: str, stamps_ns: Ints, positions: Floats) -> Joints:
+    """Make joints from samples as recorded; those whose stamps go back are dropped and counted.
+
+    Raises:
+        BackwardStamps: As in `forward_samples`.
+        NotFinite: A position is NaN or infinite.
+    """
+    kept, _, backward = forward_samples(topic, stamps_ns, positions, equal_stamps=True)
+    if kept is None:
+        return Joints(arm, topic, stamps_ns, positions)
+    check_finite(topic, stamps_ns, positions)
+    return Joints(arm, topic, stamps_ns[kept], positions[kept], backward)
+
+
+def equal_samples(tip_mm: Floats, rotation_xyzw: Floats | None) -> int:
+    """Count the samples that repeat the pose of the sample before to the last bit.
+
+    A measured pose has noise: an arm that only rests repeats none. Many such samples mean that the recorder was faster
+    than the source.
+
+    Args:
+        tip_mm: Positions, shape (T, 3).
+        rotation_xyzw: Quaternions, shape (T, 4), or None.
+    """
+    same = (tip_mm[1:] == tip_mm[:-1]).all(axis=1)
+    if rotation_xyzw is not None:
+        same &= (rotation_xyzw[1:] == rotation_xyzw[:-1]).all(axis=1)
+    return int(same.sum())
 
 
 def _preference(motion: Motion) -> tuple[int, str]:

@@ -114,9 +114,12 @@ def _joined_motion(pieces: list[Motion]) -> Motion:
         tip_mm=np.concatenate([piece.tip_mm for piece in pieces]),
         rotation_xyzw=np.concatenate(turns) if len(turns) == len(pieces) else None,
     )
-    # `recorded_motion` counts only duplicates between the pieces; each piece has counted its own before.
-    dropped = sum(piece.duplicate_stamps for piece in pieces)
-    return replace(whole, duplicate_stamps=whole.duplicate_stamps + dropped)
+    # `recorded_motion` counts only what it drops between the pieces; each piece has counted its own before.
+    return replace(
+        whole,
+        duplicate_stamps=whole.duplicate_stamps + sum(piece.duplicate_stamps for piece in pieces),
+        backward_stamps=whole.backward_stamps + sum(piece.backward_stamps for piece in pieces),
+    )
 
 
 def _joints(parts: Iterable[Iterable[Joints]]) -> tuple[Joints, ...]:
@@ -130,6 +133,7 @@ def _joints(parts: Iterable[Iterable[Joints]]) -> tuple[Joints, ...]:
             topic,
             np.concatenate([piece.stamps_ns for piece in pieces]),
             np.concatenate([piece.positions for piece in pieces]),
+            sum(piece.backward_stamps for piece in pieces),
         )
         for topic, pieces in sorted(by_topic.items())
     )
@@ -145,7 +149,8 @@ def _signals(parts: Iterable[Pairs]) -> tuple[tuple[str, Signal], ...]:
 
 def _joined_signal(pieces: list[Signal]) -> Signal:
     stamps_ns = np.concatenate([piece.stamps_ns for piece in pieces])
-    return Signal(stamps_ns, np.concatenate([piece.values for piece in pieces]), pieces[0].topic)
+    dropped = sum(piece.backward_stamps for piece in pieces)
+    return Signal(stamps_ns, np.concatenate([piece.values for piece in pieces]), pieces[0].topic, dropped)
 
 
 def _clutch(pedals: tuple[tuple[str, Signal], ...], clutches: list[Signal]) -> Signal | None:

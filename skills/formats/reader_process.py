@@ -26,7 +26,17 @@ import numpy as np
 
 from skills import errors, packing
 from skills.compiled import check_kept, kept_in, make_ready
-from skills.demonstration.recording import BaseFrame, Joints, Label, Motion, Recording, Signal, Topic, base_frames
+from skills.demonstration.recording import (
+    BaseFrame,
+    Joints,
+    Label,
+    Motion,
+    Recording,
+    Signal,
+    Topic,
+    base_frames,
+    equal_samples,
+)
 from skills.demonstration.segments import Segment, press_times, propose_by_arm
 from skills.errors import BadInput, SkillsError, TooLarge, Unanswered, UnknownFormat, UnreadableRecording
 from skills.fields import as_json
@@ -75,8 +85,10 @@ def tell(recording: Recording) -> Told:
 def about_recording(recording: Recording, proposed: Sequence[Segment]) -> dict[str, Any]:
     """Return the description of a recording for clients: its contents, its quality and the proposed hand-offs.
 
-    Each list that the recording could make arbitrarily long is limited to `MOST` entries.
+    Each list that the recording could make arbitrarily long is limited to `MOST` entries. Counts of dropped and of
+    equal samples are only present if there are any, so that all other descriptions are those of version 0.1.0.
     """
+    dropped = [asdict(one) for one in _dropped(recording)[:MOST]]
     return {
         "duration_s": recording.duration_s,
         "notes": dict(recording.notes),
@@ -85,7 +97,7 @@ def about_recording(recording: Recording, proposed: Sequence[Segment]) -> dict[s
             asdict(described.Motion(m.arm, m.topic, m.frame, len(m.stamps_ns), m.duplicate_stamps))
             for m in recording.motions
         ],
-        "quality": [asdict(_quality(motion)) for motion in recording.motions],
+        "quality": [_quality(motion) for motion in recording.motions],
         "segments": [as_json(segment) for segment in proposed[:MOST]],
         "counts": asdict(described.RecordingCounts(len(proposed), len(recording.labels))),
         "labels": [asdict(_label(recording, label)) for label in recording.labels[:MOST]],
@@ -103,19 +115,28 @@ def about_recording(recording: Recording, proposed: Sequence[Segment]) -> dict[s
         ],
         "left_out": [asdict(described.LeftOut(topic, why)) for topic, why in recording.left_out[:MOST]],
         "base_frames": [as_json(base) for base in base_frames(recording)],
-    }
+    } | ({"dropped": dropped} if dropped else {})
 
 
-def _quality(motion: Motion) -> described.Quality:
-    steps_ns = np.diff(motion.stamps_ns)
-    return described.Quality(
+def _dropped(recording: Recording) -> list[described.Dropped]:
+    signals = [signal for _, signal in (*recording.jaws, *recording.grippers)]
+    streams: list[Motion | Joints | Signal]
+    streams = [*recording.motions, *recording.joints, *recording.masters, *signals]
+    return [described.Dropped(one.topic, one.backward_stamps) for one in streams if one.backward_stamps]
+
+
+def _quality(motion: Motion) -> dict[str, Any]:
+    steps_ns, equal = np.diff(motion.stamps_ns), equal_samples(motion.tip_mm, motion.rotation_xyzw)
+    quality = described.Quality(
         arm=motion.arm,
         topic=motion.topic,
         duration_s=float(np.ptp(motion.stamps_ns)) / 1e9,
         rate_hz=1e9 / float(np.median(steps_ns)) if len(steps_ns) else None,
         longest_gap_s=float(steps_ns.max(initial=0)) / 1e9,
         extent_mm=np.ptp(motion.tip_mm, axis=0).tolist(),
+        equal_samples=equal,
     )
+    return {name: value for name, value in asdict(quality).items() if name != "equal_samples" or value}
 
 
 def _label(recording: Recording, label: Label) -> described.Label:

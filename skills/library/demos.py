@@ -1,18 +1,13 @@
-"""Recordings, and demonstrations: hand-offs cut out of them and put into their grid worlds.
+"""Demonstrations: hand-offs cut out of recordings and put into their grid worlds, checked before they are stored.
 
-    file --Upload--> read_upload, tell_upload --keep--> StoredRecording with its chunks of 1 MiB
-    recording, DemoIn --make_demo--> Made --upload_demo, add_demo--> Added
-
-Everything is read and checked before any transaction.
+recording, DemoIn --make_demo--> Made --upload_demo, add_demo--> Added
 """
 
-import base64
-import hashlib
 import json
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from sqlalchemy import select
@@ -22,8 +17,6 @@ from skills.db import now, rfc3339
 from skills.db.models import (
     Demonstration,
     RecordingChunk,
-    RecordingSurgeon,
-    RecordingUpload,
     Release,
     StoredRecording,
     StoredRewardMap,
@@ -33,18 +26,19 @@ from skills.db.packed import digest
 from skills.db.row_visibility import EVERYBODYS
 from skills.db.service_tables import record_event
 from skills.db.session import Database
-from skills.demonstration.demonstration import Demo, Recording, Segment, cut_demo
+from skills.demonstration.demonstration import Demo, Segment, cut_demo
 from skills.demonstration.quality import describe
+from skills.demonstration.recording import equal_samples
 from skills.demonstration.segments import TakenSegment
-from skills.errors import BadInput, BadSegment, Conflict, Corrupt, SegmentNotNamed, UnknownFormat, UnreadableRecording
+from skills.errors import BadSegment, Conflict, SegmentNotNamed
 from skills.fields import as_json
-from skills.formats import MEDIA_TYPES, media_type_of, read_recording
 from skills.formats.reader_process import MOST, Told, read_told
 from skills.gridworld.grid import PAPER_GRID, GridPath, choose_grid, describe_path, discretize
 from skills.gridworld.reward import RewardMap, sparse_reward
 from skills.library import consent
 from skills.library.catalogue import find_surgeon, find_suture_type
 from skills.library.integrity import demo_identity, find_by_digest
+from skills.library.recordings import Teller, Upload, find_recording, keep, recording_bytes, tell_upload
 from skills.library.releases import withdraw_resting_on
 from skills.packing import canonical
 from skills.remedies import Action, Remedy
@@ -52,198 +46,8 @@ from skills.schemas import ChosenGrid
 from skills.schemas.recordings import DemoReport
 from skills.schemas.requests import DemoIn
 
-CHUNK_BYTES = 1 << 20
-Reader = Callable[..., Recording]  # `read_recording`, or a callable that runs it in another process
-Teller = Callable[..., Told]  # `read_told`, or a callable that runs it in another process
-BAGS = ("mcap", "rosbag1", "rosbag2")  # formats with checksums; text files have none
-
-
-@dataclass(frozen=True)
-class Upload:
-    """An upload, spooled to a file: its SHA-256, and the reading parameters that the format itself does not contain."""
-
-    file: BinaryIO
-    sha256: str
-    size_bytes: int
-    media_type: str
-    rate_hz: float | None = None
-    frame: str | None = None
-    vouched: bool = False  # the client sent a Content-Digest, and it matches the bytes
-
-    @property
-    def reading(self) -> dict[str, Any]:
-        """The reader's arguments."""
-        return {"rate_hz": self.rate_hz, "frame": self.frame}
-
-
-def check_digest(header: str | None, of_bytes: str) -> bool:
-    """Compare a `Content-Digest` (RFC 9530) with the SHA-256 of the bytes, in hex; return whether one was given.
-
-    Raises:
-        UnreadableRecording: It is the digest of other bytes.
-        BadInput: It has no SHA-256.
-    """
-    if header is None:
-        return False
-    for part in header.split(","):
-        name, _, value = part.strip().partition("=")
-        if name != "sha-256":
-            continue
-        wanted = base64.b64encode(bytes.fromhex(of_bytes)).decode()
-        if value.strip() != f":{wanted}:":
-            raise UnreadableRecording("Content-Digest does not match the bytes received; send them again.")
-        return True
-    raise BadInput("Content-Digest needs sha-256=:BASE64:, the SHA-256 of the body.")
-
-
-def read_upload(upload: Upload, read: Reader = read_recording) -> Recording:
-    """Read and check a recording.
-
-    Raises:
-        BadRecording: It cannot be used, or it has no checksum that would reveal damage.
-        UnknownFormat: Its content is not of the media type of the request.
-    """
-    _check_type(upload)
-    recording = read(upload.file, **upload.reading)
-    _check_vouched(upload, recording)
-    return recording
-
-
-def tell_upload(upload: Upload, tell: Teller = read_told) -> Told:
-    """Read and check a recording, and derive the proposed hand-offs and its description; it raises as `read_upload`."""
-    _check_type(upload)
-    told = tell(upload.file, **upload.reading)
-    _check_vouched(upload, told.recording)
-    return told
-
-
-def _check_type(upload: Upload) -> None:
-    right = media_type_of(upload.file)
-    if right != upload.media_type:
-        raise UnknownFormat(
-            f"The content is {MEDIA_TYPES[right]}, which does not match Content-Type; send it as {right}."
-        )
-
-
-def _check_vouched(upload: Upload, recording: Recording) -> None:
-    if recording.format in BAGS and recording.integrity == "none" and not upload.vouched:
-        raise UnreadableRecording(
-            f"The content is {MEDIA_TYPES[upload.media_type]} without checksums, so damage could not be detected; "
-            "send it with a Content-Digest header (sha-256=:BASE64:), or record it as MCAP with CRCs."
-        )
-
-
-def store_recording(
-    database: Database, upload: Upload, actor: str, read: Teller = read_told, surgeon: str | None = None
-) -> tuple[StoredRecording, bool]:
-    """Store a recording once, under a surgeon if one is named; return the row, and whether it is new."""
-    if surgeon is not None:
-        with database.reading() as session:  # fails early, before the long reading; looked up again when writing
-            find_surgeon(session, surgeon)
-    told = tell_upload(upload, read)
-    with database.writing() as session:
-        stored, new = keep(session, upload, told, actor)
-        if surgeon is not None:
-            session.merge(RecordingSurgeon(recording_row=stored.row, surgeon_row=find_surgeon(session, surgeon).row))
-        return stored, new
-
-
-def keep(session: Session, upload: Upload, told: Told, actor: str) -> tuple[StoredRecording, bool]:
-    """Write a recording in the caller's transaction, once; return the row, and whether it is new to the actor.
-
-    Bytes that only others have uploaded are reported as new, so that a digest does not reveal their uploads.
-
-    Raises:
-        Conflict: The bytes are already stored with other reading parameters.
-    """
-    same = select(StoredRecording).where(StoredRecording.sha256 == upload.sha256)
-    stored = session.scalar(same.execution_options(**EVERYBODYS))
-    if stored is not None:
-        if stored.reading != upload.reading:
-            if session.get(RecordingUpload, (stored.row, actor)) is None:  # do not reveal another user's parameters
-                raise Conflict(
-                    "These bytes cannot be stored with this rate_hz and frame; ask the operator of the service."
-                )
-            raise Conflict(f"These bytes are stored already, read with {stored.reading}; send the same parameters.")
-        return stored, _brought_by(session, stored, actor)
-    stored = StoredRecording(
-        sha256=upload.sha256,
-        size_bytes=upload.size_bytes,
-        media_type=upload.media_type,
-        format=told.recording.format,
-        integrity="full" if upload.vouched else told.recording.integrity,
-        reading=upload.reading,
-        about=told.about,
-    )
-    session.add(stored)
-    session.flush()
-    upload.file.seek(0)
-    number = 0
-    # Chunk by chunk, so that memory stays bounded whatever the size of the recording.
-    while data := upload.file.read(CHUNK_BYTES):
-        session.add(RecordingChunk(recording=stored.row, number=number, data=data))
-        session.flush()
-        number += 1
-    return stored, _brought_by(session, stored, actor)
-
-
-def _brought_by(session: Session, stored: StoredRecording, actor: str) -> bool:
-    """Record that an actor uploaded a recording; return whether this is the actor's first upload of it."""
-    if session.get(RecordingUpload, (stored.row, actor)) is not None:
-        return False
-    session.add(RecordingUpload(recording_row=stored.row, actor=actor))
-    record_event(session, actor, "add", "recording", stored.sha256)
-    session.flush()
-    return True
-
-
-def find_recording(session: Session, recording_sha256: str) -> StoredRecording:
-    """Return a recording by the SHA-256 of its bytes."""
-    return find_by_digest(session, StoredRecording, recording_sha256, "recording", Remedy(Action.ADD_RECORDING))
-
-
-def recording_bytes(session: Session, stored: StoredRecording) -> Iterator[bytes]:
-    """Yield the bytes of a recording chunk by chunk, and verify their SHA-256 at the end.
-
-    For use within the caller's transaction. An HTTP response waits for its client between two chunks and must not hold
-    a transaction meanwhile: see `demos.exported_chunk`.
-
-    Raises:
-        Corrupt: The digest differs; the last chunk is then withheld.
-    """
-    seen, held = hashlib.sha256(), b""
-    query = select(RecordingChunk.data).where(RecordingChunk.recording == stored.row).order_by(RecordingChunk.number)
-    for data in session.scalars(query.execution_options(yield_per=1)):
-        # One chunk behind, so that the last one is only yielded after the digest was verified.
-        if held:
-            yield held
-        seen.update(data)
-        held = data
-    if seen.hexdigest() != stored.sha256:
-        raise damaged()
-    yield held
-
-
-def damaged() -> Corrupt:
-    """Return the error that a recording's bytes do not match its digest."""
-    return Corrupt("A stored recording does not match its digest; restore it from a backup.")
-
-
-def recording_json(row: StoredRecording) -> dict[str, Any]:
-    """Return a recording's JSON."""
-    return {
-        "id": row.sha256,
-        "sha256": row.sha256,
-        "size_bytes": row.size_bytes,
-        "media_type": row.media_type,
-        "format": row.format,
-        "integrity": row.integrity,
-        **row.about,
-        "created_at": rfc3339(row.created_at),
-    }
-
-
-# ---- demonstrations ------------------------------------------------------------------------------------------------
+EQUAL_SHARE = 0.1  # ours: an arm that rests on exact encoder values for a tenth of the time is no reason for advice
+COUNTED_LATER = ("backward_stamps", "equal_samples")  # counts that version 0.1.0 did not make
 
 
 @dataclass(frozen=True, eq=False)
@@ -277,9 +81,9 @@ def make_demo(told: Told, cut: DemoIn) -> Made:
     demo = cut_demo(recording, arm=part.arm, topic=part.topic, start_s=part.start_s, end_s=part.end_s)
     grid = choose_grid(demo.tip_mm, cut.grid, cut.cell_mm)
     path = discretize(demo.tip_mm, grid, cut.hysteresis)
-    duplicates = recording.motion_of(arm=demo.arm, topic=demo.topic).duplicate_stamps
+    motion = recording.motion_of(arm=demo.arm, topic=demo.topic)
     taken = TakenSegment(what, demo.start_s, demo.end_s, because)
-    report = report_on(demo, path, duplicates) | {"segment": asdict(taken)}
+    report = report_on(demo, path, motion.duplicate_stamps, motion.backward_stamps) | {"segment": asdict(taken)}
     return Made(demo, path, sparse_reward(path), report, taken)
 
 
@@ -340,39 +144,61 @@ def _listed(proposed: Sequence[Segment]) -> str:
     return f"{are} proposed in this recording ({'; '.join(shown)}{rest})."
 
 
-def report_on(demo: Demo, path: GridPath, duplicate_stamps: int) -> dict[str, Any]:
+def report_on(demo: Demo, path: GridPath, duplicate_stamps: int, backward_stamps: int) -> dict[str, Any]:
     """Return the measurements of a demonstration and its path as JSON, with advice to the surgeon.
 
     Args:
         demo: The demonstration.
         path: Its path in the grid.
         duplicate_stamps: Samples of the entire recorded motion that carried the stamp of the sample before.
+        backward_stamps: Samples of the entire recorded motion that were dropped because their stamp went back.
     """
     of_motion, of_path = describe(demo), describe_path(demo, path)
+    equal = equal_samples(demo.tip_mm, demo.rotation_xyzw)
     chosen = "paper" if path.grid == PAPER_GRID else "fit"
     more = {
         "duplicate_stamps": duplicate_stamps,
+        "backward_stamps": backward_stamps,
+        "equal_samples": equal,
         "grid": ChosenGrid(**asdict(path.grid), chosen=chosen),
         "partner": demo.partner,
-        "advice": (*of_motion.advice, *_about_duplicates(duplicate_stamps), *of_path.advice),
+        "advice": (
+            *of_motion.advice,
+            *_about_stamps(duplicate_stamps, "repeated the previous stamp and were dropped"),
+            *_about_stamps(backward_stamps, "had a stamp that went back and were dropped"),
+            *_about_equal(equal, len(demo.tip_mm)),
+            *of_path.advice,
+        ),
     }
     report = DemoReport(**vars(of_motion) | vars(of_path) | more)
-    written: dict[str, Any] = json.loads(canonical(as_json(report)))
+    # Counts of nothing are left out, so that a report of sound stamps is the one that version 0.1.0 stored.
+    counted = {name: value for name, value in as_json(report).items() if value or name not in COUNTED_LATER}
+    written: dict[str, Any] = json.loads(canonical(counted))
     return written  # canonical JSON and back: the same value as when it is read from the database
 
 
 def full_report(demonstration: Demonstration) -> dict[str, Any]:
     """Measure a stored demonstration again: reports stored by older versions have fewer measurements."""
-    motions = demonstration.recording.about["motions"]
-    duplicates = next((m["duplicate_stamps"] for m in motions if m["topic"] == demonstration.topic), 0)
-    return report_on(demonstration.demo, demonstration.path, duplicates)
+    about, topic = demonstration.recording.about, demonstration.topic
+    duplicates = next((m["duplicate_stamps"] for m in about["motions"] if m["topic"] == topic), 0)
+    backward = next((one["backward_stamps"] for one in about.get("dropped", ()) if one["topic"] == topic), 0)
+    return report_on(demonstration.demo, demonstration.path, duplicates, backward)
 
 
-def _about_duplicates(count: int) -> list[str]:
+def _about_stamps(count: int, what: str) -> list[str]:
     if count == 0:
         return []
     samples = "1 sample" if count == 1 else f"{count} samples"
-    return [f"{samples} repeated the previous stamp and were dropped: check the recorder's clock."]
+    return [f"{samples} {what}: check the recorder's clock."]
+
+
+def _about_equal(count: int, samples: int) -> list[str]:
+    if count <= EQUAL_SHARE * samples:
+        return []
+    return [
+        f"{count} of {samples} samples ({count / samples:.0%}) repeat the pose of the sample before: the recorder was "
+        "faster than its source, so speeds are less certain than the rate suggests."
+    ]
 
 
 def upload_demo(database: Database, upload: Upload, cut: DemoIn, actor: str, read: Teller = read_told) -> Added:

@@ -35,9 +35,10 @@ from skills.db.row_visibility import EVERYBODYS
 from skills.db.service_tables import Job, record_event
 from skills.errors import Conflict, NotAllowed
 from skills.library.catalogue import find_surgeon, salted
-from skills.library.demos import find_demo, find_recording
+from skills.library.demos import find_demo
 from skills.library.jobs import ACTIVE as NOT_ENDED
 from skills.library.jobs import UNSYNCHRONISED, forget_styles
+from skills.library.recordings import find_recording
 from skills.library.releases import withdraw_resting_on
 from skills.remedies import Action, Remedy
 

@@ -33,10 +33,10 @@ from skills.db.session import Database, revision_of, revisions
 from skills.errors import Busy, SkillsError
 from skills.gridworld.reward import sparse_reward
 from skills.library.calibrations import read_calibration
-from skills.library.demos import recording_bytes
 from skills.library.integrity import covered, demo_identity, planned, policy_identity
 from skills.library.jobs import identity_of
 from skills.library.policies import path_of
+from skills.library.recordings import recording_bytes
 from skills.packing import canonical, sha256
 
 ROWS_AT_ONCE = 100

@@ -45,9 +45,9 @@ from skills.gridworld.reward import RewardMap, sparse_reward
 from skills.learning.policy import Policy
 from skills.library import playbacks
 from skills.library.catalogue import find_surgeon, find_suture_type
-from skills.library.demos import Reader, find_recording, recording_bytes
 from skills.library.integrity import covered, learnt
 from skills.library.policies import learnt_from
+from skills.library.recordings import Reader, find_recording, recording_bytes
 from skills.library.releases import is_served, served
 
 RECENT = 500  # jobs in the quantiles of durations: enough for a meaningful 99th percentile

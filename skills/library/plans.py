@@ -22,9 +22,9 @@ from skills.gridworld.grid import refuse_metres
 from skills.kinematics import DEFAULT_INSTRUMENT
 from skills.learning.policy import Policy
 from skills.library import policies
-from skills.library.demos import Reader, Upload, read_upload
 from skills.library.integrity import find_by_digest, learnt, plan_identity, planned
 from skills.library.policies import learnt_from
+from skills.library.recordings import Reader, Upload, read_upload
 from skills.planning.handoff import PsmM
 from skills.planning.plan import SuturePlan, pose_xyzw, stack
 from skills.planning.trajectory import Trajectory, seams, seconds_by_phase, time_parametrise, transfers

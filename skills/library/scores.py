@@ -30,7 +30,8 @@ from skills.learning.evaluation import TIE_BREAK
 from skills.library import calibrations, releases
 from skills.library.catalogue import find_surgeon, find_suture_type
 from skills.library.consent import may, require
-from skills.library.demos import Reader, find_demo, find_recording, newest_demo, recording_bytes
+from skills.library.demos import find_demo, newest_demo
+from skills.library.recordings import Reader, find_recording, recording_bytes
 from skills.schemas.comparison import CurvePoint, Percentiles, Reference, Score, ScoredStyle
 from skills.schemas.requests import ScoreIn
 from skills.scoring.calibration import LEVELS, Level, Skill, rate, refusals, unrated

@@ -28,10 +28,15 @@ class Motion:
     duplicate_stamps: Count
 
 
-@schema
+@stored_schema
 @dataclass(frozen=True)
 class Quality:
-    """The recording quality of a motion."""
+    """The recording quality of a motion.
+
+    Attributes:
+        equal_samples: Samples that repeat the pose of the sample before to the last bit, as they do where a recorder is
+            faster than its source; 0 also where an older version did not count them.
+    """
 
     arm: str
     topic: str
@@ -39,6 +44,16 @@ class Quality:
     rate_hz: float | None
     longest_gap_s: float
     extent_mm: Point
+    equal_samples: Count = 0
+
+
+@schema
+@dataclass(frozen=True)
+class Dropped:
+    """The number of samples of a topic that were dropped because their stamps went back."""
+
+    topic: str
+    backward_stamps: Count
 
 
 @schema
@@ -142,6 +157,9 @@ class Recording(Given):
     following: list[Following]
     scales: list[Scale]
     left_out: list[LeftOut]
+    dropped: list[Dropped] = Field(
+        default=[], description="Topics with samples whose stamps went back; older versions refused these recordings."
+    )
     base_frames: list[BaseFrame]
     created_at: datetime
 
@@ -184,12 +202,17 @@ class DemoReport(PathReport, MotionReport):
 
     Attributes:
         duplicate_stamps: Samples of the entire recorded motion that carried the stamp of the sample before.
+        backward_stamps: Samples of the entire recorded motion that were dropped because their stamp went back.
+        equal_samples: Samples of the demonstration that repeat the pose of the sample before to the last bit; 0 also
+            where an older version did not count them.
         grid: The grid world of its path.
         partner: The arm that takes the needle; null if it was not recorded.
         advice: Sentences to the surgeon.
     """
 
     duplicate_stamps: Count | None = None
+    backward_stamps: Count = 0
+    equal_samples: Count = 0
     grid: ChosenGrid
     partner: Partner | None = None
 

@@ -187,11 +187,18 @@ def test_messages_are_taken_in_the_order_of_their_log_time():
 
 
 def test_repeated_stamps_are_dropped_and_counted():
-    poses = straight(10)
+    poses = straight(100)
     poses[4] = pose(START_NS + 3 * STEP_NS, 0.5)
     motion = read(pose_bag(poses)).motion_of()
-    assert (motion.duplicate_stamps, len(motion.stamps_ns)) == (1, 9)
+    assert (motion.duplicate_stamps, motion.backward_stamps, len(motion.stamps_ns)) == (1, 0, 99)
     assert motion.tip_mm[3, 0] == pytest.approx(3.0)
+
+
+def test_messages_recorded_twice_are_dropped_whatever_their_share():
+    poses = [one for one in straight(10) for _ in range(3)]
+    motion = read(pose_bag(poses)).motion_of()
+    assert (motion.duplicate_stamps, len(motion.stamps_ns)) == (20, 10)
+    np.testing.assert_array_equal(motion.tip_mm, read(pose_bag(straight(10))).motion_of().tip_mm)
 
 
 def test_a_clock_that_stood_still_is_refused():

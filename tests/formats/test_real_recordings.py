@@ -91,3 +91,12 @@ def test_the_papers_table_and_its_bag_agree_on_position_and_orientation(old):
     every_fifth = slice(0, 10_000, 5)  # the bag is the table thinned from 500 to 100 Hz
     np.testing.assert_array_equal(motion.tip_mm[every_fifth], old.motion_of().tip_mm)
     np.testing.assert_allclose(motion.rotation_xyzw[every_fifth], old.motion_of().rotation_xyzw, rtol=0, atol=1e-12)
+
+
+def test_a_real_bag_with_one_stamp_that_goes_back_is_read_with_that_sample_dropped_and_counted():
+    with (sample_folder() / "calibration" / "pitch_exp_traj_02_test_cropped.bag").open("rb") as file:
+        bag = read_recording(file)
+    motion, joints = bag.motion_of(), bag.joints[0]
+    assert (len(motion.stamps_ns), motion.backward_stamps, motion.duplicate_stamps) == (3299, 1, 0)
+    assert (len(joints.stamps_ns), joints.backward_stamps) == (3299, 1)
+    assert (motion.frame, bag.left_out) == ("ECM", ())

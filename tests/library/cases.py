@@ -16,8 +16,9 @@ from skills.learning.policy import describe_learner
 from skills.learning.q_learning import CellQLearning
 from skills.library import perform_job
 from skills.library.catalogue import put_surgeon, seed_catalogue
-from skills.library.demos import Upload, upload_demo
+from skills.library.demos import upload_demo
 from skills.library.plans import plan_sutures
+from skills.library.recordings import Upload
 from skills.library.training import request_training
 from skills.packing import sha256
 from skills.schemas.requests import DemoIn, PlanIn, TrainingIn

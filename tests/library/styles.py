@@ -11,8 +11,9 @@ from skills.formats.reader_process import read_told
 from skills.learning.policy import describe_learner
 from skills.library import demos
 from skills.library.catalogue import put_surgeon, seed_catalogue
-from skills.library.demos import Made, find_recording, keep, make_demo
+from skills.library.demos import Made, make_demo
 from skills.library.jobs import PART
+from skills.library.recordings import find_recording, keep
 from skills.library.retraining import request_retraining
 from skills.schemas.requests import DemoIn, RetrainingIn
 from tests.library import cases

@@ -16,8 +16,9 @@ from skills.library import atlas
 from skills.library.atlas import atlas_of
 from skills.library.backup import back_up, erasures_of, restore
 from skills.library.catalogue import put_surgeon
-from skills.library.demos import add_demo, store_recording, withdraw_demo
+from skills.library.demos import add_demo, withdraw_demo
 from skills.library.erasure import delete_recording, erase_demo, erase_surgeon
+from skills.library.recordings import store_recording
 from skills.schemas.requests import DemoIn
 from tests import backends
 from tests.comparison.cohort import cohort

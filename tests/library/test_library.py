@@ -25,9 +25,10 @@ from skills.learning.dynamic_programming import ValueIteration
 from skills.learning.max_ent_irl import MaxEntIRL
 from skills.library import jobs, releases
 from skills.library.catalogue import find_surgeon, put_surgeon, seed_catalogue
-from skills.library.demos import add_demo, find_demo, recording_bytes, store_recording, withdraw_demo
+from skills.library.demos import add_demo, find_demo, withdraw_demo
 from skills.library.erasure import erase_surgeon
 from skills.library.policies import learnt, policy_of
+from skills.library.recordings import recording_bytes, store_recording
 from skills.schemas.requests import DemoIn
 from skills.settings import Settings
 from tests import backends

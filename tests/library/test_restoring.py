@@ -16,11 +16,12 @@ from skills.db.session import Database
 from skills.errors import BadSettings, NotFound
 from skills.library.backup import back_up, keep_erasures, read_erasures, restore
 from skills.library.catalogue import find_surgeon, put_surgeon
-from skills.library.demos import store_recording, withdraw_demo
+from skills.library.demos import withdraw_demo
 from skills.library.erasure import delete_recording, erase_demo, erase_surgeon
 from skills.library.inspection import inspect_installation
 from skills.library.keys import create_key, revoke_key
 from skills.library.policies import policy_of
+from skills.library.recordings import store_recording
 from skills.library.releases import release, withdraw
 from skills.packing import canonical, sha256
 from skills.serving import keeping_erasures

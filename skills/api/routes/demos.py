@@ -31,10 +31,11 @@ from skills.api.routes.policies import Accept
 from skills.db.models import StoredRewardMap
 from skills.errors import BadInput, Conflict, NotFound
 from skills.formats import BYTES, MEDIA_TYPES
-from skills.library import demos, erasure, scores
+from skills.library import demos, erasure, recordings, scores
 from skills.library.atlas import CONFOUNDED, DISTANCE, MOST, SESSIONS, atlas_of, atlases
 from skills.library.catalogue import find_suture_type
-from skills.library.demos import demo_json, path_json, recording_json, reward_map_json
+from skills.library.demos import demo_json, path_json, reward_map_json
+from skills.library.recordings import recording_json
 from skills.schemas.given import Atlas, Demonstration, DemoPath, Page, Recording, RewardMap, Score
 from skills.schemas.requests import COUNT, DIGEST, SLUG, DemoIn, Schema, ScoreIn, SlugField
 from skills.settings import MEBIBYTE
@@ -82,7 +83,7 @@ def add_recording(
     upload: Incoming, asked: Annotated[RecordingQuery, Query()], db: Db, read: Tell, actor: Actor
 ) -> Response:
     """Store a recording, once for equal bytes, and propose the hand-offs in it."""
-    row, created = demos.store_recording(db, upload, actor, read, asked.surgeon)
+    row, created = recordings.store_recording(db, upload, actor, read, asked.surgeon)
     return stored(recording_json(row), created, f"/recordings/{row.sha256}")
 
 
@@ -96,7 +97,7 @@ def upload_demo(upload: Incoming, asked: Annotated[DemoUpload, Query()], db: Db,
 def get_recording(recording: Digest, db: Db, give: Giving) -> Response:
     """Return a recording."""
     with db.reading() as session:
-        return give(recording_json(demos.find_recording(session, recording)))
+        return give(recording_json(recordings.find_recording(session, recording)))
 
 
 @router.delete("/recordings/{recording}", dependencies=[needs("uploader")], **ends(404, 409))

@@ -18,9 +18,10 @@ from skills.api.routes.policies import JobId, Version
 from skills.formats import MEDIA_TYPES, SUFFIXES
 from skills.kinematics import INSTRUMENTS
 from skills.library import jobs, overview, policies, retraining, scores
-from skills.library.demos import find_demo, find_recording
+from skills.library.demos import find_demo
 from skills.library.plans import find_plan, hands_over, plan_in_words
 from skills.library.playbacks import headline_of
+from skills.library.recordings import find_recording
 from skills.library.releases import outcomes_of
 from skills.planning.handoff import Enters
 from skills.schemas.requests import DIGEST, ScoreIn

@@ -7,8 +7,9 @@ The file is read once, sequentially, and every checksum is verified; see `reader
     partial   some chunks have a checksum, others do not
     none      no checksum (0 means "not available" in MCAP; rosbags writes 0): a flipped bit would not be detected
 
-Messages are taken in order of their log time, as every MCAP reader does; samples have the stamp of their header, and
-stamps must not decrease in that order. Messages without a header have their log time as stamp.
+Messages are taken in order of their log time, as every MCAP reader does; samples have the stamp of their header. Few
+poses, joints and jaw angles with stamps that decrease in that order are dropped and counted; events such as pedals are
+not, because each one counts. Messages without a header have their log time as stamp.
 
 A demonstration needs the motions, the jaws and the clutch: an error in one of them refuses the file. All other topics
 are optional: one that cannot be used is omitted, and `left_out` has the reason.
@@ -24,7 +25,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skills.arrays import Floats, Ints
-from skills.demonstration.recording import Joints, Motion, Recording, Signal, Topic, recorded_motion
+from skills.demonstration.recording import (
+    Joints,
+    Motion,
+    Recording,
+    Signal,
+    Topic,
+    recorded_joints,
+    recorded_motion,
+    recorded_signal,
+)
 from skills.errors import MixedFrames, NoUsableTopic, SkillsError, UnreadableRecording
 from skills.formats import topics
 from skills.formats.mcap.cdr import (
@@ -300,7 +310,7 @@ def _joints(topic: _Topic) -> Joints:
             raise NoUsableTopic(f"{topic.name} has {positions.shape[1]} joints; a PSM has 6.", topic=topic.name)
         with np.errstate(over="ignore"):  # infinite values are refused below
             positions[:, _INSERTION] *= 1000.0  # ROS messages are in metres
-    return Joints(topic.meaning.whose, topic.name, stamps_ns, positions)
+    return recorded_joints(topic.meaning.whose, topic.name, stamps_ns, positions)
 
 
 def _signal(topic: _Topic) -> Signal:
@@ -309,7 +319,8 @@ def _signal(topic: _Topic) -> Signal:
         raise NoUsableTopic(
             f"{topic.name} has messages without a value; remove the topic from the recording.", topic=topic.name
         )
-    return Signal(stamps_ns, values[:, 0], topic.name)
+    make = recorded_signal if topic.meaning.kind in (Kind.JAW, Kind.GRIPPER) else Signal
+    return make(stamps_ns, values[:, 0], topic.name)
 
 
 def _tool(topic: _Topic) -> str:

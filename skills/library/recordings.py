@@ -1,0 +1,221 @@
+"""Recordings: raw files, read and checked before any transaction, and stored in chunks of 1 MiB.
+
+file --Upload--> read_upload, tell_upload --keep--> StoredRecording with its chunks
+"""
+
+import base64
+import hashlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, BinaryIO
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from skills.db import rfc3339
+from skills.db.models import (
+    RecordingChunk,
+    RecordingSurgeon,
+    RecordingUpload,
+    StoredRecording,
+)
+from skills.db.row_visibility import EVERYBODYS
+from skills.db.service_tables import record_event
+from skills.db.session import Database
+from skills.demonstration.demonstration import Recording
+from skills.errors import BadInput, Conflict, Corrupt, UnknownFormat, UnreadableRecording
+from skills.formats import MEDIA_TYPES, media_type_of, read_recording
+from skills.formats.reader_process import Told, read_told
+from skills.library.catalogue import find_surgeon
+from skills.library.integrity import find_by_digest
+from skills.remedies import Action, Remedy
+
+CHUNK_BYTES = 1 << 20
+Reader = Callable[..., Recording]  # `read_recording`, or a callable that runs it in another process
+Teller = Callable[..., Told]  # `read_told`, or a callable that runs it in another process
+BAGS = ("mcap", "rosbag1", "rosbag2")  # formats with checksums; text files have none
+
+
+@dataclass(frozen=True)
+class Upload:
+    """An upload, spooled to a file: its SHA-256, and the reading parameters that the format itself does not contain."""
+
+    file: BinaryIO
+    sha256: str
+    size_bytes: int
+    media_type: str
+    rate_hz: float | None = None
+    frame: str | None = None
+    vouched: bool = False  # the client sent a Content-Digest, and it matches the bytes
+
+    @property
+    def reading(self) -> dict[str, Any]:
+        """The reader's arguments."""
+        return {"rate_hz": self.rate_hz, "frame": self.frame}
+
+
+def check_digest(header: str | None, of_bytes: str) -> bool:
+    """Compare a `Content-Digest` (RFC 9530) with the SHA-256 of the bytes, in hex; return whether one was given.
+
+    Raises:
+        UnreadableRecording: It is the digest of other bytes.
+        BadInput: It has no SHA-256.
+    """
+    if header is None:
+        return False
+    for part in header.split(","):
+        name, _, value = part.strip().partition("=")
+        if name != "sha-256":
+            continue
+        wanted = base64.b64encode(bytes.fromhex(of_bytes)).decode()
+        if value.strip() != f":{wanted}:":
+            raise UnreadableRecording("Content-Digest does not match the bytes received; send them again.")
+        return True
+    raise BadInput("Content-Digest needs sha-256=:BASE64:, the SHA-256 of the body.")
+
+
+def read_upload(upload: Upload, read: Reader = read_recording) -> Recording:
+    """Read and check a recording.
+
+    Raises:
+        BadRecording: It cannot be used, or it has no checksum that would reveal damage.
+        UnknownFormat: Its content is not of the media type of the request.
+    """
+    _check_type(upload)
+    recording = read(upload.file, **upload.reading)
+    _check_vouched(upload, recording)
+    return recording
+
+
+def tell_upload(upload: Upload, tell: Teller = read_told) -> Told:
+    """Read and check a recording, and derive the proposed hand-offs and its description; it raises as `read_upload`."""
+    _check_type(upload)
+    told = tell(upload.file, **upload.reading)
+    _check_vouched(upload, told.recording)
+    return told
+
+
+def _check_type(upload: Upload) -> None:
+    right = media_type_of(upload.file)
+    if right != upload.media_type:
+        raise UnknownFormat(
+            f"The content is {MEDIA_TYPES[right]}, which does not match Content-Type; send it as {right}."
+        )
+
+
+def _check_vouched(upload: Upload, recording: Recording) -> None:
+    if recording.format in BAGS and recording.integrity == "none" and not upload.vouched:
+        raise UnreadableRecording(
+            f"The content is {MEDIA_TYPES[upload.media_type]} without checksums, so damage could not be detected; "
+            "send it with a Content-Digest header (sha-256=:BASE64:), or record it as MCAP with CRCs."
+        )
+
+
+def store_recording(
+    database: Database, upload: Upload, actor: str, read: Teller = read_told, surgeon: str | None = None
+) -> tuple[StoredRecording, bool]:
+    """Store a recording once, under a surgeon if one is named; return the row, and whether it is new."""
+    if surgeon is not None:
+        with database.reading() as session:  # fails early, before the long reading; looked up again when writing
+            find_surgeon(session, surgeon)
+    told = tell_upload(upload, read)
+    with database.writing() as session:
+        stored, new = keep(session, upload, told, actor)
+        if surgeon is not None:
+            session.merge(RecordingSurgeon(recording_row=stored.row, surgeon_row=find_surgeon(session, surgeon).row))
+        return stored, new
+
+
+def keep(session: Session, upload: Upload, told: Told, actor: str) -> tuple[StoredRecording, bool]:
+    """Write a recording in the caller's transaction, once; return the row, and whether it is new to the actor.
+
+    Bytes that only others have uploaded are reported as new, so that a digest does not reveal their uploads.
+
+    Raises:
+        Conflict: The bytes are already stored with other reading parameters.
+    """
+    same = select(StoredRecording).where(StoredRecording.sha256 == upload.sha256)
+    stored = session.scalar(same.execution_options(**EVERYBODYS))
+    if stored is not None:
+        if stored.reading != upload.reading:
+            if session.get(RecordingUpload, (stored.row, actor)) is None:  # do not reveal another user's parameters
+                raise Conflict(
+                    "These bytes cannot be stored with this rate_hz and frame; ask the operator of the service."
+                )
+            raise Conflict(f"These bytes are stored already, read with {stored.reading}; send the same parameters.")
+        return stored, _brought_by(session, stored, actor)
+    stored = StoredRecording(
+        sha256=upload.sha256,
+        size_bytes=upload.size_bytes,
+        media_type=upload.media_type,
+        format=told.recording.format,
+        integrity="full" if upload.vouched else told.recording.integrity,
+        reading=upload.reading,
+        about=told.about,
+    )
+    session.add(stored)
+    session.flush()
+    upload.file.seek(0)
+    number = 0
+    # Chunk by chunk, so that memory stays bounded whatever the size of the recording.
+    while data := upload.file.read(CHUNK_BYTES):
+        session.add(RecordingChunk(recording=stored.row, number=number, data=data))
+        session.flush()
+        number += 1
+    return stored, _brought_by(session, stored, actor)
+
+
+def _brought_by(session: Session, stored: StoredRecording, actor: str) -> bool:
+    """Record that an actor uploaded a recording; return whether this is the actor's first upload of it."""
+    if session.get(RecordingUpload, (stored.row, actor)) is not None:
+        return False
+    session.add(RecordingUpload(recording_row=stored.row, actor=actor))
+    record_event(session, actor, "add", "recording", stored.sha256)
+    session.flush()
+    return True
+
+
+def find_recording(session: Session, recording_sha256: str) -> StoredRecording:
+    """Return a recording by the SHA-256 of its bytes."""
+    return find_by_digest(session, StoredRecording, recording_sha256, "recording", Remedy(Action.ADD_RECORDING))
+
+
+def recording_bytes(session: Session, stored: StoredRecording) -> Iterator[bytes]:
+    """Yield the bytes of a recording chunk by chunk, and verify their SHA-256 at the end.
+
+    For use within the caller's transaction. An HTTP response waits for its client between two chunks and must not hold
+    a transaction meanwhile: see `demos.exported_chunk`.
+
+    Raises:
+        Corrupt: The digest differs; the last chunk is then withheld.
+    """
+    seen, held = hashlib.sha256(), b""
+    query = select(RecordingChunk.data).where(RecordingChunk.recording == stored.row).order_by(RecordingChunk.number)
+    for data in session.scalars(query.execution_options(yield_per=1)):
+        # One chunk behind, so that the last one is only yielded after the digest was verified.
+        if held:
+            yield held
+        seen.update(data)
+        held = data
+    if seen.hexdigest() != stored.sha256:
+        raise damaged()
+    yield held
+
+
+def damaged() -> Corrupt:
+    """Return the error that a recording's bytes do not match its digest."""
+    return Corrupt("A stored recording does not match its digest; restore it from a backup.")
+
+
+def recording_json(row: StoredRecording) -> dict[str, Any]:
+    """Return a recording's JSON."""
+    return {
+        "id": row.sha256,
+        "sha256": row.sha256,
+        "size_bytes": row.size_bytes,
+        "media_type": row.media_type,
+        "format": row.format,
+        "integrity": row.integrity,
+        **row.about,
+        "created_at": rfc3339(row.created_at),
+    }
