@@ -6,61 +6,52 @@ its fourth transaction. Results that the service alone decides (digests, numbers
 the gate, whether a batch finds it worse) are taken from its responses; the expected state comes from the model.
 
 The calls go over HTTP to the application in this process; the machine is the worker, and does the command line's part
-for backups. Three things are replaced: the date, the reader of uploads (in this process instead of a confined one),
-and the job engine, which may miss any notification and here misses all of them.
+for backups. The date, the reader of uploads and the job engine are replaced (`tests.model.replaced`).
 """
 
 import shutil
 import tempfile
-import uuid
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from copy import copy
-from datetime import date, datetime, timedelta
+from datetime import timedelta
 from functools import cache
 from pathlib import Path
-from typing import Any, BinaryIO, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
-import pytest
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
-from sqlalchemy import LargeBinary, make_url, select
-from sqlalchemy.orm import Session
+from sqlalchemy import LargeBinary, select
 
-import skills.api.app
-import skills.db
 from skills.comparison.distances import distances_of, shape_of
 from skills.db import Base
 from skills.db.models import Demonstration, MeasuredShape
 from skills.db.packed import Packed
 from skills.db.service_tables import Job as JobRow
 from skills.db.session import Database
-from skills.demonstration.demonstration import Recording, cut_demo
+from skills.demonstration.demonstration import cut_demo
 from skills.errors import NotFound, SkillsError
 from skills.formats import read_recording
-from skills.formats.reader_process import read_told
 from skills.jobs.workflows import Work
-from skills.library import perform_job, retraining
+from skills.library import perform_job
 from skills.library.atlas import atlas_of
 from skills.library.backup import back_up, keep_erasures, read_erasures, restore
 from skills.library.jobs import BATCH, PART
-from skills.library.keys import create_key
 from skills.packing import sha256
 from skills.settings import Settings
 from tests import backends
 from tests.api.service import CSV, Service
 from tests.library import cases
 from tests.model.invariant import ALL_USES, Consent, Demo, Job, Key, Model, Style, Version
+from tests.model.replaced import ADMIN, FIRST_DAY, Clock, Interruptible, settled
 
 SURGEONS = ("kestrel", "heron", "lark", "wren")
 SUTURES = (cases.SUTURE, "horizontal-mattress")
 FILES = [cases.table(cases.points_mm((0.0, 2.5 * shift, 0.0), samples=4)) for shift in range(4)]
 NAMES = {sha256(data): data for data in FILES}
-FIRST_DAY = date(2026, 3, 1)
 ACTIVE = ("queued", "running")
-ADMIN = "admin"
 MOST_BACKUPS = 3
 
 Step = tuple[Any, ...]
@@ -637,80 +628,3 @@ def _plain_columns() -> dict[str, Any]:
     packed = (LargeBinary, Packed)
     tables = Base.metadata.tables.items()
     return {name: select(*(c for c in table.c if not isinstance(c.type, packed))) for name, table in tables}
-
-
-# ---- replaced parts ------------------------------------------------------------------------------------------------
-
-
-class Clock(datetime):
-    """A clock with the simulated date and the real time of day."""
-
-    day: ClassVar[date] = FIRST_DAY
-
-    @classmethod
-    def now(cls, tz: Any = None) -> datetime:  # type: ignore[override]
-        return datetime.now(tz).replace(year=cls.day.year, month=cls.day.month, day=cls.day.day)
-
-
-class Interruptible(Database):
-    """A database with a callback before each of its transactions."""
-
-    pause: ClassVar[Callable[[], None]] = staticmethod(lambda: None)
-
-    def reading(self) -> AbstractContextManager[Session]:
-        self.pause()
-        return super().reading()
-
-    def writing(self) -> AbstractContextManager[Session]:
-        self.pause()
-        return super().writing()
-
-
-class Deaf:
-    """A job engine that misses every notification."""
-
-    def tell(self, *_job: object) -> None: ...
-
-    def cancel(self, *_job: object) -> None: ...
-
-    def close(self) -> None: ...
-
-
-def read_here(file: BinaryIO, *, rate_hz: float | None, frame: str | None, **_who: object) -> Recording:
-    return read_recording(file, rate_hz=rate_hz, frame=frame)
-
-
-read_here.tell = lambda file, *, key="", **how: read_told(file, **how)  # type: ignore[attr-defined]
-
-
-@contextmanager
-def in_our_hands() -> Iterator[None]:
-    """Replace the clock, the reader and the engine; and put several styles into a part of a batch."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(skills.db, "datetime", Clock)
-        patch.setattr(skills.api.app, "confined_reader", lambda _settings: nullcontext(read_here))
-        patch.setattr(skills.api.app, "Engine", lambda _settings: Deaf())
-        patch.setattr(retraining, "FEWEST_PARTS", 2)
-        yield
-
-
-def settled(backend: str, folder: Path) -> tuple[str, str]:
-    """Copy a database with a catalogue and an admin's key; return its URL, and the key."""
-    template, key = _settled(backend)
-    if backend == "sqlite":
-        return f"sqlite:///{shutil.copy(template, folder / 'settled.sqlite')}", key
-    name = f"i{uuid.uuid4().hex[:12]}"
-    backends.on_server(f"CREATE DATABASE {name} TEMPLATE {template}")
-    return backends.server_url(name), key
-
-
-@cache
-def _settled(backend: str) -> tuple[str, str]:
-    """Make that database, once; return its file or name, and the key."""
-    url = backends.fresh(backend, backends.migrated_file().parent)
-    database = Database(url)
-    skills.api.app.prepare_database(database)
-    with database.writing() as session:
-        key = create_key(session, ADMIN, "admin", "local")[1]
-    database.close()
-    return url.removeprefix("sqlite:///") if backend == "sqlite" else str(make_url(url).database), key

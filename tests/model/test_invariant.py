@@ -12,7 +12,8 @@ from hypothesis.stateful import run_state_machine_as_test
 
 from tests import backends
 from tests.library import cases
-from tests.model.machine import Installation, Step, in_our_hands
+from tests.model.machine import Installation, Step
+from tests.model.replaced import in_our_hands
 
 TRAIN: Step = ("train", "kestrel", cases.SUTURE, "newest", 0, True)
 NO_TRAINING: Step = ("agree", "kestrel", frozenset({"atlas", "export"}), None)
