@@ -73,7 +73,7 @@ UNUSABLE = {  # by SQLite's result code: the message and the remedy
 MIGRATIONS = resources.files("skills") / "migrations"
 AT = "alembic_version"  # Alembic's own table of one row
 EXIT_CODE = 74  # EX_IOERR of sysexits.h
-POSTGRESQL_FULL = "53100"  # disk_full
+POSTGRESQL_FULL, POSTGRESQL_FAILED = "53100", "58030"  # disk_full, io_error
 # SQLite's codes for a full disk; the index of the write-ahead log cannot grow on one either.
 _FULL = (sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR_SHMSIZE)
 # I/O errors that leave the stored data unchanged: reading, memory, locks.
@@ -169,6 +169,12 @@ def _in_words(url: URL) -> Iterator[None]:
             raise StorageFull(
                 "The disk of the database is full, so nothing was stored; free some space on it."
             ) from error
+        if getattr(error.orig, "sqlstate", None) == POSTGRESQL_FAILED:
+            log.critical("The disk of the PostgreSQL server failed: %s", str(error.orig).strip())
+            raise Busy(
+                "The disk of the database failed, so it is unknown whether this was stored.",
+                "Ask the operator of the service to check the disk and its log, then look before you try again.",
+            ) from error
         if "no such table" in str(error.orig):
             raise Conflict("The database has no tables of this version yet.", Remedy(Action.MIGRATE)) from error
         if (unusable := _unusable(url, error)) is not None:
@@ -198,7 +204,7 @@ def _unusable(url: URL, error: DBAPIError) -> SkillsError | None:
     if url.get_backend_name() == "sqlite" or error.statement is not None or error.connection_invalidated:
         return None
     said = str(error.orig)
-    at = f"{url.host or 'localhost'}:{url.port or 5432}"
+    at = url.query.get("host") or f"{url.host or 'localhost'}:{url.port or 5432}"  # a folder with a socket, or a host
     if "password" in said or "authentication" in said:
         return DatabaseUnusable(f"The PostgreSQL server at {at} does not let the user '{url.username}' in.", SPELLING)
     if f'database "{url.database}" does not exist' in said:

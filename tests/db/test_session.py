@@ -185,6 +185,7 @@ def test_more_transactions_than_connections_wait_and_then_raise_busy(database: D
 WRITE_ON = """
 import logging, resource, sys
 from pathlib import Path
+from tests.failing_disk import fail_syncs
 from skills.db.models import SutureType
 from skills.db.session import Database
 
@@ -192,7 +193,10 @@ logging.basicConfig(level="INFO")
 database, wal = Database(sys.argv[1]), Path(sys.argv[2])
 with database.writing() as session:
     session.add(SutureType(slug="first", name="0", also_called=[], family="-", description=""))
-resource.setrlimit(resource.RLIMIT_FSIZE, (wal.stat().st_size + 100,) * 2)
+if sys.argv[3] == "write":
+    resource.setrlimit(resource.RLIMIT_FSIZE, (wal.stat().st_size + 100,) * 2)
+else:
+    fail_syncs()
 try:
     with database.writing() as session:
         session.add(SutureType(slug="second", name="0", also_called=[], family="-", description="." * 100_000))
@@ -233,17 +237,30 @@ def test_a_full_disk_is_told_and_logged_and_nothing_is_kept(
         assert session.get(SutureType, "large-0") is None
 
 
-def test_a_write_that_fails_ends_the_process(tmp_path: Path):
+@pytest.mark.parametrize("url", ["postgresql"], indirect=True)
+def test_a_failed_disk_of_postgresql_is_told_and_logged(
+    database: Database, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(logging.getLogger("skills.db.session"), "disabled", False)
+    failed = "DO $$ BEGIN RAISE EXCEPTION 'could not fdatasync file' USING ERRCODE = '58030'; END $$"
+    with pytest.raises(Busy, match="unknown whether this was stored"), database.writing() as session:
+        session.execute(text(failed))
+    assert "The disk of the PostgreSQL server failed" in caplog.text and "could not fdatasync file" in caplog.text
+
+
+@pytest.mark.parametrize("failing", ["write", "fsync"])
+def test_a_write_or_a_sync_that_fails_ends_the_process(failing: str, tmp_path: Path):
     url = backends.fresh("sqlite", tmp_path)
     wal = Path(url.removeprefix("sqlite:///") + "-wal")
-    ran = subprocess.run([sys.executable, "-c", WRITE_ON, url, str(wal)], capture_output=True, text=True)
+    ran = subprocess.run([sys.executable, "-c", WRITE_ON, url, str(wal), failing], capture_output=True, text=True)
     assert ran.returncode == EXIT_CODE, ran.stderr
-    assert "The database's disk failed (SQLITE_IOERR_WRITE" in ran.stderr
+    assert f"The database's disk failed (SQLITE_IOERR_{failing.upper()}" in ran.stderr
     assert "went on" not in ran.stdout
     again = Database(url)
     with again.reading() as session:
         assert session.get(SutureType, "first") is not None
-        assert session.get(SutureType, "second") is None
+        if failing == "write":  # a commit that was written and not synced may be there or not: it was not acknowledged
+            assert session.get(SutureType, "second") is None
     again.close()
 
 

@@ -1,21 +1,26 @@
-"""The real service on a small separate file system that fills up, and on a disk whose writes fail."""
+"""The real service on a small separate file system that fills up, and on a disk whose writes or syncs fail."""
 
 import os
 import resource
 import select
 import shutil
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import httpx2 as httpx
 import pytest
 
 from skills.db.session import EXIT_CODE
+from skills.serving import environment
 from tests.api.service import CSV, KESTREL, assert_problem
-from tests.e2e.conftest import Service, running
+from tests.e2e.conftest import WORKER, Service, running
+from tests.jobs.house import House
 from tests.library import cases
+from tests.waiting import END_S, until
 
 pytestmark = pytest.mark.nightly
 
@@ -105,6 +110,60 @@ def test_a_write_that_fails_ends_the_service_and_its_workers(tmp_path: Path, cap
         assert service.process.wait(30) == EXIT_CODE
         assert "The database's disk failed" in capfd.readouterr().err
         until_gone(worker)
+
+
+def fragile(*words: str, environment: dict[str, str]) -> subprocess.Popen[bytes]:
+    """Start a command whose syncs fail from SIGUSR2 on; those of its children do not."""
+    return subprocess.Popen([sys.executable, "-m", "tests.failing_disk", "-m", "skills", *words], env=environment)
+
+
+class Fragile(Service):
+    """A service whose disk can be told to fail."""
+
+    def launch(self) -> None:
+        self.process = fragile("serve", environment=self.environment)
+
+
+def test_a_sync_that_fails_ends_the_service_and_its_workers(tmp_path: Path, capfd: pytest.CaptureFixture[str]):
+    service = Fragile(tmp_path)
+    try:
+        service.start()
+        assert service.process is not None
+        worker = service.child(WORKER)
+        assert httpx.put(f"{service.url}/surgeons/wren", json={}).status_code == 201
+        fail(service.process.pid)
+        assert httpx.get(f"{service.url}/surgeons/wren").status_code == 200  # reading syncs nothing
+        with pytest.raises(httpx.HTTPError):
+            httpx.put(f"{service.url}/surgeons/heron", json={})
+        assert service.process.wait(END_S) == EXIT_CODE
+        printed = capfd.readouterr().err
+        assert "The database's disk failed (SQLITE_IOERR_FSYNC" in printed and "skills verify" in printed
+        until_gone(worker)
+        service.start()
+        assert httpx.get(f"{service.url}/surgeons/wren").status_code == 200
+        assert httpx.put(f"{service.url}/surgeons/plover", json={}).status_code == 201
+    finally:
+        if service.process is not None and service.process.poll() is None:
+            service.stop()
+
+
+def test_a_sync_that_fails_ends_a_worker(tmp_path: Path, capfd: pytest.CaptureFixture[str]):
+    with closing(House(f"sqlite:///{tmp_path / 'skills.sqlite'}", tmp_path)) as house:
+        worker = fragile("worker", environment=environment(house.settings))
+        try:
+            until(house.executors, by=[worker])
+            fail(worker.pid)
+            assert worker.wait(END_S) == EXIT_CODE  # its next heartbeat is not stored
+        finally:
+            worker.kill()
+            worker.wait()
+        assert "The database's disk failed (SQLITE_IOERR_FSYNC" in capfd.readouterr().err
+
+
+def fail(pid: int) -> None:
+    """Let the syncs of a `fragile` process fail, and wait until they do."""
+    os.kill(pid, signal.SIGUSR2)
+    until(lambda: "Seccomp_filters:\t0" not in Path(f"/proc/{pid}/status").read_text())
 
 
 def until_gone(pid: int) -> None:

