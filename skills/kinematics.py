@@ -25,6 +25,7 @@ from numpy.typing import ArrayLike
 from skills.arrays import Flags, Floats, Ints, frozen
 from skills.errors import BadInput, ImproperRotation, UnknownInstrument, Unreachable
 from skills.fields import Point, Six, schema
+from skills.remedies import did_you_mean
 
 JOINTS = ("yaw", "pitch", "insertion", "roll", "wrist_pitch", "wrist_yaw")
 Unit = Literal["rad", "mm"]
@@ -158,7 +159,8 @@ def instrument_of(name: str) -> InstrumentConstants:
     """
     if name not in INSTRUMENTS:
         known = ", ".join(INSTRUMENTS)
-        raise UnknownInstrument(f"The instrument {name!r} is unknown; use one of {known}.", instrument=name)
+        near = did_you_mean(name, INSTRUMENTS)
+        raise UnknownInstrument(f"The instrument {name!r} is unknown; use one of {known}.", *near, instrument=name)
     return INSTRUMENTS[name]
 
 

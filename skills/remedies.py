@@ -7,6 +7,7 @@ The code that raises names the action and its values. Each interface chooses the
 remedy that reads the same for every interface is a plain sentence.
 """
 
+import re
 import shlex
 from collections.abc import Callable, Iterable
 from difflib import get_close_matches
@@ -281,8 +282,16 @@ def read_remedies(said: Any) -> list[Remedy | str]:
 def did_you_mean(given: str, known: Iterable[str]) -> list[str]:
     """Return the known names most similar to an unknown one, as a list of one sentence or none."""
     names = list(known)
-    near = get_close_matches(given, names, n=3, cutoff=0.6)
+    plain = {_plain(name): name for name in reversed(names)}
+    near = [plain[one] for one in get_close_matches(_plain(given), plain, n=3, cutoff=0.6)]
+    if near and _plain(near[0]) == _plain(given):
+        near = near[:1]
     near = near or [name for name in names if len(given) >= LEAST_PART and given in name][:3]
     if not near:
         return []
     return [f"Did you mean {' or '.join(repr(name) for name in near)}?"]
+
+
+def _plain(name: str) -> str:
+    """Return a name without the parts that are easily mistaken: case, and characters between words."""
+    return re.sub(r"[-_. ]", "", name).lower()

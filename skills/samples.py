@@ -9,7 +9,7 @@ trial, and the others continue.
 import io
 import re
 import tomllib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib import resources
@@ -21,6 +21,7 @@ from skills.client import Client, Problem
 from skills.errors import BadInput, SkillsError
 from skills.formats.archive import pack
 from skills.formats.jigsaws import Skill, Trial, meta_line, trials
+from skills.remedies import did_you_mean
 from skills.schemas.given import Demonstration, Recording
 from skills.seeds.recordings import sample_recordings
 
@@ -77,11 +78,15 @@ def find_trials(folder: Path, tasks: Sequence[str] = ()) -> list[Trial]:
     Raises:
         BadInput: There are none.
     """
-    found = [trial for trial in trials(folder) if not tasks or trial.task in tasks]
+    there = list(trials(folder))
+    found = [trial for trial in there if not tasks or trial.task in tasks]
+    if there and not found:
+        here = sorted({trial.task for trial in there})
+        near = [one for task in tasks for one in did_you_mean(task, here)]
+        raise BadInput(f"{folder} has trials of {', '.join(here)}, not of {', '.join(tasks)}.", *near)
     if not found:
         raise BadInput(
-            f"{folder} has no trials of JIGSAWS{' in ' + ', '.join(tasks) if tasks else ''}; they are expected as "
-            "TASK/kinematics/AllGestures/TASK_B001.txt."
+            f"{folder} has no trials of JIGSAWS; they are expected as TASK/kinematics/AllGestures/TASK_B001.txt."
         )
     return found
 
@@ -93,6 +98,7 @@ def send_trials(
     suture: str | None = None,
     arm: str | None = None,
     prefix: str = "jigsaws",
+    worded: Callable[[SkillsError], str] = str,
 ) -> Iterator[Sent]:
     """Send trials one after the other, each with its surgeon.
 
@@ -102,7 +108,13 @@ def send_trials(
         suture: The suture type of the demonstrations; None stores recordings only.
         arm: The arm of the hand-offs, "PSM_left" or "PSM_right"; None: both.
         prefix: Prefix of pseudonyms, before the surgeon's letter.
+        worded: Words an error for `Sent.problems`; in those of Python by default.
+
+    Raises:
+        Problem: There is no such suture type; nothing was sent.
     """
+    if suture is not None:
+        client.suture_type(suture)
     known: set[str] = set()
     for trial in found:
         rated = trial.rated
@@ -120,10 +132,10 @@ def send_trials(
             with _packed(trial) as file:
                 stored = client.add_recording(file, surgeon=sent.surgeon)
             sent.recording = stored.sha256
-            _cut(client, stored, sent, suture, arm)
+            _cut(client, stored, sent, suture, arm, worded)
         except SkillsError as error:
             # a refused trial does not stop the others
-            sent.problems.append(str(error))
+            sent.problems.append(worded(error))
         yield sent
 
 
@@ -137,7 +149,14 @@ def _make_known(client: Client, surgeon: str, skill_level: Skill | None) -> None
         client.put_surgeon(surgeon, skill_level=skill_level)
 
 
-def _cut(client: Client, stored: Recording, sent: Sent, suture: str | None, arm: str | None) -> None:
+def _cut(
+    client: Client,
+    stored: Recording,
+    sent: Sent,
+    suture: str | None,
+    arm: str | None,
+    worded: Callable[[SkillsError], str],
+) -> None:
     proposed = [part for part in stored.segments if arm in (None, part.arm)]
     sent.proposed = len(proposed)
     for part in proposed if suture else ():
@@ -154,7 +173,7 @@ def _cut(client: Client, stored: Recording, sent: Sent, suture: str | None, arm:
             )
             sent.demos.append(demo.id)
         except SkillsError as error:
-            sent.problems.append(f"{part.arm} {part.start_s:.1f} to {part.end_s:.1f} s: {error}")
+            sent.problems.append(f"{part.arm} {part.start_s:.1f} to {part.end_s:.1f} s: {worded(error)}")
 
 
 @contextmanager

@@ -4,10 +4,13 @@
 """
 
 import gc
+import logging
+import os
 import re
 import shlex
 import shutil
 import socket
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -15,9 +18,11 @@ from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from typing import Any
 from unittest.mock import patch
 
 import uvicorn
+from sqlalchemy import Engine, event
 from typer.testing import CliRunner
 
 from skills.api.app import create_app
@@ -59,7 +64,7 @@ class Mistake:
 
 @dataclass(frozen=True)
 class Said:
-    """The output, with its variable parts replaced by words, and the exit code."""
+    """The message, or else the output, with its variable parts replaced by words, and the exit code."""
 
     lines: list[str]
     code: int
@@ -94,6 +99,28 @@ def without_learners(folder: Path) -> Iterator[None]:
         yield
 
 
+def without_pybullet(folder: Path) -> Iterator[None]:
+    """Simulate an installation on a platform that has no wheel of PyBullet, for all processes that are started."""
+    hidden = folder / "hidden"
+    hidden.mkdir(exist_ok=True)
+    (hidden / "sitecustomize.py").write_text("import sys; sys.modules['pybullet'] = None")
+    paths = os.pathsep.join([str(hidden), *sys.path])
+    with patch.dict(os.environ, PYTHONPATH=paths):
+        yield
+
+
+def full_disk(folder: Path) -> Iterator[None]:
+    """Prevent the database from growing."""
+
+    def limit(connection: Any, _record: object) -> None:
+        connection.execute("PRAGMA max_page_count=1")  # SQLite raises this to the current number of pages
+
+    event.listen(Engine, "connect", limit)
+    with patch.object(logging.getLogger("skills.db.session"), "disabled", True):  # here the log is no file of its own
+        yield
+    event.remove(Engine, "connect", limit)
+
+
 def newer_database(folder: Path) -> Iterator[None]:
     """Write a database that a newer version has migrated."""
     url = backends.fresh("sqlite", folder)
@@ -110,6 +137,8 @@ def good_backup(folder: Path) -> Iterator[None]:
     """Back the database up."""
     with closing(Database(f"sqlite:///{folder / 'skills.sqlite'}")) as database:
         back_up(database, folder / "good.zip")
+    for left in folder.glob("skills.jobs.sqlite*"):  # of an earlier mistake; it would be refused first
+        left.unlink()
     yield
     (folder / "good.zip").unlink()
 
@@ -185,12 +214,18 @@ MISTAKES = [
     Mistake("a misspelt surgeon", "demo add hand-off.csv --surgeon kestral --suture simple-running"),
     Mistake("a misspelt suture type", "demo add hand-off.csv --surgeon kestrel --suture simple-runing"),
     Mistake("an unknown arm", f"demo add hand-off.csv {ADD} --arm PSM7"),
+    Mistake("a misspelt arm", f"demo add real.mcap {ADD} --arm psm_2"),
+    Mistake("a misspelt word for a segment", f"demo add hand-off.csv {ADD} --segment hole"),
+    Mistake("another frame for bytes that are stored", "recording add hand-off.csv --frame PSM2_base"),
     Mistake("a negative cell size", f"demo add hand-off.csv {ADD} --cell-mm=-5 --grid fit"),
     Mistake("a cell size in metres", f"demo add hand-off.csv {ADD} --cell-mm 0.005 --grid fit"),
     Mistake("a hysteresis of cells", f"demo add hand-off.csv {ADD} --hysteresis 5"),
     Mistake("milliseconds for seconds", f"demo add hand-off.csv {ADD} --start-s 100 --end-s 400"),
     Mistake("an end before the start", f"demo add hand-off.csv {ADD} --start-s 0.4 --end-s 0.1"),
     Mistake("a trial's folder without trials", "jigsaws add nothing-in-it"),
+    Mistake("a misspelt task", "jigsaws add jigsaws --task Sutring"),
+    Mistake("a misspelt suture type for trials", "jigsaws add jigsaws --suture simple-runing"),
+    Mistake("an arm of the dVRK for trials", "jigsaws add jigsaws --arm PSM1", 2),
     # surgeons, keys
     Mistake("a name for a pseudonym", "surgeon put 'Dr. Bob'"),
     Mistake("a misspelt level", "surgeon put wren --skill-level novise", 2),
@@ -202,7 +237,9 @@ MISTAKES = [
     # learning
     Mistake("a misspelt learner", f"train {STYLE} --learner dnq"),
     Mistake("a learner that is not installed", f"train {STYLE} --learner dqn", around=without_learners),
+    Mistake("a release that the gate refuses", f"train {STYLE} --learner max-ent-irl --release"),
     Mistake("a setting without its learner", f"train {STYLE} --setting steps=10"),
+    Mistake("a misspelt setting of a learner", f"train {STYLE} --learner dqn --setting stps=10"),
     Mistake("a setting without a value", f"train {STYLE} --learner dqn --setting steps"),
     Mistake("an invalid digest", f"train {STYLE} --demo newest"),
     Mistake("a style without a demonstration", "train wren simple-running"),
@@ -219,6 +256,7 @@ MISTAKES = [
     Mistake("a start of two numbers", f"rollout {STYLE} --start=5,55"),
     # plans
     Mistake("a plan without points", f"plan {STYLE}"),
+    Mistake("points and a scene", f"plan {STYLE} --point 5,55,-125 --scene notes.txt"),
     Mistake("a suture point in metres", f"plan {STYLE} --point 0.005,0.055,-0.125"),
     Mistake("a suture point out of reach", f"plan {STYLE} --point 5,555,-120 --no-handoff"),
     Mistake("a plan without PSM_M, the arm that takes the needle", f"plan {STYLE} --point 5,55,-125"),
@@ -228,11 +266,15 @@ MISTAKES = [
     Mistake("a rate above the limit of robots", f"plan {STYLE} --point 5,55,-125 --rate-hz 1000"),
     Mistake("a scene that is not a recording", f"plan {STYLE} --scene notes.txt"),
     Mistake("an unknown plan", "play 01234567"),
+    Mistake("a playback without PyBullet", "play PLAN", around=without_pybullet),
     Mistake("a bag of an unknown plan", "export 01234567 bag.zip"),
     Mistake("an unknown demonstration", "demo show 01234567"),
     Mistake("a misspelt suture type", "atlas simple-runing"),
+    Mistake("a misspelt arm of a motion to score", f"score real.mcap {ADD} --arm PSM1"),
     Mistake("a score of a missing file", f"score nothing.csv {ADD}"),
     # the installation
+    Mistake("a full disk", f"demo add another.mcap {ADD}", around=full_disk),
+    Mistake("a misspelt task to calibrate on", "calibrate jigsaws --task suturing"),
     Mistake("a backup over a file that exists", "backup notes.txt"),
     Mistake("a backup to a folder that is not writable", "backup /proc/backup.zip"),
     Mistake("a file that is not a backup", "restore notes.txt --check"),
@@ -245,6 +287,8 @@ MISTAKES = [
     # settings
     Mistake("a misspelt setting", "surgeon list", env={"SKILLS_DATBASE_URL": "sqlite:////data/skills.sqlite"}),
     Mistake("a port that is not a number", "surgeon list", env={"SKILLS_PORT": "eighty"}),
+    Mistake("a limit with its unit", "surgeon list", env={"SKILLS_MAX_UPLOAD_BYTES": "256MB"}),
+    Mistake("a misspelt level of the log", "surgeon list", env={"SKILLS_LOG_LEVEL": "warn"}),
     Mistake("a database that is not a URL", "surgeon list", env={"SKILLS_DATABASE_URL": "skills.sqlite"}),
     Mistake("a database in memory", "surgeon list", env={"SKILLS_DATABASE_URL": "sqlite://"}),
     Mistake("a database of another kind", "surgeon list", env={"SKILLS_DATABASE_URL": "mysql://me:secret@host/skills"}),
@@ -286,11 +330,16 @@ def fill(folder: Path) -> None:
     url = service.copy_of_trained(folder)
     with service.serving(url) as installation:
         installation.client.put_surgeon("wren")
+        place = {"position_mm": (5.0, 55.0, -125.0)}
+        plan = installation.client.plan("kestrel", "simple-running", [place], handoff="none")
+        (folder / "plan.txt").write_text(plan["id"] if isinstance(plan, dict) else plan.id)
     sample = next(one for one in sample_recordings() if one.surgeon == "wren").data
     table = cases.hand_off()
     _, *rows = table.decode().splitlines()
     files = {
         "hand-off.csv": table,
+        "real.mcap": sample,
+        "another.mcap": next(one for one in sample_recordings() if one.surgeon == "heron").data,
         "empty.mcap": b"",
         "report.pdf": b"%PDF-1.7\n%\xe2\xe3\xcf\xd3\n1 0 obj\n<< /Type /Catalog >>\nendobj\n",
         "truncated.mcap": sample[: len(sample) // 3],
@@ -308,8 +357,6 @@ def fill(folder: Path) -> None:
 @contextmanager
 def surroundings(mistake: Mistake, folder: Path) -> Iterator[None]:
     """Set the variables of a mistake and no other setting, and make its surroundings."""
-    import os
-
     kept = {name: value for name, value in os.environ.items() if not name.startswith("SKILLS_")}
     ours = {"SKILLS_DATABASE_URL": f"sqlite:///{folder / 'skills.sqlite'}", "COLUMNS": "200"}
     env = {name: value.replace("PORT", str(PORT)) for name, value in mistake.env.items()}
@@ -330,9 +377,15 @@ def surroundings(mistake: Mistake, folder: Path) -> Iterator[None]:
 def make(mistake: Mistake, folder: Path) -> Said:
     """Make a mistake in this process."""
     with surroundings(mistake, folder):
-        result = CliRunner().invoke(app, shlex.split(mistake.typed), input="")
+        result = CliRunner().invoke(app, words_of(mistake, folder), input="")
     crashed = result.exception if not isinstance(result.exception, SystemExit) else None
-    return Said(lasting(result.output, folder), result.exit_code, crashed)
+    return Said(lasting(result.stderr or result.output, folder), result.exit_code, crashed)
+
+
+def words_of(mistake: Mistake, folder: Path) -> list[str]:
+    """Return the words of the command; PLAN stands for the digest of a plan."""
+    plan = (folder / "plan.txt").read_text()
+    return [plan if word == "PLAN" else word for word in shlex.split(mistake.typed)]
 
 
 def lasting(said: str, folder: Path) -> list[str]:

@@ -16,7 +16,9 @@ from skills.cli import app
 from skills.client import Client, Problem
 from skills.remedies import Action, Door, Remedy, did_you_mean, read_remedies
 from skills.schemas.requests import in_words
+from skills.seeds.recordings import sample_recordings
 from skills.settings import settings
+from tests.library import cases
 
 ROOT = Path(skills.__file__).parent
 HTTP_WORDS = re.compile(r"\b(GET|PUT|POST|DELETE|PATCH) (/|\.\.\./)|Authorization|X-API-Key|openapi")
@@ -123,6 +125,8 @@ def test_an_error_is_worded_by_each_door():
 def test_near_misses_are_suggested_and_others_are_not():
     assert did_you_mean("kestral", ["kestrel", "wren"]) == ["Did you mean 'kestrel'?"]
     assert did_you_mean("zebra", ["kestrel", "wren"]) == []
+    assert did_you_mean("psm_1", ["PSM1", "PSM2", "MTMR"]) == ["Did you mean 'PSM1'?"]
+    assert did_you_mean("Knot tying", ["Knot_Tying", "Suturing"]) == ["Did you mean 'Knot_Tying'?"]
 
 
 def patterns_of(document: object) -> Iterator[str]:
@@ -189,3 +193,40 @@ def test_a_refused_argument_is_named_with_value_and_limit_at_each_door(door: Cli
     assert result.stderr.splitlines()[0] == "--point must be at most 10000; 99999 was given"
     with pytest.raises(TypeError, match=r"no argument 'point'\. Did you mean 'suture_points'"):
         door.plan("kestrel", "simple-running", point=[far])  # type: ignore[call-arg]
+
+
+CALL = {"surgeon": "kestrel", "suture": "simple-running"}
+PLACE = {"suture_points": [{"position_mm": [5, 55, -125]}]}
+
+
+@pytest.mark.parametrize(
+    ("path", "body", "where", "meant"),
+    [
+        ("/trainings", {**CALL, "relaese": True}, "body", "'release'"),
+        ("/trainings", {**CALL, "learner": {"kind": "dqn", "stps": 5}}, "body.learner.dqn", "'steps'"),
+        ("/trainings", {**CALL, "learner": {"kind": "dnq"}}, "body.learner", "'dqn'"),
+        ("/trainings", {**CALL, "combine": {"kind": "medoit"}}, "body.combine.kind", "'medoid'"),
+        ("/plans", {**CALL, "suture_points": [{"position": [5, 55, -125]}]}, "body.suture_points.0", "'position_mm'"),
+        ("/plans", {**CALL, **PLACE, "psm_m": {"aproach": [0, 0, 1]}}, "body.psm_m", "'approach'"),
+        ("/plans", {**CALL, **PLACE, "psm_m": {"instrument": "400-006"}}, "body.psm_m.instrument", "'400006'"),
+        ("/plans", {**CALL, **PLACE, "psm_m": {"enters": "after-A1"}}, "body.psm_m.enters", "'after_A1'"),
+    ],
+)
+def test_a_near_miss_in_a_body_is_suggested(door: Client, path: str, body: object, where: str, meant: str):
+    said = door.http.post(path, json=body).json()
+    whys = [one["why"] for one in said["errors"] if one["where"] == where]
+    assert any(f"did you mean {meant}" in why for why in whys), said["errors"]
+
+
+def test_a_near_miss_of_an_arm_is_suggested(door: Client):
+    door.put_surgeon("kestrel")
+    stored = door.add_recording(sample_recordings()[0].data)
+    with pytest.raises(Problem) as refused:
+        door.cut_demo(stored.sha256, **CALL, arm="psm_2", segment="whole")
+    assert "no pose for arm psm_2" in str(refused.value) and "Did you mean 'PSM2'?" in str(refused.value)
+
+
+def test_how_bytes_were_read_is_told_in_words(door: Client):
+    door.add_recording(cases.hand_off(), frame="PSM1_base")
+    with pytest.raises(Problem, match="stored already, read with no rate_hz and frame PSM1_base"):
+        door.add_recording(cases.hand_off())

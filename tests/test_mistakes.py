@@ -1,6 +1,5 @@
 """Mistakes of a new user: each is reported in the words of the command line, as docs/mistakes.md shows."""
 
-import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -8,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from skills.remedies import Door
-from tests.mistakes import MISTAKES, PAGE, Mistake, Said, fill, lasting, make, surroundings
+from tests.mistakes import MISTAKES, PAGE, Mistake, Said, fill, lasting, make, surroundings, words_of
 from tests.test_messages import foreign
 
 QUICK = [mistake for number, mistake in enumerate(MISTAKES) if number % 3 == 0]
@@ -64,12 +63,12 @@ def test_every_other_mistake_is_told_as_the_page_says(mistake: Mistake, folder: 
 def test_a_mistake_in_the_settings_is_told_by_a_process_of_its_own(mistake: Mistake, folder: Path):
     with surroundings(mistake, folder):
         ended = subprocess.run(
-            [sys.executable, "-m", "skills", *shlex.split(mistake.typed)],
+            [sys.executable, "-m", "skills", *words_of(mistake, folder)],
             capture_output=True,
             text=True,
             stdin=subprocess.DEVNULL,
             timeout=120,
             check=False,
         )
-    said = Said(lasting(ended.stdout + ended.stderr, folder), ended.returncode, None)
+    said = Said(lasting(ended.stderr or ended.stdout, folder), ended.returncode, None)
     assert said.row(mistake) in PAGE.read_text().splitlines(), said

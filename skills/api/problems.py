@@ -10,11 +10,13 @@ import logging
 import math
 import re
 import secrets
-from typing import Any
+from collections.abc import Iterable, Sequence
+from typing import Any, get_args, get_origin
 
 import orjson
 from fastapi import FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
+from pydantic import BaseModel
 from starlette.exceptions import HTTPException
 
 from skills import errors
@@ -72,7 +74,6 @@ def problem(
 SHOWN = 1e12  # larger numbers are not repeated in messages
 LIMITS = {
     "missing": "is missing",
-    "extra_forbidden": "there is no such field",
     "greater_than": "must be more than {gt}",
     "greater_than_equal": "must be at least {ge}",
     "less_than": "must be less than {lt}",
@@ -120,24 +121,53 @@ def _where(one: dict[str, Any]) -> str:
     return ".".join(str(part) for part in known)[:200]
 
 
-def _why(one: dict[str, Any]) -> str:
+def _meant(given: object, known: Iterable[str]) -> str:
+    """Return a suggestion of similar names, in parentheses, or nothing."""
+    near = did_you_mean(str(given), known)
+    return f" (did you mean {near[0].removeprefix('Did you mean ')})" if near else ""
+
+
+def _names(kind: Any, path: Sequence[str | int]) -> list[str]:
+    """Return the names of the fields of the model at a path below a type; none if there is no model."""
+    if isinstance(kind, type) and issubclass(kind, BaseModel):
+        if not path:
+            return [field.alias or name for name, field in kind.model_fields.items()]
+        if (field := kind.model_fields.get(str(path[0]))) is not None:
+            return _names(field.annotation, path[1:])
+        # the tag of a union, which is no field, precedes the fields of its model
+        tag = kind.model_fields.get("kind")
+        return _names(kind, path[1:]) if tag is not None and path[0] in get_args(tag.annotation) else []
+    parts = get_args(kind)
+    if get_origin(kind) in (list, tuple) and path:
+        return _names(parts[0], path[1:])
+    return next((found for part in parts if (found := _names(part, path))), [])
+
+
+def _why(one: dict[str, Any], body: Any = None) -> str:
     """Return why a field is refused, as a phrase that follows its name: the limit in words, and the given number.
 
     Text that was sent is not repeated: the client, which has it, adds it to the message.
+
+    Args:
+        one: An error of pydantic.
+        body: The type of the request's body.
     """
     kind, about, given = one["type"], one.get("ctx", {}), one.get("input")
+    if kind == "extra_forbidden":
+        _, *path, name = one["loc"]
+        return f"has an unknown field{_meant(name, _names(body, path))}"
     if kind == "json_invalid":
         return f"{about['error']}."
     if kind == "missing" and isinstance(one["loc"][-1], int):
         return "is missing; give more numbers"
     if kind == "string_pattern_mismatch":
         one_of = re.fullmatch(r"\^\(([\w|-]+)\)\$", about["pattern"])
-        return in_words(about["pattern"]) if one_of is None else f"must be one of {one_of[1].replace('|', ', ')}"
+        if one_of is None:
+            return in_words(about["pattern"])
+        return f"must be one of {one_of[1].replace('|', ', ')}{_meant(given, one_of[1].split('|'))}"
     if kind in ("literal_error", "union_tag_invalid"):
         known = re.findall(r"'([^']+)'", about.get("expected") or about["expected_tags"])
-        near = did_you_mean(str(about.get("tag", given)), known)
-        meant = f" (did you mean {near[0].removeprefix('Did you mean ')})" if near else ""
-        return f"must be one of {', '.join(known)}{meant}"
+        return f"must be one of {', '.join(known)}{_meant(about.get('tag', given), known)}"
     words = LIMITS.get(kind)
     said = (
         str(one["msg"]).removeprefix("Value error, ")
@@ -190,8 +220,10 @@ def answer_refusals(app: FastAPI) -> None:
         return answer_to(error)
 
     @app.exception_handler(RequestValidationError)
-    def invalid(_request: Request, error: RequestValidationError) -> Response:
-        wrong = [{"where": _where(one), "why": _why(one)} for one in error.errors()[:20]]
+    def invalid(request: Request, error: RequestValidationError) -> Response:
+        bodies = getattr(getattr(request.scope.get("route"), "dependant", None), "body_params", ())
+        body = bodies[0].field_info.annotation if bodies else None
+        wrong = [{"where": _where(one), "why": _why(one, body)} for one in error.errors()[:20]]
         return problem(
             422,
             "invalid-request",

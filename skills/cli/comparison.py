@@ -22,6 +22,7 @@ from skills.cli.shell import (
     show,
 )
 from skills.errors import BadInput
+from skills.remedies import did_you_mean
 
 if TYPE_CHECKING:
     from skills.schemas.given import Atlas
@@ -150,6 +151,12 @@ def _part(
         stored = client.add_recording(file, progress=progress)
     if proposal is None and (start_s, end_s) != (None, None):
         return {"recording": stored.sha256, "arm": arm, "start_s": start_s, "end_s": end_s}
+    arms = sorted({part.arm for part in stored.segments})
+    if arm is not None and arms and arm not in arms:
+        raise BadInput(
+            f"No hand-off of {arm} is proposed in the recording; there are proposals of {', '.join(arms)}.",
+            *did_you_mean(arm, arms),
+        )
     proposed = [part for part in stored.segments if arm in (None, part.arm)]
     number = proposal or 1
     if not 1 <= number <= len(proposed) or (proposal is None and len(proposed) > 1):

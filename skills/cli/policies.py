@@ -78,8 +78,7 @@ def train(
     result = result_of(job)
     show(job if as_json else result, as_json, ("policy_version", "sha256", "releasable", "released"))
     if release and not result["released"]:
-        said = f"Version {result['policy_version']} is not released: {result['not_released_because']}"
-        raise Conflict(f"{said} {result['remedy']}")
+        raise Conflict(_not_released(result["policy_version"], result["not_released_because"]), result["remedy"])
 
 
 @learning_commands.command()
@@ -116,7 +115,12 @@ def _kept_back(style: "RetrainedStyle") -> str:
     """Return why a version trained by a batch is not released, with the remedy."""
     assert style.comparison is not None, "it was trained"
     because, remedy = style.comparison.not_released_because, style.comparison.remedy
-    return f"{style.surgeon}, {style.suture}: version {style.policy_version} is not released: {because} {remedy}"
+    return f"{style.surgeon}, {style.suture}: {_not_released(style.policy_version, str(because))} {remedy}"
+
+
+def _not_released(version: int | None, because: str) -> str:
+    """Return that a version is not released, and why; the gate's reason names the version itself."""
+    return because if because.startswith("Version ") else f"Version {version} is not released: {because}"
 
 
 def _learner(kind: str | None, settings: list[str]) -> dict[str, Any] | None:
@@ -346,7 +350,9 @@ def plan(
     as_json: AsJson = False,
 ) -> None:
     """Stack the released policy at suture points."""
-    if bool(point) == (scene is not None):
+    if point and scene is not None:
+        raise BadInput("Use --point or --scene, not both.", "A scene's file contains the suture points itself.")
+    if not point and scene is None:
         raise BadInput(
             "A plan needs suture points, from --point or from --scene.",
             "For each pass: --point X,Y,Z in mm; or --scene with a simulator's file that contains them.",

@@ -4,6 +4,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -24,7 +25,8 @@ from skills.cli.shell import (
     service,
     show,
 )
-from skills.errors import BadInput
+from skills.errors import BadInput, SkillsError
+from skills.remedies import Door, did_you_mean
 
 surgeon_commands = typer.Typer()
 surgeons = typer.Typer(no_args_is_help=True, help="Surgeons, by pseudonym; never by name.")
@@ -291,7 +293,11 @@ def _part_of(segment: str) -> "Part":
     if segment == "whole":
         return "whole"
     if not segment.isdecimal():
-        raise BadInput(f"--segment is the number of a proposed hand-off, or whole, not {segment!r}.")
+        raise BadInput(
+            f"--segment {segment!r} is neither the number of a proposed hand-off nor whole.",
+            *did_you_mean(segment, ["whole"]),
+            "List the proposed hand-offs: skills recording add FILE",
+        )
     return int(segment)
 
 
@@ -400,7 +406,7 @@ def jigsaws_add(
             autocompletion=complete_sutures,
         ),
     ] = None,
-    arm: Annotated[str | None, typer.Option(help="Only PSM_left or PSM_right.")] = None,
+    arm: Annotated[Literal["PSM_left", "PSM_right"] | None, typer.Option(help="Only this arm.")] = None,
     prefix: Annotated[str, typer.Option(help="Prefix of the pseudonyms, before the surgeon's letter.")] = "jigsaws",
     as_json: AsJson = False,
 ) -> None:
@@ -411,7 +417,8 @@ def jigsaws_add(
 
     found = find_trials(folder, task or ())
     with service() as client:
-        sending = send_trials(client, found, suture=suture, arm=arm, prefix=prefix)
+        worded = partial(SkillsError.words, door=Door.COMMAND)
+        sending = send_trials(client, found, suture=suture, arm=arm, prefix=prefix, worded=worded)
         done = [
             asdict(sent)
             for sent in track(

@@ -64,7 +64,7 @@ class Refused:
 
     def sentence(self, name: str | None = None) -> str:
         """Return a sentence with the argument, the reason and the given value; `name` replaces the argument's name."""
-        called = name or ".".join(self.path)
+        called = name or ".".join(self.path) or ("The request" if self.why.startswith("has ") else "")
         why = self.why[:1].upper() + self.why[1:] if not called else f"{called} {self.why}"
         shown = isinstance(self.given, str) and len(self.given) <= LONGEST_SHOWN and "was given" not in why
         return f"{why}; {self.given!r} was given" if shown else why

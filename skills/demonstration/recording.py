@@ -34,6 +34,7 @@ from skills.errors import (
 )
 from skills.fields import Count, Point, Quaternion, schema
 from skills.kinematics import quaternion_of
+from skills.remedies import did_you_mean
 
 COORDINATE_LIMIT_MM = 1000.0  # ours: a PSM reaches 0.3 m; far beyond it millimetres were taken for metres
 QUATERNION_TOLERANCE = 1e-3  # ours: three printed decimals pass, an unnormalised quaternion does not
@@ -360,8 +361,10 @@ class Recording:
         if not fitting:
             here = ", ".join(f"{m.topic} of {m.arm}" for m in self.motions)
             asked = " and ".join(x for x in (arm and f"arm {arm}", topic and f"topic {topic}") if x)
+            near = did_you_mean(arm, self.arms) if arm is not None and arm not in self.arms else []
+            near = near or did_you_mean(topic or "", [m.topic for m in self.motions])
             raise NoUsableTopic(
-                f"The recording has no pose for {asked}. It has poses for {here}.", arm=arm, topic=topic
+                f"The recording has no pose for {asked}. It has poses for {here}.", *near, arm=arm, topic=topic
             )
         arms = sorted({m.arm for m in fitting})
         if len(arms) > 1:

@@ -26,6 +26,7 @@ from skills.formats.mcap.records import RECOVER
 from skills.formats.reader_process import answered
 from skills.formats.topics import POSE
 from skills.kinematics import angle_between, matrix_of, quaternion_of
+from skills.remedies import did_you_mean
 from skills.schemas.recordings import SuturePoint
 from skills.schemas.recordings import SuturePoints as SuturePoints
 
@@ -191,7 +192,8 @@ def _base_of(scene: Recording, arm: str | None, frame: str | None, seen_in: str)
     if frame is None:
         raise NoUsableTopic(
             f"The marks are in the frame {seen_in!r}, and the file has no pose of the arm's base in it; record "
-            f"/CRTK/<psm>/{_BASE} too, or, if the marks are in the arm's base frame, name that as the frame."
+            f"/CRTK/<psm>/{_BASE} too, or, if the marks are in the arm's base frame, name that as the frame.",
+            *did_you_mean(arm or "", [one.arm for one in bases]),
         )
     return None
 

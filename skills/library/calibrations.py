@@ -27,7 +27,7 @@ from skills.errors import BadInput, BadRecording, BadSegment, Corrupt, NotMetres
 from skills.formats import jigsaws
 from skills.formats.jigsaws import Trial
 from skills.packing import canonical, sha256
-from skills.remedies import Action, Remedy
+from skills.remedies import Action, Remedy, did_you_mean
 from skills.scoring import calibration
 from skills.scoring.calibration import (
     LEAST_RATING,
@@ -181,15 +181,17 @@ def read_calibration(stored: StoredCalibration) -> SkillModel:
 
 
 def _one_task(folder: Path, task: str | None) -> list[Trial]:
-    found = [trial for trial in jigsaws.trials(folder) if task in (None, trial.task)]
-    tasks = sorted({trial.task for trial in found})
+    there = list(jigsaws.trials(folder))
+    tasks = sorted({trial.task for trial in there})
+    if there and task not in (None, *tasks):
+        raise BadInput(f"{folder} has trials of {', '.join(tasks)}, not of {task}.", *did_you_mean(str(task), tasks))
+    found = [trial for trial in there if task in (None, trial.task)]
     if not found:
-        named = f" of the task {task}" if task else ""
         raise BadInput(
-            f"{folder} has no trials of JIGSAWS{named}; they are expected as "
+            f"{folder} has no trials of JIGSAWS; they are expected as "
             "TASK/kinematics/AllGestures/TASK_B001.txt, with TASK/meta_file_TASK.txt."
         )
-    if len(tasks) > 1:
+    if task is None and len(tasks) > 1:
         raise BadInput(f"The folder has trials of {', '.join(tasks)}; name one of them with --task.")
     twice = [name for name, count in Counter(trial.name for trial in found).items() if count > 1]
     if twice:

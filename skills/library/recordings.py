@@ -142,7 +142,8 @@ def keep(session: Session, upload: Upload, told: Told, actor: str) -> tuple[Stor
                 raise Conflict(
                     "These bytes cannot be stored with this rate_hz and frame; ask the operator of the service."
                 )
-            raise Conflict(f"These bytes are stored already, read with {stored.reading}; send the same parameters.")
+            before = " and ".join(f"no {name}" if to is None else f"{name} {to}" for name, to in stored.reading.items())
+            raise Conflict(f"These bytes are stored already, read with {before}; send the same parameters.")
         return stored, _brought_by(session, stored, actor)
     stored = StoredRecording(
         sha256=upload.sha256,

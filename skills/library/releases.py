@@ -142,16 +142,18 @@ STANDS = (
     .limit(1)
 )
 # Remedies by words in the reason for which a version is not released; the first match counts.
+_OTHERWISE = "Train it with other settings or another learner, or record the hand-off again."
 _REMEDIES = (
     ("consent", "Record a consent of the surgeon that covers training, then request the release again."),
     ("was released", "Request the release again if this version is to be served in its place."),
     ("was withdrawn.", "Request the release again if this version is to be served."),
     ("demonstration was withdrawn", "Train from a demonstration that is active, and request its release."),
-    ("worse than", "Release it by its number if it is to replace the released version anyway."),
+    ("is worse than", "Release it by its number if it is to replace the released version anyway."),
+    ("not optimal", _OTHERWISE),
+    ("do not reach the goal", _OTHERWISE),
     ("joint limits", "Record the hand-off further inside the arm's reach, or with the arm's base elsewhere."),
     ("not the arm's base", "Record the arm's local/measured_cp, which is in the frame of its base."),
 )
-_OTHERWISE = "Train it with other settings or another learner, or record the hand-off again."
 
 
 def remedy(reason: str) -> str:

@@ -383,7 +383,8 @@ def _driven(policy: Policy, demo: Demo) -> tuple[DrivenPass | None, list[str]]:
     try:
         driven = driven_pass(policy, demo)
     except BadPlan as refused:
-        return None, [f"the demonstrated pass cannot be driven, so the joint limits were not checked: {refused}"]
+        why = refused.message.removesuffix(".")
+        return None, [f"the demonstrated pass cannot be driven, so the joint limits were not checked: {why}"]
     if driven.beyond == 0:
         return driven, []
     nearest, arm = driven.nearest_limit, instrument_of(demo.instrument).arm.name

@@ -152,7 +152,7 @@ def test_of_several_tasks_one_is_named(copied: Path) -> None:
     with pytest.raises(BadInput, match="Knot_Tying, Suturing; name one of them with --task"):
         read_cohort(copied)
     assert read_cohort(copied, task="Suturing").data["trials"] == 40
-    with pytest.raises(BadInput, match="of the task Sewing"):
+    with pytest.raises(BadInput, match="has trials of Knot_Tying, Suturing, not of Sewing"):
         read_cohort(copied, task="Sewing")
 
 
