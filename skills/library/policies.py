@@ -33,7 +33,7 @@ from skills.remedies import Action, Remedy
 from skills.schemas import policies as described
 from skills.schemas.policies import Rollout
 
-MAX_JSON_ACTIONS = 10**6  # interface.md: above it, JSON has null and a link to the arrays
+MAX_JSON_ACTIONS = 10**6  # ours: above it, JSON has null and names the arrays
 MOST_DEMOS = 50  # ours: all pairs are compared, and the combined path with each some ten times, in a third of a second
 BEST = Corridor()  # nearest to left-out demonstrations, with an outlier and without: docs/results.md
 

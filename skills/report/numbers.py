@@ -45,6 +45,7 @@ from skills.learning.max_ent_irl import MaxEntIRL, recover_reward
 from skills.learning.policy import Policy, Rollout, learn_tabular, rollout, rollout_from
 from skills.learning.q_learning import CellQLearning, PhaseQLearning
 from skills.learning.slip import replay
+from skills.packing import sha256
 from skills.planning.plan import SuturePoint, stack
 from skills.report import rivals
 from skills.report.rivals import Disturbed, disturb, learn_primitive
@@ -294,10 +295,14 @@ class LearntStyle:
 
 @dataclass(frozen=True)
 class Tried:
-    """The number of seeds with which a learner reaches the goal from the demonstrated start, and follows it exactly."""
+    """The number of seeds with which a learner reaches the goal from the demonstrated start, and follows it exactly.
+
+    `tables` is the number of different tables that they learn: where it is 1, the number of seeds says nothing.
+    """
 
     by: str
     seeds: int
+    tables: int
     reached: int
     exact: int
 
@@ -361,13 +366,17 @@ def try_seeds(source: FigureSource, seeds: int) -> tuple[Tried, ...]:
         )
 
 
-def _try(reward: RewardMap, learner: CellQLearning | PhaseQLearning, seed: int) -> Rollout:
-    return rollout_from(learn_tabular(reward, learner, seed), reward.path.start)
+def _try(reward: RewardMap, learner: CellQLearning | PhaseQLearning, seed: int) -> tuple[Rollout, str]:
+    """Return the rollout from the demonstrated start, and the digest of the learnt table."""
+    policy = learn_tabular(reward, learner, seed)
+    return rollout_from(policy, reward.path.start), sha256(policy.q.tobytes())
 
 
-def _count(by: str, rollouts: Sequence[Rollout]) -> Tried:
+def _count(by: str, tried: Sequence[tuple[Rollout, str]]) -> Tried:
+    rollouts = [followed for followed, _ in tried]
     exact = [one.finished and np.array_equal(one.states, one.path.states) for one in rollouts]
-    return Tried(by, len(rollouts), sum(one.finished for one in rollouts), sum(exact))
+    tables = len({table for _, table in tried})
+    return Tried(by, len(rollouts), tables, sum(one.finished for one in rollouts), sum(exact))
 
 
 @dataclass(frozen=True, eq=False)

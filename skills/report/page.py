@@ -104,8 +104,8 @@ def _fig_8(numbers: Numbers) -> Table:
 
 
 def _tried(numbers: Numbers) -> Table:
-    rows = ((one.by, one.seeds, one.reached, one.exact) for one in numbers.tried)
-    columns = ("learner", "seeds", "arrive", "give the demonstration back")
+    rows = ((one.by, one.seeds, one.tables, one.reached, one.exact) for one in numbers.tried)
+    columns = ("learner", "seeds", "different tables", "arrive", "give the demonstration back")
     return _named("seeds", numbers, "The same learners on many seeds, from 0 on", columns, rows)
 
 

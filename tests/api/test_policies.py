@@ -12,7 +12,7 @@ import pytest
 from skills.client import Problem
 from skills.learning.q_learning import CellQLearning
 from tests import backends
-from tests.api.service import CSV, GOAL_MM, KESTREL, POLICY, Service, assert_problem, serving
+from tests.api.service import CSV, GOAL_MM, KESTREL, POLICY, Service, assert_problem, copy_of_trained, serving
 from tests.library import cases
 
 FIELDS = (
@@ -96,6 +96,20 @@ def test_a_policy_has_every_field_of_the_interface(still: Service):
     assert policy["metrics"]["dtw_total_mm"] == 0
     assert policy["grid_certificate"]["refused_because"] == []
     assert "accuracy" in policy["grid_certificate"]["note"]
+
+
+def test_above_its_limit_the_json_names_the_arrays_that_have_the_actions(tmp_path, monkeypatch):
+    with serving(copy_of_trained(tmp_path)) as service:
+        policy = service.client.policy(**KESTREL)
+        entries = policy["phases"] * policy["coverage"]["n_states"]
+        monkeypatch.setattr("skills.library.policies.MAX_JSON_ACTIONS", entries - 1)
+        served = service.http.get(f"/policy-versions/{policy['sha256']}").json()
+        assert served["actions"] is None
+        path, _, accept = served["arrays"].partition(" with Accept: ")
+        arrays = np.load(io.BytesIO(service.http.get(path, headers={"Accept": accept}).content))
+        table = np.full(np.shape(policy["actions"]), -2)
+        table[arrays["phase"], arrays["state"]] = arrays["action"]
+        assert table.tolist() == policy["actions"]
 
 
 def test_the_arrays_agree_with_the_json(still: Service):
