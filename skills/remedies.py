@@ -135,6 +135,36 @@ class Action(Enum):
         command="Join the parts first: skills recording add FOLDER",
         python="Join the parts first: skills.read_recording(FOLDER) does it.",
     )
+    DECIMAL_COMMA = Words(
+        http="Send it with decimal=comma.",
+        command="Read it with decimal commas: --decimal comma",
+        python="Read it with decimal commas: decimal='comma'",
+    )
+    NAME_COLUMNS = Words(
+        http="Name each quantity's column with column=x_mm=NAME (docs/tables.md); the others are then not used.",
+        command="Name each quantity's column: --column x_mm=NAME (docs/tables.md); the others are then not used.",
+        python="Name each quantity's column: column=['x_mm=NAME', ...] (docs/tables.md); the others are then not used.",
+    )
+    NAME_UNIT = Words(
+        http="Name it: unit={one} or unit={other}.",
+        command="Name it: --unit {one} or --unit {other}",
+        python="Name it: unit=[{one}] or unit=[{other}]",
+    )
+    NAME_RATE = Words(
+        http="Send it with rate_hz, or name the column of times: column=t_s=NAME, t_ms, t_us or t_ns.",
+        command="Give --rate-hz, or name the column of times: --column t_s=NAME, t_ms, t_us or t_ns",
+        python="Give rate_hz, or name the column of times: column=['t_s=NAME'], t_ms, t_us or t_ns",
+    )
+    NAME_FRAME = Words(
+        http="Name it: frame=base if each arm's poses are in its own base, else the frame's name, such as frame=ECM.",
+        command="Name it: --frame base if each arm's poses are in its own base, else its name, such as --frame ECM",
+        python="Name it: frame='base' if each arm's poses are in its own base, else its name, such as frame='ECM'",
+    )
+    NAME_INSTRUMENT = Words(
+        http="Name it: instrument={one} or instrument={other}.",
+        command="Name it: --instrument {one} or --instrument {other}",
+        python="Name it: instrument={one} or instrument={other}",
+    )
     ADD_JIGSAWS = Words(
         http="Send each trial by itself.",
         command="Store all trials of the folder: skills jigsaws add {folder}",

@@ -23,7 +23,6 @@ from tests.library import rated
 from tests.needs import need
 
 PAGE = (Path(__file__).parent.parent / "docs" / "cli.md").read_text()
-BLOCKS = re.findall(r"```console\n(.*?)```", PAGE, re.DOTALL)
 NAME = re.compile(r"skills_[\w-]+|\b[0-9a-f]{8,64}\b")
 MOMENT = re.compile(r"\d{4}-\d\d-\d\d[T ][\d:.]+(?:Z|\+00:00)")
 AS_SHOWN, HOW = doctest.OutputChecker(), doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
@@ -49,9 +48,9 @@ def installation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[No
     settings.cache_clear()
 
 
-def steps() -> Iterator[tuple[str, bool, str]]:
-    """Yield each command of the page, whether it fails, and its output."""
-    for block in BLOCKS:
+def steps(page: str = PAGE) -> Iterator[tuple[str, bool, str]]:
+    """Yield each command of a page, whether it fails, and its output."""
+    for block in re.findall(r"```console\n(.*?)```", page, re.DOTALL):
         for step in re.split(r"^\$ ", block, flags=re.MULTILINE)[1:]:
             line, _, printed = step.partition("\n")
             command, _, comment = line.partition("  # ")

@@ -25,7 +25,7 @@ from skills.formats import BYTES, MEDIA_TYPES, media_type_of
 from skills.jobs import Engine
 from skills.library.jobs import refuse_too_many
 from skills.library.recordings import Reader, Teller, Upload, check_digest
-from skills.schemas.requests import DIGEST, FRAME, SLUG
+from skills.schemas.requests import DIGEST, SLUG
 from skills.settings import Settings
 
 
@@ -134,8 +134,6 @@ async def receive(
     content_type: Annotated[str, Header()] = "",
     content_digest: Annotated[str | None, Header(max_length=500)] = None,
     content_encoding: Annotated[str | None, Header(max_length=100)] = None,
-    rate_hz: Annotated[float | None, Query(gt=0, le=10_000, allow_inf_nan=False)] = None,
-    frame: Annotated[str | None, Query(pattern=FRAME)] = None,
 ) -> AsyncIterator[Upload]:
     """Spool the raw body to a temporary file, and compute its size and SHA-256 meanwhile.
 
@@ -170,7 +168,7 @@ async def receive(
         vouched = check_digest(content_digest, sha256)
         if media_type == BYTES:
             media_type = media_type_of(file)  # type: ignore[arg-type]
-        yield Upload(file, sha256, size, media_type, rate_hz, frame, vouched)  # type: ignore[arg-type]
+        yield Upload(file, sha256, size, media_type, vouched)  # type: ignore[arg-type]
 
 
 async def _in_time(request: Request, settings: Settings) -> AsyncIterator[bytes]:

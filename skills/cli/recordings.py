@@ -108,7 +108,7 @@ def erase(
 
 if TYPE_CHECKING:
     from skills.client import Progress
-    from skills.schemas.given import Demonstration, Recording
+    from skills.schemas.given import Demonstration, Recording, RecordingPreview
 
     Part = Literal["whole"] | int | None
 
@@ -121,7 +121,24 @@ commands.add_typer(demos, name="demo")
 commands.add_typer(jigsaws, name="jigsaws")
 
 RateHz = Annotated[float | None, typer.Option(help="Samples per second, for a table without times.")]
-Frame = Annotated[str | None, typer.Option(help="The frame of a table's positions; PSM_base by default.")]
+Frame = Annotated[
+    str | None, typer.Option(help="The frame of a table's positions; base, the default for one arm: the arm's base.")
+]
+Columns = Annotated[
+    list[str] | None,
+    typer.Option("--column", help="A table's column under another name, as x_mm=PosX; repeatable (docs/tables.md)."),
+]
+Units = Annotated[
+    list[str] | None,
+    typer.Option("--unit", help="The unit of columns that name none: m, mm, rad, deg, s, ms, us or ns; repeatable."),
+]
+Decimal = Annotated[
+    Literal["point", "comma"] | None, typer.Option(help="The decimal mark of a table: point, the default, or comma.")
+]
+TableArm = Annotated[str | None, typer.Option(help="The arm of a table; PSM by default.")]
+Instrument = Annotated[
+    str | None, typer.Option(help="The instrument with which a table's joints become poses, such as 400006.")
+]
 RecordingPath = Annotated[
     Path, typer.Argument(help="A recording, a bag folder, or a session's folder with one; pictures are not sent.")
 ]
@@ -154,6 +171,11 @@ def recording_add(
     path: RecordingPath,
     rate_hz: RateHz = None,
     frame: Frame = None,
+    column: Columns = None,
+    unit: Units = None,
+    decimal: Decimal = None,
+    table_arm: TableArm = None,
+    instrument: Instrument = None,
     surgeon: Annotated[
         str | None,
         typer.Option(
@@ -164,8 +186,66 @@ def recording_add(
 ) -> None:
     """Store a recording, and list the hand-offs proposed in it."""
     with service() as client, ready(path) as (file, progress):
-        stored = client.add_recording(file, rate_hz=rate_hz, frame=frame, surgeon=surgeon, progress=progress)
+        stored = client.add_recording(
+            file,
+            rate_hz=rate_hz,
+            frame=frame,
+            column=column,
+            unit=unit,
+            decimal=decimal,
+            table_arm=table_arm,
+            instrument=instrument,
+            surgeon=surgeon,
+            progress=progress,
+        )
     _tell(stored, as_json)
+
+
+@recordings.command("preview")
+@refusing
+def recording_preview(
+    path: RecordingPath,
+    rate_hz: RateHz = None,
+    frame: Frame = None,
+    column: Columns = None,
+    unit: Units = None,
+    decimal: Decimal = None,
+    table_arm: TableArm = None,
+    instrument: Instrument = None,
+    as_json: AsJson = False,
+) -> None:
+    """Show what would be understood of a recording, above all of a table; nothing is stored."""
+    with service() as client, ready(path) as (file, progress):
+        seen = client.preview_recording(
+            file,
+            rate_hz=rate_hz,
+            frame=frame,
+            column=column,
+            unit=unit,
+            decimal=decimal,
+            table_arm=table_arm,
+            instrument=instrument,
+            progress=progress,
+        )
+    if as_json:
+        print_json(seen)
+        return
+    for one in seen.columns:
+        meaning = f"{one.quantity} in {one.unit}" if one.unit else one.quantity or "not used"
+        out.print(f"column {one.name}: {meaning}", markup=False, soft_wrap=True)
+    for motion, quality in zip(seen.motions, seen.quality, strict=True):
+        x, y, z = quality.extent_mm
+        rate = "" if quality.rate_hz is None else f" in {quality.duration_s:.3f} s, {quality.rate_hz:.1f} Hz"
+        where = f"arm {motion.arm}, frame {motion.frame}, {motion.topic}"
+        extent = f"extent x {x:.1f}, y {y:.1f}, z {z:.1f} mm"
+        out.print(f"{where}: {motion.samples} samples{rate}; {extent}", markup=False, soft_wrap=True)
+    for left in seen.left_out:
+        out.print(f"left out {left.topic}: {left.because}", markup=False, soft_wrap=True)
+    for line in _counted(seen):
+        out.print(line, markup=False, soft_wrap=True)
+    if not seen.timed:
+        out.print("No times: it is stored only with a rate (--rate-hz) or a column of times.", soft_wrap=True)
+    out.print("Nothing was stored.")
 
 
 @recordings.command("show")
@@ -205,7 +285,7 @@ def _tell(stored: "Recording", as_json: bool) -> None:
     show(stored.segments, False, ("arm", "start_s", "end_s", "reason"))
 
 
-def _counted(stored: "Recording") -> list[str]:
+def _counted(stored: "Recording | RecordingPreview") -> list[str]:
     """Return a line for each count of samples that were dropped, or repeat the one before."""
     repeated = [(one.duplicate_stamps, one.topic, "with a repeated stamp dropped") for one in stored.motions]
     back = [(one.backward_stamps, one.topic, "with a stamp that went back dropped") for one in stored.dropped]
@@ -243,6 +323,11 @@ def demo_add(
     session: Annotated[str | None, typer.Option()] = None,
     rate_hz: RateHz = None,
     frame: Frame = None,
+    column: Columns = None,
+    unit: Units = None,
+    decimal: Decimal = None,
+    table_arm: TableArm = None,
+    instrument: Instrument = None,
     as_json: AsJson = False,
 ) -> None:
     """Store a recording and one demonstration of it; if several hand-offs are proposed, name one with --segment."""
@@ -269,6 +354,11 @@ def demo_add(
                 session=session,
                 rate_hz=rate_hz,
                 frame=frame,
+                column=column,
+                unit=unit,
+                decimal=decimal,
+                table_arm=table_arm,
+                instrument=instrument,
                 progress=progress,
             )
 

@@ -7,7 +7,7 @@ from typing import Any, Literal
 from skills.client.connection import Connection, at, call, given
 from skills.client.transport import Progress
 from skills.schemas import Handedness, SkillLevel
-from skills.schemas.given import Demonstration, DemoPath, Recording, RewardMap, Surgeon, SutureType
+from skills.schemas.given import Demonstration, DemoPath, Recording, RecordingPreview, RewardMap, Surgeon, SutureType
 
 
 class Catalogue(Connection):
@@ -78,6 +78,11 @@ class Recordings(Connection):
         *,
         rate_hz: float | None = None,
         frame: str | None = None,
+        column: list[str] | None = None,
+        unit: list[str] | None = None,
+        decimal: Literal["point", "comma"] | None = None,
+        table_arm: str | None = None,
+        instrument: str | None = None,
         surgeon: str | None = None,
         progress: Progress | None = None,
     ) -> Recording:
@@ -87,13 +92,47 @@ class Recordings(Connection):
             recording: A path, whose file is streamed and never held in memory, or bytes. The digest is sent along.
             media_type: The media type; default: determined by the content.
             rate_hz: Samples per second, of a table without times.
-            frame: Frame of a table's positions.
+            frame: Frame of a table's positions; "base": the base of each arm.
+            column: A table's columns under other names (docs/tables.md), each as "x_mm=PosX".
+            unit: Units of the columns that name none, such as "mm".
+            decimal: A table's decimal mark.
+            table_arm: A table's arm; default: PSM.
+            instrument: Number of the instrument with which a table's joints become poses.
             surgeon: The recorded surgeon; erasing the surgeon then deletes the recording even if nothing was cut out of
                 it.
             progress: Called with the bytes sent and the total; it starts again from 0 when a lost upload is retried.
         """
-        query = {"rate_hz": rate_hz, "frame": frame, "surgeon": surgeon}
+        query = {
+            **{"rate_hz": rate_hz, "frame": frame, "column": column, "unit": unit, "decimal": decimal},
+            **{"table_arm": table_arm, "instrument": instrument, "surgeon": surgeon},
+        }
         return await self._upload(Recording, at("recordings"), recording, media_type, progress, query)
+
+    @call
+    async def preview_recording(
+        self,
+        recording: Path | bytes,
+        media_type: str | None = None,
+        *,
+        rate_hz: float | None = None,
+        frame: str | None = None,
+        column: list[str] | None = None,
+        unit: list[str] | None = None,
+        decimal: Literal["point", "comma"] | None = None,
+        table_arm: str | None = None,
+        instrument: str | None = None,
+        progress: Progress | None = None,
+    ) -> RecordingPreview:
+        """Return what would be understood of a recording, a table's columns included; nothing is stored.
+
+        Arguments are those of `add_recording`. A table without times is counted, and its durations and rates are None.
+        """
+        query = {
+            **{"rate_hz": rate_hz, "frame": frame, "column": column, "unit": unit, "decimal": decimal},
+            **{"table_arm": table_arm, "instrument": instrument},
+        }
+        path = at("recordings", "preview")
+        return await self._upload(RecordingPreview, path, recording, media_type, progress, query)
 
     @call
     async def recording(self, recording: str) -> Recording:
@@ -124,13 +163,19 @@ class Recordings(Connection):
         media_type: str | None = None,
         rate_hz: float | None = None,
         frame: str | None = None,
+        column: list[str] | None = None,
+        unit: list[str] | None = None,
+        decimal: Literal["point", "comma"] | None = None,
+        table_arm: str | None = None,
+        instrument: str | None = None,
         progress: Progress | None = None,
     ) -> Demonstration:
         """Store a recording and one demonstration of it; see `add_recording` and `cut_demo`."""
         query = {
             **{"surgeon": surgeon, "suture": suture, "arm": arm, "topic": topic, "start_s": start_s, "end_s": end_s},
             **{"segment": segment, "grid": grid, "cell_mm": cell_mm, "hysteresis": hysteresis, "session": session},
-            **{"rate_hz": rate_hz, "frame": frame},
+            **{"rate_hz": rate_hz, "frame": frame, "column": column, "unit": unit, "decimal": decimal},
+            **{"table_arm": table_arm, "instrument": instrument},
         }
         return await self._upload(Demonstration, at("demos"), recording, media_type, progress, query)
 

@@ -4,6 +4,7 @@
     ├── Motion      the tip of one arm, one per pose topic: stamps_ns (T,), tip_mm (T, 3), rotation_xyzw (T, 4)
     ├── Joints      the measured joints of one arm: stamps_ns (T,), positions (T, J)
     ├── Signal      one number over time, a jaw's angle or a pedal: stamps_ns (T,), values (T,)
+    ├── Column      a column of a table, and what it was read as
     ├── Label       a named interval: a stage of the session, a gesture
     └── Topic       a topic of the file, used or not
     --base_frames--> BaseFrame   the pose of an arm's base in the frame of another of its topics
@@ -276,6 +277,22 @@ class Topic:
     messages: Count
 
 
+@schema
+@dataclass(frozen=True)
+class Column:
+    """A column of a table, and what it was read as.
+
+    Attributes:
+        name: Its name in the header.
+        quantity: Such as "x", "q3" or "PSM1 qw"; "" for a column that is not used.
+        unit: Its unit; "" where it has none.
+    """
+
+    name: str
+    quantity: str
+    unit: str
+
+
 @dataclass(frozen=True, eq=False)
 class Recording:
     """The content of one file, as far as this package uses it.
@@ -297,6 +314,7 @@ class Recording:
         labels: Named intervals, in order of time.
         notes: Metadata of the file, name and value, such as the digest of the file that it was made from.
         left_out: Topics that were not usable, and the fault of each; no demonstration depends on any of them.
+        columns: The columns of a table.
     """
 
     format: Format
@@ -315,6 +333,7 @@ class Recording:
     labels: tuple[Label, ...] = ()
     notes: tuple[tuple[str, str], ...] = ()
     left_out: tuple[tuple[str, str], ...] = ()
+    columns: tuple[Column, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.motions:
@@ -326,6 +345,11 @@ class Recording:
                 motions=len(self.motions),
                 arms=len(self.arms),
             )
+
+    @property
+    def is_timed(self) -> bool:
+        """Whether the file itself has times: a table may have none."""
+        return not self.columns or any(column.quantity == "t" for column in self.columns)
 
     @property
     def origin_ns(self) -> int:

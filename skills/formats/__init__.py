@@ -6,15 +6,17 @@ The format is detected from the content, never from a name. A file is either rea
 """
 
 import codecs
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import fields
 from typing import BinaryIO
 
 from skills.demonstration.recording import Recording
 from skills.errors import BadSettings, MixedFrames, UnknownFormat, UnreadableRecording
-from skills.formats import archive, jigsaws, rosbag, tables
+from skills.formats import archive, ee_csv, jigsaws, rosbag, tables
 from skills.formats.bag_folder import read_one, read_zip
+from skills.formats.cells import SEPARATORS, Decimals, header_of, open_text
 from skills.formats.mcap.recording import MAGIC
-from skills.formats.tables import DEFAULT_FRAME, read_table
+from skills.formats.tables import TableReading, read_table
 from skills.formats.writer import write_bag, write_mcap
 
 __all__ = ["BYTES", "MEDIA_TYPES", "SUFFIXES", "media_type_of", "read_recording", "write_bag", "write_mcap"]
@@ -46,14 +48,31 @@ _OTHERS = (
 _READ = "MCAP, zipped bag folders, ROS 1 and .db3 bags, CSV and JIGSAWS kinematics can be read."
 
 
-def read_recording(file: BinaryIO, *, rate_hz: float | None = None, frame: str | None = None) -> Recording:
+def read_recording(
+    file: BinaryIO,
+    *,
+    rate_hz: float | None = None,
+    frame: str | None = None,
+    column: Sequence[str] = (),
+    unit: Sequence[str] = (),
+    decimal: Decimals = "point",
+    table_arm: str | None = None,
+    instrument: str | None = None,
+    untimed: bool = False,
+) -> Recording:
     """Read a recording of any supported format.
 
     Args:
         file: Seekable; read from its beginning and left open.
         rate_hz: Samples per second, for a table without times.
-        frame: The frame of a table's positions, by default "PSM_base". Any other recording names its own frames; it is
-            refused if none of its motions is in the given frame.
+        frame: The frame of a table's positions, by default the base of its arm; an ee_csv needs it. Any other recording
+            names its own frames; it is refused if none of its motions is in the given frame.
+        column: The columns of a table, each as `x_mm=PosX` or `x=PosX`; see `skills.formats.tables`.
+        unit: The units of columns without a unit, such as "mm".
+        decimal: The decimal mark of a table.
+        table_arm: The arm of a table, by default "PSM".
+        instrument: The number of the instrument, with which a table's joints become poses.
+        untimed: Count the samples of a table without times, instead of refusing it: for a preview.
 
     Returns:
         The recording, in millimetres.
@@ -61,14 +80,28 @@ def read_recording(file: BinaryIO, *, rate_hz: float | None = None, frame: str |
     Raises:
         UnknownFormat: The content is of no supported format.
         BadRecording: It is of a supported format and cannot be used; `skills.errors` has the subclasses.
-        BadSettings: `rate_hz` is not a rate, or was given for a recording with stamps or a rate of its own.
+        BadSettings: An argument is impossible, or was given for a recording that says itself what it states.
     """
     kind = media_type_of(file)
+    said = TableReading(rate_hz, frame, tuple(column), tuple(unit), decimal, table_arm, instrument, untimed)
     if kind == TABLE and not _is_extract(file):
-        return read_table(file, rate_hz=rate_hz, frame=DEFAULT_FRAME if frame is None else frame)
-    if rate_hz is not None:
-        raise BadSettings(f"This is {MEDIA_TYPES[kind]}, which has its own stamps or rate; omit rate_hz.")
+        if not column and ee_csv.is_header(_names(file)):
+            return ee_csv.read_ee_csv(file, said)
+        return read_table(file, said)
+    for field in fields(said):
+        if field.name not in ("frame", "untimed") and getattr(said, field.name) != field.default:
+            raise BadSettings(
+                f"This is {MEDIA_TYPES[kind]}, which has its own stamps, columns and arms; omit {field.name}."
+            )
     return _in_frame(_READERS[kind](file), frame)
+
+
+def _names(file: BinaryIO) -> list[str]:
+    """Return the names of a table's columns; the position is at the beginning afterwards."""
+    with open_text(file) as text:
+        names, _ = header_of(text)
+    file.seek(0)
+    return names
 
 
 def media_type_of(file: BinaryIO) -> str:
@@ -103,9 +136,10 @@ def _kind_of_text(head: bytes) -> str:
     if "\0" not in text and jigsaws.looks_like_kinematics(first_line):
         return TEXT
     # Markup, JSON and binary data are refused here: the table reader would only complain about columns.
-    if "\0" in text or text.lstrip()[:1] in ("<", "{", "[") or "," not in first_line:
+    if "\0" in text or text.lstrip()[:1] in ("<", "{", "[") or not any(one in first_line for one in SEPARATORS):
         raise UnknownFormat(
-            f"The content is neither a table with a header of comma-separated names nor another known format. {_READ}"
+            "The content is neither a table with a header of names, separated by commas, semicolons or tabs, nor "
+            f"another known format. {_READ}"
         )
     return TABLE
 

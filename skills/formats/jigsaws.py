@@ -25,7 +25,7 @@ import numpy as np
 from skills.arrays import Floats, Ints
 from skills.demonstration.recording import Label, Motion, Recording, Signal, Topic, recorded_motion
 from skills.errors import NotAQuaternion, NotFinite, UnreadableRecording
-from skills.formats.tables import is_number
+from skills.formats.cells import is_number
 
 COLUMNS = 76
 RATE_HZ = 30.0

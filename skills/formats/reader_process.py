@@ -28,6 +28,7 @@ from skills import errors, packing
 from skills.compiled import check_kept, kept_in, make_ready
 from skills.demonstration.recording import (
     BaseFrame,
+    Column,
     Joints,
     Label,
     Motion,
@@ -71,9 +72,9 @@ class Told:
         return about
 
 
-def read_told(file: BinaryIO, *, rate_hz: float | None = None, frame: str | None = None) -> Told:
+def read_told(file: BinaryIO, **how: Any) -> Told:
     """Read a recording and compute its description; arguments and errors are those of `read_recording`."""
-    return tell(read_recording(file, rate_hz=rate_hz, frame=frame))
+    return tell(read_recording(file, **how))
 
 
 def tell(recording: Recording) -> Told:
@@ -220,7 +221,7 @@ class Refusal:
         return error
 
 
-KNOWN = packing.known(Recording, Motion, Signal, Joints, BaseFrame, Label, Topic, Segment, Told, Refusal)
+KNOWN = packing.known(Recording, Motion, Signal, Joints, BaseFrame, Column, Label, Topic, Segment, Told, Refusal)
 
 
 class ConfinedReader:

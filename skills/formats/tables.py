@@ -1,18 +1,26 @@
-"""CSV tables of one arm's motion: with columns named by their units, or as dVRK recorders extract them from a bag.
+"""CSV tables of one arm's motion: with named columns, or as dVRK recorders extract them from a bag.
 
 `read_table` reads one row per sample, with these columns:
 
-    t_s                            seconds, never decreasing; or `rate_hz` from the caller, for tables without times
+    t_s                            or t_ms, t_us, t_ns, never decreasing; or `rate_hz` from the caller, for tables
+                                   without times
     x_m, y_m, z_m                  the tip, or x_mm, y_mm, z_mm; one unit for all three
     qx, qy, qz, qw                 its orientation as a unit quaternion, or
-    roll_rad, pitch_rad, yaw_rad   as rotations about the fixed axes x, then y, then z
-    jaw_rad                        the jaw's angle
+    roll_rad, pitch_rad, yaw_rad   as rotations about the fixed axes x, then y, then z (or _deg), or
+    rx_rad, ry_rad, rz_rad         as a rotation vector (or _deg)
+    jaw_rad                        the jaw's angle (or jaw_deg)
     clutch                         0 released, 1 pressed, 2 a quick tap
+    q1_rad, q2_rad, q3_m,          the measured joints; joints alone become poses by forward kinematics with the
+    q4_rad, q5_rad, q6_rad         instrument that the caller states
 
-The header of the paper's raw recordings, `Rot R, Rot P, Rot Y, Pos X, Pos Y, Pos Z` (rad and m), means the same as
-`roll_rad, pitch_rad, yaw_rad, x_m, y_m, z_m`. Roll, pitch and yaw are those of KDL's `Rotation::RPY`, which the dVRK's
-tools use: R = Rz(yaw) Ry(pitch) Rx(roll). Any other column is refused, because a time or an orientation under another
-name would be ignored silently.
+Under other names, a column is what the caller says: `x_mm=PosX`, or `x=PosX` with the unit `mm`. Columns that are
+neither named like this nor mapped are refused, because a time or an orientation under another name would be ignored
+silently; where the caller maps columns, the others are not used. Nothing is guessed from the values.
+
+Two headers mean the same as these: that of the paper's raw recordings, `Rot R, Rot P, Rot Y, Pos X, Pos Y, Pos Z` (rad
+and m), and that of joint tables of calibrations, `measured_q1` ... `measured_q6`, `measured_x` ... `measured_rz` (rad
+and m, a rotation vector). Roll, pitch and yaw are those of KDL's `Rotation::RPY`, which the dVRK's tools use:
+R = Rz(yaw) Ry(pitch) Rx(roll).
 
 `read_extract` reads the extract of one pose topic:
 
@@ -23,71 +31,72 @@ name would be ignored silently.
 Its columns are the message's fields by their dotted names, in any order: metres, a unit quaternion, the header's stamp.
 `timestamp`, the time of reception, and all other columns are not used.
 
-A table has no checksum, so its integrity is "none". The length of each line is limited before it is parsed.
+A table has no checksum, so its integrity is "none".
 """
 
-import csv
-import io
+import re
 from array import array
-from collections.abc import Iterator
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from decimal import Decimal
-from typing import TYPE_CHECKING, BinaryIO, TextIO
+from typing import BinaryIO, TextIO
 
 import numpy as np
 
 from skills.arrays import Floats, Ints
-from skills.demonstration.recording import Motion, Recording, Signal, Topic, recorded_motion
-from skills.errors import BadColumns, BadSettings, MixedFrames, NotFinite, NotMetres, NoUsableTopic, UnreadableRecording
+from skills.demonstration.recording import (
+    COORDINATE_LIMIT_MM,
+    Column,
+    Motion,
+    Recording,
+    Signal,
+    Topic,
+    recorded_joints,
+    recorded_motion,
+    recorded_signal,
+)
+from skills.errors import (
+    BadColumns,
+    BadSettings,
+    MixedFrames,
+    NotAQuaternion,
+    NotMetres,
+    NoUsableTopic,
+    UnreadableRecording,
+)
 from skills.formats import topics
-from skills.kinematics import CANNULA_MM, INSTRUMENTS
-
-LINE_CHARACTERS = 16_384  # a row of the widest supported table has 2,500
-
-if TYPE_CHECKING:
-    from _csv import Reader
-
-
-def csv_rows(text: TextIO, *, first_line: int = 1) -> "Reader":
-    """Return an iterator over comma-separated rows, each from one line of at most `LINE_CHARACTERS` characters.
-
-    A row of numbers never continues on a second line; with quoted cells that do, a row could be unlimited in length.
-    Iterating raises `csv.Error`, and `UnreadableRecording` for a line that is longer or has an unclosed quoted cell.
-
-    Args:
-        text: Positioned at the first row.
-        first_line: The number of the line at which `text` is positioned, for messages.
-    """
-    return csv.reader(_lines(text, first_line), strict=True)
-
-
-def _lines(text: TextIO, number: int) -> Iterator[str]:
-    while line := text.readline(LINE_CHARACTERS + 1):
-        if len(line) > LINE_CHARACTERS:
-            raise UnreadableRecording(
-                f"Line {number} of the table has more than {LINE_CHARACTERS} characters; export the table again.",
-                line=number,
-            )
-        if line.count('"') % 2:
-            raise UnreadableRecording(
-                f"The table is not comma-separated text: line {number} opens a quoted cell and does not close it. "
-                "Export the table again.",
-                line=number,
-            )
-        yield line
-        number += 1
-
+from skills.formats.cells import LINE_CHARACTERS, NS_PER, Decimals, csv_rows, header_of, open_text, read_numbers
+from skills.kinematics import CANNULA_MM, INSTRUMENTS, JOINTS, UNITS, forward, instrument_of, quaternion_of
+from skills.remedies import Action, Remedy, did_you_mean
 
 TOPIC = "table"
-DEFAULT_FRAME = "PSM_base"  # relative to the remote centre of motion
 DEFAULT_ARM = "PSM"
 # The tip is further from the remote centre than the wrist, because the wrist bends by less than a right angle. A reach
 # of 290 mm is 11.4 inches, so a path in inches never exceeds this limit.
 OUTSIDE_MM = min(CANNULA_MM - instrument.wrist_offset_mm for instrument in INSTRUMENTS.values())
+BEYOND_LIMIT = {"rad": 0.1, "mm": 10.0}  # ours: encoders overshoot a joint's limit by less; degrees and metres do not
+_FASTEST_HZ = 100_000.0
+_TURN_RAD = 2 * np.pi
+_JOINT_RAD = 7.0  # ours: more than any joint turns, less than 8 degrees
 
-if TYPE_CHECKING:
-    from _csv import Reader as _Rows
-
+LENGTHS: Mapping[str, float] = {"m": 1000.0, "mm": 1.0}  # in mm
+ANGLES: Mapping[str, float] = {"rad": 1.0, "deg": np.pi / 180}  # in rad
+_DIMENSIONS: tuple[Mapping[str, float], ...] = (NS_PER, LENGTHS, ANGLES)
+PLAIN: Mapping[str, float] = {"": 1.0}
+POSITION, QUATERNION = ("x", "y", "z"), ("qx", "qy", "qz", "qw")
+RPY, ROTATION_VECTOR = ("roll", "pitch", "yaw"), ("rx", "ry", "rz")
+JOINT_NAMES = tuple(f"q{k}" for k in range(1, len(JOINTS) + 1))
+QUANTITIES: Mapping[str, Mapping[str, float]] = {
+    "t": NS_PER,
+    **dict.fromkeys(POSITION, LENGTHS),
+    **dict.fromkeys(QUATERNION, PLAIN),
+    **dict.fromkeys((*RPY, *ROTATION_VECTOR, "jaw"), ANGLES),
+    "clutch": PLAIN,
+    **{name: LENGTHS if unit == "mm" else ANGLES for name, unit in zip(JOINT_NAMES, UNITS, strict=True)},
+}
+KNOWN = (
+    "t_s (or t_ms, t_us, t_ns), x_m, y_m, z_m (or _mm), qx, qy, qz, qw, roll_rad, pitch_rad, yaw_rad, rx_rad, ry_rad, "
+    "rz_rad, jaw_rad (or _deg), clutch, q1_rad, q2_rad, q3_m, q4_rad, q5_rad, q6_rad"
+)
 _PAPER_NAMES = {
     "Rot R": "roll_rad",
     "Rot P": "pitch_rad",
@@ -96,69 +105,429 @@ _PAPER_NAMES = {
     "Pos Y": "y_m",
     "Pos Z": "z_m",
 }
-_METRES, _MILLIMETRES = ("x_m", "y_m", "z_m"), ("x_mm", "y_mm", "z_mm")
-_QUATERNION, _RPY = ("qx", "qy", "qz", "qw"), ("roll_rad", "pitch_rad", "yaw_rad")
-KNOWN = ("t_s", *_METRES, *_MILLIMETRES, *_QUATERNION, *_RPY, "jaw_rad", "clutch")
-COLUMNS = 100  # there are 17 names; up to this number the message names the first unknown or duplicate one
-ROWS = 5_000_000  # 14 hours at 100 Hz
-_LATEST_S = 4e9  # the year 2096; larger values are in milliseconds or a smaller unit
-_FASTEST_HZ = 100_000.0
-_FIRST_ROW = 2  # the header is row 1
+_CALIBRATION_NAMES = {
+    f"measured_{name}": f"{name}_{'m' if QUANTITIES[name] is LENGTHS else 'rad'}"
+    for name in (*JOINT_NAMES, *POSITION, *ROTATION_VECTOR)
+}
+_OTHERS_OF_CALIBRATIONS = re.compile(r"traj_index|(marker|setpoint)_\w+")
+
+
+@dataclass(frozen=True)
+class TableReading:
+    """What the caller says about a table, as far as the table does not say it.
+
+    Attributes:
+        rate_hz: Samples per second, for a table without times.
+        frame: The frame of the positions; by default the base of the arm.
+        column: The columns under other names, each as `x_mm=PosX` or `x=PosX`.
+        unit: The units of columns without a unit: of lengths, angles and times, one each.
+        decimal: The decimal mark.
+        table_arm: The name of the arm.
+        instrument: The number of its instrument.
+        untimed: Count the samples of a table without times, instead of refusing it: for a preview.
+    """
+
+    rate_hz: float | None = None
+    frame: str | None = None
+    column: Sequence[str] = ()
+    unit: Sequence[str] = ()
+    decimal: Decimals = "point"
+    table_arm: str | None = None
+    instrument: str | None = None
+    untimed: bool = False
+
+    def __post_init__(self) -> None:
+        if self.rate_hz is not None and not 0 < self.rate_hz <= _FASTEST_HZ:
+            raise BadSettings(f"rate_hz is {self.rate_hz}; give samples per second, above 0 and up to {_FASTEST_HZ:g}.")
+        if self.decimal not in ("point", "comma"):
+            raise BadSettings(f"decimal is {self.decimal!r}; it is point or comma.")
+        if self.instrument is not None:
+            instrument_of(self.instrument)
+
+
+@dataclass(frozen=True)
+class _Use:
+    """A column that is read: its index, and the unit in which it has its quantity."""
+
+    index: int
+    unit: str
 
 
 @dataclass(frozen=True)
 class _Table:
-    """The cells as numbers: columns by name, each of shape (T,), and exact stamps if there is a column `t_s`."""
+    """The columns of a table in mm and rad by quantity, each of shape (T,), and the stamps."""
 
     columns: dict[str, Floats]
-    stamps_ns: Ints | None
-    rows: int
+    stamps_ns: Ints
 
-    def stacked(self, names: tuple[str, ...]) -> Floats:
-        """Return some columns as one array, shape (T, len(names))."""
+    def stacked(self, names: Iterable[str]) -> Floats:
+        """Return some columns as one array, shape (T, number of names)."""
         return np.stack([self.columns[name] for name in names], axis=1)
 
 
-def read_table(
-    file: BinaryIO, *, rate_hz: float | None = None, frame: str = DEFAULT_FRAME, arm: str = DEFAULT_ARM
-) -> Recording:
-    """Read one arm's motion from a CSV file.
+def read_table(file: BinaryIO, reading: TableReading | None = None) -> Recording:
+    """Read one arm's motion from a table.
 
     Args:
-        file: The file, at its beginning; UTF-8, comma-separated, with the header in its first line.
-        rate_hz: Samples per second, for a table without `t_s`.
-        frame: The frame of the positions.
-        arm: The arm's name.
+        file: The file, at its beginning; UTF-8, separated by commas, semicolons or tabs, with the header in its first
+            line.
+        reading: What the caller says about it.
 
     Returns:
         The recording, in millimetres.
 
     Raises:
         BadColumns: A column is unknown, duplicate, missing or ambiguous, or time is given twice or not at all.
-        BadSettings: `rate_hz` is not a rate.
-        NoUsableTopic: There are no position columns.
+        BadSettings: A mapping or a unit is impossible or contradicts a column.
+        NoUsableTopic: There are neither positions nor joints with a stated instrument.
         UnreadableRecording: A row of another length, a cell that is not a number, no rows.
         NotFinite, NotMetres, BackwardStamps, RepeatedStamps, NotAQuaternion: As in `skills.demonstration.recording`.
     """
-    table = _read(file, rate_hz)
-    stamps_ns = _stamps_ns(table, rate_hz)
+    said = reading or TableReading()
+    with open_text(file) as text:
+        names, separator = header_of(text)
+        uses = _uses(names, said)
+        _check_groups(uses, names)
+        time = uses.get("t")
+        check_time(None if time is None else names[time.index], said)
+        numbers = read_numbers(
+            text,
+            names,
+            [use.index for use in uses.values()],
+            separator,
+            said.decimal,
+            None if time is None else (time.index, time.unit),
+        )
+    stamps_ns = stamps_of(numbers.stamps_ns, len(numbers.values), said)
+    if time is not None and time.unit != "s":
+        check_steps(names[time.index], time.unit, stamps_ns)
+    columns = {
+        name: scaled(numbers.values[:, k], QUANTITIES[name][use.unit]) for k, (name, use) in enumerate(uses.items())
+    }
+    return _recording(_Table(columns, stamps_ns), said, _listed(names, uses))
+
+
+def _listed(names: Sequence[str], uses: Mapping[str, _Use]) -> tuple[Column, ...]:
+    quantities = {use.index: (quantity, use.unit) for quantity, use in uses.items()}
+    return tuple(Column(name, *quantities.get(index, ("", ""))) for index, name in enumerate(names))
+
+
+def _recording(table: _Table, said: TableReading, columns: tuple[Column, ...]) -> Recording:
+    arm = said.table_arm or DEFAULT_ARM
+    joints = None
+    if JOINT_NAMES[0] in table.columns:
+        joints = table.stacked(JOINT_NAMES)
+        check_joints(TOPIC, joints)
+    if POSITION[0] in table.columns:
+        tip_mm, rotation = table.stacked(POSITION), _rotation_xyzw(table)
+        frame = said.frame if said.frame not in (None, "base") else f"{arm}_base"
+    else:
+        assert joints is not None  # `_check_groups`
+        tip_mm, rotation = posed(TOPIC, joints, said.instrument)
+        frame = base_of(arm, said.frame)
     motion = recorded_motion(
-        arm=arm,
-        topic=TOPIC,
-        frame=frame,
-        stamps_ns=stamps_ns,
-        tip_mm=_tip_mm(table),
-        rotation_xyzw=_rotation_xyzw(table),
+        arm=arm, topic=TOPIC, frame=frame, stamps_ns=table.stamps_ns, tip_mm=tip_mm, rotation_xyzw=rotation
     )
-    _check_outside(motion)
+    check_outside(motion)
     return Recording(
         format="csv",
         integrity="none",
         motions=(motion,),
-        jaws=tuple((arm, signal) for signal in [_signal(table, "jaw_rad", stamps_ns)] if signal is not None),
-        clutch=_signal(table, "clutch", stamps_ns),
-        topics=(Topic(TOPIC, "text/csv", table.rows),),
+        jaws=tuple((arm, signal) for signal in [_signal(table, "jaw", "jaw_rad")] if signal is not None),
+        clutch=_signal(table, "clutch", "clutch"),
+        topics=(Topic(TOPIC, "text/csv", len(table.stamps_ns)),),
+        joints=() if joints is None else (recorded_joints(arm, f"{TOPIC} joints", table.stamps_ns, joints),),
+        tools=() if said.instrument is None else ((arm, said.instrument),),
+        columns=columns,
     )
+
+
+# ---- the meaning of the columns ----------------------------------------------------------------------------------
+
+
+def _uses(names: list[str], said: TableReading) -> dict[str, _Use]:
+    """Return the columns to read by quantity, in the order of the header.
+
+    Raises:
+        BadColumns: A column is unknown or duplicate, or a mapping names one that does not exist.
+        BadSettings: A mapping or a unit is impossible, or contradicts another.
+    """
+    mapped, aliases = _mapped(names, said), _aliases(names)
+    of_calibration = aliases is not _PAPER_NAMES
+    taken, own, unknown = {use.index for use in mapped.values()}, dict[str, _Use](), list[str]()
+    for index, name in enumerate(names):
+        if index in taken:
+            continue
+        quantity, unit = _named(aliases.get(name, name))
+        if not quantity or (not unit and QUANTITIES[quantity] is not PLAIN):
+            if not mapped and not (of_calibration and _OTHERS_OF_CALIBRATIONS.fullmatch(name)):
+                unknown.append(name)
+        elif quantity in own:
+            one, other = _full(quantity, own[quantity].unit), _full(quantity, unit)
+            what = f"column {one!r} twice" if one == other else f"same quantity twice, as {one} and as {other}"
+            raise BadColumns(f"The table has the {what}; keep one of them.", doubled=[one, other])
+        elif quantity not in mapped:
+            own[quantity] = _Use(index, unit)
+    if unknown:
+        raise BadColumns(
+            f"The table has the unknown column {unknown[0][:80]!r}. Known columns: {KNOWN}.",
+            Remedy(Action.NAME_COLUMNS),
+            unknown=unknown[:20],
+        )
+    return dict(sorted({**mapped, **own}.items(), key=lambda one: one[1].index))
+
+
+def _aliases(names: Sequence[str]) -> Mapping[str, str]:
+    measured = all(f"measured_{name}" in names for name in JOINT_NAMES)
+    return _CALIBRATION_NAMES if measured else _PAPER_NAMES
+
+
+def _named(name: str) -> tuple[str, str]:
+    """Split a name such as "x_mm" into quantity and unit; ("", "") for any other, no unit where none is named."""
+    if name in QUANTITIES:
+        return name, ""
+    quantity, _, unit = name.rpartition("_")
+    return (quantity, unit) if unit and unit in QUANTITIES.get(quantity, ()) else ("", "")
+
+
+def _full(quantity: str, unit: str) -> str:
+    return f"{quantity}_{unit}" if unit else quantity
+
+
+def _mapped(names: list[str], said: TableReading) -> dict[str, _Use]:
+    """Return the columns that the caller maps, by quantity; raises as `_uses`."""
+    units, needed = _units(said), set[str]()
+    mapped: dict[str, _Use] = {}
+    for one in said.column:
+        target, equals, column = one.partition("=")
+        quantity, unit = _named(target.strip())
+        column = column.strip()
+        if not equals or not quantity or not column:
+            raise BadSettings(f"The mapping {one[:80]!r} is not of the form x_mm=NAME. Known columns: {KNOWN}.")
+        if column not in names:
+            raise BadColumns(
+                f"The table has no column {column[:80]!r}; it has {', '.join(names)[:500]}.",
+                *did_you_mean(column, names),
+                column=column[:80],
+            )
+        if names.count(column) > 1:
+            raise BadColumns(f"The table has the column {column[:80]!r} twice; rename one.", doubled=[column[:80]])
+        if quantity in mapped or names.index(column) in {use.index for use in mapped.values()}:
+            raise BadSettings(
+                f"The mapping {one[:80]!r} names {quantity} or its column a second time; keep one of them."
+            )
+        mapped[quantity] = _Use(names.index(column), _unit_of(quantity, unit, column, units, needed))
+    unneeded = [unit for unit in units.values() if unit not in needed]
+    if unneeded:
+        raise BadSettings(
+            f"The unit {unneeded[0]} belongs to no mapped column without a unit; omit it, or map one, as in x=NAME."
+        )
+    return mapped
+
+
+def _unit_of(quantity: str, unit: str, column: str, units: Mapping[int, str], needed: set[str]) -> str:
+    """Return the unit of a mapped column; of the units that the caller gave, those that apply are added to `needed`."""
+    possible = QUANTITIES[quantity]
+    given = units.get(id(possible), "")
+    if given:
+        needed.add(given)
+    if unit and given and unit != given:
+        raise BadSettings(
+            f"The column {column[:80]!r} is mapped in {unit}, and the unit is {given}; which is it? Omit the other."
+        )
+    if not unit and not given and possible is not PLAIN:
+        one, other, *_ = possible
+        raise BadSettings(
+            f"In which unit is the column {column[:80]!r}?", Remedy(Action.NAME_UNIT, one=one, other=other)
+        )
+    return unit or given
+
+
+def _units(said: TableReading) -> dict[int, str]:
+    """Return the units that the caller gives, by the identity of their dimension."""
+    units: dict[int, str] = {}
+    for unit in said.unit:
+        dimension = next((one for one in _DIMENSIONS if unit in one), None)
+        if dimension is None:
+            known = ", ".join(unit for one in _DIMENSIONS for unit in one)
+            raise BadSettings(f"The unit {unit[:20]!r} is unknown; use one of {known}.")
+        if units.setdefault(id(dimension), unit) != unit:
+            raise BadSettings(
+                f"The units {units[id(dimension)]} and {unit} contradict each other; which of them is it?"
+            )
+    return units
+
+
+def _check_groups(uses: Mapping[str, _Use], names: Sequence[str]) -> None:
+    """Refuse incomplete groups of columns, and two orientations.
+
+    Raises:
+        BadColumns: A group is incomplete or given twice.
+        NoUsableTopic: There are neither positions nor joints.
+    """
+    if not {*POSITION, *JOINT_NAMES} & set(uses):
+        raise NoUsableTopic(
+            "The table has no position; name the columns x_m, y_m, z_m (or _mm).", Remedy(Action.NAME_COLUMNS)
+        )
+    for group in (POSITION, QUATERNION, RPY, ROTATION_VECTOR, JOINT_NAMES):
+        here = [name for name in group if name in uses]
+        if not here:
+            continue
+        missing = [name for name in group if name not in uses]
+        units = {} if group == JOINT_NAMES else {uses[name].unit for name in here}
+        first = uses[here[0]].unit
+        if len(units) > 1:  # one in m and another in mm
+            missing = [name for name in here if uses[name].unit != first]
+        if missing:
+            full = [_full(name, first if group != JOINT_NAMES else _usual(name)) for name in group]
+            gone = full[group.index(missing[0])]
+            raise BadColumns(f"The table needs all of {', '.join(full)}: {gone} is missing.", missing=missing)
+    turns = [group for group in (QUATERNION, RPY, ROTATION_VECTOR) if group[0] in uses]
+    if len(turns) > 1:
+        raise BadColumns(
+            f"The table has the same quantity twice, as {turns[0][0]} ... and as {turns[1][0]} ...; keep one of them."
+        )
+
+
+def _usual(joint: str) -> str:
+    return "m" if QUANTITIES[joint] is LENGTHS else "rad"
+
+
+# ---- what tables of every kind share -----------------------------------------------------------------------------
+
+
+def check_time(column: str | None, said: TableReading) -> None:
+    """Refuse a table whose times are given twice or not at all.
+
+    Raises:
+        BadColumns: There are a column of times and a rate, or neither.
+    """
+    if column is not None and said.rate_hz is not None:
+        raise BadColumns(f"The table has the column {column} and the request has rate_hz; use one of them.")
+    if column is None and said.rate_hz is None and not said.untimed:
+        raise BadColumns(
+            "The table has no column t_s; add it, or give rate_hz for samples at a constant rate.",
+            Remedy(Action.NAME_RATE),
+        )
+
+
+def stamps_of(stamps_ns: Ints | None, count: int, said: TableReading) -> Ints:
+    """Return the stamps of a table: its own, those of the rate, or a second per sample where neither is known."""
+    if stamps_ns is not None:
+        return stamps_ns
+    even: Ints = np.rint(np.arange(count) * (1e9 / (said.rate_hz or 1.0))).astype(np.int64)
+    return even
+
+
+def check_steps(column: str, unit: str, stamps_ns: Ints) -> None:
+    """Refuse times that no recorder has: in another unit they would be plausible.
+
+    Raises:
+        BadColumns: The median step between different stamps is shorter than at `_FASTEST_HZ`.
+    """
+    steps_ns = np.diff(stamps_ns)
+    steps_ns = steps_ns[steps_ns > 0]
+    if len(steps_ns) and np.median(steps_ns) < 1e9 / _FASTEST_HZ:
+        raise BadColumns(
+            f"The times of the column {column} are {np.median(steps_ns):g} ns apart, read as {unit}; in which unit are "
+            "they? Name their column as t_s=NAME, t_ms=NAME, t_us=NAME or t_ns=NAME.",
+            column=column,
+        )
+
+
+def scaled(values: Floats, factor: float) -> Floats:
+    """Return values in mm or rad."""
+    return values if factor == 1 else factor * values
+
+
+def base_of(arm: str, frame: str | None) -> str:
+    """Return the frame of poses that follow from the joints: the base of the arm.
+
+    Raises:
+        MixedFrames: The caller names another frame.
+    """
+    base = f"{arm}_base"
+    if frame not in (None, "base", base):
+        raise MixedFrames(
+            f"The poses that follow from the joints are in {base}, not in {frame!r}; omit the frame.", frames=[base]
+        )
+    return base
+
+
+def check_joints(topic: str, joints: Floats) -> None:
+    """Refuse numbers that no joint of a PSM has in rad, and its insertion in mm.
+
+    Raises:
+        NotMetres: An insertion beyond 1 m, or an angle beyond `_JOINT_RAD`.
+    """
+    limits = np.where(np.array(UNITS) == "mm", COORDINATE_LIMIT_MM, _JOINT_RAD)
+    wrong = np.abs(joints) > limits
+    if wrong.any():
+        row, joint = np.argwhere(wrong)[0].tolist()
+        raise NotMetres(
+            f"{topic}: {JOINTS[joint]} is {joints[row, joint]:g} {UNITS[joint]} in sample {row}; no joint of a PSM is. "
+            "Give angles in rad and the insertion in m, or name the units of the columns.",
+            sample=row,
+            joint=JOINTS[joint],
+        )
+
+
+def posed(topic: str, joints: Floats, instrument: str | None) -> tuple[Floats, Floats]:
+    """Compute poses from joints by forward kinematics with a stated instrument.
+
+    Args:
+        topic: The source, for messages.
+        joints: Shape (T, 6), rad and mm.
+        instrument: Its number; None if none is stated.
+
+    Returns:
+        Positions in the arm's base frame in mm, shape (T, 3), and unit quaternions, shape (T, 4).
+
+    Raises:
+        NoUsableTopic: No instrument is stated.
+        NotMetres: A joint is beyond its limits, so the instrument, the unit or the order is another.
+    """
+    if instrument is None:
+        one, other, *_ = INSTRUMENTS
+        raise NoUsableTopic(
+            f"{topic} has joints and no poses; they become poses with the instrument that was on the arm.",
+            Remedy(Action.NAME_INSTRUMENT, one=one, other=other),
+            instruments=list(INSTRUMENTS),
+        )
+    tool = instrument_of(instrument)
+    beyond = np.maximum(tool.lower - joints, joints - tool.upper) - [BEYOND_LIMIT[unit] for unit in UNITS]
+    if (beyond > 0).any():
+        row, joint = np.argwhere(beyond > 0)[0].tolist()
+        raise NotMetres(
+            f"{topic}: {JOINTS[joint]} is {joints[row, joint]:.5g} {UNITS[joint]} in sample {row}, beyond the limits "
+            f"{tool.lower[joint]:.4g} to {tool.upper[joint]:.4g} of the {tool.arm.name} with {tool.name}; check the "
+            "units, the order of the joints and the instrument.",
+            sample=row,
+            joint=JOINTS[joint],
+        )
+    tip_mm, rotation = forward(joints, instrument)
+    return tip_mm, quaternion_of(rotation)
+
+
+def check_outside(motion: Motion) -> None:
+    """Refuse a path that never leaves the cannula: its numbers are in another unit, or from another origin.
+
+    Raises:
+        NotMetres: The tip is never outside.
+    """
+    if not motion.frame.endswith("_base"):  # only there the origin is the remote centre
+        return
+    away_mm = np.sqrt(np.einsum("ij,ij->i", motion.tip_mm, motion.tip_mm))
+    furthest = int(np.argmax(away_mm))
+    if away_mm[furthest] < OUTSIDE_MM:
+        at_s = (int(motion.stamps_ns[furthest]) - int(motion.stamps_ns[0])) / 1e9
+        raise NotMetres(
+            f"The tip is at most {away_mm[furthest]:.3g} mm from the remote centre (at {at_s:.3f} s); below "
+            f"{OUTSIDE_MM:.3g} mm its wrist is inside the cannula. Give the positions in the unit of the column "
+            "names, not in inches; or name the frame, if they are not relative to the remote centre.",
+            sample=furthest,
+            furthest_mm=float(away_mm[furthest]),
+        )
 
 
 def quaternion_of_rpy(rpy_rad: Floats) -> Floats:
@@ -176,160 +545,46 @@ def quaternion_of_rpy(rpy_rad: Floats) -> Floats:
     return np.stack([x, y, z, w], axis=1)
 
 
-def _read(file: BinaryIO, rate_hz: float | None) -> _Table:
-    text = io.TextIOWrapper(file, encoding="utf-8-sig", newline="")
-    try:
-        rows = csv_rows(text)
-        names = _checked_header([_PAPER_NAMES.get(name.strip(), name.strip()) for name in next(rows, [])], rate_hz)
-        return _numbers(names, rows)
-    except (csv.Error, UnicodeDecodeError) as error:
-        raise UnreadableRecording(f"The table is not comma-separated UTF-8 text: {error}. Export it again.") from error
-    finally:
-        text.detach()  # otherwise the wrapper would close the caller's file
+def quaternion_of_vector(vector_rad: Floats) -> Floats:
+    """Return the unit quaternions x, y, z, w of rotation vectors: the axis times the angle.
 
+    Args:
+        vector_rad: Shape (T, 3).
 
-def _checked_header(names: list[str], rate_hz: float | None) -> list[str]:
-    if len(names) > COLUMNS:
-        raise BadColumns(
-            f"The table has {len(names)} columns, more than the limit of {COLUMNS}; keep those with the motion. "
-            f"Known columns: {', '.join(KNOWN)}.",
-            columns=len(names),
+    Returns:
+        Shape (T, 4).
+
+    Raises:
+        NotAQuaternion: A vector is longer than a whole turn, so its unit is another.
+    """
+    with np.errstate(over="ignore"):
+        angle = np.linalg.norm(vector_rad, axis=1)
+    if not (angle <= _TURN_RAD).all():
+        row = int(np.argmin(angle <= _TURN_RAD))
+        raise NotAQuaternion(
+            f"{TOPIC}: the rotation vector of sample {row} has the length {angle[row]:g} rad, more than a turn; name "
+            "its columns with their unit, rx_rad or rx_deg.",
+            sample=row,
         )
-    unknown = [name for name in names if name not in KNOWN]
-    doubled = sorted({name for name in names if names.count(name) > 1})
-    if unknown or doubled:
-        what = f"has the unknown column {unknown[0]!r}" if unknown else f"has the column {doubled[0]!r} twice"
-        raise BadColumns(f"The table {what}; known columns: {', '.join(KNOWN)}.", unknown=unknown, doubled=doubled)
-    if not {*_METRES, *_MILLIMETRES} & set(names):
-        raise NoUsableTopic("The table has no position; name the columns x_m, y_m, z_m (or _mm).")
-    for group in (_METRES, _MILLIMETRES, _QUATERNION, _RPY):
-        missing = [name for name in group if name not in names]
-        if 0 < len(missing) < len(group):
-            raise BadColumns(f"The table needs all of {', '.join(group)}: {missing[0]} is missing.", missing=missing)
-    for one, other in ((_METRES, _MILLIMETRES), (_QUATERNION, _RPY)):
-        if one[0] in names and other[0] in names:
-            raise BadColumns(
-                f"The table has the same quantity twice, as {one[0]} ... and as {other[0]} ...; keep one of them."
-            )
-    _check_time(has_times="t_s" in names, rate_hz=rate_hz)
-    return names
-
-
-def _check_time(*, has_times: bool, rate_hz: float | None) -> None:
-    if has_times and rate_hz is not None:
-        raise BadColumns("The table has the column t_s and the request has rate_hz; use one of them.")
-    if rate_hz is not None and not 0 < rate_hz <= _FASTEST_HZ:
-        raise BadSettings(f"rate_hz is {rate_hz}; give samples per second, above 0 and up to {_FASTEST_HZ:g}.")
-
-
-def _numbers(names: list[str], rows: "_Rows") -> _Table:
-    # Times are also stored as text, because a float is too coarse for nanoseconds (`_exact_ns`).
-    cells, times, blank_line = array("d"), list[str](), 0
-    time_column = names.index("t_s") if "t_s" in names else None
-    for row in rows:
-        if not row:
-            blank_line = blank_line or rows.line_num
-            continue
-        if len(cells) >= ROWS * len(names):
-            raise UnreadableRecording(f"The table has more than {ROWS} rows; cut it into parts and send each part.")
-        if blank_line or len(row) != len(names):
-            line = blank_line or rows.line_num
-            found = 0 if blank_line else len(row)
-            raise UnreadableRecording(f"Row {line} has {found} cells, the header {len(names)}. Export the table again.")
-        try:
-            cells.extend(map(float, row))
-        except ValueError:
-            raise _no_number(names, row, rows.line_num) from None
-        if "_" in "".join(row):  # Python parses 1_000, which no exporter writes
-            raise _no_number(names, row, rows.line_num)
-        if time_column is not None:
-            times.append(row[time_column])
-    if not cells:
-        raise UnreadableRecording("The table has a header and no rows.")
-    columns = np.frombuffer(cells).reshape(-1, len(names))
-    _check_finite(names, columns)
-    return _Table(
-        columns={name: columns[:, k] for k, name in enumerate(names)},
-        stamps_ns=None if time_column is None else _exact_ns(times, columns[:, time_column]),
-        rows=len(columns),
-    )
-
-
-def _no_number(names: list[str], row: list[str], line: int) -> UnreadableRecording:
-    name = next(name for name, cell in zip(names, row, strict=True) if not is_number(cell))
-    return UnreadableRecording(
-        f"Row {line}, column {name}: not a number; export the table again.", row=line, column=name
-    )
-
-
-def is_number(cell: str) -> bool:
-    """Return whether a cell of a table is a number, in any form that an exporter writes."""
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return "_" not in cell  # Python parses 1_000, which no exporter writes
-
-
-def _check_finite(names: list[str], columns: Floats) -> None:
-    wrong = ~np.isfinite(columns)
-    if wrong.any():
-        row, column = np.argwhere(wrong)[0].tolist()
-        line, name = row + _FIRST_ROW, names[column]
-        raise NotFinite(f"Row {line}, column {name}: NaN or infinity; cut the row.", row=line, column=name)
-
-
-def _exact_ns(times: list[str], seconds: Floats) -> Ints:
-    """Convert seconds to whole nanoseconds exactly: a float of seconds since 1970 is only accurate to 240 ns."""
-    late = np.abs(seconds) > _LATEST_S
-    if late.any():
-        row = int(np.argmax(late))
-        raise BadColumns(
-            f"Row {row + _FIRST_ROW}, column t_s: {seconds[row]:g} s is after the year 2096; give seconds.",
-            row=row + _FIRST_ROW,
-        )
-    return np.array([round(Decimal(cell.strip()) * 1_000_000_000) for cell in times], dtype=np.int64)
-
-
-def _stamps_ns(table: _Table, rate_hz: float | None) -> Ints:
-    if table.stamps_ns is not None:
-        return table.stamps_ns
-    if rate_hz is None:
-        raise BadColumns("The table has no column t_s; add it, or give rate_hz for samples at a constant rate.")
-    even: Ints = np.rint(np.arange(table.rows) * (1e9 / rate_hz)).astype(np.int64)
-    return even
-
-
-def _tip_mm(table: _Table) -> Floats:
-    return 1000.0 * table.stacked(_METRES) if "x_m" in table.columns else table.stacked(_MILLIMETRES)
-
-
-def _check_outside(motion: Motion) -> None:
-    """Refuse a path that never leaves the cannula: its numbers are in another unit, or from another origin."""
-    if not motion.frame.endswith("_base"):  # only there the origin is the remote centre
-        return
-    away_mm = np.sqrt(np.einsum("ij,ij->i", motion.tip_mm, motion.tip_mm))
-    furthest = int(np.argmax(away_mm))
-    if away_mm[furthest] < OUTSIDE_MM:
-        at_s = (int(motion.stamps_ns[furthest]) - int(motion.stamps_ns[0])) / 1e9
-        raise NotMetres(
-            f"The tip is at most {away_mm[furthest]:.3g} mm from the remote centre (at {at_s:.3f} s); below "
-            f"{OUTSIDE_MM:.3g} mm its wrist is inside the cannula. Give the positions in the unit of the column "
-            "names, not in inches; or name the frame, if they are not relative to the remote centre.",
-            sample=furthest,
-            furthest_mm=float(away_mm[furthest]),
-        )
+    half = 0.5 * np.sinc(angle / _TURN_RAD)  # sin(angle / 2) / angle, which is 1/2 at 0
+    return np.column_stack([vector_rad * half[:, None], np.cos(angle / 2)])
 
 
 def _rotation_xyzw(table: _Table) -> Floats | None:
-    if "qx" in table.columns:
-        return table.stacked(_QUATERNION)
-    return quaternion_of_rpy(table.stacked(_RPY)) if "roll_rad" in table.columns else None
+    if QUATERNION[0] in table.columns:
+        return table.stacked(QUATERNION)
+    if RPY[0] in table.columns:
+        return quaternion_of_rpy(table.stacked(RPY))
+    return quaternion_of_vector(table.stacked(ROTATION_VECTOR)) if ROTATION_VECTOR[0] in table.columns else None
 
 
-def _signal(table: _Table, name: str, stamps_ns: Ints) -> Signal | None:
-    return Signal(stamps_ns, table.columns[name], f"{TOPIC} {name}") if name in table.columns else None
+def _signal(table: _Table, quantity: str, name: str) -> Signal | None:
+    if quantity not in table.columns:
+        return None
+    return recorded_signal(table.stamps_ns, table.columns[quantity], f"{TOPIC} {name}")
 
+
+# ---- extracts ----------------------------------------------------------------------------------------------------
 
 FIRST = "# Topic:"
 
@@ -357,18 +612,13 @@ def read_extract(file: BinaryIO) -> Recording:
         UnreadableRecording: A row of another length, a cell that is not a number, no rows.
         MixedFrames, NotFinite, NotMetres, BackwardStamps, RepeatedStamps, NotAQuaternion: See `skills.errors`.
     """
-    text = io.TextIOWrapper(file, encoding="utf-8-sig", newline="")
-    try:
+    with open_text(file, "Extract") as text:
         first, second = text.readline(LINE_CHARACTERS), text.readline(LINE_CHARACTERS)
         topic, kind = first.removeprefix(FIRST).strip(), second.removeprefix(_SECOND).strip()
         arm = topics.arm_of_pose(topic, kind)
         if arm is None:
             raise NoUsableTopic(f"The table is of {topic[:200]} ({kind[:200]}), which is not the pose of a PSM.")
         stamps_ns, poses, frames = _samples(text, _PLACES[kind])
-    except (csv.Error, UnicodeDecodeError) as error:
-        raise UnreadableRecording(f"The table is not comma-separated UTF-8 text: {error}. Extract it again.") from error
-    finally:
-        text.detach()  # otherwise the wrapper would close the caller's file
     if len(frames) > 1:
         raise MixedFrames(
             f"{topic} has poses in {len(frames)} frames; record each frame on a separate topic.", frames=frames[:20]

@@ -43,7 +43,7 @@ def find_suture_points(upload: Upload, arm: str | None, read: Reader) -> SutureP
     Raises:
         BadRecording: It cannot be used; `skills.errors` lists the kinds.
     """
-    return suture_points(read_upload(upload, partial(read, target=PARSE)), arm=arm, frame=upload.frame)
+    return suture_points(read_upload(upload, partial(read, target=PARSE)), arm=arm, frame=upload.reading["frame"])
 
 
 LEAST_MM = 0.1  # ours: a speed (mm/s) or an offset below it was given in metres

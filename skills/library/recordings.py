@@ -6,7 +6,8 @@ file --Upload--> read_upload, tell_upload --keep--> StoredRecording with its chu
 import base64
 import hashlib
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, BinaryIO
 
 from sqlalchemy import select
@@ -24,11 +25,13 @@ from skills.db.service_tables import record_event
 from skills.db.session import Database
 from skills.demonstration.demonstration import Recording
 from skills.errors import BadInput, Conflict, Corrupt, UnknownFormat, UnreadableRecording
+from skills.fields import as_json
 from skills.formats import MEDIA_TYPES, media_type_of, read_recording
 from skills.formats.reader_process import Told, read_told
 from skills.library.catalogue import find_surgeon
 from skills.library.integrity import find_by_digest
 from skills.remedies import Action, Remedy
+from skills.schemas.requests import Reading
 
 CHUNK_BYTES = 1 << 20
 Reader = Callable[..., Recording]  # `read_recording`, or a callable that runs it in another process
@@ -44,14 +47,12 @@ class Upload:
     sha256: str
     size_bytes: int
     media_type: str
-    rate_hz: float | None = None
-    frame: str | None = None
     vouched: bool = False  # the client sent a Content-Digest, and it matches the bytes
+    reading: dict[str, Any] = field(default_factory=lambda: Reading().said)
 
-    @property
-    def reading(self) -> dict[str, Any]:
-        """The reader's arguments."""
-        return {"rate_hz": self.rate_hz, "frame": self.frame}
+    def read_as(self, reading: dict[str, Any]) -> "Upload":
+        """Return the upload with the reader's arguments."""
+        return replace(self, reading=reading)
 
 
 def check_digest(header: str | None, of_bytes: str) -> bool:
@@ -126,6 +127,39 @@ def store_recording(
         return stored, new
 
 
+def preview(upload: Upload, read: Teller = read_told) -> dict[str, Any]:
+    """Return what would be understood of a recording, as JSON; nothing is stored.
+
+    A table without times is counted, one second for each sample, and its durations and rates are null.
+
+    Raises:
+        BadRecording, UnknownFormat: As in `read_upload`.
+    """
+    told = tell_upload(upload, partial(read, untimed=True))
+    timed = told.recording.is_timed or upload.reading["rate_hz"] is not None
+    about = told.about if timed else _untimed(told.about)
+    return {
+        "sha256": upload.sha256,
+        "size_bytes": upload.size_bytes,
+        "media_type": upload.media_type,
+        "format": told.recording.format,
+        "integrity": "full" if upload.vouched else told.recording.integrity,
+        "timed": timed,
+        "columns": [as_json(column) for column in told.recording.columns],
+        **about,
+    }
+
+
+def _untimed(about: dict[str, Any]) -> dict[str, Any]:
+    nothing = {"duration_s": None, "rate_hz": None, "longest_gap_s": None}
+    return about | {
+        "duration_s": None,
+        "quality": [one | nothing for one in about["quality"]],
+        "segments": [],
+        "counts": about["counts"] | {"segments": 0},
+    }
+
+
 def keep(session: Session, upload: Upload, told: Told, actor: str) -> tuple[StoredRecording, bool]:
     """Write a recording in the caller's transaction, once; return the row, and whether it is new to the actor.
 
@@ -140,7 +174,7 @@ def keep(session: Session, upload: Upload, told: Told, actor: str) -> tuple[Stor
         if stored.reading != upload.reading:
             if session.get(RecordingUpload, (stored.row, actor)) is None:  # do not reveal another user's parameters
                 raise Conflict(
-                    "These bytes cannot be stored with this rate_hz and frame; ask the operator of the service."
+                    "These bytes cannot be stored with these reading parameters; ask the operator of the service."
                 )
             before = " and ".join(f"no {name}" if to is None else f"{name} {to}" for name, to in stored.reading.items())
             raise Conflict(f"These bytes are stored already, read with {before}; send the same parameters.")

@@ -29,7 +29,7 @@ from skills.schemas.policies import (
     Rollout,
     Version,
 )
-from skills.schemas.recordings import Demonstration, DemoPath, Recording, RewardMap, SuturePoints
+from skills.schemas.recordings import Demonstration, DemoPath, Recording, RecordingPreview, RewardMap, SuturePoints
 from skills.verification.monte_carlo import Doubt, Probability
 from skills.verification.verdict import PlaybackReport
 
@@ -53,6 +53,7 @@ __all__ = [
     "Problem",
     "Ready",
     "Recording",
+    "RecordingPreview",
     "RetrainedStyle",
     "Retraining",
     "RewardMap",

@@ -8,7 +8,7 @@ from pydantic import Field
 
 from skills.demonstration.partner import Partner
 from skills.demonstration.quality import MotionReport
-from skills.demonstration.recording import BaseFrame, Format, Topic
+from skills.demonstration.recording import BaseFrame, Column, Format, Topic
 from skills.demonstration.segments import Segment, TakenSegment
 from skills.fields import Count, Point, Quaternion, Sha256, Slug, schema, stored_schema
 from skills.gridworld.grid import PathReport
@@ -133,20 +133,17 @@ class LeftOut:
     because: str
 
 
-class Recording(Given):
-    """A raw file as it was uploaded: its content, its quality, and the proposed hand-offs."""
+class Described(Given):
+    """The content of a raw file, its quality, and the proposed hand-offs."""
 
-    id: Sha256
     sha256: Sha256
     size_bytes: Count
     media_type: str
     format: str = Field(description=f"One of {', '.join(get_args(Format))}.")
     integrity: Literal["full", "partial", "none"] = Field(description="How much of it a checksum vouches for.")
-    duration_s: float
     notes: dict[str, str]
     topics: list[Topic]
     motions: list[Motion]
-    quality: list[Quality]
     segments: list[Segment]
     counts: RecordingCounts
     labels: list[Label]
@@ -161,7 +158,42 @@ class Recording(Given):
         default=[], description="Topics with samples whose stamps went back; older versions refused these recordings."
     )
     base_frames: list[BaseFrame]
+
+
+class Recording(Described):
+    """A raw file as it was uploaded: its content, its quality, and the proposed hand-offs."""
+
+    id: Sha256
+    duration_s: float
+    quality: list[Quality]
     created_at: datetime
+
+
+@stored_schema
+@dataclass(frozen=True)
+class PreviewedQuality:
+    """The quality of a motion; durations and rate are null where the samples have no times.
+
+    Attributes:
+        equal_samples: Samples that repeat the pose of the sample before to the last bit.
+    """
+
+    arm: str
+    topic: str
+    duration_s: float | None
+    rate_hz: float | None
+    longest_gap_s: float | None
+    extent_mm: Point
+    equal_samples: Count = 0
+
+
+class RecordingPreview(Described):
+    """What would be understood of a raw file; nothing of it is stored."""
+
+    timed: bool = Field(description="Whether the samples have times; a table without them is stored only with a rate.")
+    duration_s: float | None
+    quality: list[PreviewedQuality]
+    columns: list[Column] = Field(description="The columns of a table, used or not; empty of any other file.")
 
 
 @schema

@@ -26,6 +26,7 @@ JOB = r"^[0-9a-f]{16}$"
 KEY = r"^[0-9a-f]{8}$"
 OWNER = r"^[A-Za-z0-9][A-Za-z0-9 ._@-]{0,63}$"
 FRAME = r"^[A-Za-z0-9_./-]{1,64}$"
+ARM = r"^[A-Za-z][A-Za-z0-9_]{0,31}$"
 LINE = r"^[^\x00-\x1f\x7f]+$"
 LINES = r"^[^\x00-\x08\x0b-\x1f\x7f]*$"
 COUNT = r"^\d{0,4}$"
@@ -36,6 +37,7 @@ _IN_WORDS = {
     JOB: "must be a job's id: 16 of the characters 0-9 and a-f",
     KEY: "must be a key's id: the 8 characters after skills_",
     FRAME: "must be 1 to 64 letters, digits, or _ . / -",
+    ARM: "must be 1 to 32 letters, digits or _, and begin with a letter",
     OWNER: "must be 1 to 64 letters, digits, spaces or . _ @ -, and begin with a letter or a digit",
     LINE: "must be one line of text",
     LINES: "must be text without control characters",
@@ -152,6 +154,46 @@ class DemoIn(Schema):
     cell_mm: Annotated[float, Field(ge=0.25, le=50)] | None = None
     hysteresis: Hysteresis = 0.0
     session: SlugField | None = None
+
+
+class Reading(Schema):
+    """What an upload says about a recording, as far as the recording does not say it."""
+
+    rate_hz: Annotated[float, Field(gt=0, le=10_000)] | None = Field(
+        default=None, description="Samples per second, of a table without times."
+    )
+    frame: Annotated[str, Field(pattern=FRAME)] | None = Field(
+        default=None,
+        description="The frame of a table's positions; base: the base of each arm, which is the default where a table "
+        "is of one arm.",
+    )
+
+    @property
+    def said(self) -> dict[str, Any]:
+        """The reader's arguments: rate and frame, and of the others those that were given, as they are stored."""
+        given = self.model_dump(include=READING, exclude_none=True)
+        return {"rate_hz": self.rate_hz, "frame": self.frame, **given}
+
+
+class TableReading(Reading):
+    """What an upload says about a table (docs/tables.md)."""
+
+    column: Annotated[list[Annotated[str, Field(max_length=200, pattern=LINE)]], Field(max_length=30)] | None = Field(
+        default=None, description="A table's columns under other names, each as x_mm=NAME, or x=NAME with a unit."
+    )
+    unit: Annotated[list[Literal["m", "mm", "rad", "deg", "s", "ms", "us", "ns"]], Field(max_length=3)] | None = Field(
+        default=None, description="Units of the columns that name none: of lengths, angles and times."
+    )
+    decimal: Literal["point", "comma"] | None = Field(default=None, description="The decimal mark; point by default.")
+    table_arm: Annotated[str, Field(pattern=ARM)] | None = Field(
+        default=None, description="The arm of a table; PSM by default."
+    )
+    instrument: Annotated[str, Field(pattern=f"^({'|'.join(INSTRUMENTS)})$")] | None = Field(
+        default=None, description="The instrument with which a table's joints become poses."
+    )
+
+
+READING = {"column", "unit", "decimal", "table_arm", "instrument"}
 
 
 def _learner(learner: type[Learner]) -> Any:

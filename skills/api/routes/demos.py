@@ -36,8 +36,8 @@ from skills.library.atlas import CONFOUNDED, DISTANCE, MOST, SESSIONS, atlas_of,
 from skills.library.catalogue import find_suture_type
 from skills.library.demos import demo_json, path_json, reward_map_json
 from skills.library.recordings import recording_json
-from skills.schemas.given import Atlas, Demonstration, DemoPath, Page, Recording, RewardMap, Score
-from skills.schemas.requests import COUNT, DIGEST, SLUG, DemoIn, Schema, ScoreIn, SlugField
+from skills.schemas.given import Atlas, Demonstration, DemoPath, Page, Recording, RecordingPreview, RewardMap, Score
+from skills.schemas.requests import COUNT, DIGEST, SLUG, DemoIn, ScoreIn, SlugField, TableReading
 from skills.settings import MEBIBYTE
 
 uploads = APIRouter(tags=["demonstrations"])
@@ -59,21 +59,16 @@ AskedDemo = Annotated[
 ]
 
 
-class RecordingQuery(Schema):
-    """Query parameters of an upload of a recording; `rate_hz` and `frame` describe a table (see `receive`)."""
+class RecordingQuery(TableReading):
+    """Query parameters of an upload of a recording."""
 
-    rate_hz: float | None = None
-    frame: str | None = None
     surgeon: SlugField | None = Field(
         None, description="The surgeon who was recorded; erasing this surgeon deletes the recording."
     )
 
 
-class DemoUpload(DemoIn):
-    """Query parameters of an upload of a demonstration: `DemoIn`, and the description of a table (see `receive`)."""
-
-    rate_hz: float | None = None
-    frame: str | None = None
+class DemoUpload(DemoIn, TableReading):
+    """Query parameters of an upload of a demonstration: `DemoIn`, and what it says about a table."""
 
 
 @uploads.post(
@@ -83,14 +78,20 @@ def add_recording(
     upload: Incoming, asked: Annotated[RecordingQuery, Query()], db: Db, read: Tell, actor: Actor
 ) -> Response:
     """Store a recording, once for equal bytes, and propose the hand-offs in it."""
-    row, created = recordings.store_recording(db, upload, actor, read, asked.surgeon)
+    row, created = recordings.store_recording(db, upload.read_as(asked.said), actor, read, asked.surgeon)
     return stored(recording_json(row), created, f"/recordings/{row.sha256}")
+
+
+@uploads.post("/recordings/preview", dependencies=[needs("uploader")], openapi_extra=RAW_BODY, **says(RecordingPreview))
+def preview_recording(upload: Incoming, asked: Annotated[TableReading, Query()], read: Tell) -> Response:
+    """Read a recording and return what would be understood of it, a table's columns included; nothing is stored."""
+    return say(recordings.preview(upload.read_as(asked.said), read))
 
 
 @uploads.post("/demos", dependencies=[needs("uploader")], openapi_extra=RAW_BODY, **makes(Demonstration, 404, 409, 410))
 def upload_demo(upload: Incoming, asked: Annotated[DemoUpload, Query()], db: Db, read: Tell, actor: Actor) -> Response:
     """Store a recording and one demonstration of it, both or neither."""
-    return _stored(demos.upload_demo(db, upload, asked, actor, read))
+    return _stored(demos.upload_demo(db, upload.read_as(asked.said), asked, actor, read))
 
 
 @router.get("/recordings/{recording}", dependencies=[needs("reader")], **gives(Recording, 404))

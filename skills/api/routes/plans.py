@@ -32,7 +32,7 @@ from skills.planning.plan import MAX_PASSES
 from skills.planning.trajectory import Trajectory
 from skills.schemas.given import Comparison, Plan, Playback, SuturePoints
 from skills.schemas.given import Trajectory as GivenTrajectory
-from skills.schemas.requests import DIGEST, Name, PlanIn, PlaybackIn, Schema
+from skills.schemas.requests import DIGEST, Name, PlanIn, PlaybackIn, Reading
 from skills.settings import MEBIBYTE, Settings
 from skills.verification.playback import Pictures
 
@@ -78,12 +78,10 @@ def get_playback(playback: Digest, db: Db, give: Giving, settings: Configured) -
 suture_point_router = APIRouter(tags=["plans"])
 
 
-class SuturePointsUpload(Schema):
-    """Query parameters of a scene upload: the arm whose base frame is used, and the frame's name (see `receive`)."""
+class SuturePointsUpload(Reading):
+    """Query parameters of a scene upload: the arm whose base frame is used, and the frame's name."""
 
     arm: Name | None = None
-    rate_hz: float | None = None
-    frame: str | None = None
 
 
 @suture_point_router.post(
@@ -95,7 +93,7 @@ def read_suture_points(upload: Incoming, asked: Annotated[SuturePointsUpload, Qu
     `is_goal` proposes the exits as goals of passes: there the needle comes out and is handed over. A suture point of a
     plan takes `position_mm`, and as its rotation `turn_xyzw` if the style was demonstrated at the first of them.
     """
-    return say(find_suture_points(upload, asked.arm, read).model_dump(mode="json"))
+    return say(find_suture_points(upload.read_as(asked.said), asked.arm, read).model_dump(mode="json"))
 
 
 trajectory_router = APIRouter(tags=["plans"])

@@ -1,0 +1,249 @@
+"""The text of a table as columns of numbers: separators, decimal marks and exact times.
+
+    bytes --open_text, header_of--> names of the columns --read_numbers--> Numbers
+
+Cells are separated by commas, semicolons or tabs; the header says by which. A decimal comma is only read where the
+caller says so, because a comma in a number may as well group thousands. `np.float64(0.5)`, which some recorders write,
+is 0.5. Times are converted from their text, because a float of nanoseconds since 1970 is only accurate to 240 ns.
+
+A row of numbers never continues on a second line. Lines, columns and rows are limited in number and length, and each
+limit is checked before the text is parsed.
+"""
+
+import csv
+import io
+import re
+from array import array
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from decimal import Decimal
+from typing import TYPE_CHECKING, BinaryIO, Literal, TextIO
+
+import numpy as np
+
+from skills.arrays import Floats, Ints
+from skills.errors import BadColumns, NotFinite, UnreadableRecording
+from skills.remedies import Action, Remedy
+
+if TYPE_CHECKING:
+    from _csv import Reader
+
+Decimals = Literal["point", "comma"]
+LINE_CHARACTERS = 16_384  # a row of the widest supported table has 6,000
+COLUMNS = 400  # the widest known recorder writes 180
+ROWS = 5_000_000  # 14 hours at 100 Hz
+SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs"}
+NS_PER = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}  # units of time
+_LATEST_S = 4_000_000_000  # the year 2096; larger values are in a smaller unit
+_QUOTED = re.compile('"[^"]*"')
+_NUMPY = re.compile(r"np\.float64\(([^(),;\t]*)\)")
+_FIRST_ROW = 2  # the header is row 1
+
+
+@dataclass(frozen=True)
+class Numbers:
+    """The numbers of the columns that are used, shape (T, columns), and exact stamps where one of them has times."""
+
+    values: Floats
+    stamps_ns: Ints | None
+
+
+@contextmanager
+def open_text(file: BinaryIO, verb: str = "Export") -> Iterator[TextIO]:
+    """Yield the text of a table, and leave its file open; text that is no table is refused, with a verb to repair it.
+
+    Raises:
+        UnreadableRecording: It is not UTF-8, or not separated text.
+    """
+    text = io.TextIOWrapper(file, encoding="utf-8-sig", newline="")
+    try:
+        yield text
+    except (csv.Error, UnicodeDecodeError) as error:
+        raise UnreadableRecording(f"The table is not comma-separated UTF-8 text: {error}. {verb} it again.") from error
+    finally:
+        text.detach()  # otherwise the wrapper would close the caller's file
+
+
+def csv_rows(text: TextIO, *, first_line: int = 1, separator: str = ",") -> "Reader":
+    """Return an iterator over rows, each from one line of at most `LINE_CHARACTERS` characters.
+
+    A row of numbers never continues on a second line; with quoted cells that do, a row could be unlimited in length.
+    Iterating raises `csv.Error`, and `UnreadableRecording` for a line that is longer or has an unclosed quoted cell.
+
+    Args:
+        text: Positioned at the first row.
+        first_line: The number of the line at which `text` is positioned, for messages.
+        separator: The character between two cells.
+    """
+    return csv.reader(_lines(text, first_line), strict=True, delimiter=separator)
+
+
+def _lines(text: TextIO, number: int) -> Iterator[str]:
+    while line := text.readline(LINE_CHARACTERS + 1):
+        if len(line) > LINE_CHARACTERS:
+            raise UnreadableRecording(
+                f"Line {number} of the table has more than {LINE_CHARACTERS} characters; export the table again.",
+                line=number,
+            )
+        if line.count('"') % 2:
+            raise UnreadableRecording(
+                f"The table is not comma-separated text: line {number} opens a quoted cell and does not close it. "
+                "Export the table again.",
+                line=number,
+            )
+        yield _NUMPY.sub(r"\1", line) if "np.float64(" in line else line
+        number += 1
+
+
+def separator_of(header: str) -> str:
+    """Return the separator of a table, from its header line.
+
+    Raises:
+        BadColumns: The header has two kinds of separators.
+    """
+    found = [one for one in SEPARATORS if one in _QUOTED.sub("", header)]
+    if len(found) > 1:
+        kinds = " and ".join(SEPARATORS[one] for one in found)
+        raise BadColumns(
+            f"The header has both {kinds}; which of them separate the columns? Quote the names, or leave the others "
+            "out of them."
+        )
+    return found[0] if found else ","
+
+
+def header_of(text: TextIO) -> tuple[list[str], str]:
+    """Read the header of a table; return the names of its columns, without spaces around them, and the separator.
+
+    Raises:
+        BadColumns: It has two kinds of separators, too many columns, or a column twice.
+    """
+    line = next(_lines(text, 1), "")
+    separator = separator_of(line)
+    names = [name.strip() for name in next(csv.reader([line], strict=True, delimiter=separator), [])]
+    if len(names) > COLUMNS:
+        raise BadColumns(
+            f"The table has {len(names)} columns, more than the limit of {COLUMNS}; keep those with the motion.",
+            columns=len(names),
+        )
+    return names, separator
+
+
+def read_numbers(
+    text: TextIO,
+    names: Sequence[str],
+    used: Sequence[int],
+    separator: str = ",",
+    decimal: Decimals = "point",
+    time: tuple[int, str] | None = None,
+) -> Numbers:
+    """Read the rows of a table below its header.
+
+    Args:
+        text: Positioned below the header.
+        names: The names of all columns, for messages.
+        used: The indices of the columns to read, at least one.
+        separator: The character between two cells.
+        decimal: The decimal mark.
+        time: The index of the column with times, and its unit: one of `NS_PER`.
+
+    Raises:
+        UnreadableRecording: A row of another length, a cell that is not a number, too many rows, or none.
+        NotFinite: A number is NaN or infinite.
+        BadColumns: A time is beyond the year 2096.
+    """
+    rows = csv_rows(text, first_line=_FIRST_ROW, separator=separator)
+    cells, stamps_ns, count, blank_line = array("d"), array("q"), 0, 0
+    for row in rows:
+        line = rows.line_num + 1
+        if not row:
+            blank_line = blank_line or line
+            continue
+        if count >= ROWS:
+            raise UnreadableRecording(f"The table has more than {ROWS} rows; cut it into parts and send each part.")
+        if blank_line or len(row) != len(names):
+            line, found = blank_line or line, 0 if blank_line else len(row)
+            raise UnreadableRecording(f"Row {line} has {found} cells, the header {len(names)}. Export the table again.")
+        picked = [row[k] for k in used]
+        if decimal == "comma":
+            picked = _with_points(names, used, picked, line)
+        try:
+            cells.extend(map(float, picked))
+        except ValueError:
+            raise _no_number(names, used, picked, line) from None
+        if "_" in "".join(picked):  # Python parses 1_000, which no exporter writes
+            raise _no_number(names, used, picked, line)
+        if time is not None:
+            stamps_ns.append(_exact_ns(picked[used.index(time[0])].strip(), NS_PER[time[1]]))
+        count += 1
+    if not count:
+        raise UnreadableRecording("The table has a header and no rows.")
+    values = np.frombuffer(cells).reshape(count, len(used))
+    _check_finite([names[k] for k in used], values)
+    if time is None:
+        return Numbers(values, None)
+    _check_early(names[time[0]], time[1], values[:, used.index(time[0])])
+    return Numbers(values, np.frombuffer(stamps_ns, dtype=np.int64))
+
+
+def is_number(cell: str) -> bool:
+    """Return whether a cell of a table is a number, in any form that an exporter writes."""
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return "_" not in cell  # Python parses 1_000, which no exporter writes
+
+
+def _with_points(names: Sequence[str], used: Sequence[int], cells: list[str], line: int) -> list[str]:
+    """Return cells with points for decimal commas."""
+    for k, cell in zip(used, cells, strict=True):
+        if "." in cell or cell.count(",") > 1:
+            raise UnreadableRecording(
+                f"Row {line}, column {names[k]}: {cell[:40]!r} is not a number with a decimal comma; export the table "
+                "with one decimal mark and without grouped thousands.",
+                row=line,
+                column=names[k],
+            )
+    return [cell.replace(",", ".") for cell in cells]
+
+
+def _no_number(names: Sequence[str], used: Sequence[int], cells: list[str], line: int) -> UnreadableRecording:
+    k, cell = next((k, cell) for k, cell in zip(used, cells, strict=True) if not is_number(cell))
+    where = f"Row {line}, column {names[k]}"
+    if is_number(cell.replace(",", ".", 1)):
+        return UnreadableRecording(
+            f"{where}: {cell[:40]!r} has a comma; is it the decimal mark?",
+            Remedy(Action.DECIMAL_COMMA),
+            row=line,
+            column=names[k],
+        )
+    return UnreadableRecording(f"{where}: not a number; export the table again.", row=line, column=names[k])
+
+
+def _check_finite(names: Sequence[str], values: Floats) -> None:
+    wrong = ~np.isfinite(values)
+    if wrong.any():
+        row, column = np.argwhere(wrong)[0].tolist()
+        line, name = row + _FIRST_ROW, names[column]
+        raise NotFinite(f"Row {line}, column {name}: NaN or infinity; cut the row.", row=line, column=name)
+
+
+def _exact_ns(cell: str, ns_per_unit: int) -> int:
+    """Convert a time to whole nanoseconds exactly; 0 for one that `_check_early` or `_check_finite` refuses."""
+    time = float(cell)
+    if time == 0 or not abs(time) < _LATEST_S * (1_000_000_000 // ns_per_unit):
+        return 0
+    stamp_ns = int(cell) * ns_per_unit if cell.isdecimal() else round(Decimal(cell) * ns_per_unit)
+    return min(stamp_ns, _LATEST_S * 1_000_000_000)
+
+
+def _check_early(name: str, unit: str, times: Floats) -> None:
+    late = np.abs(times) >= _LATEST_S * (1_000_000_000 // NS_PER[unit])
+    if late.any():
+        row = int(np.argmax(late))
+        words = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}[unit]
+        raise BadColumns(
+            f"Row {row + _FIRST_ROW}, column {name}: {times[row]:g} {unit} is after the year 2096; give {words}.",
+            row=row + _FIRST_ROW,
+        )
