@@ -19,6 +19,7 @@ read as the tip if it moves, and one fixed transform leads from it to the other 
 whose pose is 0 in every row, quaternion included, was not recorded, and is left out.
 """
 
+import os
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -40,7 +41,7 @@ from skills.demonstration.recording import (
     recorded_motion,
     recorded_signal,
 )
-from skills.errors import BadColumns, BadSettings, MixedFrames, NoUsableTopic, SkillsError
+from skills.errors import BadColumns, BadSettings, MixedFrames, NoUsableTopic, SkillsError, UnreadableRecording
 from skills.formats.cells import header_of, open_text, read_numbers
 from skills.formats.tables import (
     TableReading,
@@ -50,6 +51,7 @@ from skills.formats.tables import (
     check_steps,
     check_time,
     posed,
+    scaled,
     stamps_of,
 )
 from skills.kinematics import INSERTION, JOINTS
@@ -100,6 +102,7 @@ def read_ee_csv(file: BinaryIO, said: TableReading) -> Recording:
     """
     if said.table_arm is not None:
         raise BadSettings("The columns name their arms; omit table_arm.")
+    _check_end(file)
     with open_text(file) as text:
         names, separator = header_of(text)
         groups = _groups(names)
@@ -115,6 +118,15 @@ def read_ee_csv(file: BinaryIO, said: TableReading) -> Recording:
     stamps_ns = stamps_of(numbers.stamps_ns, len(numbers.values), said)
     parts = {(one.arm, one.kind): numbers.values[:, [place[k] for k in one.columns]] for one in groups}
     return _recording(parts, stamps_ns, said, _columns(names, groups, time))
+
+
+def _check_end(file: BinaryIO) -> None:
+    """Refuse a file that ends within a row, which would change its last number; the recorders end every line."""
+    file.seek(-1, os.SEEK_END)
+    last = file.read(1)
+    file.seek(0)
+    if last not in (b"\n", b"\r"):
+        raise UnreadableRecording("The last row of the table has no line end: the file was cut. Copy it again.")
 
 
 def _groups(names: Sequence[str]) -> list[_Group]:
@@ -192,7 +204,9 @@ def _recording(
             jaws.append((arm, recorded_signal(stamps_ns, values[:, 0], f"/{arm}/jaw/measured_js")))
         elif kind == "pose" and arm in posing:
             frame = _frame(arm, posing, said)
-            motions.append(_motion(arm, f"/{arm}/measured_cp", frame, stamps_ns, 1000.0 * values[:, :3], values[:, 3:]))
+            motions.append(
+                _motion(arm, f"/{arm}/measured_cp", frame, stamps_ns, scaled(values[:, :3], 1000.0), values[:, 3:])
+            )
         elif kind == "pose":
             left_out.append((f"/{arm}/measured_cp", "All its numbers are 0: the arm was not recorded."))
     for (arm, kind), values in parts.items():
@@ -229,7 +243,7 @@ def _motion(arm: str, topic: str, frame: str, stamps_ns: Ints, tip_mm: Floats, r
 
 def _in_mm(joints: Floats) -> Floats:
     positions = joints.copy()
-    positions[:, INSERTION] *= 1000.0  # the recorders write metres
+    positions[:, INSERTION] = scaled(positions[:, INSERTION], 1000.0)  # the recorders write metres
     return positions
 
 
@@ -257,7 +271,7 @@ def _local(arm: str, stamps_ns: Ints, values: Floats, motion: Motion | None) -> 
     """Return the motion in the arm's base, or the reason why `rcm_pose` is not one."""
     topic = f"/{arm}/local/measured_cp"
     try:
-        local = _motion(arm, topic, f"{arm}_base", stamps_ns, 1000.0 * values[:, :3], values[:, 3:])
+        local = _motion(arm, topic, f"{arm}_base", stamps_ns, scaled(values[:, :3], 1000.0), values[:, 3:])
     except SkillsError as error:  # no demonstration depends on it, where the arm has another pose
         return None, str(error)
     if np.ptp(local.tip_mm, axis=0).max() < WIDE_MM:

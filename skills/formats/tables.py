@@ -436,8 +436,9 @@ def check_steps(column: str, unit: str, stamps_ns: Ints) -> None:
 
 
 def scaled(values: Floats, factor: float) -> Floats:
-    """Return values in mm or rad."""
-    return values if factor == 1 else factor * values
+    """Return values in mm or rad; infinite ones, where they overflow, are refused by the recording's values."""
+    with np.errstate(over="ignore"):
+        return values if factor == 1 else factor * values
 
 
 def base_of(arm: str, frame: str | None) -> str:

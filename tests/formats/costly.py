@@ -83,6 +83,10 @@ def costly_tables() -> dict[str, bytes]:
         "a row of 450,000 cells": head + b"1," * 450_000,
         "a row of 200,000 lines": head + b'"\n",' * 200_000,
         "a cell of 900,000 characters": head + b"1,1,1," + b"1" * 900_000,
+        "an ee_csv of 100,000 columns": b",".join(b"psm%d_pose.position.x" % k for k in range(40_000)) + b"\n",
+        "an ee_csv of numpy's brackets": b"timestamp,psm1_pose.position.x\n" + b"np.float64(" * 80_000,
+        "a table of tabs": b"t_s" + b"\t" * 900_000,
+        "an ee_csv of 16,000 brackets in a line": b"timestamp,psm1_pose.position.x\n" + b"np.float64(" * 1_400 + b"\n",
         "an extract of 100,000 columns": extract + b",".join([b"header.frame_id"] * 60_000) + b"\n",
         "an extract of an endless first line": b"# Topic: " + b"/" * 900_000,
     }

@@ -113,7 +113,7 @@ def test_an_arm_of_zeros_was_not_recorded_and_one_zero_quaternion_is_refused():
     for line in lines[1:]:
         for k in of_arm:
             line[k] = "np.float64(0.0)"
-    recording = read("\n".join(",".join(line) for line in lines))
+    recording = read("\n".join(",".join(line) for line in lines) + "\n")
     assert recording.arms == ("PSM2",)
     assert "was not recorded" in dict(recording.left_out)["/PSM1/measured_cp"]
     broken = PLAIN
@@ -139,7 +139,7 @@ def test_without_stamps_a_rate_is_needed_and_joints_need_an_instrument():
 def test_samples_recorded_twice_are_dropped_and_counted():
     lines = PLAIN.splitlines()
     twice = [lines[0], *[line for line in lines[1:] for _ in range(2)]]
-    motion = read("\n".join(twice)).motion_of(arm="PSM2")
+    motion = read("\n".join(twice) + "\n").motion_of(arm="PSM2")
     assert (motion.duplicate_stamps, len(motion.stamps_ns)) == (120, 120)
 
 
@@ -150,6 +150,7 @@ def test_samples_recorded_twice_are_dropped_and_counted():
         (without(MORE, "psm1_js[2]"), {}, BadColumns, "q3 of PSM1's js is missing"),
         (PLAIN.replace("psm1_sp.position.x", "psm1_pose.position.x", 1), {}, BadColumns, "twice"),
         (PLAIN.replace("psm1_sp.position.x", "timestamp", 1), {}, BadColumns, "twice"),
+        (PLAIN[:-3], {}, UnreadableRecording, "was cut"),
         (PLAIN, {"rate_hz": 30.0}, BadColumns, "use one of them"),
         (PLAIN, {"table_arm": "PSM1"}, BadSettings, "omit table_arm"),
         (changed(PLAIN, "psm2_pose.position.x", 3, "None"), {}, UnreadableRecording, "Row 5, column psm2_pose.pos"),

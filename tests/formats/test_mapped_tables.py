@@ -183,7 +183,7 @@ def test_joints_in_other_units_are_refused_or_named():
     np.testing.assert_allclose(
         named.motion_of().tip_mm, read(text, rate_hz=30.0, instrument="400006").motion_of().tip_mm, atol=1e-9
     )
-    with pytest.raises(NotMetres, match="insertion"):
+    with pytest.raises(NotMetres, match="inside the cannula"):
         read(
             text.replace("q3_m", "q3_mm"), rate_hz=30.0, instrument="400006", column=["q1_rad=q2_rad", "q2_rad=q1_rad"]
         )
