@@ -18,6 +18,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from decimal import Decimal
+from itertools import chain
 from typing import TYPE_CHECKING, BinaryIO, Literal, TextIO
 
 import numpy as np
@@ -35,7 +36,9 @@ COLUMNS = 400  # the widest known recorder writes 180
 ROWS = 5_000_000  # 14 hours at 100 Hz
 SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs"}
 NS_PER = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}  # units of time
+_PLACES = {ns: len(str(ns)) - 1 for ns in NS_PER.values()}  # decimals of a unit that are whole nanoseconds
 _LATEST_S = 4_000_000_000  # the year 2096; larger values are in a smaller unit
+_ODD = re.compile('["\x00\x1c-\x1f]')  # quotes, and what numpy takes for a space
 _QUOTED = re.compile('"[^"]*"')
 _NUMPY = re.compile(r"np\.float64\(([^(),;\t]*)\)")
 _FIRST_ROW = 2  # the header is row 1
@@ -152,6 +155,85 @@ def read_numbers(
         NotFinite: A number is NaN or infinite.
         BadColumns: A time is beyond the year 2096.
     """
+    quick = _plain_numbers(text, len(names), used, separator, decimal, time)
+    if quick is None:
+        text.seek(0)
+        next(_lines(text, 1))  # the header
+        quick = _any_numbers(text, names, used, separator, decimal, time)
+    _check_finite([names[k] for k in used], quick.values)
+    if time is not None:
+        _check_early(names[time[0]], time[1], quick.values[:, list(used).index(time[0])])
+    return quick
+
+
+class _NotPlain(Exception):
+    """A row that `_any_numbers` reads or refuses."""
+
+
+def _plain_numbers(
+    text: TextIO, columns: int, used: Sequence[int], separator: str, decimal: Decimals, time: tuple[int, str] | None
+) -> Numbers | None:
+    """Read a table whose rows are plain with numpy's parser, in a third of the time; None for any other table.
+
+    Numpy accepts no number that Python does not, control characters aside, and then the same one. Arguments are those
+    of `read_numbers`.
+    """
+    stamps_ns = array("q")
+    rows = _plain_rows(text, columns, separator, decimal, time, stamps_ns)
+    try:
+        first = next(rows, None)
+        if first is None:
+            return None
+        values = np.loadtxt(chain([first], rows), delimiter=separator, usecols=used, comments=None, ndmin=2)
+    except (ValueError, ArithmeticError, _NotPlain):  # the reason is found by `_any_numbers`
+        return None
+    return Numbers(values, None if time is None else np.frombuffer(stamps_ns, dtype=np.int64))
+
+
+def _plain_rows(
+    text: TextIO, columns: int, separator: str, decimal: Decimals, time: tuple[int, str] | None, stamps_ns: "array[int]"
+) -> Iterator[str]:
+    """Yield rows of the right number of cells without quotes, and append their times to `stamps_ns`.
+
+    Raises:
+        _NotPlain: A row is another one, or there are too many.
+    """
+    blank = False
+    for count in range(ROWS + 1):
+        line = text.readline(LINE_CHARACTERS + 1)
+        if not line:
+            return
+        if "np.float64(" in line:
+            line = _NUMPY.sub(r"\1", line)
+        if line in ("\n", "\r\n", "\r"):
+            blank = True
+            continue
+        if (
+            blank
+            or count == ROWS
+            or len(line) > LINE_CHARACTERS
+            or _ODD.search(line)
+            or line.count(separator) != columns - 1
+        ):
+            raise _NotPlain
+        if decimal == "comma":
+            if "." in line:
+                raise _NotPlain
+            line = line.replace(",", ".")
+        if time is not None:
+            stamps_ns.append(_exact_ns(line.split(separator, time[0] + 1)[time[0]].strip(), NS_PER[time[1]]))
+        yield line
+
+
+def _any_numbers(
+    text: TextIO,
+    names: Sequence[str],
+    used: Sequence[int],
+    separator: str,
+    decimal: Decimals,
+    time: tuple[int, str] | None,
+) -> Numbers:
+    """Read the rows one by one; arguments and errors are those of `read_numbers`."""
     rows = csv_rows(text, first_line=_FIRST_ROW, separator=separator)
     cells, stamps_ns, count, blank_line = array("d"), array("q"), 0, 0
     for row in rows:
@@ -179,11 +261,7 @@ def read_numbers(
     if not count:
         raise UnreadableRecording("The table has a header and no rows.")
     values = np.frombuffer(cells).reshape(count, len(used))
-    _check_finite([names[k] for k in used], values)
-    if time is None:
-        return Numbers(values, None)
-    _check_early(names[time[0]], time[1], values[:, used.index(time[0])])
-    return Numbers(values, np.frombuffer(stamps_ns, dtype=np.int64))
+    return Numbers(values, None if time is None else np.frombuffer(stamps_ns, dtype=np.int64))
 
 
 def is_number(cell: str) -> bool:
@@ -231,10 +309,14 @@ def _check_finite(names: Sequence[str], values: Floats) -> None:
 
 def _exact_ns(cell: str, ns_per_unit: int) -> int:
     """Convert a time to whole nanoseconds exactly; 0 for one that `_check_early` or `_check_finite` refuses."""
-    time = float(cell)
-    if time == 0 or not abs(time) < _LATEST_S * (1_000_000_000 // ns_per_unit):
-        return 0
-    stamp_ns = int(cell) * ns_per_unit if cell.isdecimal() else round(Decimal(cell) * ns_per_unit)
+    whole, _, part = cell.partition(".")
+    if whole.isdecimal() and len(whole) < 20 and (not part or part.isdecimal()) and len(part) <= _PLACES[ns_per_unit]:
+        stamp_ns = int(whole + part.ljust(_PLACES[ns_per_unit], "0"))  # ten times as fast as a Decimal
+    else:
+        time = float(cell)
+        if time == 0 or not abs(time) < _LATEST_S * (1_000_000_000 // ns_per_unit):
+            return 0
+        stamp_ns = round(Decimal(cell) * ns_per_unit)
     return min(stamp_ns, _LATEST_S * 1_000_000_000)
 
 
