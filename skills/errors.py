@@ -218,6 +218,10 @@ class NotAQuaternion(BadRecording):
     """A quaternion does not have length one."""
 
 
+class JointsDisagree(BadRecording):
+    """The joints of an arm contradict its poses, or the instrument or frame that the recording states."""
+
+
 class BadColumns(BadRecording):
     """The header of a table is unknown, duplicated, incomplete or ambiguous."""
 

@@ -36,6 +36,7 @@ ROLL = 3
 WRIST_MM = 9.1  # from the wrist's pitch axis to the hinge of the jaws
 JAW_TIP_MM = 10.2  # from the hinge to the finger tips, along the approach (dvrk_model @70998aa)
 CANNULA_MM = 35.0  # with a smaller insertion the wrist is still inside the cannula (saw engages at 25 mm)
+_USUAL_OFFSET_MM = 15.6  # `wrist_offset_mm` of every tool on an arm of its own generation
 _ROUND_OFF = 1e-9  # rad and mm: a joint exactly at its limit is within it
 
 
@@ -70,8 +71,8 @@ class InstrumentConstants:
     """A tool on an arm.
 
     Attributes:
-        name: The tool's number in the dVRK's files.
-        arm: The arm that it fits on.
+        name: The tool's number in the dVRK's files; "420006-Classic" on an arm of the other generation than its own.
+        arm: The arm that it is on.
         shaft_mm: Length of its shaft up to the wrist.
         jaw_rad: Range of the opening of its jaws.
     """
@@ -85,6 +86,11 @@ class InstrumentConstants:
     def wrist_offset_mm(self) -> float:
         """Distance by which the wrist lags behind the insertion: at this insertion it is in the remote centre."""
         return self.arm.remote_centre_mm - self.shaft_mm
+
+    @property
+    def cannula_mm(self) -> float:
+        """The insertion with which the wrist is out of the cannula: `CANNULA_MM` where tool and arm belong together."""
+        return CANNULA_MM + round(self.wrist_offset_mm - _USUAL_OFFSET_MM, 6)
 
     @property
     def lower(self) -> Floats:
@@ -136,6 +142,9 @@ INSTRUMENTS: Mapping[str, InstrumentConstants] = MappingProxyType(
     {
         "400006": InstrumentConstants("400006", CLASSIC, 416.2, (radians(-40), radians(80))),
         "420006": InstrumentConstants("420006", SI, 467.0, (radians(-20), radians(80))),
+        # Each on an arm of the other generation: laboratories do it, and the tip is 50.8 mm further in or out.
+        "400006-Si": InstrumentConstants("400006-Si", SI, 416.2, (radians(-40), radians(80))),
+        "420006-Classic": InstrumentConstants("420006-Classic", CLASSIC, 467.0, (radians(-20), radians(80))),
     }
 )
 
@@ -149,7 +158,7 @@ def instrument_of(name: str) -> InstrumentConstants:
     """Return an instrument by its number.
 
     Args:
-        name: The tool's number in the dVRK's files, such as "400006".
+        name: The tool's number in the dVRK's files, such as "400006"; or "400006-Si" on an arm of the other generation.
 
     Returns:
         The instrument, with its arm.
@@ -190,6 +199,30 @@ def forward(joints: ArrayLike, instrument: str = DEFAULT_INSTRUMENT) -> tuple[Fl
     ):
         pose = pose @ _link(alpha, a, theta, d, len(q))
     return pose[:, :3, 3].copy(), pose[:, :3, :3] @ _TIP_IN_HINGE
+
+
+def axes_of(joints: Floats) -> tuple[Floats, Floats, Floats]:
+    """Compute the directions of shaft and wrist, of which the tip of every instrument is made.
+
+    The tip is (insertion - wrist offset) * shaft + (length of the wrist) * wrist. Instruments differ in these lengths
+    only, so that one call is enough to try all of them.
+
+    Args:
+        joints: Rows of `JOINTS`, rad and mm, shape (T, 6).
+
+    Returns:
+        The direction of the shaft and that from the wrist's pitch axis to the hinge of the jaws, in the PSM base frame,
+        each of shape (T, 3); and the rotation of the tip [n o a], shape (T, 3, 3).
+    """
+    (s1, s2, s4, s5, s6), (c1, c2, c4, c5, c6) = (f(joints[:, (0, 1, 3, 4, 5)]).T[:, :, None] for f in (np.sin, np.cos))
+    shaft = np.concatenate([c2 * s1, -s2, -c2 * c1], axis=1)
+    x3 = np.concatenate([-s1 * s2, -c2, c1 * s2], axis=1)
+    y3 = _cross(shaft, x3)
+    x4, z5 = c4 * x3 + s4 * y3, c4 * y3 - s4 * x3
+    wrist = s5 * x4 + c5 * shaft
+    hinge = _cross(wrist, z5)
+    between = -s6 * wrist - c6 * z5
+    return shaft, wrist, np.stack([hinge, between, _cross(hinge, between)], axis=-1)
 
 
 def _link(alpha: float, a: float, theta: Floats | float, d: Floats | float, count: int) -> Floats:

@@ -7,9 +7,12 @@ from skills.errors import BadInput, ImproperRotation, UnknownInstrument, Unreach
 from skills.kinematics import (
     CANNULA_MM,
     CLASSIC,
+    INSTRUMENTS,
     JAW_TIP_MM,
     POINTING_DOWN,
+    WRIST_MM,
     angle_between,
+    axes_of,
     forward,
     instrument_of,
     inverse,
@@ -105,6 +108,28 @@ def test_the_si_with_its_own_tool_gives_the_classics_poses():
     for classic, si in zip(forward(joints, "400006"), forward(joints, "420006"), strict=True):
         np.testing.assert_allclose(classic, si, atol=1e-10)
     assert instrument_of("420006").wrist_offset_mm == pytest.approx(instrument_of("400006").wrist_offset_mm)
+
+
+@pytest.mark.parametrize(
+    ("mixed", "own", "further_in_mm"), [("400006-Si", "420006", 50.8), ("420006-Classic", "400006", -50.8)]
+)
+def test_a_tool_on_an_arm_of_the_other_generation_is_the_difference_of_the_shafts_off(mixed, own, further_in_mm):
+    joints = any_joints(100)
+    deeper = joints + np.array([0.0, 0.0, further_in_mm, 0.0, 0.0, 0.0])
+    for one, other in zip(forward(deeper, mixed), forward(joints, own), strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-10)
+    assert instrument_of(mixed).cannula_mm == pytest.approx(CANNULA_MM + further_in_mm)
+    assert instrument_of(own).cannula_mm == CANNULA_MM
+    np.testing.assert_array_equal(instrument_of(mixed).upper, instrument_of(own).upper)  # the arm's limits
+
+
+@pytest.mark.parametrize("instrument", INSTRUMENTS)
+def test_the_axes_of_shaft_and_wrist_make_the_tip_of_every_instrument(instrument):
+    joints, tool = any_joints(1000), instrument_of(instrument)
+    shaft, wrist, rotation = axes_of(joints)
+    tip, turned = forward(joints, instrument)
+    np.testing.assert_allclose((joints[:, 2:3] - tool.wrist_offset_mm) * shaft + WRIST_MM * wrist, tip, atol=1e-10)
+    np.testing.assert_allclose(rotation, turned, atol=1e-13)
 
 
 def test_margins_count_from_the_nearer_limit():

@@ -282,6 +282,8 @@ def _tell(stored: "Recording", as_json: bool) -> None:
         out.print(f"{name}: {value}", markup=False, soft_wrap=True)
     for line in _counted(stored):
         out.print(line, markup=False, soft_wrap=True)
+    for one in stored.identifications:
+        out.print(f"{one.topic}: {one.found.verdict}: {one.found.reason}", markup=False, soft_wrap=True)
     show(stored.segments, False, ("arm", "start_s", "end_s", "reason"))
 
 

@@ -17,8 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from skills.arrays import Floats, frozen
-from skills.demonstration.partner import Partner, partner_at
+from skills.demonstration.partner import Partner, in_base, partner_at
 from skills.demonstration.recording import (
+    BaseFrame,
     Format,
     Integrity,
     Motion,
@@ -29,7 +30,7 @@ from skills.demonstration.recording import (
     recorded_motion,
 )
 from skills.demonstration.segments import Pause, Segment, clutched, is_driven, propose_segments, undriven
-from skills.errors import BadSegment, NotMetres
+from skills.errors import BadSegment, JointsDisagree, NotMetres
 
 __all__ = [
     "Demo",
@@ -47,7 +48,7 @@ __all__ = [
     "recorded_motion",
 ]
 
-CLASSIC_LARGE_NEEDLE_DRIVER = "400006"  # the dVRK's tool number; recordings rarely name another one
+CLASSIC_LARGE_NEEDLE_DRIVER = "400006"  # the dVRK's tool number, if the recording neither shows nor states one
 EXTENT_LIMITS_MM = (1.0, 300.0)  # less: metres declared as millimetres; more: beyond a PSM's reach
 PAUSES_LIMIT = 200  # ours: no hand-off has so many, and the motion between two of them is measured separately
 EDGE_NS = 1000  # tolerance at the recording's ends, for times in seconds that were rounded
@@ -69,7 +70,8 @@ class Demo:
         jaw_rad: Angle of the jaw at each stamp, shape (T,): interpolated, and constant beyond the first and last jaw
             sample. None if not recorded.
         clutch_presses: Number of presses of the clutch pedal within the segment; quick taps do not count.
-        instrument: The tool's number in the dVRK's files.
+        instrument: The tool's number in the dVRK's files, as joints and poses show it, or as the recording states it;
+            "400006-Si" on an arm of the other generation.
         pauses: The intervals between the first and the last sample in which the arm was not driven.
         partner: Pose of the other arm as it takes the needle, in `frame`; None if no other arm is near or its pose
             cannot be expressed in `frame`.
@@ -125,15 +127,18 @@ def cut_demo(
         end_s: Seconds since the recording's `origin_ns`; by default the motion's last sample.
 
     Returns:
-        The demonstration: positions in mm in the frame of the motion, at least 2 samples.
+        The demonstration: positions in mm, at least 2 samples. They are in the frame of the motion; if the joints show
+        where the arm's base stands in that frame, they are in the base.
 
     Raises:
         NoUsableTopic: There is no such arm or topic, or there are several arms and none is named.
         BadSegment: The segment is not finite, ends before it starts, lies outside the recording, holds fewer than 2
             samples of a driven arm, or has more than 200 pauses in which the arm was not driven.
         NotMetres: The path's extent is below 1 mm or above 300 mm.
+        JointsDisagree: The joints recorded beside the poses contradict them, or the stated instrument.
     """
     motion = recording.motion_of(arm=arm, topic=topic)
+    _check_joints(recording, motion)
     first_ns, last_ns = _segment_ns(recording, motion, start_s, end_s)
     within = (motion.stamps_ns >= first_ns) & (motion.stamps_ns <= last_ns)
     # before the count: a segment in which only the clutch was down has no demonstrated sample
@@ -147,20 +152,61 @@ def cut_demo(
         )
     stamps_ns = motion.stamps_ns[inside]
     seconds = recording.seconds(stamps_ns)
+    bases, base = base_frames(recording), recording.base_under(motion)
+    tip_mm = motion.tip_mm[inside]
+    rotation_xyzw = None if motion.rotation_xyzw is None else motion.rotation_xyzw[inside]
+    partner = partner_at(recording, motion, float(seconds[-1]), bases)
+    if base is not None:
+        tip_mm, rotation_xyzw = _in_base(base, tip_mm, rotation_xyzw)
+        partner = None if partner is None else in_base(partner, base, bases)
     return Demo(
         arm=motion.arm,
         topic=motion.topic,
-        frame=motion.frame,
+        frame=motion.frame if base is None else base.local_frame,
         start_s=float(seconds[0]),
         end_s=float(seconds[-1]),
         stamps_s=(stamps_ns - stamps_ns[0]) / 1e9,  # integers are subtracted first, so that no nanosecond is lost
-        tip_mm=motion.tip_mm[inside],
-        rotation_xyzw=None if motion.rotation_xyzw is None else motion.rotation_xyzw[inside],
+        tip_mm=tip_mm,
+        rotation_xyzw=rotation_xyzw,
         jaw_rad=_jaw_at(recording, motion.arm, seconds),
         clutch_presses=sum(first_ns <= down_ns <= last_ns for down_ns, _ in clutched(recording)),
+        instrument=recording.instrument_on(motion.arm) or CLASSIC_LARGE_NEEDLE_DRIVER,
         pauses=_pauses(recording, motion.arm, int(stamps_ns[0]), int(stamps_ns[-1])),
-        partner=partner_at(recording, motion, float(seconds[-1]), base_frames(recording)),
+        partner=partner,
     )
+
+
+def _check_joints(recording: Recording, motion: Motion) -> None:
+    """Refuse poses that the measured joints contradict, or an instrument that they do.
+
+    Poses that are not stated to be in the arm's base are not refused for their place: a camera may have moved.
+    """
+    found = recording.identification_of(motion)
+    if found is None or found.verdict not in ("wrong instrument", "wrong frame", "contradiction"):
+        return
+    if found.verdict != "wrong instrument" and not motion.states_base:
+        return
+    remedy = {
+        "wrong instrument": "Correct the name of the tool in the recording, or remove it.",
+        "wrong frame": "State the frame in which the poses are, or use the arm's local/measured_cp.",
+        "contradiction": "Record them again, or remove the joints if they are wrong.",
+    }[found.verdict]
+    raise JointsDisagree(
+        f"{motion.topic}: {found.reason}.",
+        remedy,
+        topic=motion.topic,
+        verdict=found.verdict,
+        stated=found.stated,
+        candidates=list(found.candidates),
+        residual_mm=found.residual_mm,
+    )
+
+
+def _in_base(base: BaseFrame, tip_mm: Floats, rotation_xyzw: Floats | None) -> tuple[Floats, Floats | None]:
+    """Transform a motion into its arm's base; its orientation only if it was recorded."""
+    known = np.tile([0.0, 0.0, 0.0, 1.0], (len(tip_mm), 1)) if rotation_xyzw is None else rotation_xyzw
+    tip, rotation = base.seen_from(tip_mm, known)
+    return tip, None if rotation_xyzw is None else rotation
 
 
 def _pauses(recording: Recording, arm: str, first_ns: int, last_ns: int) -> tuple[Pause, ...]:

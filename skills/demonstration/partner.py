@@ -8,14 +8,14 @@ that frame as well, its pose in this arm's base is returned too, so that a plan 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from skills.arrays import Floats, xyz
 from skills.demonstration.recording import BaseFrame, Motion, Recording
 from skills.fields import Point, Quaternion, computed_field, schema
-from skills.kinematics import INSTRUMENTS, matrix_of, quaternion_of
+from skills.kinematics import INSTRUMENTS, matrix_of
 
 NEAR_MM = 40.0  # between tips that hold one needle: 26 mm along its arc, 17 mm across, plus the width of the jaws
 STEADY_MM, STEADY_RAD = 3.0, 0.05  # a base that moved more in the other frame has no single pose
@@ -95,6 +95,20 @@ def partner_at(
     return min(near, key=lambda one: one[0])[1] if near else None
 
 
+def in_base(partner: Partner, base: BaseFrame, bases: Sequence[BaseFrame]) -> Partner:
+    """Transform the other arm's pose into this arm's base.
+
+    Args:
+        partner: The other arm in the frame in which this arm's base stands.
+        base: This arm's base.
+        bases: Result of `base_frames` for the recording.
+    """
+    position, rotation = _seen_from(base, np.array(partner.position_mm), np.array(partner.rotation_xyzw))
+    base_mm, base_xyzw = _other_base(base, partner.arm, bases) if _is_steady(base) else (None, None)
+    position_mm, rotation_xyzw = xyz(position), _xyzw(rotation)
+    return replace(partner, position_mm=position_mm, rotation_xyzw=rotation_xyzw, base_mm=base_mm, base_xyzw=base_xyzw)
+
+
 def pose_at(recording: Recording, motion: Motion, second: float) -> int | None:
     """Find the sample of a motion that is nearest to a time.
 
@@ -135,16 +149,15 @@ def _is_steady(base: BaseFrame) -> bool:
 
 
 def _instrument_of(recording: Recording, arm: str) -> str | None:
-    """Return the number of an arm's instrument, such as 400006 of "LARGE_NEEDLE_DRIVER:400006"; None if unknown."""
-    number = dict(recording.tools).get(arm, "").rpartition(":")[2]
+    """Return the instrument of an arm, such as 400006; None if it is not known, or its constants are not."""
+    number = recording.instrument_on(arm)
     return number if number in INSTRUMENTS else None
 
 
 def _seen_from(base: BaseFrame, position_mm: Floats, rotation_xyzw: Floats) -> tuple[Floats, Floats]:
-    """Transform a pose from the frame in which a base stands into the base's own frame."""
-    turn = matrix_of(np.array([base.rotation_xyzw]))[0]
-    rotation = quaternion_of(turn.T @ matrix_of(rotation_xyzw[None]))[0]
-    return (position_mm - np.asarray(base.position_mm)) @ turn, rotation
+    """Transform one pose from the frame in which a base stands into the base's own frame."""
+    position, rotation = base.seen_from(position_mm[None], rotation_xyzw[None])
+    return position[0], rotation[0]
 
 
 def _xyzw(values: Floats) -> Quaternion:

@@ -8,6 +8,7 @@
     ├── Label       a named interval: a stage of the session, a gesture
     └── Topic       a topic of the file, used or not
     --base_frames--> BaseFrame   the pose of an arm's base in the frame of another of its topics
+    --identifications--> ArmIdentification   arm, instrument and base that joints and poses of an arm show together
 
 Motions, joints and signals are checked here, once, in their constructors: numbers are finite, time does not run
 backwards, coordinates are plausible for an arm, quaternions have length one. Data that fail are refused with topic and
@@ -24,6 +25,13 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from skills.arrays import Flags, Floats, Ints, frozen
+from skills.demonstration.identification import (
+    MOST_SAMPLES,
+    ArmIdentification,
+    Identification,
+    identify,
+    stated_instrument,
+)
 from skills.errors import (
     BackwardStamps,
     NotAQuaternion,
@@ -34,7 +42,7 @@ from skills.errors import (
     UnreadableRecording,
 )
 from skills.fields import Count, Point, Quaternion, schema
-from skills.kinematics import quaternion_of
+from skills.kinematics import matrix_of, quaternion_of
 from skills.remedies import did_you_mean
 
 COORDINATE_LIMIT_MM = 1000.0  # ours: a PSM reaches 0.3 m; far beyond it millimetres were taken for metres
@@ -146,6 +154,8 @@ DROPPED_GAP_NS = 50_000_000  # ours: a tip at 100 mm/s moves by 5 mm in it, one 
 BASES_LIMIT = 64  # ours: pairs of motions of one arm in two frames; a dVRK's recording has one or two per arm
 PAIR_NS = 2_000_000  # ours: between two poses so near in time a tip at 100 mm/s moves by 0.2 mm
 PAIRS_LEAST = 10  # ours: from fewer pairs it cannot be concluded that a base stood still
+IDENTIFIED_LIMIT = 16  # ours: pairs of joints and poses that are compared, each for 0.1 s; a dVRK has two per arm
+JOINT_GAP_NS = 50_000_000  # ours: joints further apart in time are not interpolated
 WIDE_MM = 2.0  # ours: a rotation cannot be fitted to tips that move less than this in a second direction
 
 _INVERSE = np.array([-1.0, -1.0, -1.0, 1.0])  # a unit quaternion x, y, z, w times this is its inverse
@@ -201,6 +211,11 @@ class Motion:
     def is_local(self) -> bool:
         """Whether the poses are relative to the arm's own remote centre. The topic decides: frame names differ."""
         return "/local/" in self.topic
+
+    @property
+    def states_base(self) -> bool:
+        """Whether topic or frame state that the poses are relative to the arm's own remote centre."""
+        return self.is_local or self.frame.casefold() == f"{self.arm}_base".casefold()
 
 
 @dataclass(frozen=True, eq=False)
@@ -364,7 +379,37 @@ class Recording:
     @cached_property
     def bases(self) -> tuple["BaseFrame", ...]:
         """The poses of the arms' bases, see `base_frames`; computed once."""
-        return _base_frames(self.motions)
+        paired = _base_frames(self.motions)
+        known = {(base.arm, base.frame) for base in paired}
+        return *paired, *(base for base in _bases_of(self) if (base.arm, base.frame) not in known)
+
+    @cached_property
+    def identifications(self) -> tuple["ArmIdentification", ...]:
+        """The arms and instruments that joints and poses show together; computed once."""
+        return tuple(_identifications(self))
+
+    def identification_of(self, motion: "Motion") -> Identification | None:
+        """Return what the joints show of a motion; None if they were not recorded beside it."""
+        return next((one.found for one in self.identifications if one.is_of(motion.arm, motion.topic)), None)
+
+    def base_under(self, motion: "Motion") -> "BaseFrame | None":
+        """Return the base of a motion's arm in the frame of the motion, if joints show it and it is another frame."""
+        found = self.identification_of(motion)
+        if motion.states_base or found is None or found.verdict != "identified":
+            return None
+        return next((base for base in _bases_of(self) if base.is_of(motion)), None)
+
+    def instrument_on(self, arm: str) -> str | None:
+        """Return the instrument of an arm: the one that its joints show, or else the one that the recording states.
+
+        Returns:
+            Its number in the dVRK's files, such as "400006", of which constants may not be known; None if it is neither
+            shown nor stated.
+        """
+        shown = [one.found for one in self.identifications if one.arm == arm and one.found.verdict == "identified"]
+        if shown:
+            return min(shown, key=lambda found: found.residual_mm).instrument
+        return stated_instrument(dict(self.tools).get(arm, ""))
 
     @property
     def arms(self) -> tuple[str, ...]:
@@ -423,6 +468,72 @@ class BaseFrame:
     rotation_xyzw: Quaternion
     spread_mm: float
     spread_rad: float
+
+    def is_of(self, motion: Motion) -> bool:
+        """Return whether it is the base of a motion's arm in the frame of that motion."""
+        return (self.arm, self.frame) == (motion.arm, motion.frame)
+
+    def seen_from(self, position_mm: Floats, rotation_xyzw: Floats) -> tuple[Floats, Floats]:
+        """Transform poses from `frame` into the base's own frame.
+
+        Args:
+            position_mm: Positions in `frame`, shape (T, 3).
+            rotation_xyzw: Unit quaternions in `frame`, shape (T, 4).
+
+        Returns:
+            The same in `local_frame`.
+        """
+        turn = matrix_of(np.array([self.rotation_xyzw]))[0]
+        rotation = quaternion_of(turn.T @ matrix_of(rotation_xyzw))
+        return (position_mm - np.asarray(self.position_mm)) @ turn, rotation
+
+
+def _identifications(recording: Recording) -> Iterator[ArmIdentification]:
+    stated = dict(recording.tools)
+    pairs = (
+        (joints, motion) for joints in recording.joints for motion in recording.motions if joints.arm == motion.arm
+    )
+    # Limited, because each pair costs some hypotheses for some thousand samples.
+    for joints, motion in islice(pairs, IDENTIFIED_LIMIT):
+        at, values = _joints_at(joints, motion.stamps_ns)
+        if len(at) == 0:
+            continue
+        rotation = None if motion.rotation_xyzw is None else matrix_of(motion.rotation_xyzw[at])
+        tool = stated.get(motion.arm)
+        found = identify(values, motion.tip_mm[at], rotation, in_base=motion.states_base, stated=tool)
+        if found is not None:
+            yield ArmIdentification(motion.arm, joints.topic, motion.topic, motion.frame, found)
+
+
+def _joints_at(joints: Joints, stamps_ns: Ints) -> tuple[Ints, Floats]:
+    """Return indices of stamps, at most `MOST_SAMPLES`, between two samples of the joints, and the joints there."""
+    at = np.linspace(0, len(stamps_ns) - 1, min(len(stamps_ns), MOST_SAMPLES)).round().astype(np.int64)
+    if len(joints.stamps_ns) < 2:
+        return at[:0], joints.positions[:0]
+    wanted_ns, known_ns = stamps_ns[at], joints.stamps_ns
+    after = np.clip(np.searchsorted(known_ns, wanted_ns), 1, len(known_ns) - 1)
+    before = after - 1
+    gap_ns = known_ns[after] - known_ns[before]
+    near = (wanted_ns >= known_ns[before]) & (wanted_ns <= known_ns[after]) & (gap_ns <= JOINT_GAP_NS)
+    at, after, before, wanted_ns, gap_ns = at[near], after[near], before[near], wanted_ns[near], gap_ns[near]
+    share = ((wanted_ns - known_ns[before]) / np.maximum(1, gap_ns))[:, None]
+    return at, (1.0 - share) * joints.positions[before] + share * joints.positions[after]
+
+
+def _bases_of(recording: Recording) -> Iterator[BaseFrame]:
+    """Yield the bases that joints show in the frame of poses which are not stated to be in the base."""
+    stated = {(motion.arm, motion.topic) for motion in recording.motions if motion.states_base}
+    for one in recording.identifications:
+        if one.found.verdict == "identified" and (one.arm, one.topic) not in stated:
+            yield BaseFrame(
+                arm=one.arm,
+                frame=one.frame,
+                local_frame=f"{one.arm}_base",
+                position_mm=one.found.position_mm,
+                rotation_xyzw=one.found.rotation_xyzw,
+                spread_mm=one.found.greatest_mm,
+                spread_rad=one.found.residual_rad or 0.0,
+            )
 
 
 def base_frames(recording: Recording) -> tuple[BaseFrame, ...]:

@@ -116,6 +116,7 @@ def about_recording(recording: Recording, proposed: Sequence[Segment]) -> dict[s
         ],
         "left_out": [asdict(described.LeftOut(topic, why)) for topic, why in recording.left_out[:MOST]],
         "base_frames": [as_json(base) for base in base_frames(recording)],
+        "identifications": [as_json(one) for one in recording.identifications],
     } | ({"dropped": dropped} if dropped else {})
 
 

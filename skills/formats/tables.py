@@ -65,14 +65,14 @@ from skills.errors import (
 )
 from skills.formats import topics
 from skills.formats.cells import LINE_CHARACTERS, NS_PER, Decimals, csv_rows, header_of, open_text, read_numbers
-from skills.kinematics import CANNULA_MM, INSTRUMENTS, JOINTS, UNITS, forward, instrument_of, quaternion_of
+from skills.kinematics import INSTRUMENTS, JOINTS, UNITS, forward, instrument_of, quaternion_of
 from skills.remedies import Action, Remedy, did_you_mean
 
 TOPIC = "table"
 DEFAULT_ARM = "PSM"
 # The tip is further from the remote centre than the wrist, because the wrist bends by less than a right angle. A reach
 # of 290 mm is 11.4 inches, so a path in inches never exceeds this limit.
-OUTSIDE_MM = min(CANNULA_MM - instrument.wrist_offset_mm for instrument in INSTRUMENTS.values())
+OUTSIDE_MM = min(instrument.cannula_mm - instrument.wrist_offset_mm for instrument in INSTRUMENTS.values())
 BEYOND_LIMIT = {"rad": 0.1, "mm": 10.0}  # ours: encoders overshoot a joint's limit by less; degrees and metres do not
 _FASTEST_HZ = 100_000.0
 _TURN_RAD = 2 * np.pi

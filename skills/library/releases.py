@@ -152,7 +152,7 @@ _REMEDIES = (
     ("not optimal", _OTHERWISE),
     ("do not reach the goal", _OTHERWISE),
     ("joint limits", "Record the hand-off further inside the arm's reach, or with the arm's base elsewhere."),
-    ("not the arm's base", "Record the arm's local/measured_cp, which is in the frame of its base."),
+    ("not the arm's base", "Record the arm's local/measured_cp, which is in its base, or its measured_js."),
 )
 
 

@@ -378,7 +378,8 @@ def _driven(policy: Policy, demo: Demo) -> tuple[DrivenPass | None, list[str]]:
     if not demo.frame.endswith("_base"):
         return None, [
             f"the frame '{demo.frame}' is not the arm's base, so its joint limits cannot be checked; demonstrate on a "
-            "topic in the frame of the arm's base, such as local/measured_cp of a dVRK"
+            "topic in the frame of the arm's base, such as local/measured_cp of a dVRK, or record its joints beside "
+            "the poses"
         ]
     try:
         driven = driven_pass(policy, demo)

@@ -6,6 +6,7 @@ from typing import Literal, get_args
 
 from pydantic import Field
 
+from skills.demonstration.identification import ArmIdentification
 from skills.demonstration.partner import Partner
 from skills.demonstration.quality import MotionReport
 from skills.demonstration.recording import BaseFrame, Column, Format, Topic
@@ -158,6 +159,9 @@ class Described(Given):
         default=[], description="Topics with samples whose stamps went back; older versions refused these recordings."
     )
     base_frames: list[BaseFrame]
+    identifications: list[ArmIdentification] = Field(
+        default=[], description="What joints recorded beside poses show; empty of one that an older version stored."
+    )
 
 
 class Recording(Described):

@@ -24,6 +24,8 @@ from dataclasses import dataclass
 from hashlib import sha256
 from importlib.metadata import version
 from importlib.resources import as_file, files
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import ModuleType
 from typing import Any, BinaryIO
 
@@ -45,6 +47,7 @@ PLACE, TURN = 4, 5  # indices of the frame in a link's state; 0 and 1 would be i
 EFFORT = 3  # index of the effort in a joint's state
 POSITION_GAIN, VELOCITY_GAIN = 0.3, 1.0
 FINGER_EFFORT = 0.16  # Nm
+URDF_CENTRE_MM, URDF_WRIST_MM = 431.8, 15.6  # remote centre and wrist offset of `urdf/psm.urdf`
 PSM_M_COLOUR = (0.35, 0.55, 0.35, 1.0)
 LOOK_CLOSER_MM = 2.0  # ours: twice the gates' distances; nearer than this, every sample is measured
 Asked = dict[str, Any]  # named arrays, numbers and texts
@@ -234,8 +237,15 @@ class Scene:
 
     # -- loading --
 
-    def _load(self, name: str, position_mm: Floats, quaternion: Sequence[float], scale: float = 1.0) -> int:
-        with as_file(files("skills") / "urdf" / name) as path:
+    def _load(
+        self,
+        name: str,
+        position_mm: Floats,
+        quaternion: Sequence[float],
+        scale: float = 1.0,
+        wrist_mm: float | None = None,
+    ) -> int:
+        with _file(name, wrist_mm) as path:
             self.files[name] = sha256(path.read_bytes()).hexdigest()
             return int(
                 self.bullet.loadURDF(
@@ -253,7 +263,7 @@ class Scene:
     def _load_arm(
         self, position_mm: Floats, quaternion: Floats, tool: InstrumentConstants, opening_rad: float
     ) -> SceneBody:
-        number = self._load("psm.urdf", position_mm, np.asarray(quaternion).tolist())
+        number = self._load("psm.urdf", position_mm, np.asarray(quaternion).tolist(), wrist_mm=tool.wrist_offset_mm)
         found = [
             self.bullet.getJointInfo(number, index, physicsClientId=self.client)
             for index in range(self.bullet.getNumJoints(number, physicsClientId=self.client))
@@ -283,6 +293,25 @@ class Scene:
         for index in arm.fingers:
             self.bullet.resetJointState(number, index, opening_rad, physicsClientId=self.client)
         return arm
+
+
+@contextmanager
+def _file(name: str, wrist_mm: float | None) -> Iterator[Path]:
+    """Give a file of the scene; an arm's with its remote centre where the wrist's offset, in mm, is this one."""
+    with as_file(files("skills") / "urdf" / name) as path:
+        if wrist_mm is None or abs(wrist_mm - URDF_WRIST_MM) < 1e-6:
+            yield path
+            return
+        before, after = (
+            f'"0 {URDF_CENTRE_MM * MM:.4f} 0"',
+            f'"0 {(URDF_CENTRE_MM + wrist_mm - URDF_WRIST_MM) * MM:.4f} 0"',
+        )
+        text = path.read_text()
+        assert text.count(before) == 1
+        with TemporaryDirectory() as folder:
+            moved = Path(folder) / name
+            moved.write_text(text.replace(before, after))
+            yield moved
 
 
 def in_metres(joints: Floats) -> Floats:

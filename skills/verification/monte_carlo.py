@@ -40,7 +40,7 @@ from numpy.typing import ArrayLike
 from skills.arrays import Bytes, Flags, Floats, Ints
 from skills.errors import BadInput, BadSettings
 from skills.fields import Count, Figure, Fraction, schema
-from skills.kinematics import INSERTION, forward, instrument_of, joint_margins, matrix_of, solutions_of
+from skills.kinematics import CANNULA_MM, INSERTION, forward, instrument_of, joint_margins, matrix_of, solutions_of
 from skills.learning.slip import wilson
 from skills.planning.handoff import HOLDING_RAD, OPEN_RAD, hand_off
 from skills.planning.trajectory import A2, Trajectory
@@ -152,6 +152,10 @@ class Planned:
         tool = instrument_of(self.instrument)
         return joint_margins(joints, self.instrument) / (tool.upper - tool.lower)
 
+    def insertion_mm(self, joints: Floats) -> Floats:
+        """Return the insertion at which a tool on an arm of its own generation has its wrist as deep, shape (T,)."""
+        return np.asarray(joints[:, INSERTION] - (instrument_of(self.instrument).cannula_mm - CANNULA_MM))
+
 
 @dataclass(frozen=True, eq=False)
 class PlannedPass:
@@ -245,7 +249,9 @@ def _spoiled(scene: PlannedPass, drawn: Drawn, errors: Floats, limits: Limits) -
     offsets = (drawn.offset_a, drawn.offset_m)
     # Joints stay as commanded, so these faults are the same under every tip error.
     margin = np.minimum.reduce([_least(arm.margins(q), count) for arm, q in zip(scene.arms, joints, strict=True)])
-    insertion = np.minimum.reduce([_least(q[:, INSERTION], count) for q in joints])
+    insertion = np.minimum.reduce(
+        [_least(arm.insertion_mm(q), count) for arm, q in zip(scene.arms, joints, strict=True)]
+    )
     top = scene.pad_top_mm + np.repeat(drawn.shift_mm[:, 2], samples)  # the pad moves with the pass
     above = [_least(clearance_to_pad(one, top), count) for one in links]
     raised = [clear + errors * offset[:, 2] for clear, offset in zip(above, offsets, strict=False)]

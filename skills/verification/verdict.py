@@ -136,7 +136,8 @@ class Limits:
             right.
         fk_deg: The same for the rotation.
         joint_margin: Least distance of every joint from its limits, as a part of its range.
-        insertion_mm: Least insertion: with less the wrist is inside the cannula.
+        insertion_mm: Least insertion: with less the wrist is inside the cannula. On an arm of the other generation than
+            the tool's the insertion that puts the wrist at the same depth counts.
         speed_ratio: Greatest joint speed as a part of its limit; a millionth is left for round-off.
         acceleration_ratio: Greatest joint acceleration as a part of its limit; the same.
         tracking_mm: Greatest servo error; the simulator's own is under 0.001 mm, and in contact it is millimetres.
@@ -264,7 +265,8 @@ def _joint_gates(arm: ArmSamples, limits: Limits) -> Iterator[_Gate]:
         values = arm.joints[:, joint]
         yield _Gate(f"{whose}{name}", UNITS[joint], values, float(arm.tool.upper[joint] - spare[joint]) + 1e-9)
         yield _Gate(f"{whose}{name}", UNITS[joint], values, float(arm.tool.lower[joint] + spare[joint]) - 1e-9, True)
-    yield _Gate(f"{whose}insertion out of the cannula", "mm", arm.joints[:, INSERTION], limits.insertion_mm, True)
+    least_mm = limits.insertion_mm + arm.tool.cannula_mm - CANNULA_MM
+    yield _Gate(f"{whose}insertion out of the cannula", "mm", arm.joints[:, INSERTION], least_mm, True)
     for joint, name in enumerate(JOINTS):
         yield _Gate(f"speed of {whose}{name}", "of its limit", arm.speed[:, joint], limits.speed_ratio)
         accelerations = arm.acceleration[:, joint]

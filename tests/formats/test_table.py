@@ -19,7 +19,7 @@ from skills.errors import (
 )
 from skills.formats import read_recording
 from skills.formats.tables import OUTSIDE_MM, quaternion_of_rpy, read_table
-from skills.kinematics import CANNULA_MM, INSERTION, INSTRUMENTS, forward
+from skills.kinematics import INSERTION, INSTRUMENTS, forward
 
 
 def read(text, **how):
@@ -146,7 +146,7 @@ def test_inches_in_millimetre_columns_are_refused_in_the_whole_workspace():
 def test_paths_outside_the_cannula_or_only_starting_inside_are_accepted():
     for instrument in INSTRUMENTS.values():
         joints = np.random.default_rng(6).uniform(instrument.lower, instrument.upper, (200, 6))
-        joints[:, INSERTION] = CANNULA_MM
+        joints[:, INSERTION] = instrument.cannula_mm
         assert (np.linalg.norm(forward(joints, instrument.name)[0], axis=1) > OUTSIDE_MM).all()
     assert len(read("t_s,x_mm,y_mm,z_mm\n0,0,0,-5\n1,0,0,-20\n").motion_of().tip_mm) == 2
 

@@ -4,13 +4,17 @@ With the jaw straight down and the tip in the plane x = 0 the arm's pitch is wor
 the tip, so |pitch| = atan2(y, -(z + 9.1)), and its limit is 53 degrees.
 """
 
+import io
 from itertools import pairwise
 from math import atan2, radians
 
 import numpy as np
 import pytest
 
+from skills.demonstration.recording import Joints, Motion, Recording
 from skills.errors import Conflict
+from skills.formats import read_recording, write_mcap
+from skills.kinematics import POINTING_DOWN, inverse, matrix_of, quaternion_of
 from skills.library import releases, retraining, training
 from tests.formats.bags import sample_folder
 from tests.library import cases
@@ -94,3 +98,30 @@ def test_a_release_refused_by_an_older_gate_is_learnt_again_on_request(database,
     old = trained(database, reaching(135))
     monkeypatch.undo()
     assert cases.train(database).version == old.version + 1
+
+
+@pytest.mark.parametrize("instrument", ["400006", "400006-Si"])
+def test_poses_in_a_cameras_frame_are_released_if_the_joints_show_where_the_base_stands(database, instrument):
+    turn = matrix_of([[0.3, -0.2, 0.1, 0.9]])[0]
+    tip_mm = cases.points_mm()
+    stamps_ns = cases.START_NS + np.arange(len(tip_mm)) * (10**9 // cases.RATE_HZ)
+    joints = Joints("PSM2", "/PSM2/measured_js", stamps_ns, inverse(tip_mm, POINTING_DOWN, instrument))
+    rotation = quaternion_of(np.broadcast_to(turn @ POINTING_DOWN, (len(tip_mm), 3, 3)))
+    seen = Motion("PSM2", "/PSM2/measured_cp", "ECM", stamps_ns, tip_mm @ turn.T + [50.0, 0.0, 120.0], rotation)
+    data = write_mcap(Recording("mcap", "full", (seen,), joints=(joints,)))
+    version = trained(database, data)
+    assert (version.manifest["frame"], version.manifest["instrument"]) == ("PSM2_base", instrument)
+    assert version.manifest["grid_certificate"]["refused_because"] == []
+    np.testing.assert_allclose(version.manifest["start_mm"], (-10.0, 55.0, -135.0), atol=1e-3)
+    with database.writing() as session:
+        releases.release(session, session.merge(version), "test")
+
+
+def test_an_instrument_without_constants_is_named_and_not_released(database):
+    (motion,) = read_recording(io.BytesIO(cases.bag())).motions
+    named = Recording("mcap", "full", (motion,), tools=(("PSM2", "MEGA_NEEDLE_DRIVER:400194"),))
+    version = trained(database, write_mcap(named))
+    assert version.manifest["instrument"] == "400194"
+    (reason,) = version.manifest["grid_certificate"]["refused_because"]
+    assert "'400194' is unknown" in reason
+    assert not version.releasable

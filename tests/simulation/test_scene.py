@@ -6,7 +6,7 @@ from importlib.resources import files
 import numpy as np
 import pytest
 
-from skills.kinematics import CANNULA_MM, INSTRUMENTS, angle_between, forward, instrument_of, inverse, matrix_of
+from skills.kinematics import INSTRUMENTS, angle_between, forward, instrument_of, inverse, matrix_of
 from skills.verification.playback import LINKS, PAD_SIZE_MM
 from tests.needs import need
 
@@ -27,7 +27,7 @@ def joints_anywhere(count: int, instrument: str = "400006") -> np.ndarray:
     rng = np.random.default_rng(11)
     tool = instrument_of(instrument)
     joints = rng.uniform(tool.lower, tool.upper, (count, 6))
-    joints[:, 2] = rng.uniform(CANNULA_MM, tool.upper[2], count)
+    joints[:, 2] = rng.uniform(max(0.0, tool.cannula_mm), tool.upper[2], count)
     return joints
 
 

@@ -1,0 +1,535 @@
+"""Identification: which arm and instrument made a motion, and where the arm's base stood, from joints beside poses.
+
+    joints, poses --identify--> Identification
+
+A recording rarely says which arm generation it is of, with which instrument, and where the base was in the frame of its
+poses. Joints and poses together do: forward kinematics q -> f(q) of the right arm and instrument is the recorded pose,
+up to one rigid transform from the base to the frame of the poses, and that of a wrong one is not.
+
+*Hypotheses.* The tip is (q3 - offset) s + wrist x5 (`kinematics.axes_of`), so an arm with an instrument is two lengths:
+
+    offset   remote centre less shaft: 15.6 mm for an instrument on an arm of its own generation, 66.4 mm for a Classic
+             instrument on a Si, -35.2 mm for a S/Si instrument on a Classic
+    wrist    from its pitch axis to the hinge of the jaws: 9.1 to 11.2 mm
+
+Instruments with equal lengths are one hypothesis, because no pose can tell them apart: a Classic with 400006 and a Si
+with 420006 have the same kinematics. What the file states then decides between them, else the range of the joints, else
+the large needle driver of the Classic is named, with all others in `candidates`.
+
+*Fit.* For each hypothesis the transform is fitted to positions and orientations together (Kabsch), an orientation with
+the weight of a lever of `LEVER_MM`. Where the recording states that its poses are in the arm's base, no transform is
+fitted, and the base must be there.
+
+*Decision.* A hypothesis fits with a residual of at most `FIT_MM` and `FIT_RAD`. Another one that fits nearly as well
+(`MARGIN`, `FLOOR_MM`) is not told apart: if their offsets differ, the motion was too small, and nothing is identified.
+
+Sources: jhu-dvrk/sawIntuitiveResearchKit @9e535e68, share/tool/*.json (numbers, lengths of shaft and wrist) and
+share/kinematic/PSM.json and PSM_Si.json. The snake-like instruments and the stapler there have other wrists, which are
+not computed. Hypotheses, thresholds and decision are ours.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from math import isfinite
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from skills.arrays import Floats, frozen, xyz
+from skills.fields import Count, Point, Quaternion, schema
+from skills.kinematics import CLASSIC, INSERTION, JAW_TIP_MM, SI, ArmConstants, axes_of, check_rotation, quaternion_of
+
+FIT_MM = 1.0  # a recorder that writes the joints 10 ms later than the pose is off by 0.5 mm at 50 mm/s
+FIT_RAD = 0.03  # the same of a wrist that turns at 3 rad/s
+# A hypothesis is told apart if its residual is three times the best one's. With a smaller factor a systematic error of
+# the recorder, as large as the best residual and in the direction of the difference, could exchange the two.
+MARGIN = 3.0
+FLOOR_MM = 0.02  # and by as much more: the residual of sound recordings with stamps of their own is 0.02 mm
+SAME_MM = 0.5  # hypotheses nearer to each other than this need not be told apart: the tip is known to as much
+LEVER_MM = 30.0
+MOST_SAMPLES = 6000  # evenly spread; more samples of one motion do not change the fit
+FEWEST_SAMPLES = 10
+PIECES = 8  # if the frame moved, each eighth of the recording may fit by itself
+MOVING_PIECES = 2  # and in so many of these it may have been moving
+STILL_SHARE = 0.05  # of a piece's own extent: a piece that hardly moves fits everything
+BEYOND_RAD, BEYOND_MM = 0.05, 5.0  # a measured joint may be this far beyond the limits with which its arm is driven
+_WILD = 1e6  # rad or mm: no joint's value; the sine of it would be meaningless
+
+Generation = Literal["Classic", "Si"]
+Verdict = Literal["identified", "undetermined", "wrong instrument", "wrong frame", "moved frame", "contradiction"]
+
+_ARMS: dict[Generation, ArmConstants] = {"Classic": CLASSIC, "Si": SI}
+_SHAFT_MM: dict[Generation, float] = {"Classic": 416.2, "Si": 467.0}
+_PREFIX: dict[Generation, str] = {"Classic": "400", "Si": "420"}
+# The last three digits of the instruments of each generation, by the length of the wrist in mm; the most usual first.
+_NUMBERS: dict[Generation, dict[float, str]] = {
+    "Classic": {
+        9.1: "006 296 036 001 003 007 033 035 048 049 178 179 181",
+        9.3: "183 184",
+        10.0: "309",
+        10.7: "093 127 172 189 205 207 208 230",
+        11.2: "194",
+    },
+    "Si": {
+        9.1: "006 296 036 001 007 033 048 049 178 179 181",
+        9.3: "183 184",
+        10.0: "309",
+        10.7: "093 172 205 230 327",
+        11.2: "194",
+    },
+}
+_OTHER_WRISTS = ("400117", "420117", "400143", "410298")  # two snake-like needle drivers, a dissector, a stapler
+
+
+@dataclass(frozen=True)
+class _Hypothesis:
+    """The lengths of an arm with an instrument, and the names of all that have them."""
+
+    offset_mm: float
+    wrist_mm: float
+    names: tuple[str, ...]
+
+
+def _hypotheses() -> tuple[_Hypothesis, ...]:
+    found: dict[tuple[float, float], list[str]] = {}
+    for made_for, by_wrist in _NUMBERS.items():
+        for wrist_mm, numbers in by_wrist.items():
+            for generation, arm in _ARMS.items():
+                offset_mm = round(arm.remote_centre_mm - _SHAFT_MM[made_for], 6)
+                on = "" if generation == made_for else f"-{generation}"
+                names = [f"{_PREFIX[made_for]}{number}{on}" for number in numbers.split()]
+                found.setdefault((offset_mm, wrist_mm), []).extend(names)
+    return tuple(_Hypothesis(offset, wrist, tuple(names)) for (offset, wrist), names in found.items())
+
+
+HYPOTHESES = _hypotheses()
+_KNOWN = frozenset(name for one in HYPOTHESES for name in one.names)
+
+
+@schema
+@dataclass(frozen=True, kw_only=True)
+class Identification:
+    """The arm and the instrument that joints and poses together show, and the place of the arm's base.
+
+    Attributes:
+        verdict: "identified": one arm with one instrument explains poses and joints, or several of equal lengths;
+            "undetermined": the motion is too small to tell several apart;
+            "wrong instrument": the stated one does not fit, and another one does;
+            "wrong frame": the poses are not relative to the arm's base, as the recording states;
+            "moved frame": each part fits by itself: the camera or the set-up joints moved;
+            "contradiction": no known arm and instrument explains both.
+        instrument: The instrument, such as "400006", or "420006-Classic" on an arm of the other generation; null if
+            nothing is identified.
+        generation: The arm's generation; null if nothing is identified.
+        candidates: All instruments whose poses cannot be told from these, the named one first.
+        stated: The instrument that the recording states; null if it states none.
+        in_base: Whether the poses are relative to the arm's base.
+        position_mm: Position of the arm's base in the frame of the poses.
+        rotation_xyzw: Its rotation, a unit quaternion.
+        residual_mm: Root mean square of the distances between the recorded positions and those of the joints.
+        greatest_mm: The greatest of these distances.
+        residual_rad: Root mean square of the angles between the orientations; null if they were not recorded.
+        next_mm: `residual_mm` of the best arm and instrument that is told apart from these; null if there is none.
+        samples: Number of samples that were compared.
+        reason: The verdict in words.
+    """
+
+    verdict: Verdict
+    instrument: str | None
+    generation: Generation | None
+    candidates: tuple[str, ...]
+    stated: str | None
+    in_base: bool
+    position_mm: Point
+    rotation_xyzw: Quaternion
+    residual_mm: float
+    greatest_mm: float
+    residual_rad: float | None
+    next_mm: float | None
+    samples: Count
+    reason: str
+
+
+@schema
+@dataclass(frozen=True)
+class ArmIdentification:
+    """The arm, the instrument and the base that the joints of one topic and the poses of another show together.
+
+    Attributes:
+        arm: The arm's name.
+        joints: The topic of the joints.
+        topic: The topic of the poses.
+        frame: The frame of the poses.
+        found: What they show.
+    """
+
+    arm: str
+    joints: str
+    topic: str
+    frame: str
+    found: Identification
+
+    def is_of(self, arm: str, topic: str) -> bool:
+        """Return whether it is of the poses of an arm on a topic."""
+        return (self.arm, self.topic) == (arm, topic)
+
+
+def stated_instrument(name: str) -> str | None:
+    """Return the number in the name of a tool, as the console or a user gives it.
+
+    Args:
+        name: Such as "LARGE_NEEDLE_DRIVER:420006[..11]", "420006" or "420006-Classic".
+
+    Returns:
+        The number, with the arm's generation if it is named; None if there is no number.
+    """
+    said = name.rpartition(":")[2].partition("[")[0]
+    number, _, on = said.partition("-")
+    is_number = len(number) == 6 and number.isascii() and number.isdigit()
+    return said if is_number and (said == number or on in _ARMS) else None
+
+
+@dataclass(frozen=True, eq=False)
+class _Poses:
+    """Joints as directions, and poses: what all hypotheses are compared with.
+
+    Attributes:
+        joints: Rad and mm, shape (T, 6).
+        shaft: Direction of the shaft in the base, shape (T, 3).
+        wrist: Direction from the wrist's pitch axis to the hinge in the base, shape (T, 3).
+        turned: Rotation of the tip in the base, shape (T, 3, 3).
+        tip_mm: Recorded positions in the frame of the poses, shape (T, 3).
+        rotation: Recorded rotations in that frame, shape (T, 3, 3), or None.
+        in_base: Whether that frame is stated to be the base.
+        beyond_mm: Distance along the approach of the point that the positions are of from the hinge.
+    """
+
+    joints: Floats
+    shaft: Floats
+    wrist: Floats
+    turned: Floats
+    tip_mm: Floats
+    rotation: Floats | None
+    in_base: bool
+    beyond_mm: float = 0.0
+
+    def tips_of(self, one: _Hypothesis) -> Floats:
+        """Return the positions in the base that a hypothesis predicts, mm, shape (T, 3)."""
+        depth = self.joints[:, INSERTION : INSERTION + 1] - one.offset_mm
+        tip: Floats = depth * self.shaft + one.wrist_mm * self.wrist
+        return tip + self.beyond_mm * self.turned[:, :, 2] if self.beyond_mm else tip
+
+    def part(self, samples: slice) -> "_Poses":
+        """Return some of the samples."""
+        rotation = None if self.rotation is None else self.rotation[samples]
+        return _Poses(
+            joints=self.joints[samples],
+            shaft=self.shaft[samples],
+            wrist=self.wrist[samples],
+            turned=self.turned[samples],
+            tip_mm=self.tip_mm[samples],
+            rotation=rotation,
+            in_base=self.in_base,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """A hypothesis with the best transform: position and rotation of the base in the frame of the poses."""
+
+    of: _Hypothesis
+    position_mm: Floats
+    rotation: Floats
+    away_mm: Floats  # distance of each sample, shape (T,)
+    residual_rad: float
+
+    @property
+    def residual_mm(self) -> float:
+        return float(np.sqrt((self.away_mm**2).mean()))
+
+    @property
+    def is_good(self) -> bool:
+        # NaN is not good.
+        return self.residual_mm <= FIT_MM and self.residual_rad <= FIT_RAD
+
+
+def identify(
+    joints: ArrayLike,
+    tip_mm: ArrayLike,
+    rotation: ArrayLike | None = None,
+    *,
+    in_base: bool = False,
+    stated: str | None = None,
+) -> Identification | None:
+    """Find the arm, the instrument and the place of the arm's base that explain both joints and poses.
+
+    Args:
+        joints: Measured joints at the times of the poses, rad, the insertion in mm, shape (T, 6) or wider; a jaw after
+            them is not used.
+        tip_mm: Recorded positions of the tip in the frame of the poses, mm, shape (T, 3).
+        rotation: Recorded rotations [n o a] in that frame, shape (T, 3, 3); None if they were not recorded.
+        in_base: Whether that frame is stated to be the arm's base.
+        stated: The instrument that the recording states: a number, or a name as in `stated_instrument`.
+
+    Returns:
+        The identification; None with fewer than `FEWEST_SAMPLES` samples or six joints.
+
+    Raises:
+        BadInput: A number is NaN or infinite, or the shapes do not agree.
+        ImproperRotation: A rotation is not orthonormal with determinant 1.
+    """
+    q = frozen(joints, np.float64, (None, None), "joints")
+    tip = frozen(tip_mm, np.float64, (len(q), 3), "tip_mm")
+    turned = None if rotation is None else frozen(rotation, np.float64, (len(q), 3, 3), "rotation")
+    if len(q) < FEWEST_SAMPLES or q.shape[1] < 6:
+        return None
+    chosen = np.linspace(0, len(q) - 1, min(len(q), MOST_SAMPLES)).round().astype(np.int64)
+    q, tip, turned = q[chosen, :6], tip[chosen], None if turned is None else turned[chosen]
+    if turned is not None:
+        check_rotation(turned)
+    number = None if stated is None else stated_instrument(stated)
+    if not (np.abs(q) <= _WILD).all():
+        return _unexplained(len(q), number, in_base, "a joint's value is beyond a million rad or mm")
+    poses = _Poses(q, *axes_of(q), tip, turned, in_base)
+    fits = sorted(_fits(poses), key=_misfit)
+    if not fits[0].is_good:
+        return _not_explained(poses, fits[0], number)
+    return _decided(poses, fits, number)
+
+
+def _fits(poses: _Poses) -> Iterator[_Fit]:
+    for one in HYPOTHESES:
+        yield _fit(poses, one)
+
+
+def _misfit(fit: _Fit) -> float:
+    """Return by how much a hypothesis is off; NaN counts as infinite."""
+    misfit = fit.residual_mm + LEVER_MM * fit.residual_rad
+    return misfit if isfinite(misfit) else np.inf
+
+
+def _fit(poses: _Poses, one: _Hypothesis) -> _Fit:
+    """Fit the transform from the base to the frame of the poses; none if that frame is stated to be the base."""
+    tip = poses.tips_of(one)
+    if poses.in_base:
+        return _Fit(one, np.zeros(3), np.eye(3), np.linalg.norm(poses.tip_mm - tip, axis=1), _turn(poses, np.eye(3)))
+    middle, recorded = tip.mean(axis=0), poses.tip_mm.mean(axis=0)
+    covariance = (poses.tip_mm - recorded).T @ (tip - middle) / len(tip)
+    if poses.rotation is not None:
+        # The sum of R_recorded R_predicted^T; both sums are largest for the same rotation if the hypothesis is right.
+        covariance += LEVER_MM**2 * np.tensordot(poses.rotation, poses.turned, axes=([0, 2], [0, 2])) / len(tip)
+    left, _, right = np.linalg.svd(covariance)
+    rotation = left @ np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))]) @ right
+    position = recorded - rotation @ middle
+    away = np.linalg.norm(poses.tip_mm - position - tip @ rotation.T, axis=1)
+    return _Fit(one, position, rotation, away, _turn(poses, rotation))
+
+
+def _turn(poses: _Poses, rotation: Floats) -> float:
+    """Return the root mean square of the angles between recorded and predicted orientations; 0 if none are recorded."""
+    if poses.rotation is None:
+        return 0.0
+    chord = np.sqrt(((poses.rotation - rotation @ poses.turned) ** 2).sum(axis=(1, 2)) / 8.0)
+    return float(np.sqrt(((2.0 * np.arcsin(np.minimum(1.0, chord))) ** 2).mean()))
+
+
+# ---- the decision -----------------------------------------------------------------------------------------------
+
+
+def _decided(poses: _Poses, fits: list[_Fit], stated: str | None) -> Identification:
+    """Decide among hypotheses of which the first fits."""
+    best = fits[0]
+    least_mm = max(MARGIN * best.residual_mm, best.residual_mm + FLOOR_MM)
+    near = [fit for fit in fits if fit.is_good and fit.residual_mm < least_mm]
+    others = [fit for fit in fits if fit not in near]
+    if poses.in_base and (moved := _beside_the_base(poses, best)) is not None:
+        return moved
+    stood = [name for fit in near for name in fit.of.names if _reaches(poses.joints, name)]
+    found = _told(poses, best, "identified", stood, stated, min((fit.residual_mm for fit in others), default=None))
+    names = _in_words(found)
+    if stated in _OTHER_WRISTS or (stated in _KNOWN and not _matching(stood, stated)):
+        reason = f"the recording states {stated}, but its joints and poses fit {names}"
+        return replace(found, verdict="wrong instrument", reason=reason)
+    lengths = np.array([(fit.of.offset_mm, fit.of.wrist_mm) for fit in near])
+    if not stood or not (np.ptp(lengths, axis=0) <= SAME_MM).all():
+        reason = f"the motion is too small to tell {len(found.candidates)} instruments apart ({names})"
+        return replace(found, verdict="undetermined", instrument=None, generation=None, reason=reason)
+    return replace(found, reason=f"joints and poses fit {names}")
+
+
+def _matching(names: list[str], stated: str) -> list[str]:
+    """Return the names that a stated instrument may have: of a bare number also those on the other generation."""
+    return [name for name in names if stated in (name, name.partition("-")[0])]
+
+
+def _reaches(joints: Floats, name: str) -> bool:
+    """Return whether the arm of an instrument can have these joints."""
+    number, _, generation = name.partition("-")
+    arm = _ARMS[_generation(number, generation)]
+    beyond = np.array([BEYOND_RAD, BEYOND_RAD, BEYOND_MM])
+    low, high = np.array(arm.lower[:3]) - beyond, np.array(arm.upper[:3]) + beyond
+    return bool(((joints[:, :3] >= low) & (joints[:, :3] <= high)).all())
+
+
+def _generation(number: str, on: str) -> Generation:
+    if on:
+        return "Classic" if on == "Classic" else "Si"
+    return "Classic" if number.startswith(_PREFIX["Classic"]) else "Si"
+
+
+def _beside_the_base(poses: _Poses, best: _Fit) -> Identification | None:
+    """Return the verdict that poses stated to be in the base are a small way off it; None if they are in it."""
+    free = _fit(replace(poses, in_base=False), best.of)
+    within = max(MARGIN * free.residual_mm, free.residual_mm + 0.1)
+    if best.residual_mm <= within:
+        return None
+    return _wrong_frame(poses, free)
+
+
+def _wrong_frame(poses: _Poses, free: _Fit) -> Identification:
+    x, y, z = free.position_mm.tolist()
+    turn = np.degrees(np.arccos(np.clip((np.trace(free.rotation) - 1.0) / 2.0, -1.0, 1.0)))
+    reason = (
+        f"the poses are stated to be relative to the arm's base, but the joints put the base at ({x:.1f}, {y:.1f}, "
+        f"{z:.1f}) mm in their frame, turned by {turn:.1f} degrees"
+    )
+    found = _told(replace(poses, in_base=False), free, "wrong frame", [], None, None)
+    return replace(found, reason=reason, instrument=None, generation=None)
+
+
+def _told(
+    poses: _Poses, fit: _Fit, verdict: Verdict, names: list[str], stated: str | None, next_mm: float | None
+) -> Identification:
+    preferred = _matching(names, stated) if stated is not None else []
+    candidates = tuple(dict.fromkeys(preferred + names))
+    first = candidates[0] if candidates else None
+    x, y, z, w = quaternion_of(fit.rotation[None])[0].tolist()
+    return Identification(
+        verdict=verdict,
+        instrument=first,
+        generation=None if first is None else _generation(*first.partition("-")[::2]),
+        candidates=candidates,
+        stated=stated,
+        in_base=poses.in_base or _is_identity(fit),
+        position_mm=xyz(fit.position_mm),
+        rotation_xyzw=(x, y, z, w),
+        residual_mm=fit.residual_mm,
+        greatest_mm=float(fit.away_mm.max()),
+        residual_rad=None if poses.rotation is None else fit.residual_rad,
+        next_mm=next_mm,
+        samples=len(poses.tip_mm),
+        reason="",
+    )
+
+
+def _is_identity(fit: _Fit) -> bool:
+    """Return whether the fitted transform is none, within the residual."""
+    away = np.linalg.norm(fit.position_mm) + 200.0 * np.abs(fit.rotation - np.eye(3)).max()
+    return bool(away <= max(MARGIN * fit.residual_mm, 0.1))
+
+
+def _in_words(found: Identification) -> str:
+    shown = ", ".join(found.candidates[:4])
+    more = len(found.candidates) - 4
+    return f"{shown} and {more} more" if more > 0 else shown or "no arm whose joints reach so far"
+
+
+# ---- if nothing fits --------------------------------------------------------------------------------------------
+
+
+def _not_explained(poses: _Poses, best: _Fit, stated: str | None) -> Identification:
+    """Return the verdict if no hypothesis fits the poses as they are stated to be, explained if possible."""
+    if poses.in_base:
+        free = min(_fits(replace(poses, in_base=False)), key=_misfit)
+        if free.is_good:
+            return replace(_wrong_frame(poses, free), stated=stated)
+    elif _fits_in_pieces(poses):
+        reason = "each part of the recording fits by itself, but not all together: the frame of the poses moved"
+        found = _told(poses, best, "moved frame", [], stated, None)
+        return replace(found, reason=reason)
+    turn = "" if poses.rotation is None else f" and {np.degrees(best.residual_rad):.1f} degrees"
+    reason = (
+        "no known arm and instrument puts the tip where the poses have it: the best is off by "
+        f"{best.residual_mm:.2f} mm{turn} (root mean square)"
+    )
+    hint = next((words for words, tried in _explanations(poses) if min(map(_misfit, _fits(tried))) < _BETTER), None)
+    found = _told(poses, best, "contradiction", [], stated, None)
+    return replace(found, reason=reason if hint is None else f"{reason}; they would agree {hint}")
+
+
+_BETTER = FIT_MM + LEVER_MM * FIT_RAD
+
+
+def _fits_in_pieces(poses: _Poses) -> bool:
+    """Return whether one hypothesis fits every eighth of the recording, each with a transform of its own."""
+    edges = np.linspace(0, len(poses.tip_mm), PIECES + 1).round().astype(np.int64)
+    pieces = [poses.part(slice(a, b)) for a, b in pairwise(edges.tolist())]
+    if min(len(piece.tip_mm) for piece in pieces) < FEWEST_SAMPLES:
+        return False
+    extent = np.concatenate([piece.tip_mm - piece.tip_mm.mean(axis=0) for piece in pieces])
+    least_mm = STILL_SHARE * float(np.sqrt((extent**2).sum(axis=1).mean()))
+    for one in HYPOTHESES:
+        fits = [_fit(piece, one) for piece in pieces]
+        away_mm = float(np.sqrt((np.concatenate([fit.away_mm for fit in fits]) ** 2).mean()))
+        # A frame that moves during a piece spoils this piece alone.
+        if (
+            sum(fit.is_good for fit in fits) >= PIECES - 2
+            and float(np.median([f.residual_mm for f in fits])) <= least_mm
+        ):
+            return away_mm <= 20.0 * FIT_MM
+    return False
+
+
+def _explanations(poses: _Poses) -> Iterator[tuple[str, _Poses]]:
+    """Yield mistakes that recorders make, in words, with the poses as they are without the mistake."""
+    angles = np.array([0, 1, 3, 4, 5])
+
+    def with_joints(joints: Floats) -> _Poses:
+        shaft, wrist, turned = axes_of(joints)
+        return replace(poses, joints=joints, shaft=shaft, wrist=wrist, turned=turned)
+
+    for words, factor in (("degrees", np.pi / 180.0), ("radians", 180.0 / np.pi)):
+        joints = poses.joints.copy()
+        joints[:, angles] *= factor
+        yield f"if the joints were in {words}", with_joints(joints)
+    for words, factor in (("millimetres", 1e-3), ("metres", 1e3)):
+        joints = poses.joints.copy()
+        joints[:, INSERTION] *= factor
+        yield f"if the insertion were in {words}", with_joints(joints)
+        yield f"if the positions were in {words}", replace(poses, tip_mm=poses.tip_mm * factor)
+    for axis, name in enumerate("xyz"):
+        mirror = np.where(np.arange(3) == axis, -1.0, 1.0)
+        yield (
+            f"with {name} reversed (the frame is left-handed)",
+            replace(
+                poses,
+                tip_mm=poses.tip_mm * mirror,
+                rotation=None if poses.rotation is None else mirror[:, None] * poses.rotation * mirror,
+            ),
+        )
+        yield f"with {name} of the positions reversed", replace(poses, tip_mm=poses.tip_mm * mirror)
+    yield "if the positions were those of the finger tips", replace(poses, beyond_mm=JAW_TIP_MM)
+    if poses.rotation is not None:
+        yield "if the orientations were inverted", replace(poses, rotation=poses.rotation.swapaxes(1, 2))
+        yield "without the orientations", replace(poses, rotation=None)
+
+
+def _unexplained(samples: int, stated: str | None, in_base: bool, reason: str) -> Identification:
+    return Identification(
+        verdict="contradiction",
+        instrument=None,
+        generation=None,
+        candidates=(),
+        stated=stated,
+        in_base=in_base,
+        position_mm=(0.0, 0.0, 0.0),
+        rotation_xyzw=(0.0, 0.0, 0.0, 1.0),
+        residual_mm=_WILD,
+        greatest_mm=_WILD,
+        residual_rad=None,
+        next_mm=None,
+        samples=samples,
+        reason=reason,
+    )

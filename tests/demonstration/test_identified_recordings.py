@@ -1,0 +1,162 @@
+"""Recordings with joints beside poses: their instruments, their bases, and demonstrations in the base of the arm."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from rosbags.rosbag1 import Reader
+from rosbags.typesys import Stores, get_typestore
+
+from skills.demonstration.demonstration import cut_demo, propose_segments
+from skills.demonstration.recording import Joints, Motion, Recording, base_frames
+from skills.errors import JointsDisagree
+from skills.kinematics import angle_between, forward, instrument_of, matrix_of, solutions_of
+from tests.demonstration.sessions import A, Kind, M, session
+from tests.formats.bags import sample_folder
+
+CAMERA, LOCAL = f"/{A}/measured_cp", f"/{A}/local/measured_cp"
+
+
+def joints_of(motion: Motion, instrument: str = "400006", late_ns: int = 300_000) -> Joints:
+    """Return the joints that put the tip of an instrument where a motion has it, on stamps of their own."""
+    q = solutions_of(motion.tip_mm, matrix_of(motion.rotation_xyzw), instrument_of(instrument))[:, 0]
+    q[:, 3:] = np.unwrap(q[:, 3:], axis=0)
+    return Joints(motion.arm, f"/{motion.arm}/measured_js", motion.stamps_ns + late_ns, q)
+
+
+@pytest.fixture(scope="module")
+def recorded() -> Recording:
+    """Return a session of two arms with poses in both frames and joints."""
+    value, _ = session(Kind(seed=4, passes=1))
+    joints = tuple(joints_of(value.motion_of(topic=f"/{arm}/local/measured_cp")) for arm in (A, M))
+    return replace(value, joints=joints)
+
+
+def only(value: Recording, word: str) -> Recording:
+    """Keep the motions whose topics contain (or, with a leading "-", do not contain) a word."""
+    keep = [(word[1:] not in m.topic) if word[0] == "-" else (word in m.topic) for m in value.motions]
+    return replace(value, motions=tuple(m for m, kept in zip(value.motions, keep, strict=True) if kept))
+
+
+def test_poses_in_the_cameras_frame_become_those_of_the_base_and_so_does_the_partner(recorded):
+    camera = only(recorded, "-local")
+    (part,) = propose_segments(recorded, A)
+    wanted, got = (cut_demo(one, arm=A, start_s=part.start_s, end_s=part.end_s) for one in (recorded, camera))
+    assert (got.topic, got.frame, got.instrument) == (CAMERA, f"{A}_base", "400006")
+    assert np.linalg.norm(got.tip_mm - wanted.tip_mm, axis=1).max() < 0.05  # mm; the session's poses have 0.02 mm noise
+    assert angle_between(matrix_of(got.rotation_xyzw), matrix_of(wanted.rotation_xyzw)).max() < 1e-3
+    assert got.partner.arm == wanted.partner.arm == M
+    assert got.partner.instrument == "400006"
+    np.testing.assert_allclose(got.partner.position_mm, wanted.partner.position_mm, atol=0.05)
+    np.testing.assert_allclose(got.partner.base_mm, wanted.partner.base_mm, atol=0.05)
+
+
+def test_the_bases_of_a_recording_in_the_cameras_frame_are_found(recorded):
+    paired = {base.arm: base for base in base_frames(recorded)}
+    shown = {base.arm: base for base in base_frames(only(recorded, "-local"))}
+    assert set(shown) == {A, M}
+    for arm, base in shown.items():
+        assert (base.frame, base.local_frame) == ("ECM", f"{arm}_base")
+        np.testing.assert_allclose(base.position_mm, paired[arm].position_mm, atol=0.05)
+
+
+def test_without_joints_a_demonstration_is_in_the_frame_of_its_poses_as_before(recorded):
+    assert cut_demo(replace(only(recorded, "-local"), joints=()), arm=A).frame == "ECM"
+
+
+def test_poses_without_a_frames_name_in_the_base_are_named_after_it(recorded):
+    local = recorded.motion_of(topic=LOCAL)
+    nameless = replace(recorded, motions=(replace(local, topic=CAMERA, frame=""),))
+    demo = cut_demo(nameless)
+    assert demo.frame == f"{A}_base"
+    np.testing.assert_allclose(demo.tip_mm, cut_demo(recorded, topic=LOCAL).tip_mm, atol=0.02)
+
+
+@pytest.mark.parametrize("instrument", ["400006", "420006", "400006-Si", "420006-Classic"])
+@pytest.mark.parametrize("topic", [LOCAL, CAMERA])
+def test_the_instrument_of_a_demonstration_is_the_one_that_its_joints_show(recorded, instrument, topic):
+    joints = (joints_of(recorded.motion_of(topic=LOCAL), instrument),)
+    tools = ((A, f"LARGE_NEEDLE_DRIVER:{instrument.partition('-')[0]}"),)
+    demo = cut_demo(replace(recorded, joints=joints, tools=tools), topic=topic)
+    assert (demo.instrument, demo.frame) == (instrument, f"{A}_base")
+
+
+@pytest.mark.parametrize(
+    ("named", "instrument"),
+    [
+        ("LARGE_NEEDLE_DRIVER:420006", "420006"),
+        ("LARGE_NEEDLE_DRIVER:420006[..11]", "420006"),
+        ("MEGA_NEEDLE_DRIVER:400194", "400194"),
+        ("", "400006"),
+    ],
+)
+def test_without_joints_the_instrument_is_the_stated_one(recorded, named, instrument):
+    assert cut_demo(replace(recorded, joints=(), tools=((A, named),)), arm=A).instrument == instrument
+
+
+@pytest.mark.parametrize("topic", [LOCAL, CAMERA])
+def test_a_stated_instrument_that_does_not_fit_is_refused_by_name(recorded, topic):
+    stated = replace(recorded, tools=((A, "MEGA_NEEDLE_DRIVER:400194"),))
+    with pytest.raises(JointsDisagree, match="states 400194, but its joints and poses fit 400006") as caught:
+        cut_demo(stated, topic=topic)
+    assert caught.value.numbers["stated"] == "400194"
+    assert "Correct the name of the tool" in str(caught.value)
+    assert cut_demo(stated, arm=M).instrument == "400006"  # the other arm is not concerned
+
+
+def test_poses_that_are_not_in_the_base_as_stated_are_refused(recorded):
+    camera = recorded.motion_of(topic=CAMERA)
+    for stated in (replace(camera, topic=LOCAL), replace(camera, frame=f"{A}_base")):
+        with pytest.raises(
+            JointsDisagree, match="stated to be relative to the arm's base, but the joints put the base"
+        ):
+            cut_demo(replace(recorded, motions=(stated,)))
+
+
+def test_joints_in_degrees_are_a_contradiction_of_poses_in_the_base_and_reported_of_a_cameras(recorded):
+    (joints, *_) = recorded.joints
+    degrees = replace(joints, positions=joints.positions * np.degrees([1, 1, np.pi / 180, 1, 1, 1]))
+    value = replace(recorded, joints=(degrees,))
+    with pytest.raises(JointsDisagree, match="if the joints were in degrees"):
+        cut_demo(value, topic=LOCAL)
+    assert cut_demo(value, topic=CAMERA).frame == "ECM"
+    assert {one.found.verdict for one in value.identifications} == {"contradiction"}
+
+
+def test_stamps_of_joints_that_are_far_from_those_of_the_poses_show_nothing(recorded):
+    (joints, *_) = recorded.joints
+    elsewhere = replace(joints, stamps_ns=joints.stamps_ns + 10**12)
+    sparse = replace(joints, stamps_ns=joints.stamps_ns[::20], positions=joints.positions[::20])  # 0.2 s apart
+    for one in (elsewhere, sparse):
+        assert replace(recorded, joints=(one,)).identifications == ()
+
+
+@pytest.mark.needs("recordings")
+def test_the_camera_of_a_real_bag_is_found():
+    store, rows = get_typestore(Stores.ROS1_NOETIC), {"/PSM2/measured_js": [], "/PSM2/measured_cp": []}
+    with Reader(sample_folder() / "calibration" / "pitch_exp_traj_02_test_cropped.bag") as reader:
+        for connection, _, data in reader.messages():
+            if connection.topic in rows:
+                message = store.deserialize_ros1(data, connection.msgtype)
+                stamp_ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+                rows[connection.topic].append((stamp_ns, message))
+    (js, cp) = (
+        [row for row, last in zip(of, [(-1, None), *of], strict=False) if row[0] > last[0]] for of in rows.values()
+    )
+    q = np.array([message.position for _, message in js]) * [1, 1, 1000, 1, 1, 1]
+    poses = [message.pose for _, message in cp]
+    tip_mm = 1000 * np.array([(p.position.x, p.position.y, p.position.z) for p in poses])
+    turns = np.array([(p.orientation.x, p.orientation.y, p.orientation.z, p.orientation.w) for p in poses])
+    stamps = [np.array([stamp for stamp, _ in of]) for of in (js, cp)]
+    motion = Motion("PSM2", "/PSM2/measured_cp", "ECM", stamps[1], tip_mm, turns)
+    value = Recording("rosbag1", "full", (motion,), joints=(Joints("PSM2", "/PSM2/measured_js", stamps[0], q),))
+    (one,) = value.identifications
+    assert (one.found.verdict, one.found.instrument) == ("identified", "400006")
+    assert one.found.residual_mm < 0.05
+    # The console's setting, as it seems: 200 mm along x, turned by 150 degrees about x.
+    np.testing.assert_allclose(one.found.position_mm, [200.0, 0.0, 0.0], atol=0.005)
+    assert abs(one.found.rotation_xyzw[0]) == pytest.approx(np.sin(np.radians(75)), abs=1e-5)
+    demo = cut_demo(value)
+    assert demo.frame == "PSM2_base"
+    expected = forward(np.stack([np.interp(motion.stamps_ns, stamps[0], column) for column in q.T], axis=1))[0]
+    assert np.sqrt((np.linalg.norm(demo.tip_mm - expected, axis=1) ** 2).mean()) < 0.05
