@@ -20,6 +20,9 @@ the large needle driver of the Classic is named, with all others in `candidates`
 the weight of a lever of `LEVER_MM`. Where the recording states that its poses are in the arm's base, no transform is
 fitted, and the base must be there.
 
+*Time.* Joints and poses are rarely of the same moment. If the best fit leaves more than `FLOOR_MM` and the speeds of
+the joints are known, the delay of the joints that fits best is found, and all hypotheses are fitted again without it.
+
 *Decision.* A hypothesis fits with a residual of at most `FIT_MM` and `FIT_RAD`. Another one that fits nearly as well
 (`MARGIN`, `FLOOR_MM`) is not told apart: if their offsets differ, the motion was too small, and nothing is identified.
 
@@ -41,7 +44,7 @@ from skills.arrays import Floats, frozen, xyz
 from skills.fields import Count, Point, Quaternion, schema
 from skills.kinematics import CLASSIC, INSERTION, JAW_TIP_MM, SI, ArmConstants, axes_of, check_rotation, quaternion_of
 
-FIT_MM = 1.0  # a recorder that writes the joints 10 ms later than the pose is off by 0.5 mm at 50 mm/s
+FIT_MM = 1.0  # a recorder that writes the last joints it has at 30 Hz is off by 0.5 mm at 50 mm/s
 FIT_RAD = 0.03  # the same of a wrist that turns at 3 rad/s
 # A hypothesis is told apart if its residual is three times the best one's. With a smaller factor a systematic error of
 # the recorder, as large as the best residual and in the direction of the difference, could exchange the two.
@@ -49,6 +52,8 @@ MARGIN = 3.0
 FLOOR_MM = 0.02  # and by as much more: the residual of sound recordings with stamps of their own is 0.02 mm
 SAME_MM = 0.5  # hypotheses nearer to each other than this need not be told apart: the tip is known to as much
 LEVER_MM = 30.0
+LATEST_S = 0.05  # a larger delay is no delay; and the joints are moved by it along their speeds, not along their path
+DELAYED_MM = 5.0  # at 100 mm/s the largest delay is this far; with a larger residual no delay is sought
 MOST_SAMPLES = 6000  # evenly spread; more samples of one motion do not change the fit
 FEWEST_SAMPLES = 10
 PIECES = 8  # if the frame moved, each eighth of the recording may fit by itself
@@ -131,6 +136,7 @@ class Identification:
         residual_mm: Root mean square of the distances between the recorded positions and those of the joints.
         greatest_mm: The greatest of these distances.
         residual_rad: Root mean square of the angles between the orientations; null if they were not recorded.
+        delay_s: Time by which the joints' stamps are later than those of the poses; 0 where it was not sought.
         next_mm: `residual_mm` of the best arm and instrument that is told apart from these; null if there is none.
         samples: Number of samples that were compared.
         reason: The verdict in words.
@@ -147,6 +153,7 @@ class Identification:
     residual_mm: float
     greatest_mm: float
     residual_rad: float | None
+    delay_s: float
     next_mm: float | None
     samples: Count
     reason: str
@@ -203,6 +210,8 @@ class _Poses:
         tip_mm: Recorded positions in the frame of the poses, shape (T, 3).
         rotation: Recorded rotations in that frame, shape (T, 3, 3), or None.
         in_base: Whether that frame is stated to be the base.
+        speeds: Speeds of the joints, rad/s and mm/s, shape (T, 6); None if they are not known.
+        delay_s: The delay of the joints that was taken out of them.
         beyond_mm: Distance along the approach of the point that the positions are of from the hinge.
     """
 
@@ -213,7 +222,14 @@ class _Poses:
     tip_mm: Floats
     rotation: Floats | None
     in_base: bool
+    speeds: Floats | None = None
+    delay_s: float = 0.0
     beyond_mm: float = 0.0
+
+    def moved(self, joints: Floats) -> "_Poses":
+        """Return the same poses with other joints."""
+        shaft, wrist, turned = axes_of(joints)
+        return replace(self, joints=joints, shaft=shaft, wrist=wrist, turned=turned)
 
     def tips_of(self, one: _Hypothesis) -> Floats:
         """Return the positions in the base that a hypothesis predicts, mm, shape (T, 3)."""
@@ -260,6 +276,7 @@ def identify(
     tip_mm: ArrayLike,
     rotation: ArrayLike | None = None,
     *,
+    speeds: ArrayLike | None = None,
     in_base: bool = False,
     stated: str | None = None,
 ) -> Identification | None:
@@ -270,6 +287,7 @@ def identify(
             them is not used.
         tip_mm: Recorded positions of the tip in the frame of the poses, mm, shape (T, 3).
         rotation: Recorded rotations [n o a] in that frame, shape (T, 3, 3); None if they were not recorded.
+        speeds: Speeds of the joints, of their shape, rad/s and mm/s; with them a delay of the joints is found.
         in_base: Whether that frame is stated to be the arm's base.
         stated: The instrument that the recording states: a number, or a name as in `stated_instrument`.
 
@@ -283,17 +301,22 @@ def identify(
     q = frozen(joints, np.float64, (None, None), "joints")
     tip = frozen(tip_mm, np.float64, (len(q), 3), "tip_mm")
     turned = None if rotation is None else frozen(rotation, np.float64, (len(q), 3, 3), "rotation")
+    speed = None if speeds is None else frozen(speeds, np.float64, q.shape, "speeds")
     if len(q) < FEWEST_SAMPLES or q.shape[1] < 6:
         return None
     chosen = np.linspace(0, len(q) - 1, min(len(q), MOST_SAMPLES)).round().astype(np.int64)
     q, tip, turned = q[chosen, :6], tip[chosen], None if turned is None else turned[chosen]
+    speed = None if speed is None else speed[chosen, :6]
     if turned is not None:
         check_rotation(turned)
     number = None if stated is None else stated_instrument(stated)
-    if not (np.abs(q) <= _WILD).all():
-        return _unexplained(len(q), number, in_base, "a joint's value is beyond a million rad or mm")
-    poses = _Poses(q, *axes_of(q), tip, turned, in_base)
+    if not (np.abs(q) <= _WILD).all() or not (speed is None or (np.abs(speed) <= _WILD).all()):
+        return _unexplained(len(q), number, in_base, "a joint's value or speed is beyond a million rad or mm")
+    poses = _Poses(q, *axes_of(q), tip, turned, in_base, speed)
     fits = sorted(_fits(poses), key=_misfit)
+    if speed is not None and FLOOR_MM < fits[0].residual_mm <= DELAYED_MM:
+        poses = _without_delay(poses, fits[0].of)
+        fits = sorted(_fits(poses), key=_misfit)
     if not fits[0].is_good:
         return _not_explained(poses, fits[0], number)
     return _decided(poses, fits, number)
@@ -302,6 +325,25 @@ def identify(
 def _fits(poses: _Poses) -> Iterator[_Fit]:
     for one in HYPOTHESES:
         yield _fit(poses, one)
+
+
+def _without_delay(poses: _Poses, one: _Hypothesis) -> _Poses:
+    """Take the delay that fits a hypothesis best out of the joints; nothing changes if none up to `LATEST_S` does."""
+    assert poses.speeds is not None
+    now, step_s = poses, 1e-3
+    for _ in range(3):
+        fit, tip = _fit(now, one), now.tips_of(one)
+        shift = (poses.moved(now.joints + step_s * poses.speeds).tips_of(one) - tip) / step_s
+        off = (now.tip_mm - fit.position_mm) @ fit.rotation - tip
+        way = float((shift**2).sum())
+        if not way > 0.0:
+            return poses
+        delay_s = now.delay_s + float((off * shift).sum()) / way
+        if not abs(delay_s) <= LATEST_S:
+            return poses
+        # Late joints are those of an earlier moment, and were further on at the moment of the pose.
+        now = replace(poses.moved(poses.joints + delay_s * poses.speeds), delay_s=delay_s)
+    return now
 
 
 def _misfit(fit: _Fit) -> float:
@@ -418,6 +460,7 @@ def _told(
         residual_mm=fit.residual_mm,
         greatest_mm=float(fit.away_mm.max()),
         residual_rad=None if poses.rotation is None else fit.residual_rad,
+        delay_s=poses.delay_s,
         next_mm=next_mm,
         samples=len(poses.tip_mm),
         reason="",
@@ -486,18 +529,14 @@ def _explanations(poses: _Poses) -> Iterator[tuple[str, _Poses]]:
     """Yield mistakes that recorders make, in words, with the poses as they are without the mistake."""
     angles = np.array([0, 1, 3, 4, 5])
 
-    def with_joints(joints: Floats) -> _Poses:
-        shaft, wrist, turned = axes_of(joints)
-        return replace(poses, joints=joints, shaft=shaft, wrist=wrist, turned=turned)
-
     for words, factor in (("degrees", np.pi / 180.0), ("radians", 180.0 / np.pi)):
         joints = poses.joints.copy()
         joints[:, angles] *= factor
-        yield f"if the joints were in {words}", with_joints(joints)
+        yield f"if the joints were in {words}", poses.moved(joints)
     for words, factor in (("millimetres", 1e-3), ("metres", 1e3)):
         joints = poses.joints.copy()
         joints[:, INSERTION] *= factor
-        yield f"if the insertion were in {words}", with_joints(joints)
+        yield f"if the insertion were in {words}", poses.moved(joints)
         yield f"if the positions were in {words}", replace(poses, tip_mm=poses.tip_mm * factor)
     for axis, name in enumerate("xyz"):
         mirror = np.where(np.arange(3) == axis, -1.0, 1.0)
@@ -529,6 +568,7 @@ def _unexplained(samples: int, stated: str | None, in_base: bool, reason: str) -
         residual_mm=_WILD,
         greatest_mm=_WILD,
         residual_rad=None,
+        delay_s=0.0,
         next_mm=None,
         samples=samples,
         reason=reason,

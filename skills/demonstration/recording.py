@@ -495,21 +495,21 @@ def _identifications(recording: Recording) -> Iterator[ArmIdentification]:
     )
     # Limited, because each pair costs some hypotheses for some thousand samples.
     for joints, motion in islice(pairs, IDENTIFIED_LIMIT):
-        at, values = _joints_at(joints, motion.stamps_ns)
+        at, values, speeds = _joints_at(joints, motion.stamps_ns)
         if len(at) == 0:
             continue
         rotation = None if motion.rotation_xyzw is None else matrix_of(motion.rotation_xyzw[at])
         tool = stated.get(motion.arm)
-        found = identify(values, motion.tip_mm[at], rotation, in_base=motion.states_base, stated=tool)
+        found = identify(values, motion.tip_mm[at], rotation, speeds=speeds, in_base=motion.states_base, stated=tool)
         if found is not None:
             yield ArmIdentification(motion.arm, joints.topic, motion.topic, motion.frame, found)
 
 
-def _joints_at(joints: Joints, stamps_ns: Ints) -> tuple[Ints, Floats]:
-    """Return indices of stamps, at most `MOST_SAMPLES`, between two samples of the joints, and the joints there."""
+def _joints_at(joints: Joints, stamps_ns: Ints) -> tuple[Ints, Floats, Floats]:
+    """Return indices of stamps, at most `MOST_SAMPLES`, between two samples of the joints; joints and speeds there."""
     at = np.linspace(0, len(stamps_ns) - 1, min(len(stamps_ns), MOST_SAMPLES)).round().astype(np.int64)
     if len(joints.stamps_ns) < 2:
-        return at[:0], joints.positions[:0]
+        return at[:0], joints.positions[:0], joints.positions[:0]
     wanted_ns, known_ns = stamps_ns[at], joints.stamps_ns
     after = np.clip(np.searchsorted(known_ns, wanted_ns), 1, len(known_ns) - 1)
     before = after - 1
@@ -517,7 +517,11 @@ def _joints_at(joints: Joints, stamps_ns: Ints) -> tuple[Ints, Floats]:
     near = (wanted_ns >= known_ns[before]) & (wanted_ns <= known_ns[after]) & (gap_ns <= JOINT_GAP_NS)
     at, after, before, wanted_ns, gap_ns = at[near], after[near], before[near], wanted_ns[near], gap_ns[near]
     share = ((wanted_ns - known_ns[before]) / np.maximum(1, gap_ns))[:, None]
-    return at, (1.0 - share) * joints.positions[before] + share * joints.positions[after]
+    # Speeds over some samples, because the difference of two is mostly the noise of the encoders.
+    first, last = np.maximum(before - 2, 0), np.minimum(after + 2, len(known_ns) - 1)
+    seconds = np.maximum(1, known_ns[last] - known_ns[first])[:, None] / 1e9
+    speeds = (joints.positions[last] - joints.positions[first]) / seconds
+    return at, (1.0 - share) * joints.positions[before] + share * joints.positions[after], speeds
 
 
 def _bases_of(recording: Recording) -> Iterator[BaseFrame]:

@@ -29,7 +29,10 @@ class Recorded:
 
     def identified(self) -> Identification:
         """Identify it."""
-        found = identify(self.joints, self.tip_mm, self.rotation, in_base=self.in_base, stated=self.stated)
+        speeds = np.gradient(self.joints, 1.0 / RATE_HZ, axis=0)
+        found = identify(
+            self.joints, self.tip_mm, self.rotation, speeds=speeds, in_base=self.in_base, stated=self.stated
+        )
         assert found is not None
         return found
 

@@ -130,6 +130,26 @@ def test_a_camera_that_moved_is_told_from_a_contradiction():
     assert (found.verdict, found.instrument) == ("moved frame", None)
 
 
+@pytest.mark.parametrize("delay_s", [0.03, 0.004, -0.01])
+@pytest.mark.parametrize("in_base", [True, False])
+def test_late_joints_are_told_and_do_not_hide_the_length_of_the_wrist(delay_s, in_base):
+    seconds = np.arange(2000) / 100.0
+
+    def at(times):
+        phase = np.array([0.3, 0.2, 0.25, 0.15, 0.35, 0.4]) * 2 * np.pi * times[:, None] + np.arange(6)
+        return np.array([0.1, 0.2, 140.0, 0.3, 0.1, -0.2]) + [0.1, 0.1, 20.0, 0.5, 0.5, 0.5] * np.sin(phase)
+
+    tip_mm, rotation = forward(at(seconds))
+    joints = at(seconds - delay_s)
+    speeds = np.gradient(joints, 0.01, axis=0)
+    found = identify(joints, tip_mm, rotation, speeds=speeds, in_base=in_base)
+    assert (found.verdict, found.instrument) == ("identified", "400006")
+    assert found.delay_s == pytest.approx(delay_s, abs=1e-4)
+    assert found.residual_mm < 0.2
+    wrong = identify(joints, tip_mm, rotation, speeds=speeds, in_base=in_base, stated="400194")
+    assert wrong.verdict == "wrong instrument"
+
+
 def test_names_of_tools_are_read_as_the_console_writes_them():
     assert stated_instrument("LARGE_NEEDLE_DRIVER:400006") == "400006"
     assert stated_instrument("LARGE_NEEDLE_DRIVER:420006[..11]") == "420006"

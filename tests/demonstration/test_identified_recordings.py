@@ -1,5 +1,6 @@
 """Recordings with joints beside poses: their instruments, their bases, and demonstrations in the base of the arm."""
 
+import io
 from dataclasses import replace
 
 import numpy as np
@@ -9,8 +10,11 @@ from rosbags.typesys import Stores, get_typestore
 
 from skills.demonstration.demonstration import cut_demo, propose_segments
 from skills.demonstration.recording import Joints, Motion, Recording, base_frames
-from skills.errors import JointsDisagree
-from skills.kinematics import angle_between, forward, instrument_of, matrix_of, solutions_of
+from skills.errors import JointsDisagree, NotMetres
+from skills.formats import write_mcap
+from skills.formats.reader_process import read_told
+from skills.kinematics import angle_between, forward, instrument_of, matrix_of, quaternion_of, solutions_of
+from tests.demonstration.arms import MISTAKES, REAL, Recorded, another_unit, cut, drawn, real
 from tests.demonstration.sessions import A, Kind, M, session
 from tests.formats.bags import sample_folder
 
@@ -160,3 +164,29 @@ def test_the_camera_of_a_real_bag_is_found():
     assert demo.frame == "PSM2_base"
     expected = forward(np.stack([np.interp(motion.stamps_ns, stamps[0], column) for column in q.T], axis=1))[0]
     assert np.sqrt((np.linalg.norm(demo.tip_mm - expected, axis=1) ** 2).mean()) < 0.05
+
+
+@pytest.mark.needs("recordings")
+@pytest.mark.parametrize("count", [4, pytest.param(40, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("mistake", [None, *MISTAKES])
+def test_a_file_says_what_its_joints_show_and_no_planted_mistake_is_silent(mistake, count):
+    for seed in range(count):
+        one = drawn(2000 + seed) if seed % 4 else cut(real(REAL[seed // 4 % 3]), seed)
+        try:
+            about = read_told(io.BytesIO(one_file(mistake(one, np.random.default_rng(seed)) if mistake else one))).about
+        except NotMetres:  # positions a thousand times too large
+            assert mistake is another_unit
+            continue
+        (shown,) = about["identifications"]
+        verdict, stated = shown["found"]["verdict"], shown["found"]["stated"]
+        assert (verdict in ("identified", "undetermined")) == (mistake is None), (seed, one.truth, stated, shown)
+
+
+def one_file(one: Recorded) -> bytes:
+    """Write what was recorded as the MCAP file of a dVRK."""
+    stamps_ns = np.arange(len(one.joints)) * 10**7
+    topic, frame = ("/PSM2/local/measured_cp", "PSM2_base") if one.in_base else ("/PSM2/measured_cp", "ECM")
+    motion = Motion("PSM2", topic, frame, stamps_ns, one.tip_mm, quaternion_of(one.rotation))
+    joints = (Joints("PSM2", "/PSM2/measured_js", stamps_ns, one.joints),)
+    tools = () if one.stated is None else (("PSM2", one.stated),)
+    return write_mcap(Recording("mcap", "full", (motion,), joints=joints, tools=tools))
