@@ -87,10 +87,11 @@ def about_recording(recording: Recording, proposed: Sequence[Segment]) -> dict[s
     """Return the description of a recording for clients: its contents, its quality and the proposed hand-offs.
 
     Each list that the recording could make arbitrarily long is limited to `MOST` entries. Counts of dropped and of
-    equal samples are only present if there are any, so that all other descriptions are those of version 0.1.0.
+    equal samples, and identifications, are only present if there are any, so that all other descriptions are those of
+    version 0.1.0.
     """
     dropped = [asdict(one) for one in _dropped(recording)[:MOST]]
-    return {
+    about: dict[str, Any] = {
         "duration_s": recording.duration_s,
         "notes": dict(recording.notes),
         "topics": [as_json(topic) for topic in recording.topics],
@@ -116,8 +117,10 @@ def about_recording(recording: Recording, proposed: Sequence[Segment]) -> dict[s
         ],
         "left_out": [asdict(described.LeftOut(topic, why)) for topic, why in recording.left_out[:MOST]],
         "base_frames": [as_json(base) for base in base_frames(recording)],
-        "identifications": [as_json(one) for one in recording.identifications],
-    } | ({"dropped": dropped} if dropped else {})
+    }
+    if recording.identifications:
+        about["identifications"] = [as_json(one) for one in recording.identifications]
+    return about | ({"dropped": dropped} if dropped else {})
 
 
 def _dropped(recording: Recording) -> list[described.Dropped]:

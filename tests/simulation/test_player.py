@@ -153,6 +153,30 @@ def test_the_si_plays_beyond_the_classics_limits():
 
 
 @needs_simulator
+@pytest.mark.parametrize(("instrument", "further_in_mm"), [("400006-Si", 50.8), ("420006-Classic", -50.8)])
+def test_an_instrument_on_an_arm_of_the_other_generation_plays_the_same_motion(played, instrument, further_in_mm):
+    motion = time_parametrise([hand_off(-8.0 * k) for k in range(2)], instrument=instrument, rate_hz=60.0)
+    np.testing.assert_allclose(motion.joints[:, 2], TRAJECTORY.joints[:, 2] + further_in_mm, atol=1e-9)
+    report = judge(play(motion), motion)
+    assert report.feasible, report.failure
+    assert report.fk_error_mm < 1e-4
+    usual = judge(played, TRAJECTORY)
+    assert report.clearance_pad_mm == pytest.approx(usual.clearance_pad_mm, abs=0.01)
+
+
+@needs_simulator
+def test_an_instrument_that_is_still_in_the_cannula_is_infeasible_whatever_the_arm():
+    # The wrist is 18 mm deep: for a 400006 on a Si that is an insertion of 84 mm, which is not out of the cannula.
+    high = PassPath([[0, 4, -26.5], [0, 3, -27.0]], POINTING_DOWN)
+    for instrument, insertion_mm in (("400006", 33), ("400006-Si", 84)):
+        motion = time_parametrise([high], instrument=instrument, rate_hz=60.0)
+        assert motion.joints[:, 2].min() == pytest.approx(insertion_mm, abs=1.5)
+        failure = judge(play(motion), motion).failure
+        assert failure is not None
+        assert "insertion out of the cannula" in failure.quantity
+
+
+@needs_simulator
 def test_a_pass_of_a2_alone_is_played_and_pictured():
     alone = PassPath(hand_off().tip_mm[-1:], POINTING_DOWN, hand_off().target_rotation)
     motion = time_parametrise([alone], rate_hz=60.0)
