@@ -177,6 +177,7 @@ class Motion:
         rotation_xyzw: Orientations of the tip in `frame` as unit quaternions, shape (T, 4); None if not recorded.
         duplicate_stamps: Number of samples that were dropped because they had the stamp of the sample before.
         backward_stamps: Number of samples that were dropped because their stamp was earlier than one before.
+        from_joints: The poses were computed from the recorded joints, so these identify neither arm nor instrument.
     """
 
     arm: str
@@ -187,6 +188,7 @@ class Motion:
     rotation_xyzw: Floats | None = None
     duplicate_stamps: int = 0
     backward_stamps: int = 0
+    from_joints: bool = False
 
     def __post_init__(self) -> None:
         count = len(self.stamps_ns)
@@ -490,9 +492,8 @@ class BaseFrame:
 
 def _identifications(recording: Recording) -> Iterator[ArmIdentification]:
     stated = dict(recording.tools)
-    pairs = (
-        (joints, motion) for joints in recording.joints for motion in recording.motions if joints.arm == motion.arm
-    )
+    measured = [motion for motion in recording.motions if not motion.from_joints]
+    pairs = ((joints, motion) for joints in recording.joints for motion in measured if joints.arm == motion.arm)
     # Limited, because each pair costs some hypotheses for some thousand samples.
     for joints, motion in islice(pairs, IDENTIFIED_LIMIT):
         at, values, speeds = _joints_at(joints, motion.stamps_ns)
@@ -500,7 +501,14 @@ def _identifications(recording: Recording) -> Iterator[ArmIdentification]:
             continue
         rotation = None if motion.rotation_xyzw is None else matrix_of(motion.rotation_xyzw[at])
         tool = stated.get(motion.arm)
-        found = identify(values, motion.tip_mm[at], rotation, speeds=speeds, in_base=motion.states_base, stated=tool)
+        found = identify(
+            values,
+            motion.tip_mm[at],
+            rotation,
+            speeds=speeds if recording.is_timed else None,
+            in_base=motion.states_base,
+            stated=tool,
+        )
         if found is not None:
             yield ArmIdentification(motion.arm, joints.topic, motion.topic, motion.frame, found)
 
@@ -514,7 +522,8 @@ def _joints_at(joints: Joints, stamps_ns: Ints) -> tuple[Ints, Floats, Floats]:
     after = np.clip(np.searchsorted(known_ns, wanted_ns), 1, len(known_ns) - 1)
     before = after - 1
     gap_ns = known_ns[after] - known_ns[before]
-    near = (wanted_ns >= known_ns[before]) & (wanted_ns <= known_ns[after]) & (gap_ns <= JOINT_GAP_NS)
+    same = (wanted_ns == known_ns[before]) | (wanted_ns == known_ns[after])  # nothing is interpolated
+    near = (wanted_ns >= known_ns[before]) & (wanted_ns <= known_ns[after]) & (same | (gap_ns <= JOINT_GAP_NS))
     at, after, before, wanted_ns, gap_ns = at[near], after[near], before[near], wanted_ns[near], gap_ns[near]
     share = ((wanted_ns - known_ns[before]) / np.maximum(1, gap_ns))[:, None]
     # Speeds over some samples, because the difference of two is mostly the noise of the encoders.

@@ -22,7 +22,7 @@ whose pose is 0 in every row, quaternion included, was not recorded, and is left
 import os
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import BinaryIO
 
 import numpy as np
@@ -199,7 +199,8 @@ def _recording(
             joints.append(recorded_joints(arm, topic, stamps_ns, positions))
             if (arm, "pose") not in parts:
                 tip_mm, rotation = posed(topic, positions, said.instrument)
-                motions.append(_motion(arm, topic, base_of(arm, said.frame), stamps_ns, tip_mm, rotation))
+                motion = _motion(arm, topic, base_of(arm, said.frame), stamps_ns, tip_mm, rotation)
+                motions.append(replace(motion, from_joints=True))
         elif kind == "jaw":
             jaws.append((arm, recorded_signal(stamps_ns, values[:, 0], f"/{arm}/jaw/measured_js")))
         elif kind == "pose" and arm in posing:

@@ -37,7 +37,7 @@ A table has no checksum, so its integrity is "none".
 import re
 from array import array
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import BinaryIO, TextIO
 
 import numpy as np
@@ -228,6 +228,7 @@ def _recording(table: _Table, said: TableReading, columns: tuple[Column, ...]) -
     motion = recorded_motion(
         arm=arm, topic=TOPIC, frame=frame, stamps_ns=table.stamps_ns, tip_mm=tip_mm, rotation_xyzw=rotation
     )
+    motion = replace(motion, from_joints=POSITION[0] not in table.columns)
     check_outside(motion)
     return Recording(
         format="csv",

@@ -167,6 +167,8 @@ def test_joints_alone_become_poses_with_a_stated_instrument():
     np.testing.assert_allclose(motion.tip_mm, wanted.tip_mm[::7][: len(motion.tip_mm)], atol=1e-6)
     assert angle_between(matrix_of(motion.rotation_xyzw), matrix_of(wanted.rotation_xyzw[::7])).max() < 1e-6
     assert (motion.frame, joints.arm, recording.tools) == ("PSM2_base", "PSM2", (("PSM2", "400006"),))
+    assert recording.identifications == ()  # the poses were computed from the joints, and show nothing about them
+    assert recording.instrument_on("PSM2") == "400006"
     with pytest.raises(MixedFrames, match="PSM2_base"):
         read(text, rate_hz=30.0, instrument="400006", table_arm="PSM2", frame="ECM")
 
@@ -201,14 +203,14 @@ def test_joints_beyond_the_limits_of_the_arm_are_refused(instrument):
 
 @pytest.mark.needs("recordings")
 @pytest.mark.parametrize(
-    ("name", "rows", "off_mm"),
+    ("name", "rows", "off_mm", "instrument"),
     [
-        ("classic_tool_fixed.csv", 4506, 0.0532),
-        ("raw_sensor_rosbag_09_traj3.csv", 507, 0.0532),
-        ("Si_tool_fixed.csv", 4473, 50.9),
+        ("classic_tool_fixed.csv", 4506, 0.0532, "400006"),
+        ("raw_sensor_rosbag_09_traj3.csv", 507, 0.0532, "400006"),
+        ("Si_tool_fixed.csv", 4473, 50.9, "420006-Classic"),
     ],
 )
-def test_real_tables_of_joints_and_poses_agree_with_the_kinematics_and_need_a_rate(name, rows, off_mm):
+def test_real_tables_of_joints_and_poses_agree_with_the_kinematics_and_need_a_rate(name, rows, off_mm, instrument):
     table = (sample_folder() / "calibration" / name).read_bytes()
     with pytest.raises(BadColumns, match="rate_hz"):
         read_recording(io.BytesIO(table))
@@ -220,3 +222,6 @@ def test_real_tables_of_joints_and_poses_agree_with_the_kinematics_and_need_a_ra
     assert np.linalg.norm(tip_mm - motion.tip_mm, axis=1).max() < off_mm
     assert angle_between(rotation, matrix_of(motion.rotation_xyzw)).max() < 0.02
     assert recording.columns[0].quantity == ""
+    (one,) = recording.identifications
+    assert (one.found.verdict, one.found.instrument) == ("identified", instrument)
+    assert one.found.greatest_mm < 0.072
