@@ -70,6 +70,16 @@ class Action(Enum):
         command="Name one: --segment N, or take the whole recording: --segment whole",
         python="Name one: segment=N, or take the whole recording: segment='whole'",
     )
+    MARK_DEMO = Words(
+        http="PUT /demos/{demo}/outcome marks it as {outcome}.",
+        command="Mark it: skills demo mark {demo} {outcome} --reason WHY",
+        python="Mark it: client.mark_demo({demo}, {outcome}, reason=...)",
+    )
+    TRAIN_ANY = Words(
+        http="Name another in demos, or learn from it all the same with outcomes 'any'.",
+        command="Name another with --demo, or learn from it all the same: --outcomes any",
+        python="Name another in demos, or learn from it all the same: client.train(..., outcomes='any')",
+    )
     ERASE_DEMOS = Words(
         http="It is deleted with the last of them: DELETE /demos/ID?erase=true.",
         command="It is deleted with the last of them: skills demo withdraw DEMO --erase",

@@ -165,6 +165,29 @@ def test_a_style_is_learnt_from_several_demonstrations(skills, tmp_path: Path) -
     assert skills("train", *style, *named[:2], "--combine", "medoid")[0] == 1
 
 
+def test_a_failure_is_marked_listed_and_learnt_from_on_request(skills, tmp_path: Path) -> None:
+    assert skills("seed")[0] == 0
+    (tmp_path / "hand-off.csv").write_bytes(cases.hand_off())
+    add = ("demo", "add", str(tmp_path / "hand-off.csv"), "--surgeon", "plover", "--suture", "horizontal-mattress")
+    code, said = skills(*add, "--outcome", "failure")
+    assert (code, said.startswith("A failure needs a reason")) == (1, True), said
+    code, said = skills(*add, "--outcome", "failure", "--reason", "The needle fell.", "--json")
+    demo = json.loads(said)
+    assert (demo["outcome"], demo["outcome_reason"]) == ("failure", "The needle fell.")
+    _, said = skills("demo", "list", "--outcome", "failure", "--json")
+    assert [one["id"] for one in json.loads(said)] == [demo["id"]]
+    style = ("plover", "horizontal-mattress")
+    code, said = skills("train", *style)
+    assert (code, "learn from it all the same: --outcomes any" in said) == (1, True)
+    code, said = skills("train", *style, "--outcomes", "any", "--json")
+    assert (code, json.loads(said)["request"]["outcomes"]) == (0, "any")
+    code, said = skills(*add, "--outcome", "success")
+    assert (code, f"skills demo mark {demo['id']} success" in said.replace("\n", "")) == (1, True), said
+    assert skills("demo", "mark", demo["id"], "success") == (0, "marked success\n")
+    assert "marked success" in skills("demo", "show", demo["id"])[1]
+    assert skills("train", *style)[0] == 0
+
+
 def test_a_batch_trains_styles_names_failures_and_sets_the_exit_code(skills) -> None:
     assert skills("seed")[0] == 0
     code, said = skills("retrain", "--only-stale", "--release", "--json")
@@ -339,7 +362,7 @@ def test_every_command_of_the_interface_is_there_and_speaks_to_programs() -> Non
     assert {(name,) for name in named.split()} <= set(every)
     for group, names in {
         "recording": "add show",
-        "demo": "add list show report save withdraw",
+        "demo": "add list show report save mark withdraw",
         "policy": "list versions show card release withdraw export",
         "keys": "create list revoke",
         "job": "list show wait cancel",

@@ -22,6 +22,7 @@ _ENDED = {
     "styles_stopped": "styles no longer served",
     "keys_revoked": "keys revoked",
     "consents_narrowed": "consents narrowed",
+    "demos_marked": "demonstrations marked",
 }
 _LISTED = {
     "recordings": "recordings deleted",

@@ -59,6 +59,10 @@ def train(
         Literal["medoid", "barycentre", "corridor"] | None,
         typer.Option(help="Way to combine several demonstrations into one path; a corridor by default."),
     ] = None,
+    outcomes: Annotated[
+        Literal["success", "any"],
+        typer.Option(help="any learns also from demonstrations that are marked recovery or failure."),
+    ] = "success",
     release: Annotated[bool, typer.Option(help="Release the version if it passes the gate.")] = False,
     seed: int = 0,
     learner: Kind = None,
@@ -72,7 +76,14 @@ def train(
     chosen = _learner(learner, setting or [])
     with service(works=True) as client:
         asked = client.train(
-            surgeon, suture, demos=demo or None, combine=combine, learner=chosen, seed=seed, release=release
+            surgeon,
+            suture,
+            demos=demo or None,
+            combine=combine,
+            learner=chosen,
+            seed=seed,
+            release=release,
+            outcomes=outcomes,
         )
         job = finished(client, asked)
     result = result_of(job)

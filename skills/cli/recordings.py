@@ -143,8 +143,9 @@ RecordingPath = Annotated[
     Path, typer.Argument(help="A recording, a bag folder, or a session's folder with one; pictures are not sent.")
 ]
 Demo = Annotated[str, typer.Argument(help="The demonstration's digest.")]
+Outcome = Literal["success", "recovery", "failure"]
 
-ABOUT = ("id", "surgeon", "suture", "arm", "state", "created_at")
+ABOUT = ("id", "surgeon", "suture", "arm", "state", "outcome", "created_at")
 
 
 @contextmanager
@@ -323,6 +324,8 @@ def demo_add(
         ),
     ] = 0.0,
     session: Annotated[str | None, typer.Option()] = None,
+    outcome: Annotated[Outcome | None, typer.Option(help="What became of the hand-off, if it is known.")] = None,
+    reason: Annotated[str | None, typer.Option(help="Why; needed for a recovery or a failure.")] = None,
     rate_hz: RateHz = None,
     frame: Frame = None,
     column: Columns = None,
@@ -354,6 +357,8 @@ def demo_add(
                 cell_mm=cell_mm,
                 hysteresis=hysteresis,
                 session=session,
+                outcome=outcome,
+                outcome_reason=reason,
                 rate_hz=rate_hz,
                 frame=frame,
                 column=column,
@@ -413,10 +418,17 @@ def _measured(demo: "Demonstration", as_json: bool) -> None:
 
 @demos.command("list")
 @refusing
-def demo_list(surgeon: OfSurgeon = None, suture: OfSuture = None, as_json: AsJson = False) -> None:
+def demo_list(
+    surgeon: OfSurgeon = None,
+    suture: OfSuture = None,
+    outcome: Annotated[
+        Literal["success", "recovery", "failure", "unknown"] | None, typer.Option(help="Only those marked so.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
     """List demonstrations, the newest first."""
     with service() as client:
-        show(client.demos(surgeon, suture), as_json, ABOUT)
+        show(client.demos(surgeon, suture, outcome=outcome), as_json, ABOUT)
 
 
 @demos.command("show")
@@ -428,6 +440,7 @@ def demo_show(demo: Demo, as_json: AsJson = False) -> None:
     _measured(shown, as_json)
     if not as_json:
         out.print(f"{shown.state}, {shown.start_s:.2f} to {shown.end_s:.2f} s of {shown.recording}", soft_wrap=True)
+        _tell_outcome(shown)
 
 
 @demos.command("report")
@@ -464,6 +477,29 @@ def _written(to: Path, as_json: bool) -> None:
         print_json({"file": to, "size_bytes": to.stat().st_size})
     else:
         out.print(f"{to}: {to.stat().st_size / 1e6:.1f} MB.", soft_wrap=True)
+
+
+@demos.command("mark")
+@refusing
+def demo_mark(
+    demo: Demo,
+    outcome: Annotated[Outcome, typer.Argument(help="What became of the hand-off.")],
+    reason: Annotated[str | None, typer.Option(help="Why; needed for a recovery or a failure.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Mark a demonstration; a recovery or a failure is not learnt from, and releases that rest on it are withdrawn."""
+    with service() as client:
+        marked = client.mark_demo(demo, outcome, reason=reason)
+    if as_json:
+        print_json(marked)
+    else:
+        _tell_outcome(marked)
+
+
+def _tell_outcome(demo: "Demonstration") -> None:
+    if demo.outcome is not None:
+        why = "" if demo.outcome_reason is None else f": {demo.outcome_reason}"
+        out.print(f"marked {demo.outcome}{why}", markup=False, soft_wrap=True)
 
 
 @demos.command("withdraw")

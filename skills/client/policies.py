@@ -71,6 +71,7 @@ class Jobs(Connection):
         learner: Mapping[str, Any] | None = None,
         seed: int = 0,
         release: bool = False,
+        outcomes: Literal["success", "any"] = "success",
     ) -> Job:
         """Request the training of a style; an equal request returns the same job.
 
@@ -80,17 +81,20 @@ class Jobs(Connection):
         Args:
             surgeon: The surgeon's pseudonym.
             suture: The suture type.
-            demos: Digests of the demonstrations to learn from; default: the newest active one.
+            demos: Digests of the demonstrations to learn from; default: the newest one that is active and not
+                marked recovery or failure.
             combine: Method that combines several demonstrations into one path; default: a corridor.
             learner: Its `kind` and settings; default: Q-learning in the phase state.
             seed: Seed of the exploration.
             release: Release the version if it passes the gate; also if an equal training is done already and its
                 version is
                 not the one that the style serves now.
+            outcomes: "any" learns also from demonstrations that are marked recovery or failure.
         """
         asked = {"surgeon": surgeon, "suture": suture, "seed": seed, "release": release}
         how = None if combine is None else {"kind": combine}
-        asked |= given({"demos": demos, "combine": how, "learner": learner})
+        of = None if outcomes == "success" else outcomes  # left out, so that an older service accepts the rest
+        asked |= given({"demos": demos, "combine": how, "learner": learner, "outcomes": of})
         return await self._ask(Job, "POST", at("trainings"), asked, harmless=not release)
 
     @call

@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from skills.client.connection import Connection, at, call, given
 from skills.client.transport import Progress
-from skills.schemas import Handedness, SkillLevel
+from skills.schemas import DemoOutcome, Handedness, OutcomeAsked, SkillLevel
 from skills.schemas.given import Demonstration, DemoPath, Recording, RecordingPreview, RewardMap, Surgeon, SutureType
 
 
@@ -160,6 +160,8 @@ class Recordings(Connection):
         cell_mm: float | None = None,
         hysteresis: float | None = None,
         session: str | None = None,
+        outcome: DemoOutcome | None = None,
+        outcome_reason: str | None = None,
         media_type: str | None = None,
         rate_hz: float | None = None,
         frame: str | None = None,
@@ -174,6 +176,7 @@ class Recordings(Connection):
         query = {
             **{"surgeon": surgeon, "suture": suture, "arm": arm, "topic": topic, "start_s": start_s, "end_s": end_s},
             **{"segment": segment, "grid": grid, "cell_mm": cell_mm, "hysteresis": hysteresis, "session": session},
+            **{"outcome": outcome, "outcome_reason": outcome_reason},
             **{"rate_hz": rate_hz, "frame": frame, "column": column, "unit": unit, "decimal": decimal},
             **{"table_arm": table_arm, "instrument": instrument},
         }
@@ -195,6 +198,8 @@ class Recordings(Connection):
         cell_mm: float | None = None,
         hysteresis: float | None = None,
         session: str | None = None,
+        outcome: DemoOutcome | None = None,
+        outcome_reason: str | None = None,
     ) -> Demonstration:
         """Cut a demonstration out of a stored recording.
 
@@ -214,6 +219,8 @@ class Recordings(Connection):
             hysteresis: Distance beyond its cell, in cells, at which a sample leaves it: 0 to 0.5; 0.25 suppresses
                 tremor.
             session: A name for recordings that were made together.
+            outcome: What became of the hand-off, where it is known; see `mark_demo`.
+            outcome_reason: Why; needed for a recovery or a failure.
 
         Raises:
             Problem: Of kind "segment-not-named" if several hand-offs are proposed and none was named;
@@ -222,6 +229,7 @@ class Recordings(Connection):
         body = {
             **{"surgeon": surgeon, "suture": suture, "arm": arm, "topic": topic, "start_s": start_s, "end_s": end_s},
             **{"segment": segment, "grid": grid, "cell_mm": cell_mm, "hysteresis": hysteresis, "session": session},
+            **{"outcome": outcome, "outcome_reason": outcome_reason},
         }
         return await self._ask(Demonstration, "POST", at("recordings", recording, "demos"), given(body))
 
@@ -233,9 +241,13 @@ class Recordings(Connection):
         *,
         recording: str | None = None,
         active: bool | None = None,
+        outcome: OutcomeAsked | None = None,
     ) -> list[Demonstration]:
-        """List demonstrations, the newest first; `active` true leaves out withdrawn ones, false all others."""
-        asked = {"surgeon": surgeon, "suture": suture, "recording": recording, "active": active}
+        """List demonstrations, the newest first.
+
+        `active` true leaves out withdrawn ones, false all others; `outcome` all that are not marked so.
+        """
+        asked = {"surgeon": surgeon, "suture": suture, "recording": recording, "active": active, "outcome": outcome}
         return await self._all(Demonstration, at("demos"), **asked)
 
     @call
@@ -278,6 +290,22 @@ class Recordings(Connection):
         """
         about = await self._get(Demonstration, at("demos", demo))
         return await self._save(at("demos", demo, "recording"), to, progress, sha256=about.recording)
+
+    @call
+    async def mark_demo(self, demo: str, outcome: DemoOutcome, *, reason: str | None = None) -> Demonstration:
+        """Mark a demonstration as success, recovery or failure; the newest mark counts.
+
+        Nothing is learnt from a recovery or a failure unless a training has `outcomes="any"`, and releases that rest on
+        it are withdrawn, except of versions that were trained so. The request is not retried after a lost connection,
+        because somebody may have decided otherwise in between.
+
+        Args:
+            demo: Its digest.
+            outcome: What became of the hand-off.
+            reason: Why; needed for a recovery or a failure.
+        """
+        body = {"outcome": outcome, "reason": reason}
+        return await self._ask(Demonstration, "PUT", at("demos", demo, "outcome"), body, harmless=False)
 
     @call
     async def withdraw_demo(self, demo: str, *, erase: bool = False) -> None:

@@ -2,10 +2,10 @@
 
 A row labels a value: it has the value's owner, time and origin, and the value itself serialised in one column.
 
-Append-only (triggers of the migrations refuse changes): recordings and their chunks, demonstrations, reward maps,
-policy versions and their further demonstrations, releases, plans, playbacks and their pictures, calibrations; a
-demonstration and a release can be withdrawn, once. Only erasure deletes. The tables of the service's own state are in
-`skills.db.service_tables`.
+Append-only (triggers of the migrations refuse changes): recordings and their chunks, demonstrations and their
+outcomes, reward maps, policy versions and their further demonstrations, releases, plans, playbacks and their pictures,
+calibrations; a demonstration and a release can be withdrawn, once. Only erasure deletes. The tables of the service's
+own state are in `skills.db.service_tables`.
 """
 
 from datetime import datetime
@@ -13,13 +13,20 @@ from typing import Any
 
 from sqlalchemy import (
     BigInteger,
+    CheckConstraint,
+    ColumnElement,
     ForeignKey,
     Index,
     LargeBinary,
+    ScalarSelect,
     String,
     UniqueConstraint,
+    and_,
+    func,
+    select,
 )
-from sqlalchemy.orm import Mapped, mapped_column, relationship
+from sqlalchemy.ext.hybrid import hybrid_property
+from sqlalchemy.orm import Mapped, column_property, mapped_column, relationship
 
 from skills.comparison.distances import Measured
 from skills.db import Base, RowId, Sha256, Slug, now
@@ -134,12 +141,44 @@ class RecordingChunk(Base):
     data: Mapped[bytes] = mapped_column(LargeBinary)
 
 
+SUCCESS = "success"
+
+
+class DemonstrationOutcome(Base):
+    """A mark of a demonstration: success, recovery or failure, with the reason. The newest mark counts."""
+
+    __tablename__ = "demonstration_outcomes"
+
+    row: Mapped[RowId]
+    demonstration_row: Mapped[int] = mapped_column(ForeignKey("demonstrations.row"))
+    outcome: Mapped[str]
+    reason: Mapped[str | None]
+    actor: Mapped[str]
+    created_at: Mapped[datetime] = mapped_column(default=now)
+
+    __table_args__ = (
+        CheckConstraint("outcome IN ('success', 'recovery', 'failure')", name="outcome"),
+        Index("ix_demonstration_outcomes_newest", "demonstration_row", "row"),
+    )
+
+
+def newest_mark(column: str, demonstration_row: Any) -> ScalarSelect[str | None]:
+    """Return a subquery of a column of a demonstration's newest mark; null if it was never marked.
+
+    It is of the bare table, to which no rule of `skills.db.row_visibility` is added: a mark is visible with its
+    demonstration.
+    """
+    marks = DemonstrationOutcome.__table__
+    newest = select(marks.c[column]).where(marks.c.demonstration_row == demonstration_row)
+    return newest.order_by(marks.c.row.desc()).limit(1).correlate_except(marks).scalar_subquery()
+
+
 class Demonstration(Base):
-    """One hand-off segment cut from a recording, with its path in a grid world."""
+    """One hand-off segment cut from a recording, with its path in a grid world; `outcome` is None if not known."""
 
     __tablename__ = "demonstrations"
 
-    row: Mapped[RowId]
+    row: Mapped[RowId] = mapped_column()
     sha256: Mapped[str] = mapped_column(Sha256, unique=True)
     recording_row: Mapped[int] = mapped_column(ForeignKey("recordings.row"), index=True)
     surgeon_row: Mapped[int] = mapped_column(ForeignKey("surgeons.row"))
@@ -157,6 +196,8 @@ class Demonstration(Base):
     report: Mapped[dict[str, Any]]
     created_at: Mapped[datetime] = mapped_column(default=now)
     withdrawn_at: Mapped[datetime | None]
+    outcome: Mapped[str | None] = column_property(newest_mark("outcome", row))
+    outcome_reason: Mapped[str | None] = column_property(newest_mark("reason", row))
 
     recording: Mapped[StoredRecording] = relationship(lazy="joined", innerjoin=True)
     surgeon: Mapped[Surgeon] = relationship(lazy="joined", innerjoin=True)
@@ -165,6 +206,21 @@ class Demonstration(Base):
         Index("ix_demonstrations_surgeon", "surgeon_row", "row"),
         Index("ix_demonstrations_suture", "suture", "row"),
     )
+
+    @property
+    def failed(self) -> bool:
+        """True if it is marked recovery or failure."""
+        return self.outcome not in (None, SUCCESS)
+
+    @hybrid_property
+    def learnable(self) -> bool:
+        """True if a style may be learnt from it without being told so: it is active, and not `failed`."""
+        return self.withdrawn_at is None and not self.failed
+
+    @learnable.inplace.expression
+    @classmethod
+    def _learnable(cls) -> ColumnElement[bool]:
+        return and_(cls.withdrawn_at.is_(None), func.coalesce(cls.outcome, SUCCESS) == SUCCESS)
 
 
 class MeasuredShape(Base):
@@ -226,9 +282,17 @@ class PolicyVersion(Base):
         return self.demonstrations[-1].row if "combined" in self.manifest else self.demonstration_row
 
     @property
-    def rests_on_withdrawn(self) -> bool:
-        """True if one of its demonstrations was withdrawn."""
-        return any(one.withdrawn_at is not None for one in self.demonstrations)
+    def of_any_outcome(self) -> bool:
+        """True if it was trained from demonstrations of any outcome; its manifest then names the outcomes."""
+        return "outcomes" in self.manifest
+
+    @property
+    def objections(self) -> list[str]:
+        """What forbids its release since the training: "was withdrawn" or "was marked failure", of a demonstration."""
+        demos = self.demonstrations
+        withdrawn = ["was withdrawn"] if any(one.withdrawn_at is not None for one in demos) else []
+        marked = set() if self.of_any_outcome else {f"was marked {one.outcome}" for one in demos if one.failed}
+        return [*withdrawn, *sorted(marked)]
 
 
 class PolicyDemonstration(Base):

@@ -16,6 +16,7 @@ from sqlalchemy.orm import ORMExecuteState, Session, with_loader_criteria
 from skills.db import Base
 from skills.db.models import (
     Demonstration,
+    DemonstrationOutcome,
     MeasuredShape,
     Plan,
     PolicyDemonstration,
@@ -74,6 +75,7 @@ class Only:
             RecordingSurgeon: RecordingSurgeon.surgeon_row.in_(mine),
             RecordingChunk: RecordingChunk.recording.in_(recordings),
             Demonstration: Demonstration.surgeon_row.in_(mine),
+            DemonstrationOutcome: DemonstrationOutcome.demonstration_row.in_(demos),
             MeasuredShape: MeasuredShape.demonstration_row.in_(demos),
             StoredRewardMap: StoredRewardMap.demonstration_row.in_(demos),
             PolicyVersion: PolicyVersion.surgeon_row.in_(mine),

@@ -3,9 +3,9 @@
     Database --back_up--> backup --restore, Erasures--> Database
     Database --keep_erasures--> list of erasures, a file outside the database
 
-A backup cannot contain later changes: erasures, withdrawals, superseded releases, revoked keys, narrowed consent. The
-list contains all of them, so that a restoration applies them again. It only removes data and permissions, never adds
-them.
+A backup cannot contain later changes: erasures, withdrawals, superseded releases, failures, revoked keys, narrowed
+consent. The list contains all of them, so that a restoration applies them again. It only removes data and permissions,
+never adds them.
 """
 
 import fcntl
@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from itertools import pairwise
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, TypeVar
 
 from sqlalchemy import Select, exists, func, inspect, select, tuple_, update
 from sqlalchemy.orm import Session
@@ -26,17 +26,18 @@ from sqlalchemy.orm import Session
 from skills import __version__
 from skills.db import Base, archive, rfc3339
 from skills.db.archive import Manifest
-from skills.db.models import Demonstration, Erasure, PolicyVersion, Release, StoredRecording, Surgeon
+from skills.db.models import SUCCESS, Demonstration, Erasure, PolicyVersion, Release, StoredRecording, Surgeon
 from skills.db.service_tables import Event, Job, Key, record_event
 from skills.db.session import Database
 from skills.errors import Conflict, Corrupt
 from skills.library.catalogue import put_surgeon, salted
-from skills.library.demos import withdraw_demo
+from skills.library.demos import MARKS, mark_demo, withdraw_demo
 from skills.library.erasure import delete_recording, erase_demo, erase_surgeon
 from skills.library.jobs import ACTIVE
 from skills.library.keys import revoke_key
 from skills.library.releases import withdraw_policies
 from skills.packing import canonical, sha256
+from skills.schemas import DemoOutcome
 
 Told = Callable[[str], None]  # progress callback; its argument is the name of the table or step
 ERASURES = "suture-skills erasures 2"
@@ -49,8 +50,17 @@ ENDS = {
     ("withdraw", "policy-version"): "releases",
     ("revoke", "key"): "keys",
 }
-LISTED = (*ENDS, ("erase", "surgeon"), ("release", "policy-version"), ("add", "surgeon"), ("change", "surgeon"))
+MARKED = {(action, "demonstration"): outcome for outcome, action in MARKS.items()}
+LISTED = (
+    *ENDS,
+    *MARKED,
+    ("erase", "surgeon"),
+    ("release", "policy-version"),
+    ("add", "surgeon"),
+    ("change", "surgeon"),
+)
 
+T = TypeVar("T")
 Consent = dict[str, Any] | None
 # By the list names in `ENDS`: digests or ids, and the moment at which each last ended.
 Ended = Mapping[str, Mapping[str, datetime]]
@@ -68,11 +78,14 @@ class Erasures:
         ended: Demonstrations that were erased or withdrawn, recordings that were deleted and policies that are no
             longer served, by their SHA-256, and revoked keys by their id; each with the moment at which it last ended.
         consents: The consent of each surgeon as last stated, by subject, and the moment of the statement.
+        outcomes: The outcome of each marked demonstration, by its SHA-256, and the moment of the newest mark; not the
+            reason, which may name a person.
     """
 
     surgeons: frozenset[tuple[str, str, datetime]] = frozenset()
     ended: Ended = field(default_factory=dict)
     consents: Mapping[str, tuple[datetime, Consent]] = field(default_factory=dict)
+    outcomes: Mapping[str, tuple[datetime, DemoOutcome]] = field(default_factory=dict)
 
     @property
     def demos(self) -> frozenset[str]:
@@ -85,20 +98,21 @@ class Erasures:
         return Erasures(
             self.surgeons | other.surgeons,
             {kind: _latest(self.ended.get(kind, {}), other.ended.get(kind, {})) for kind in kinds},
-            {**other.consents, **{who: said for who, said in self.consents.items() if _is_later(who, said[0], other)}},
+            {**other.consents, **_later(self.consents, other.consents)},
+            {**other.outcomes, **_later(self.outcomes, other.outcomes)},
         )
 
     def since(self, known: "Erasures") -> "Erasures":
         """Return the entries that an installation does not know.
 
-        It knows an entry that ended there at the same moment or later, and a consent that is as recent.
+        It knows an entry that ended there at the same moment or later, and a consent or an outcome that is as recent.
         """
         ended = {
             kind: {name: at for name, at in names.items() if not _knows(known.ended.get(kind, {}), name, at)}
             for kind, names in self.ended.items()
         }
-        consents = {who: said for who, said in self.consents.items() if _is_later(who, said[0], known)}
-        return Erasures(self.surgeons - known.surgeons, ended, consents)
+        consents, outcomes = _later(self.consents, known.consents), _later(self.outcomes, known.outcomes)
+        return Erasures(self.surgeons - known.surgeons, ended, consents, outcomes)
 
 
 def _latest(one: Mapping[str, datetime], other: Mapping[str, datetime]) -> dict[str, datetime]:
@@ -109,8 +123,11 @@ def _knows(known: Mapping[str, datetime], name: str, at: datetime) -> bool:
     return name in known and known[name] >= at
 
 
-def _is_later(who: str, at: datetime, than: Erasures) -> bool:
-    return who not in than.consents or than.consents[who][0] < at
+def _later(
+    one: Mapping[str, tuple[datetime, T]], other: Mapping[str, tuple[datetime, T]]
+) -> dict[str, tuple[datetime, T]]:
+    """Return the statements of one list that are later than the other's on the same object, or the only ones."""
+    return {name: said for name, said in one.items() if name not in other or other[name][0] < said[0]}
 
 
 NOTHING = Erasures()
@@ -128,6 +145,7 @@ class Restored:
     styles_stopped: int = 0  # released in the backup, and not any more
     keys_revoked: int = 0
     consents_narrowed: int = 0
+    demos_marked: int = 0
 
 
 def back_up(database: Database, target: Path, told: Told = lambda _: None) -> Manifest:
@@ -199,6 +217,7 @@ def keep_erasures(database: Database, target: Path) -> Erasures:
             "surgeons": sorted([salt, digest, rfc3339(at)] for salt, digest, at in listed.surgeons),
             **{kind: _written(listed.ended.get(kind, {})) for kind in sorted(set(ENDS.values()))},
             "consents": {who: [rfc3339(at), consent] for who, (at, consent) in sorted(listed.consents.items())},
+            "outcomes": {demo: [rfc3339(at), outcome] for demo, (at, outcome) in sorted(listed.outcomes.items())},
         }
         with _appearing(target) as file:
             about = {"format": ERASURES, "erasures": content, "sha256": sha256(canonical(content))}
@@ -248,6 +267,8 @@ def _read(content: dict[str, Any]) -> Erasures:
         frozenset((salt, digest, datetime.fromisoformat(at)) for salt, digest, at in content["surgeons"]),
         {kind: {name: datetime.fromisoformat(at) for name, at in content[kind].items()} for kind in ENDS.values()},
         {who: (datetime.fromisoformat(at), consent) for who, (at, consent) in content["consents"].items()},
+        # A list of an older version has none.
+        {demo: (datetime.fromisoformat(at), outcome) for demo, (at, outcome) in content.get("outcomes", {}).items()},
     )
 
 
@@ -270,7 +291,7 @@ def _listed(session: Session) -> Erasures:
     for action, kind, name, at in session.execute(events.group_by(Event.action, Event.object_kind, Event.object_id)):
         ended[ENDS[action, kind]][name] = at
     ended["releases"] = _latest(ended["releases"], _superseded(session))
-    return Erasures(frozenset(surgeons), ended, _consents(session))
+    return Erasures(frozenset(surgeons), ended, _consents(session), _outcomes(session))
 
 
 def _superseded(session: Session) -> dict[str, datetime]:
@@ -292,6 +313,17 @@ def _consents(session: Session) -> dict[str, tuple[datetime, Consent]]:
     when: dict[str | None, datetime] = {subject: at for subject, at in session.execute(said)}  # noqa: C416 - mypy
     surgeons = session.execute(select(Surgeon.subject, Surgeon.created_at, Surgeon.consent))
     return {subject: (when.get(subject, created_at), consent) for subject, created_at, consent in surgeons}
+
+
+def _outcomes(session: Session) -> dict[str, tuple[datetime, DemoOutcome]]:
+    """Return, by demonstration, the outcome of the newest mark and its moment.
+
+    They are read from the events, which remain when a demonstration is erased: it may have been added anew since.
+    """
+    marks = tuple_(Event.action, Event.object_kind).in_(MARKED)
+    newest = select(func.max(Event.row)).where(marks).group_by(Event.object_id)
+    events = select(Event.action, Event.object_kind, Event.object_id, Event.at).where(Event.row.in_(newest))
+    return {demo: (at, MARKED[action, kind]) for action, kind, demo, at in session.execute(events)}
 
 
 # ---- applying the list -------------------------------------------------------------------------------------------
@@ -322,13 +354,24 @@ def _end_again(session: Session, manifest: Manifest, erasures: Erasures) -> Rest
     withdrawn = _here(later, "withdrawn", session, standing)
     for demo in withdrawn:
         withdraw_demo(session, demo, "restore")
+    marked = _mark_again(session, later.outcomes)
     withdraw_policies(session, later.ended.get("releases", {}), "restore")
     keys = _here(later, "keys", session, select(Key.id).where(Key.revoked_at.is_(None)))
     for key in keys:
         revoke_key(session, key, "restore")
     narrowed = _narrow(session, later.consents)
     stopped = len(served - _served(session))
-    return Restored(manifest, len(surgeons), len(demos), len(deleted), len(withdrawn), stopped, len(keys), narrowed)
+    ended = (len(surgeons), len(demos), len(deleted), len(withdrawn), stopped, len(keys), narrowed)
+    return Restored(manifest, *ended, demos_marked=marked)
+
+
+def _mark_again(session: Session, outcomes: Mapping[str, tuple[datetime, DemoOutcome]]) -> int:
+    """Mark recoveries and failures again; a later success is not restored, because a list never adds a permission."""
+    failed = {demo: outcome for demo, (_, outcome) in outcomes.items() if outcome != SUCCESS}
+    here = sorted({*failed}.intersection(session.scalars(select(Demonstration.sha256))))
+    for demo in here:
+        mark_demo(session, demo, failed[demo], "Marked after the backup that was restored.", "restore")
+    return len(here)
 
 
 def _here(later: Erasures, kind: str, session: Session, names: Select[str]) -> list[str]:

@@ -32,8 +32,9 @@ from skills.fields import as_json
 from skills.learning.policy import Policy
 from skills.library import integrity, jobs, releases
 from skills.library.consent import refusal
+from skills.library.demos import newest_demos
 from skills.library.jobs import PartRequest, RetrainingRequest, Store, TrainingRequest
-from skills.library.policies import Recipe, newest_demos, recipes_of, refuse_unlike
+from skills.library.policies import Recipe, recipes_of, refuse_unlike
 from skills.library.releases import fit_of, not_worse, shown_mm, taught, way_of
 from skills.library.training import Learnt, Lesson, Stored, combined_lesson, learn_style, lessons, store_styles
 from skills.schemas.policies import FitOnTheSame, PolicyFigures, StoredComparison
@@ -242,6 +243,8 @@ def _learn(database: Database, batch: _Batch, style: _Style) -> Learnt | SkillsE
             newest = newest_demos(session, lesson.surgeon.row, lesson.suture, recipe.demos)
             refuse_unlike(newest)
             found = lessons(session, [one.row for one in newest])
+        if not found:
+            return Conflict("All demonstrations of the style were withdrawn or marked since the batch was requested.")
         if len(found) == 1:  # the others were withdrawn since, and the served policy with them
             return learn_style(found[0], batch.training_of(found[0], [found[0].sha256]), batch.settings)
         asked = batch.training_of(lesson, [one.sha256 for one in found], recipe.how)

@@ -133,13 +133,15 @@ def consent(given: dict[str, Any] | None) -> str:
     )
 
 
-def demonstration_state(withdrawn_at: datetime | None) -> str:
-    """Return the sentence on whether a demonstration is active or withdrawn."""
+def demonstration_state(withdrawn_at: datetime | None, outcome: str | None, reason: str | None) -> str:
+    """Return the sentences on whether a demonstration is active or withdrawn, and on its outcome if it is known."""
+    why = "" if reason is None else f": {reason.rstrip('.')}"
+    marked = "" if outcome is None else f" Marked {outcome}{why}."
     if withdrawn_at is None:
-        return "Active."
+        return f"Active.{marked}"
     return (
         f"Withdrawn on {withdrawn_at:%Y-%m-%d} by its surgeon or the lab. No policy that was learnt from it is "
-        "or can be released; do not use this policy."
+        f"or can be released; do not use this policy.{marked}"
     )
 
 
@@ -177,8 +179,14 @@ def lost(report: dict[str, Any]) -> str:
     )
 
 
-def learner(phases: int, settled: bool) -> str:
-    """Return the sentences on a learner's state, and on whether learning converged."""
+def learner(phases: int, settled: bool, outcomes: Sequence[str | None] | None) -> str:
+    """Return the sentences on a learner's state, on whether learning converged, and on the outcomes it learnt from.
+
+    Args:
+        phases: The number of phases of its state.
+        settled: Whether learning converged.
+        outcomes: Of a training from demonstrations of any outcome: that of each as it was then.
+    """
     state = (
         "Its state is the cell and the phase (how far along the demonstration), so a path that crosses itself can be "
         "followed."
@@ -186,7 +194,11 @@ def learner(phases: int, settled: bool) -> str:
         else "Its state is the cell alone, as in the paper, so a path that crosses itself cannot be followed."
     )
     ended = "It ended when the values no longer changed." if settled else "It ended before it had converged."
-    return f"{state} {ended} The same demonstration, settings, seed and learner version give the same numbers."
+    same = "The same demonstration, settings, seed and learner version give the same numbers."
+    if outcomes is None:
+        return f"{state} {ended} {same}"
+    known = ", ".join("not known" if one is None else one for one in outcomes)
+    return f"{state} {ended} {same} It was asked to learn from any outcome; that of its demonstrations was: {known}."
 
 
 def coverage(counts: StartCounts, starts: int) -> str:

@@ -162,8 +162,7 @@ def _status(session: Session, version: PolicyVersion, released: Sequence[Release
     served = None if serving is None else serving.policy
     # The certificate's reasons are final; the two below can arise after training.
     refused = list(version.manifest["grid_certificate"]["refused_because"])
-    if version.rests_on_withdrawn:
-        refused.append("its demonstration was withdrawn")
+    refused += [f"its demonstration {what}" for what in version.objections]
     if not consent.may(version.surgeon, "training"):
         refused.append("the surgeon's consent no longer covers training")
     return CardStatus(
@@ -211,7 +210,9 @@ def _demonstration(row: Demonstration) -> CardDemonstration:
         sha256=row.sha256,
         state="active" if row.withdrawn_at is None else "withdrawn",
         withdrawn_at=row.withdrawn_at,
-        state_in_words=words.demonstration_state(row.withdrawn_at),
+        outcome=row.outcome,
+        outcome_reason=row.outcome_reason,
+        state_in_words=words.demonstration_state(row.withdrawn_at, row.outcome, row.outcome_reason),
         arm=row.arm,
         topic=row.topic,
         frame=row.frame,
@@ -253,7 +254,7 @@ def _learner(version: PolicyVersion) -> CardLearner:
         kind=manifest["learner"],
         version=manifest["learner_version"],
         **{name: manifest[name] for name in told},
-        in_words=words.learner(manifest["phases"], manifest["training"]["settled"]),
+        in_words=words.learner(manifest["phases"], manifest["training"]["settled"], manifest.get("outcomes")),
     )
 
 

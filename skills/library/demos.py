@@ -16,6 +16,7 @@ from sqlalchemy.orm import Session
 from skills.db import now, rfc3339
 from skills.db.models import (
     Demonstration,
+    DemonstrationOutcome,
     RecordingChunk,
     Release,
     StoredRecording,
@@ -39,15 +40,21 @@ from skills.library import consent
 from skills.library.catalogue import find_surgeon, find_suture_type
 from skills.library.integrity import demo_identity, find_by_digest
 from skills.library.recordings import Teller, Upload, find_recording, keep, recording_bytes, tell_upload
-from skills.library.releases import withdraw_resting_on
+from skills.library.releases import withdraw_failed, withdraw_resting_on
 from skills.packing import canonical
 from skills.remedies import Action, Remedy
-from skills.schemas import ChosenGrid
+from skills.schemas import ChosenGrid, DemoOutcome, OutcomeAsked
 from skills.schemas.recordings import DemoReport
 from skills.schemas.requests import DemoIn
 
 EQUAL_SHARE = 0.1  # ours: an arm that rests on exact encoder values for a tenth of the time is no reason for advice
 COUNTED_LATER = ("backward_stamps", "equal_samples")  # counts that version 0.1.0 did not make
+# The actions of the events that mark an outcome.
+MARKS: dict[DemoOutcome, str] = {
+    "success": "mark-success",
+    "recovery": "mark-recovery",
+    "failure": "mark-failure",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,6 +254,7 @@ def _store_demo(session: Session, stored: StoredRecording, made: Made, cut: Demo
     if known is not None:
         if known.withdrawn_at is not None:
             raise Conflict("This demonstration was withdrawn; record another, or cut another part of the recording.")
+        _refuse_other_outcome(known, cut)
         return Added(known, False, made.taken)
     demonstration = Demonstration(
         sha256=demo_sha256,
@@ -271,7 +279,21 @@ def _store_demo(session: Session, stored: StoredRecording, made: Made, cut: Demo
         StoredRewardMap(sha256=digest(made.reward), demonstration_row=demonstration.row, map=made.reward),
     )
     record_event(session, actor, "add", "demonstration", demo_sha256, surgeon)
+    _mark(session, demonstration, cut.outcome, cut.outcome_reason, actor)
     return Added(demonstration, True, made.taken)
+
+
+def _refuse_other_outcome(known: Demonstration, cut: DemoIn) -> None:
+    """Refuse a repetition with another outcome: whoever adds demonstrations may not change one, see `mark_demo`.
+
+    Raises:
+        Conflict: The outcome or its reason differs from the stored one.
+    """
+    if cut.outcome is not None and (cut.outcome, cut.outcome_reason) != (known.outcome, known.outcome_reason):
+        because = "" if known.outcome_reason is None else f" ({known.outcome_reason})"
+        stored = "without an outcome" if known.outcome is None else f"as a {known.outcome}{because}"
+        mark = Remedy(Action.MARK_DEMO, demo=known.sha256, outcome=cut.outcome)
+        raise Conflict(f"This demonstration is stored {stored}; adding it again does not change that.", mark)
 
 
 def find_demo(session: Session, demo_sha256: str) -> Demonstration:
@@ -310,14 +332,27 @@ def exported_chunk(database: Database, demo_sha256: str, number: int) -> bytes |
 
 
 def newest_demo(session: Session, surgeon_row: int, suture: str) -> Demonstration | None:
-    """Return the newest active demonstration of a style."""
-    return session.scalar(
-        select(Demonstration)
-        .where(Demonstration.surgeon_row == surgeon_row, Demonstration.suture == suture)
-        .where(Demonstration.withdrawn_at.is_(None))
-        .order_by(Demonstration.row.desc())
-        .limit(1)
-    )
+    """Return the newest demonstration of a style that is learnable."""
+    return next(iter(newest_demos(session, surgeon_row, suture, 1)), None)
+
+
+def newest_demos(
+    session: Session, surgeon_row: int, suture: str, most: int, *, any_outcome: bool = False
+) -> list[Demonstration]:
+    """Return the newest demonstrations of a style, at most `most`, the oldest of them first.
+
+    Args:
+        session: The caller's transaction.
+        surgeon_row: The surgeon.
+        suture: The suture type.
+        most: The most demonstrations.
+        any_outcome: Return all that are active, and not only those that are learnable.
+    """
+    of = Demonstration
+    wanted = of.withdrawn_at.is_(None) if any_outcome else of.learnable
+    found = select(of).where(of.surgeon_row == surgeon_row, of.suture == suture, wanted)
+    # Selected from the newest back, returned from the oldest on.
+    return list(session.scalars(found.order_by(of.row.desc()).limit(most)))[::-1]
 
 
 def list_demos(
@@ -328,6 +363,7 @@ def list_demos(
     suture: str | None,
     recording: str | None = None,
     active: bool | None = None,
+    outcome: OutcomeAsked | None = None,
 ) -> Sequence[Demonstration]:
     """List demonstrations, the newest first.
 
@@ -339,6 +375,7 @@ def list_demos(
         suture: List only those of this suture type.
         recording: List only those cut out of this recording, by its digest.
         active: List only active ones, or only withdrawn ones.
+        outcome: List only those of this outcome.
     """
     query = select(Demonstration).order_by(Demonstration.row.desc()).limit(limit)
     if before is not None:
@@ -351,6 +388,8 @@ def list_demos(
         query = query.where(Demonstration.recording_row == find_recording(session, recording).row)
     if active is not None:
         query = query.where(Demonstration.withdrawn_at.is_(None) if active else Demonstration.withdrawn_at.is_not(None))
+    if outcome is not None:
+        query = query.where(Demonstration.outcome == (None if outcome == "unknown" else outcome))
     return session.scalars(query).all()
 
 
@@ -361,6 +400,40 @@ def withdraw_demo(session: Session, demo_sha256: str, actor: str) -> list[Releas
         demonstration.withdrawn_at = now()
         record_event(session, actor, "withdraw", "demonstration", demonstration.sha256, demonstration.surgeon)
     return withdraw_resting_on(session, demonstration, actor)
+
+
+def mark_demo(
+    session: Session, demo_sha256: str, outcome: DemoOutcome, reason: str | None, actor: str
+) -> Demonstration:
+    """Mark the outcome of a demonstration; an equal mark is not stored twice.
+
+    A failure or a recovery withdraws the releases that were learnt from it, except of versions that were trained from
+    any outcome.
+
+    Args:
+        session: The caller's transaction.
+        demo_sha256: Its digest, or a prefix of it.
+        outcome: The outcome.
+        reason: Why, in the words of the caller.
+        actor: The owner of the caller's key.
+    """
+    demonstration = find_demo(session, demo_sha256)
+    if (demonstration.outcome, demonstration.outcome_reason) != (outcome, reason):
+        _mark(session, demonstration, outcome, reason, actor)
+    if demonstration.failed:
+        withdraw_failed(session, demonstration, actor)
+    return demonstration
+
+
+def _mark(
+    session: Session, demonstration: Demonstration, outcome: DemoOutcome | None, reason: str | None, actor: str
+) -> None:
+    if outcome is not None:
+        mark = {"outcome": outcome, "reason": reason, "actor": actor}
+        session.add(DemonstrationOutcome(demonstration_row=demonstration.row, **mark))
+        record_event(session, actor, MARKS[outcome], "demonstration", demonstration.sha256, demonstration.surgeon)
+        session.flush()
+    session.refresh(demonstration, ["outcome", "outcome_reason"])
 
 
 def demo_json(row: Demonstration, taken: TakenSegment | None = None) -> dict[str, Any]:
@@ -383,6 +456,8 @@ def demo_json(row: Demonstration, taken: TakenSegment | None = None) -> dict[str
         "session": row.session,
         "hysteresis": row.hysteresis,
         "state": "active" if row.withdrawn_at is None else "withdrawn",
+        "outcome": row.outcome,
+        "outcome_reason": row.outcome_reason,
         "report": report,
         "created_at": rfc3339(row.created_at),
         "withdrawn_at": rfc3339(row.withdrawn_at),

@@ -16,6 +16,7 @@ from skills.db import in_parts
 from skills.db.changes import announce
 from skills.db.models import (
     Demonstration,
+    DemonstrationOutcome,
     Erasure,
     MeasuredShape,
     Plan,
@@ -164,7 +165,8 @@ def _erase(session: Session, which: ColumnElement[bool], surgeon: Surgeon, recor
             delete(PolicyVersion).where(PolicyVersion.row.in_(some)),
         ):
             session.execute(statement, **UNSYNCHRONISED)
-    session.execute(delete(StoredRewardMap).where(StoredRewardMap.demonstration_row.in_(demos)), **UNSYNCHRONISED)
+    for of in (StoredRewardMap, DemonstrationOutcome):
+        session.execute(delete(of).where(of.demonstration_row.in_(demos)), **UNSYNCHRONISED)
     session.execute(delete(Demonstration).where(which), **UNSYNCHRONISED)
     for some in in_parts(sorted(recordings)):
         cut = select(Demonstration.recording_row).where(Demonstration.recording_row.in_(some))

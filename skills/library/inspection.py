@@ -253,8 +253,8 @@ def _release(row: Release) -> Why:
         yield "it releases a policy of another style"
     if not policy.releasable:
         yield "its policy did not pass the gate"
-    if row.withdrawn_at is None and policy.rests_on_withdrawn:
-        yield "it is not withdrawn, but its demonstration is"
+    if row.withdrawn_at is None:
+        yield from (f"it is not withdrawn, but its demonstration {what}" for what in policy.objections)
 
 
 def _plan(row: Plan) -> Why:

@@ -153,6 +153,7 @@ class TrainingRequest(TypedDict):
     seed: int
     release: bool
     combine: NotRequired[dict[str, str]]  # of several demonstrations
+    outcomes: NotRequired[str]  # "any": of any outcome; otherwise left out
 
 
 class RetrainingRequest(TypedDict):

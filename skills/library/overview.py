@@ -19,7 +19,7 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import ColumnElement, func, select, text
+from sqlalchemy import ColumnElement, case, func, select, text
 from sqlalchemy.orm import Session
 
 from skills.db import now
@@ -339,7 +339,8 @@ def _styles(session: Session, surgeons: Sequence[int], suture: str | None = None
 
     demos, newest_demo = Counter[_Row](), dict[_Row, int]()
     of = Demonstration
-    active = select(of.surgeon_row, of.suture, func.count(), func.max(of.row)).where(of.withdrawn_at.is_(None))
+    newest_of = func.max(case((of.learnable, of.row), else_=0))
+    active = select(of.surgeon_row, of.suture, func.count(), newest_of).where(of.withdrawn_at.is_(None))
     for who, what, count, newest in session.execute(active.where(*mine(of)).group_by(of.surgeon_row, of.suture)):
         demos[who, what], newest_demo[who, what] = count, newest
     versions, newest_version = Counter[_Row](), dict[_Row, int]()

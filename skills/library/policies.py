@@ -26,7 +26,7 @@ from skills.learning.evaluation import dtw
 from skills.learning.policy import Policy, rollout
 from skills.library import consent, integrity, releases
 from skills.library.catalogue import find_surgeon, find_suture_type
-from skills.library.demos import find_demo, newest_demo
+from skills.library.demos import find_demo, newest_demos
 from skills.library.integrity import covered, learnt
 from skills.library.releases import is_served
 from skills.remedies import Action, Remedy
@@ -259,19 +259,29 @@ def summary_json(row: Release) -> dict[str, Any]:
 # ---- policies learnt from several demonstrations -------------------------------------------------------------------
 
 
-def choose_demos(session: Session, who: Surgeon, suture: str, demos: list[str] | None) -> list[Demonstration]:
-    """Return the requested demonstrations, the oldest first, or the newest active one of the style if none are named.
+def choose_demos(
+    session: Session, who: Surgeon, suture: str, demos: list[str] | None, *, any_outcome: bool = False
+) -> list[Demonstration]:
+    """Return the requested demonstrations, the oldest first, or the newest one of the style if none are named.
+
+    Args:
+        session: The caller's transaction.
+        who: The surgeon.
+        suture: The suture type.
+        demos: Their digests, or None.
+        any_outcome: Accept demonstrations that are marked recovery or failure.
 
     Raises:
         NotFound: One is unknown.
-        Conflict: One was withdrawn, or the style has none.
+        Conflict: One was withdrawn, or marked recovery or failure; or the style has none.
         BadInput: One is of another style or named twice, there are too many, or they cannot be combined.
     """
-    found = [find_demo(session, one) for one in demos] if demos else [newest_demo(session, who.row, suture)]
-    chosen = sorted((demo for demo in found if demo is not None), key=lambda demo: demo.row)
+    if demos:
+        chosen = sorted((find_demo(session, one) for one in demos), key=lambda demo: demo.row)
+    else:
+        chosen = newest_demos(session, who.row, suture, 1, any_outcome=any_outcome)
     if not chosen:
-        add = Remedy(Action.ADD_DEMO, surgeon=who.slug, suture=suture)
-        raise Conflict(f"'{who.slug}' has no active demonstration of '{suture}'.", add)
+        raise _none(session, who, suture)
     if len(chosen) > MOST_DEMOS:
         raise BadInput(f"At most {MOST_DEMOS} demonstrations can be combined.", demos=len(chosen))
     if len({demo.row for demo in chosen}) < len(chosen):
@@ -280,8 +290,21 @@ def choose_demos(session: Session, who: Surgeon, suture: str, demos: list[str] |
         raise BadInput("The demonstration belongs to another style.")
     if any(demo.withdrawn_at is not None for demo in chosen):
         raise Conflict("The demonstration was withdrawn.")
+    if not any_outcome and (failed := [demo for demo in chosen if demo.failed]):
+        one, reason = failed[0], (failed[0].outcome_reason or "no reason is given").rstrip(".")
+        why = f"The demonstration {one.sha256[:12]} is marked {one.outcome}: {reason}."
+        raise Conflict(why, Remedy(Action.TRAIN_ANY), demos=[demo.sha256 for demo in failed])
     refuse_unlike(chosen)
     return chosen
+
+
+def _none(session: Session, who: Surgeon, suture: str) -> Conflict:
+    """Return the error that a style has no demonstration to learn from."""
+    if newest_demos(session, who.row, suture, 1, any_outcome=True):
+        why = f"Every active demonstration of '{suture}' by '{who.slug}' is marked recovery or failure."
+        return Conflict(why, Remedy(Action.TRAIN_ANY))
+    add = Remedy(Action.ADD_DEMO, surgeon=who.slug, suture=suture)
+    return Conflict(f"'{who.slug}' has no active demonstration of '{suture}'.", add)
 
 
 @dataclass(frozen=True)
@@ -315,14 +338,6 @@ def recipes_of(session: Session, surgeons: Collection[int] | None = None) -> dic
         query = query.where(Release.surgeon_row.in_(surgeons))
     found = session.execute(query)
     return {(who, suture): Recipe(more + 1, combining_of({"kind": how})) for who, suture, how, more in found}
-
-
-def newest_demos(session: Session, surgeon_row: int, suture: str, most: int) -> list[Demonstration]:
-    """Return the newest active demonstrations of a style, at most `most`, the oldest of them first."""
-    of = Demonstration
-    active = select(of).where(of.surgeon_row == surgeon_row, of.suture == suture, of.withdrawn_at.is_(None))
-    # Selected from the newest back, returned from the oldest on.
-    return list(session.scalars(active.order_by(of.row.desc()).limit(most)))[::-1]
 
 
 def refuse_unlike(demonstrations: Sequence[Demonstration]) -> None:

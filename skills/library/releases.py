@@ -145,9 +145,13 @@ STANDS = (
 _OTHERWISE = "Train it with other settings or another learner, or record the hand-off again."
 _REMEDIES = (
     ("consent", "Record a consent of the surgeon that covers training, then request the release again."),
+    ("demonstration was withdrawn", "Train from a demonstration that is active, and request its release."),
+    (
+        "demonstration was marked",
+        "Train from another demonstration, or with outcomes 'any' from this one, and request the release.",
+    ),
     ("was released", "Request the release again if this version is to be served in its place."),
     ("was withdrawn.", "Request the release again if this version is to be served."),
-    ("demonstration was withdrawn", "Train from a demonstration that is active, and request its release."),
     ("is worse than", "Release it by its number if it is to replace the released version anyway."),
     ("not optimal", _OTHERWISE),
     ("do not reach the goal", _OTHERWISE),
@@ -197,8 +201,8 @@ def release(session: Session, policy: PolicyVersion, actor: str) -> Release:
     """Release a policy version if it passes the gate; releasing the served version again changes nothing.
 
     Raises:
-        Conflict: It does not pass, with the reasons; its demonstration was withdrawn; or the surgeon's consent does not
-            cover training.
+        Conflict: It does not pass, with the reasons; its demonstration was withdrawn, or marked recovery or failure; or
+            the surgeon's consent does not cover training.
         Corrupt: The stored policy does not match its digest.
     """
     consent.require(policy.surgeon, "training")
@@ -207,8 +211,7 @@ def release(session: Session, policy: PolicyVersion, actor: str) -> Release:
     if served and served[0].policy_row == policy.row:
         return served[0]
     reasons = list(policy.manifest["grid_certificate"]["refused_because"])
-    if policy.rests_on_withdrawn:
-        reasons.append("its demonstration was withdrawn")
+    reasons += [f"its demonstration {what}" for what in policy.objections]
     # Only phased policies have to reproduce their demonstration; one of the cell state must at least not be worse.
     if policy.manifest["phases"] == 1 and served:
         found = fit_of_versions(session, served[0].policy, policy)
@@ -255,6 +258,17 @@ def withdraw_resting_on(session: Session, demonstration: Demonstration, actor: s
     withdrawn = _with_superseded(releases, [r for r in releases if demonstration in r.policy.demonstrations])
     _withdraw(session, withdrawn, actor)
     return withdrawn
+
+
+def withdraw_failed(session: Session, demonstration: Demonstration, actor: str) -> None:
+    """Withdraw, as `withdraw_resting_on`, releases learnt from a demonstration that is marked recovery or failure.
+
+    Those of versions that were trained from any outcome stay, unless they were superseded by one that is withdrawn.
+    """
+    releases = standing(session, demonstration.surgeon_row, demonstration.suture)
+    resting = [one for one in releases if demonstration in one.policy.demonstrations]
+    failed = [one for one in resting if not one.policy.of_any_outcome]
+    _withdraw(session, _with_superseded(releases, failed), actor)
 
 
 def withdraw_policies(session: Session, ended: Mapping[str, datetime], actor: str) -> None:

@@ -180,8 +180,8 @@ def cleared(
     consent.require(policies.followable(policy).surgeon, "export")
     if handoff != "none" and planned(plan).psm_m is None:
         raise Conflict("This plan has no hand-off: no PSM_M, no A2.", Remedy(Action.EXPORT_A1_ALONE))
-    if policy.rests_on_withdrawn:
-        raise Conflict("The demonstration that this plan depends on was withdrawn; plan with another policy.")
+    for what in policy.objections:
+        raise Conflict(f"The demonstration that this plan depends on {what}; plan with another policy.")
     served = releases.standing(session, policy.surgeon_row, policy.suture)
     if not served or served[0].policy_row != policy.row:
         now = f"version {served[0].policy.version} is" if served else "none is"

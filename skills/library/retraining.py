@@ -20,8 +20,9 @@ from skills.learning.policy import LEARNER_VERSION, describe_learner
 from skills.learning.q_learning import PhaseQLearning
 from skills.library import jobs
 from skills.library.catalogue import find_surgeon, find_suture_type
+from skills.library.demos import newest_demos
 from skills.library.jobs import BATCH, PART, Asked, PartRequest, RetrainingRequest, did_nothing
-from skills.library.policies import Recipe, newest_demos, recipes_of
+from skills.library.policies import Recipe, recipes_of
 from skills.library.releases import Outcome
 from skills.library.training import GATE_VERSION
 from skills.packing import canonical, sha256
@@ -33,10 +34,11 @@ FEWEST_PARTS = 16  # if there are so many styles: workers share a batch part by 
 
 
 def request_retraining(session: Session, batch: RetrainingIn, actor: str) -> Asked:
-    """Queue a batch that trains styles again, each from its newest active demonstration.
+    """Queue a batch that trains styles again, each from its newest demonstration that may be learnt from.
 
-    A style that serves a policy of several demonstrations is learnt from the same number of its newest ones, combined
-    in the same way.
+    One that is marked recovery or failure is left out, even if the style serves a version trained from any outcome. A
+    style that serves a policy of several demonstrations is learnt from the same number of its newest ones, combined in
+    the same way.
 
     The styles are chosen now; they and all defaults are the job's identity. With `only_stale` a style is left out if
     its newest version was learnt from that demonstration, with these settings and this learner, and was not refused by
@@ -54,7 +56,7 @@ def request_retraining(session: Session, batch: RetrainingIn, actor: str) -> Ask
 
     Raises:
         NotFound: The surgeon or the suture type is unknown.
-        Conflict: There is no active demonstration.
+        Conflict: There is no demonstration that may be learnt from.
         LearnerNotInstalled: The learner needs a library that is not installed.
     """
     require_installed(learner := batch.chosen or PhaseQLearning())
@@ -63,7 +65,8 @@ def request_retraining(session: Session, batch: RetrainingIn, actor: str) -> Ask
     demos = _newest_demos(session, who, what)
     if not demos:
         add = Remedy(Action.ADD_DEMO, surgeon=batch.surgeon or "SURGEON", suture=batch.suture or "SUTURE")
-        raise Conflict("There is no active demonstration of the requested styles.", add)
+        why = "There is no active demonstration of the requested styles; one marked recovery or failure does not count."
+        raise Conflict(why, add)
     asked: RetrainingRequest = {
         "surgeon": batch.surgeon,
         "suture": batch.suture,
@@ -130,7 +133,7 @@ def _did_nothing(session: Session, job: Job) -> str:
 
 @dataclass(frozen=True)
 class _Newest:
-    """The newest active demonstration of a style."""
+    """The newest demonstration of a style that may be learnt from."""
 
     row: int
     sha256: str
@@ -140,7 +143,7 @@ class _Newest:
 
 def _newest_demos(session: Session, surgeon: Surgeon | None, suture: SutureType | None) -> list[_Newest]:
     of = Demonstration
-    newest = select(func.max(of.row)).where(of.withdrawn_at.is_(None), *_styles(of, surgeon, suture))
+    newest = select(func.max(of.row)).where(of.learnable, *_styles(of, surgeon, suture))
     newest = newest.group_by(of.surgeon_row, of.suture)
     query = select(of.row, of.sha256, of.surgeon_row, of.suture).where(of.row.in_(newest)).order_by(of.row)
     return [_Newest(*row) for row in session.execute(query)]

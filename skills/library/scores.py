@@ -108,12 +108,16 @@ def percentiles(
 
 
 def _by_level(others: Sequence[Other], scored: Demonstration | None, reference: Demonstration) -> list[_Level]:
-    """Group demonstrations by the skill level of their surgeons, without the scored one and the reference."""
+    """Group demonstrations by the skill level of their surgeons.
+
+    The scored one and the reference are left out, and all that are marked recovery or failure: a level is represented
+    by what is not known to have failed. The curve of a surgeon has them all.
+    """
     levels: dict[str | None, _Level] = {name: _Level(name) for name in LEVELS}
     out = {reference.row, *([scored.row] if scored else [])}
     for other in others:
         level = levels.get(other.row.surgeon.skill_level)
-        if level is not None and other.row.row not in out:
+        if level is not None and other.row.row not in out and not other.row.failed:
             level.numbers.append(other.numbers)
             level.surgeons.add(other.row.surgeon_row)
     return list(levels.values())
@@ -227,9 +231,7 @@ def score(database: Database, asked: ScoreIn, read: Reader) -> Score:
 
 def references(session: Session, suture: str) -> list[Surgeon]:
     """List the surgeons with a demonstration of a suture type to compare with, as far as they agreed, experts first."""
-    having = select(Demonstration.surgeon_row).where(
-        Demonstration.suture == suture, Demonstration.withdrawn_at.is_(None)
-    )
+    having = select(Demonstration.surgeon_row).where(Demonstration.suture == suture, Demonstration.learnable)
     found = session.scalars(select(Surgeon).where(Surgeon.row.in_(having)).order_by(Surgeon.slug))
     return sorted((one for one in found if may(one, "atlas")), key=lambda one: one.skill_level != "expert")
 
@@ -246,7 +248,7 @@ def _reference(session: Session, asked: ScoreIn) -> tuple[Demonstration, str]:
             raise BadInput("The reference is a demonstration of another style; name one of this surgeon and suture.")
         if named.withdrawn_at is not None:
             raise Conflict("The reference was withdrawn; name another, or none.")
-        return named, "it was requested"
+        return named, f"it was requested{f', and is marked {named.outcome}' if named.failed else ''}"
     served = releases.served(session, surgeon, asked.suture)
     if served is not None:
         policy = served.policy

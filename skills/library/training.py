@@ -14,7 +14,15 @@ from sqlalchemy import LargeBinary, Result, Table, bindparam, func, insert, sele
 from sqlalchemy.orm import Session
 
 from skills.comparison.combining import Combining, followed
-from skills.db.models import Demonstration, PolicyDemonstration, PolicyVersion, StoredRewardMap, Surgeon
+from skills.db.models import (
+    SUCCESS,
+    Demonstration,
+    PolicyDemonstration,
+    PolicyVersion,
+    StoredRewardMap,
+    Surgeon,
+    newest_mark,
+)
 from skills.db.packed import seal, unpack_as
 from skills.db.service_tables import Job, record_events
 from skills.db.session import Database
@@ -38,6 +46,7 @@ from skills.library.jobs import QUEUED, Asked, Store, TrainingRequest, did_nothi
 from skills.library.policies import BEST, choose_demos, combining_of, describe_combined, find_by_digest
 from skills.packing import canonical, sha256
 from skills.planning.plan import DrivenPass, driven_pass
+from skills.remedies import Action, Remedy
 from skills.schemas.policies import Coverage, GridCertificate
 from skills.schemas.requests import TrainingIn
 from skills.settings import Settings
@@ -49,6 +58,7 @@ STANDING = (
     select(
         _DEMOS.c.row,
         _DEMOS.c.withdrawn_at,
+        newest_mark("outcome", _DEMOS.c.row).label("outcome"),
         _SURGEONS.c.slug,
         _SURGEONS.c.consent,
         select(func.max(_OF_STYLE.c.version))
@@ -63,6 +73,7 @@ KNOWN = select(_VERSIONS.c.sha256, _VERSIONS.c.row, _VERSIONS.c.version).where(
     _VERSIONS.c.sha256.in_(bindparam("digests", expanding=True))
 )
 ADD = insert(_VERSIONS).returning(_VERSIONS.c.sha256, _VERSIONS.c.row, _VERSIONS.c.version)
+ANY = "any"  # `outcomes` of a training from demonstrations of any outcome
 GATE_VERSION = 2  # part of a training's identity: raise it when the gate's result for an equal policy changes
 CERTIFICATE_NOTE = (
     "Checked on the grid: every greedy action against exact dynamic programming, and every start by following it; "
@@ -80,13 +91,14 @@ def request_training(session: Session, training: TrainingIn, actor: str) -> Aske
 
     Args:
         session: The caller's transaction.
-        training: The request. Without `demos` the newest active demonstration of the style is meant, without `combine`
-            `BEST`, and without `learner` phase Q-learning with its defaults.
+        training: The request. Without `demos` the newest demonstration of the style is meant that may be learnt from,
+            without `combine` `BEST`, and without `learner` phase Q-learning with its defaults.
         actor: The owner of the caller's key.
 
     Raises:
         NotFound: The surgeon, the suture type or a demonstration is unknown.
-        Conflict: There is no active demonstration, or the surgeon's consent does not cover training.
+        Conflict: There is no active demonstration; one is marked recovery or failure, and the request does not have
+            outcomes "any"; or the surgeon's consent does not cover training.
         BadInput: A demonstration belongs to another style or is named twice, there are too many, or they cannot be
             combined.
         BadSettings: Learning would need too much memory.
@@ -95,7 +107,8 @@ def request_training(session: Session, training: TrainingIn, actor: str) -> Aske
     require_installed(learner := training.chosen or PhaseQLearning())
     who, what = find_surgeon(session, training.surgeon), find_suture_type(session, training.suture)
     require(who, "training")
-    chosen = choose_demos(session, who, what.slug, training.demos)
+    any_outcome = training.outcomes == ANY
+    chosen = choose_demos(session, who, what.slug, training.demos, any_outcome=any_outcome)
     # Before the job is queued, so that the caller sees the error at once.
     refuse_too_large(chosen[-1].path, learner)
     request: TrainingRequest = {
@@ -112,6 +125,8 @@ def request_training(session: Session, training: TrainingIn, actor: str) -> Aske
         request["combine"] = {"kind": (training.combining or BEST).kind}
     elif training.combining is not None:
         raise BadInput("A single demonstration is not combined; name several in `demos`, or omit `combine`.")
+    if any_outcome:  # left out otherwise, for the same reason
+        request["outcomes"] = ANY
     job, new = jobs.ask(session, "training", request, who, actor)
     if new:
         return Asked(job, True, QUEUED)
@@ -146,7 +161,8 @@ class Lesson:
     """A demonstration to learn from, its values still packed, with its surgeon.
 
     For several combined demonstrations it is the one at whose place their path lies; `others` are the rows of the rest,
-    and `combined` is the description of the combination in the manifest.
+    and `combined` is the description of the combination in the manifest. `outcomes` are those of all its
+    demonstrations, the oldest first; None is not known.
     """
 
     row: int
@@ -155,6 +171,7 @@ class Lesson:
     suture: str
     demo: bytes
     reward: bytes
+    outcomes: tuple[str | None, ...]
     others: tuple[int, ...] = ()
     combined: dict[str, Any] | None = None
 
@@ -217,12 +234,16 @@ def lessons(session: Session, demonstrations: Sequence[int]) -> list[Lesson]:
     of = Demonstration
     packed = type_coerce(of.demo, LargeBinary), type_coerce(StoredRewardMap.map, LargeBinary)
     query = (
-        select(of.row, of.sha256, Surgeon, of.suture, *packed)
+        select(of.row, of.sha256, Surgeon, of.suture, *packed, of.outcome)
         .join(Surgeon, Surgeon.row == of.surgeon_row)
         .join(StoredRewardMap, StoredRewardMap.demonstration_row == of.row)
         .where(of.row.in_(demonstrations))
     )
-    return [Lesson(*row) for row in session.execute(query.order_by(of.row))]
+    found = session.execute(query.order_by(of.row))
+    return [
+        Lesson(row, sha256, surgeon, suture, demo, reward, (outcome,))
+        for row, sha256, surgeon, suture, demo, reward, outcome in found
+    ]
 
 
 def combined_lesson(lessons: Sequence[Lesson], how: Combining) -> Lesson:
@@ -239,6 +260,7 @@ def combined_lesson(lessons: Sequence[Lesson], how: Combining) -> Lesson:
         lessons[at],
         demo=seal(found.demo).packed,
         reward=seal(sparse_reward(found.path, rewards[at].levels)).packed,
+        outcomes=tuple(outcome for lesson in lessons for outcome in lesson.outcomes),
         others=tuple(lesson.row for lesson in lessons if lesson is not lessons[at]),
         combined=describe_combined(found, how, [lesson.sha256 for lesson in lessons]),
     )
@@ -281,6 +303,8 @@ def certified(lesson: Lesson, request: TrainingRequest, demo: Demo, policy: Poli
     manifest = describe_policy(policy, certificate, coverage.digest, demo, request, refused_because, driven)
     if lesson.combined is not None:  # left out for one demonstration, so that older digests stay the same
         manifest["combined"] = lesson.combined
+    if request.get("outcomes") == ANY:  # left out otherwise: then none of them is marked recovery or failure
+        manifest["outcomes"] = [*lesson.outcomes]
     return Learnt(
         lesson=lesson,
         training=sha256(canonical(request)),
@@ -296,7 +320,8 @@ def store_style(session: Session, learnt: Learnt) -> Stored:
 
     Raises:
         NotFound: A demonstration was erased since.
-        Conflict: A demonstration was withdrawn since, or the surgeon's consent does not cover training any more.
+        Conflict: A demonstration was withdrawn since, or marked recovery or failure without a training from any
+            outcome; or the surgeon's consent does not cover training any more.
     """
     (stored,) = store_styles(session, [learnt])
     if isinstance(stored, SkillsError):
@@ -312,7 +337,7 @@ def store_styles(session: Session, learnt: Sequence[Learnt]) -> list[Stored | Sk
     """
     standing = {one.row: one for one in session.execute(STANDING, {"demonstrations": [o.lesson.row for o in learnt]})}
     known = _stored(session.execute(KNOWN, {"digests": [one.sha256 for one in learnt]}))
-    refused = {one.sha256: _refusal(session, one.lesson, standing.get(one.lesson.row)) for one in learnt}
+    refused = {one.sha256: _refusal(session, one, standing.get(one.lesson.row)) for one in learnt}
     # A version that is already stored is returned as it is, so a retry of a job stores nothing twice.
     new = [one for one in learnt if one.sha256 not in known and refused[one.sha256] is None]
     if new:
@@ -331,13 +356,20 @@ def _stored(found: Result[Any]) -> dict[str, Stored]:
     return {one.sha256: Stored(one.row, one.version) for one in found}
 
 
-def _refusal(session: Session, lesson: Lesson, standing: Any) -> SkillsError | None:
-    """Return the error that forbids storing: the demonstration was erased or withdrawn since, or consent has ended."""
-    others = [session.get(Demonstration, row) for row in lesson.others]
+def _refusal(session: Session, learnt: Learnt, standing: Any) -> SkillsError | None:
+    """Return the error that forbids storing.
+
+    A demonstration was erased, withdrawn or marked since, or consent has ended.
+    """
+    others = [session.get(Demonstration, row) for row in learnt.lesson.others]
     if standing is None or None in others:
         return NotFound("A demonstration was erased while the training used it.")
     if any(one.withdrawn_at is not None for one in (standing, *others)):
         return Conflict("A demonstration was withdrawn while the training used it.")
+    marked = [one.outcome for one in (standing, *others) if one.outcome not in (None, SUCCESS)]
+    if marked and "outcomes" not in learnt.manifest:
+        why = f"A demonstration was marked {marked[0]} while the training used it."
+        return Conflict(why, Remedy(Action.TRAIN_ANY))
     return refusal(standing, "training")
 
 

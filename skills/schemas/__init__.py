@@ -45,6 +45,8 @@ T = TypeVar("T")
 
 SkillLevel = Literal["novice", "intermediate", "expert"]
 Handedness = Literal["right", "left", "ambidextrous"]
+DemoOutcome = Literal["success", "recovery", "failure"]
+OutcomeAsked = Literal["success", "recovery", "failure", "unknown"]
 VersionNumber = Annotated[int, Field(ge=1)]
 
 

@@ -15,7 +15,7 @@ from skills.gridworld.reward import RewardLevels
 from skills.learning.evaluation import Metrics, SpaceRollouts
 from skills.learning.q_learning import Training
 from skills.planning.plan import DrivenPass
-from skills.schemas import Given, Grid, Page, PolicyName, VersionNumber
+from skills.schemas import DemoOutcome, Given, Grid, Page, PolicyName, VersionNumber
 from skills.schemas.recordings import DemoReport
 
 
@@ -278,6 +278,10 @@ class Policy(PolicyName):
     grid_certificate: GridCertificate
     combined: Combined | None = Field(default=None, description="Where it was learnt from several demonstrations.")
     rollouts: SpaceRollouts | None = Field(default=None, description="Where it was learnt in the continuous space.")
+    outcomes: list[DemoOutcome | None] | None = Field(
+        default=None,
+        description="Where it was trained from demonstrations of any outcome: that of each as it was then.",
+    )
     created_at: datetime
     released_at: datetime | None
     released_by: str | None
@@ -388,6 +392,8 @@ class CardDemonstration(Given):
     sha256: Sha256
     state: Literal["active", "withdrawn"]
     withdrawn_at: datetime | None
+    outcome: DemoOutcome | None = Field(default=None, description="What became of the hand-off; null: not known.")
+    outcome_reason: str | None = None
     state_in_words: str
     arm: str
     topic: str

@@ -14,7 +14,7 @@ from skills.demonstration.segments import Segment, TakenSegment
 from skills.fields import Count, Point, Quaternion, Sha256, Slug, schema, stored_schema
 from skills.gridworld.grid import PathReport
 from skills.gridworld.reward import RewardLevels
-from skills.schemas import ChosenGrid, Given
+from skills.schemas import ChosenGrid, DemoOutcome, Given
 
 
 @schema
@@ -273,6 +273,8 @@ class Demonstration(Given):
     session: Slug | None
     hysteresis: float = Field(description="Cells.")
     state: Literal["active", "withdrawn"]
+    outcome: DemoOutcome | None = Field(default=None, description="What became of the hand-off; null: not known.")
+    outcome_reason: str | None = Field(default=None, description="Why, in the words of whoever marked it.")
     report: DemoReport
     created_at: datetime
     withdrawn_at: datetime | None

@@ -17,7 +17,7 @@ from skills.kinematics import INSTRUMENTS, JAW_TIP_MM
 from skills.learning.policy import LEARNERS, MAX_SEED, Learner, learner_of
 from skills.planning.handoff import Enters
 from skills.planning.plan import MAX_OUTSIDE_MM, MAX_PASSES, MAX_TIP_OFFSET_MM, RATE_HZ, SuturePoint
-from skills.schemas import Handedness, SkillLevel
+from skills.schemas import DemoOutcome, Handedness, SkillLevel
 from skills.settings import Role
 
 SLUG = r"^[a-z0-9][a-z0-9_-]{0,63}$"
@@ -154,6 +154,34 @@ class DemoIn(Schema):
     cell_mm: Annotated[float, Field(ge=0.25, le=50)] | None = None
     hysteresis: Hysteresis = 0.0
     session: SlugField | None = None
+    outcome: DemoOutcome | None = Field(default=None, description="What became of the hand-off, where it is known.")
+    outcome_reason: Name | None = Field(default=None, description="Why; needed for a recovery or a failure.")
+
+    @model_validator(mode="after")
+    def _reason_with_outcome(self) -> Self:
+        if self.outcome is None and self.outcome_reason is not None:
+            raise ValueError("a reason needs an outcome")
+        _require_reason(self.outcome, self.outcome_reason)
+        return self
+
+
+class OutcomeIn(Schema):
+    """What became of a demonstration's hand-off, and why."""
+
+    model_config = shown({"outcome": "failure", "reason": "The needle fell."}, {"outcome": "success"})
+
+    outcome: DemoOutcome
+    reason: Name | None = Field(default=None, description="Needed for a recovery or a failure.")
+
+    @model_validator(mode="after")
+    def _why(self) -> Self:
+        _require_reason(self.outcome, self.reason)
+        return self
+
+
+def _require_reason(outcome: DemoOutcome | None, reason: str | None) -> None:
+    if outcome in ("recovery", "failure") and reason is None:
+        raise ValueError(f"a {outcome} needs a reason")
 
 
 class Reading(Schema):
@@ -231,6 +259,10 @@ class TrainingIn(Schema):
     learner: LearnerIn | None = None
     seed: Annotated[StrictInt, Field(ge=0, le=MAX_SEED)] = 0
     release: StrictBool = False
+    outcomes: Literal["success", "any"] = Field(
+        default="success",
+        description="success refuses demonstrations that are marked recovery or failure; any learns from them too.",
+    )
 
     @property
     def chosen(self) -> Learner | None:

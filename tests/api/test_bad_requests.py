@@ -38,6 +38,7 @@ SOUND: dict[tuple[str, str], Any] = {
             "base": {"position_mm": [160.0, 20.0, 20.0], "rotation_xyzw": [0.0, 0.3, 0.0, 0.95]},
         },
     },
+    ("PUT", "/demos/{demo}/outcome"): {"outcome": "failure", "reason": "It fell."},
     ("POST", "/playbacks"): {"plan": "0" * 64},
     ("POST", "/scores"): {
         **KESTREL, "recording": "0" * 64, "arm": "PSM", "topic": "table", "start_s": 0.0, "end_s": 0.5,
@@ -52,7 +53,7 @@ TOKENS = (
     '{"a": 1}', '[["b"]]', f'"{CANARY}"', '"' + "x" * 5000 + '"', "1.5e308", '"; DROP TABLE jobs; --"',
 )  # fmt: skip
 CACHED = {"measured_shapes": 0}  # a request for an atlas fills this cache and changes nothing else
-FREE_TEXT = {"owner", "name", "family", "description", "also_called", "protocol", "source"}
+FREE_TEXT = {"owner", "reason", "name", "family", "description", "also_called", "protocol", "source"}
 NUMBERS_ONLY = ("true", '"1"')  # sent in place of a number
 WHOLE_ONLY = ("1.5", "true", '"1"', "1e400", "-1")
 BODIES = (

@@ -174,6 +174,46 @@ def test_withdrawing_a_demonstration_withdraws_what_rests_on_it(trained: Service
         trained.client.add_demo(cases.hand_off(), media_type=CSV, **KESTREL)
 
 
+def test_marking_a_demonstration_as_a_failure_withdraws_what_rests_on_it(trained: Service):
+    demo = trained.client.demos()[0]
+    where = f"/demos/{demo['id']}/outcome"
+    assert demo["outcome"] is None and "outcomes" not in trained.client.policy(**KESTREL)
+    for body in ({"outcome": "failure"}, {"outcome": "unheard"}, {"outcome": "success", "why": "no"}, {}):
+        assert_problem(trained.http.put(where, json=body), 422, "invalid-request")
+    tag = trained.http.get(f"/demos/{demo['id']}").headers["etag"]
+    failed = {"outcome": "failure", "reason": "The needle fell."}
+    answer = trained.http.put(where, json=failed, headers={"If-Match": tag})
+    assert (answer.status_code, answer.json()["outcome_reason"]) == (200, "The needle fell.")
+    assert_problem(trained.http.put(where, json={"outcome": "success"}, headers={"If-Match": tag}), 412)
+    assert trained.client.policies() == []
+    assert [one["id"] for one in trained.client.demos(outcome="failure")] == [demo["id"]]
+    assert trained.client.demos(outcome="unknown") == []
+    for demos in (None, [demo["id"]]):
+        with pytest.raises(Problem, match="outcomes='any'") as refused:
+            trained.client.train(**KESTREL, demos=demos, seed=5)
+        assert refused.value.body["remedies"] == [{"action": "train-any"}]
+    with pytest.raises(Problem, match="its demonstration was marked failure"):
+        trained.client.release(**KESTREL, version=1)
+    job = trained.train(outcomes="any", release=True)
+    assert job["result"]["released"]
+    assert trained.client.policy(**KESTREL)["outcomes"] == ["failure"]
+    assert trained.client.mark_demo(demo["id"], "success")["outcome_reason"] is None
+    assert trained.client.release(**KESTREL, version=1)["version"] == 1
+    assert_problem(trained.http.put(f"/demos/{'0' * 64}/outcome", json=failed), 404, "not-found")
+
+
+def test_an_uploader_states_the_outcome_and_does_not_change_it_by_adding_again(here: Service):
+    how = {"params": {"outcome": "failure", "outcome_reason": "It fell.", **KESTREL}, "content": cases.hand_off()}
+    added = here.http.post("/demos", headers={"Content-Type": CSV}, **how)
+    assert (added.status_code, added.json()["outcome"]) == (201, "failure")
+    again = f"/recordings/{added.json()['recording']}/demos"
+    assert here.http.post(again, json=KESTREL).json()["outcome"] == "failure"
+    problem = here.http.post(again, json={**KESTREL, "outcome": "success"})
+    assert_problem(problem, 409, "conflict")
+    remedy = {"action": "mark-demo", "demo": added.json()["id"], "outcome": "success"}
+    assert problem.json()["remedies"] == [remedy]
+
+
 def test_erasing_a_demonstration_takes_what_was_learnt_from_it(trained: Service):
     trained.client.plan(**KESTREL, suture_points=[{"position_mm": [5, 55, -125]}], handoff="none")
     trained.client.withdraw_demo(trained.client.demos()[0]["id"], erase=True)

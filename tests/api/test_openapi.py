@@ -20,8 +20,8 @@ OPERATIONS = {
     "get_policy_card", "get_policy_version", "get_policy_version_card", "get_recording", "get_report",
     "get_retraining", "get_reward_map", "get_surgeon", "get_suture_type", "get_trajectory", "get_version",
     "list_all_keys", "list_demos", "list_jobs", "list_policies", "list_surgeons", "list_suture_types",
-    "list_versions", "make_key", "make_plan", "metrics", "next_action", "play", "preview_recording", "put_surgeon",
-    "put_suture_type",
+    "list_versions", "make_key", "make_plan", "mark_demo", "metrics", "next_action", "play", "preview_recording",
+    "put_surgeon", "put_suture_type",
     "read_suture_points", "ready", "release", "retrain", "roll_out", "score", "train", "upload_demo", "watch_job",
     "withdraw", "withdraw_demo",
 }  # fmt: skip
@@ -115,7 +115,7 @@ def test_every_example_of_a_request_does_what_it_shows(trained: Service, method:
         }
     digests = {"demo": there["id"], "recording": there["recording"]}
     example = {name: digests.get(name, value) for name, value in example.items()}
-    path = path.format(**PATH, recording=there["recording"])
+    path = path.format(**PATH, recording=there["recording"], demo=there["id"])
     answer = trained.http.request(method, path, json=example)
     assert answer.is_success, answer.text
 

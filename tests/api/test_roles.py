@@ -34,6 +34,7 @@ NEEDED = {
     "POST /recordings/{recording}/demos": UPLOADER,
     "DELETE /recordings/{recording}": UPLOADER,
     "POST /suture-points": UPLOADER,
+    "PUT /demos/{demo}/outcome": RELEASER,
     "DELETE /demos/{demo}": RELEASER,
     "POST /trainings": TRAINER,
     "POST /retrainings": TRAINER,

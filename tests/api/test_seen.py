@@ -67,7 +67,7 @@ def test_paths_to_kestrels_objects_are_404_for_heron_and_exist_for_admin(service
             continue
         where += query.get(path, "")
         answer = heron(method, where)
-        bodiless = method == "POST" and "{surgeon}" not in path  # refused for the missing body, before the look-up
+        bodiless = method in ("POST", "PUT") and "{surgeon}" not in path  # refused before the look-up
         refused = {403} if path == "/surgeons/{surgeon}" and method != "GET" else {404, 422} if bodiless else {404}
         assert answer.status_code in refused, (method, path, answer.status_code)
         assert "kestrel" not in answer.text, (method, path)
@@ -111,6 +111,7 @@ def test_no_body_or_query_reaches_anything_of_kestrels(service: Service, admin: 
         ("POST", "/trainings", {"json": KESTREL}),
         ("POST", "/trainings", {"json": HERON | {"demos": [kestrels["demo"]]}}),
         ("POST", "/retrainings", {"json": {"surgeon": "kestrel"}}),
+        ("PUT", f"/demos/{kestrels['demo']}/outcome", {"json": {"outcome": "success"}}),
         ("POST", "/plans", {"json": KESTREL | {"suture_points": [{"position_mm": GOAL_MM}], "handoff": "none"}}),
         ("POST", "/playbacks", {"json": {"plan": kestrels["plan"]}}),
         ("POST", f"/recordings/{own['recording']}/demos", {"json": KESTREL}),

@@ -10,6 +10,7 @@ from sqlalchemy.exc import DatabaseError, IntegrityError
 from skills.comparison.distances import STATES, Measured
 from skills.db import Base, now, service_tables
 from skills.db.models import (
+    DemonstrationOutcome,
     Erasure,
     MeasuredShape,
     RecordingSurgeon,
@@ -35,6 +36,7 @@ FROZEN = (
     "playbacks",
     "playback_pictures",
     "calibrations",
+    "demonstration_outcomes",
     "events",
     "erasures",
 )
@@ -63,6 +65,7 @@ def full(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
         session.flush()
         session.add(StoredPictures(playback_row=played.row, drawn=Pictures(b"mp4", b"gif", b"png", b"png")))
         session.add(StoredCalibration(sha256="0" * 64, about={}))
+        session.add(DemonstrationOutcome(demonstration_row=demo.row, outcome="failure", reason="fell", actor="ada"))
         session.add(Erasure(salt="0" * 64, digest="0" * 64))
         session.add(RecordingSurgeon(recording_row=demo.recording_row, surgeon_row=demo.surgeon_row))
         shape = Measured(np.zeros((STATES, 3)), np.array([1]), np.array([0.0]), np.array([0.0]))

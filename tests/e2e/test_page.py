@@ -227,6 +227,22 @@ def test_a_withdrawal_says_what_it_means_and_needs_a_yes(tab: Watched, client: C
     expect(page.locator(".lead").first).to_contain_text("version 1 is served to clients")
 
 
+def test_an_outcome_is_marked_on_the_page_of_its_style(tab: Watched, client: Client) -> None:
+    page, dialog = tab.page, tab.page.get_by_role("dialog")
+    tab.open(f"/pages/styles/{STYLE}")
+    page.get_by_text("Mark the outcome of a demonstration").click()
+    page.get_by_label("Outcome").select_option("recovery")
+    page.get_by_label("Why, for a recovery or a failure").fill("The needle slipped.")
+    page.get_by_role("button", name="Mark", exact=True).click()
+    expect(dialog).to_contain_text("releases that rest on it are withdrawn")
+    dialog.get_by_role("button", name="Mark").click()
+    expect(page.locator(".badge", has_text="recovery")).to_have_attribute("title", "The needle slipped.")
+    expect(page.locator(".lead").first).to_contain_text("learnt, not released")
+    (demo,) = client.demos(outcome="recovery")
+    client.mark_demo(demo.id, "success")
+    client.release(SAMPLE.surgeon, SAMPLE.suture, 1)
+
+
 def test_an_erasure_waits_until_the_pseudonym_is_typed(tab: Watched, client: Client) -> None:
     page, dialog = tab.page, tab.page.get_by_role("dialog")
     client.put_surgeon("siskin")

@@ -16,7 +16,7 @@ from sqlalchemy.exc import DatabaseError
 from skills.db import Base
 from skills.db.session import Database, alembic_config, revisions
 from skills.errors import Conflict
-from skills.library.demos import find_demo, withdraw_demo
+from skills.library.demos import find_demo, mark_demo, withdraw_demo
 from skills.library.erasure import erase_demo
 from skills.library.integrity import learnt, planned
 from skills.library.plans import find_plan
@@ -135,6 +135,21 @@ def test_a_policy_of_several_demos_cannot_be_downgraded_to_one_demo(database: Da
         go(database, command.downgrade, "0008")
     with database.reading() as session:
         assert session.scalar(text("SELECT count(*) FROM policy_demonstrations")) == 1
+
+
+def test_failures_block_the_downgrade_to_a_version_that_would_learn_from_them(database: Database):
+    database.migrate()
+    cases.add_surgeon(database)
+    demo = cases.add_demo(database)
+    with database.writing() as session:
+        mark_demo(session, demo.sha256, "failure", "the needle fell", "test")
+    with pytest.raises(RuntimeError, match="marked recovery or failure"):
+        go(database, command.downgrade, "0010")
+    with database.reading() as session:
+        assert session.scalar(text("SELECT count(*) FROM demonstration_outcomes")) == 1
+    with database.writing() as session:
+        erase_demo(session, demo.sha256, "test")
+    go(database, command.downgrade, "0010")
 
 
 def test_a_downgrade_drops_batches_and_cancels_the_unfinished_ones(database: Database):

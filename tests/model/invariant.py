@@ -3,19 +3,22 @@
 Nothing here depends on the service. `Model` is updated after each action of a user, and states the expected result:
 
 1.  **Served.** A style serves at most one policy version: that of its newest release that stands. A release stands
-    until it is withdrawn: by hand, with a demonstration that its version depends on, or with the surgeon's consent to
-    training (also if that is given again after its last day). The end of the served release also withdraws those that
+    until it is withdrawn: by hand, with a demonstration that its version depends on, by a mark of such a demonstration
+    as recovery or failure (unless the version was trained from any outcome), or with the surgeon's consent to training
+    (also if that is given again after its last day). The end of the served release also withdraws those that
     it superseded, so that nothing older returns by itself. Nothing is served on a day that consent to training does
     not cover. All requests for it agree.
 2.  **Stored.** Everything uploaded and learnt, and neither erased nor deleted, is stored, and nothing else. A version
     depends on demonstrations that are stored; a distance in the atlas's cache is between two that are stored, and is
-    correct. Nothing is stored that consent, at the moment of storing, did not cover. Of an erased surgeon no table
+    correct. Nothing is stored that consent, at the moment of storing, did not cover, and nothing learnt from a recovery
+    or a failure unless that was asked for. Of an erased surgeon no table
     holds the pseudonym.
 3.  **Answered.** A job that succeeded has stored its stated result. A client that requests a training with a release,
     and waits, gets the answer "released" if, and only if, that version is then served; otherwise it gets the reason.
     A call that consent or a withdrawal forbids is refused. A job fails only if there was an obstacle.
 4.  **Restored.** Of the backup's content, everything erased, withdrawn, superseded or revoked since is so again after
-    a restore, and consent covers what it covered then and as it was last stated; the rest is as in the backup.
+    a restore, what was last marked recovery or failure since is marked so, and consent covers what it covered then and
+    as it was last stated; the rest is as in the backup.
     Objects that were erased or withdrawn before another restore, and uploaded again since, end again as well: the
     list only removes. A restore never fails because of an entry of the list.
 5.  **Keys.** A key is valid until it is revoked or has expired, and not after.
@@ -64,6 +67,11 @@ class Demo:
     style: Style
     recording: str
     withdrawn: bool = False
+    mark: tuple[str, str] | None = None  # outcome and reason
+
+    @property
+    def failed(self) -> bool:
+        return self.mark is not None and self.mark[0] != "success"
 
 
 @dataclass(frozen=True)
@@ -73,6 +81,7 @@ class Version:
     number: int
     demos: frozenset[str]
     releasable: bool
+    of_any: bool  # trained from demonstrations of any outcome
 
 
 @dataclass
@@ -92,6 +101,7 @@ class Job:
     demos: frozenset[str]
     state: str
     batch: bool = False
+    of_any: bool = False
     ended: set[str] = field(default_factory=set)
     doubt: set[str] = field(default_factory=set)  # demonstrations that had an obstacle during the work on it
 
@@ -111,6 +121,7 @@ KINDS = (
     "erased demo",
     "deleted recording",
     "withdrawn demo",
+    "marked demo",
     "ended policy",
     "revoked",
     "consent",
@@ -118,7 +129,7 @@ KINDS = (
 
 
 def _key(about: Any) -> Any:
-    """Return the object of a fact; for a consent, the surgeon."""
+    """Return the object of a fact; for a consent, the surgeon; for a mark, the demonstration."""
     return about[0] if isinstance(about, tuple) else about
 
 
@@ -165,10 +176,16 @@ class Model:
             if one.style[1] == suture and not one.withdrawn and self.may(one.style[0], "atlas")
         }
 
-    def may_learn(self, demos: Set[str]) -> bool:
+    def may_learn(self, demos: Set[str], of_any: bool = False) -> bool:
         """Return whether learning from these demonstrations, and storing the result, is allowed now."""
         found = [self.demos.get(one) for one in demos]
-        return all(one is not None and not one.withdrawn and self.may(one.style[0], "training") for one in found)
+        return all(
+            one is not None and not one.withdrawn and (of_any or not one.failed) and self.may(one.style[0], "training")
+            for one in found
+        )
+
+    def may_serve(self, version: Version) -> bool:
+        return self.may_learn(version.demos, version.of_any)
 
     def cut_from(self, recording: str) -> list[Demo]:
         return [one for one in self.demos.values() if one.recording == recording]
@@ -209,7 +226,7 @@ class Model:
             self.releases.append(Release(version))
 
     def add_plan(self, plan: str, version: str) -> None:
-        assert self.may_learn(self.versions[version].demos), "a plan is stored, and consent or a withdrawal forbids it"
+        assert self.may_serve(self.versions[version]), "a plan is stored, and consent or a withdrawal forbids it"
         self.plans[plan] = version
 
     def withdraw(self, style: Style) -> None:
@@ -220,6 +237,14 @@ class Model:
             self.demos[sha256].withdrawn = True
             self._note("withdrawn demo", sha256)
             self._withdraw_resting_on(sha256)
+
+    def mark_demo(self, sha256: str, outcome: str, reason: str) -> None:
+        demo = self.demos[sha256]
+        if demo.mark != (outcome, reason):
+            demo.mark = outcome, reason
+            self._note("marked demo", (sha256, outcome))
+        if demo.failed:
+            self._withdraw_resting_on(sha256, even_of_any=False)
 
     def erase_demo(self, sha256: str) -> None:
         self.withdraw_demo(sha256)
@@ -244,6 +269,7 @@ class Model:
         model.today, model.listed = self.today, listed
         known = {(kind, _key(about)): number for kind, about, number in sorted(backup.facts, key=lambda fact: fact[2])}
         stated: dict[int, Consent] = {}
+        marked: dict[str, str] = {}
         for kind, about, number in sorted(listed, key=lambda fact: (KINDS.index(fact[0]), fact[2])):
             if known.get((kind, _key(about)), 0) >= number:
                 continue
@@ -261,6 +287,8 @@ class Model:
                     model.delete_recording(about)
                 case "withdrawn demo" if about in model.demos:
                     model.withdraw_demo(about)
+                case "marked demo":
+                    marked[about[0]] = about[1]
                 case "ended policy" if about in model.versions:
                     standing = model.standing(model.versions[about].style)
                     model._end([one for one in standing if one.version.sha256 == about and one.id < number], standing)
@@ -268,6 +296,9 @@ class Model:
                     model.revoke(about)
                 case "consent":
                     stated[about[0]] = about[1]
+        for demo, outcome in marked.items():
+            if demo in model.demos and outcome != "success":
+                model.mark_demo(demo, outcome, "restored")
         for surgeon, consent in model.surgeons.items():
             if (both := consent.and_of(stated.get(model.subjects[surgeon], consent))) != consent:
                 model.agree(surgeon, both)
@@ -281,9 +312,10 @@ class Model:
             one.withdrawn = True
             self._note("ended policy", one.version.sha256)
 
-    def _withdraw_resting_on(self, demo: str) -> None:
+    def _withdraw_resting_on(self, demo: str, *, even_of_any: bool = True) -> None:
         standing = self.standing(self.demos[demo].style)
-        self._end([one for one in standing if demo in one.version.demos], standing)
+        resting = [one for one in standing if demo in one.version.demos]
+        self._end([one for one in resting if even_of_any or not one.version.of_any], standing)
 
     def _end(self, ending: list[Release], standing: list[Release]) -> None:
         """End releases; if the served version's release is among them, end all that stand."""

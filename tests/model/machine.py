@@ -53,6 +53,7 @@ FILES = [cases.table(cases.points_mm((0.0, 2.5 * shift, 0.0), samples=4)) for sh
 NAMES = {sha256(data): data for data in FILES}
 ACTIVE = ("queued", "running")
 MOST_BACKUPS = 3
+WHY = "The needle fell."
 
 Step = tuple[Any, ...]
 Meanwhile = tuple[int, Step] | None
@@ -78,11 +79,14 @@ AGREE = step("agree", SURGEON, USES, DAYS)
 ADD_DEMO = step("add_demo", SURGEON, SUTURE, FILE)
 WITHDRAW_DEMO, ERASE_DEMO = step("withdraw_demo", INDEX), step("erase_demo", INDEX)
 ERASE_SURGEON = step("erase_surgeon", st.sampled_from(SURGEONS), st.integers(0, 3))
+MARK = step("mark", INDEX, st.sampled_from(["failure", "failure", "recovery", "success"]))
 RELEASE, WITHDRAW, CANCEL = step("release", INDEX), step("withdraw", INDEX), step("cancel", INDEX)
 PASS_A_DAY, BACK_UP = step("pass_a_day"), step("back_up")
-ELSEWHERE = (AGREE, ADD_DEMO, WITHDRAW_DEMO, ERASE_DEMO, ERASE_SURGEON, RELEASE, WITHDRAW, CANCEL, PASS_A_DAY, BACK_UP)
+ENDING = (WITHDRAW_DEMO, MARK, ERASE_DEMO, ERASE_SURGEON, WITHDRAW, CANCEL)
+ELSEWHERE = (AGREE, ADD_DEMO, RELEASE, *ENDING, PASS_A_DAY, BACK_UP)
 MEANWHILE = st.none() | st.tuples(st.integers(1, 8), st.one_of(*ELSEWHERE, AGREE, ERASE_DEMO))
-TRAIN = step("train", SURGEON, SUTURE, DEMOS, SEED, FLAG, MEANWHILE)
+ANY_OUTCOME = st.sampled_from([False, False, False, True])
+TRAIN = step("train", SURGEON, SUTURE, DEMOS, SEED, FLAG, MEANWHILE, ANY_OUTCOME)
 PLAN = step("plan", SURGEON, MEANWHILE)
 ERASED = st.tuples(st.integers(3, 7), ERASE_DEMO)  # while distances are measured
 ATLAS = step("atlas", SUTURE, st.one_of(MEANWHILE, ERASED))
@@ -91,7 +95,7 @@ STEPS = (
     TRAIN,
     TRAIN,
     TRAIN,  # more often, because all else needs a learnt policy
-    step("ask_training", SURGEON, SUTURE, DEMOS, SEED, FLAG),
+    step("ask_training", SURGEON, SUTURE, DEMOS, SEED, FLAG, ANY_OUTCOME),
     step("retrain", st.none() | SURGEON, st.booleans(), FLAG, MEANWHILE),
     step("ask_retraining", st.none() | SURGEON, st.booleans(), FLAG),
     step("work", INDEX, MEANWHILE),
@@ -231,6 +235,12 @@ class Installation(RuleBasedStateMachine):
             self.call("DELETE", f"/demos/{demo}", 204)
             self.model.withdraw_demo(demo)
 
+    def _mark(self, index: int, outcome: str) -> None:
+        if (demo := pick(self.model.demos, index)) is not None:
+            body = {"outcome": outcome, "reason": WHY}
+            assert self.call("PUT", f"/demos/{demo}/outcome", 200, json=body)["outcome"] == outcome
+            self.model.mark_demo(demo, outcome, WHY)
+
     def _erase_demo(self, index: int) -> None:
         if (demo := pick(self.model.demos, index)) is not None:
             self.call("DELETE", f"/demos/{demo}?erase=true", 204)
@@ -257,7 +267,7 @@ class Installation(RuleBasedStateMachine):
             return
         version = self.model.versions[name]
         path = f"/policies/{'/'.join(version.style)}/versions/{version.number}/release"
-        if self.model.may_learn(version.demos) and version.releasable:
+        if self.model.may_serve(version) and version.releasable:
             assert self.call("POST", path, 200)["sha256"] == name
             self.model.release(version)
         else:
@@ -272,27 +282,39 @@ class Installation(RuleBasedStateMachine):
     # ---- requests for jobs ----
 
     def _train(
-        self, surgeon: str, suture: str, which: str, seed: int, release: bool, meanwhile: Meanwhile = None
+        self,
+        surgeon: str,
+        suture: str,
+        which: str,
+        seed: int,
+        release: bool,
+        meanwhile: Meanwhile = None,
+        of_any: bool = False,
     ) -> None:
         """Request a training and wait for its end, as `skills train` does."""
-        if (job := self._ask_training(surgeon, suture, which, seed, release)) is not None:
+        if (job := self._ask_training(surgeon, suture, which, seed, release, of_any)) is not None:
             self._wait(job, meanwhile)
 
-    def _ask_training(self, surgeon: str, suture: str, which: str, seed: int, release: bool) -> str | None:
+    def _ask_training(
+        self, surgeon: str, suture: str, which: str, seed: int, release: bool, of_any: bool = False
+    ) -> str | None:
         body: dict[str, Any] = {"surgeon": surgeon, "suture": suture, "seed": seed, "release": release}
         active = [one.sha256 for one in self.model.active((surgeon, suture))]
-        chosen = {"newest": active[-1:], "oldest": active[:1], "all": active}[which]
+        taken = [one for one in active if of_any or not self.model.demos[one].failed]
+        chosen = {"newest": taken[-1:], "oldest": active[:1], "all": active}[which]
         if which != "newest":
             body["demos"] = chosen or None
+        if of_any:
+            body["outcomes"] = "any"
         if surgeon not in self.model.surgeons:
             self.call("POST", "/trainings", self._unknown(surgeon), json=body)
             return None
-        if not active or not self.model.may(surgeon, "training"):
+        if not chosen or not self.model.may_learn(set(chosen), of_any):
             self.call("POST", "/trainings", 409, json=body)
             return None
         job = self.call("POST", "/trainings", 200, 202, json=body)
         assert job["request"]["demos"] == chosen
-        return self._asked(job, Job(job["id"], surgeon, release, frozenset(chosen), job["state"]))
+        return self._asked(job, Job(job["id"], surgeon, release, frozenset(chosen), job["state"], of_any=of_any))
 
     def _retrain(self, surgeon: str | None, only_stale: bool, release: bool, meanwhile: Meanwhile = None) -> None:
         """Request a batch and wait for its end, as `skills retrain` does."""
@@ -304,7 +326,8 @@ class Installation(RuleBasedStateMachine):
         if surgeon is not None and surgeon not in self.model.surgeons:
             self.call("POST", "/retrainings", self._unknown(surgeon), json=body)
             return None
-        active = [one for one in self.model.demos.values() if not one.withdrawn and surgeon in (None, one.style[0])]
+        taken = [one for one in self.model.demos.values() if not one.withdrawn and not one.failed]
+        active = [one for one in taken if surgeon in (None, one.style[0])]
         if not active:
             self.call("POST", "/retrainings", 409, json=body)
             return None
@@ -392,7 +415,7 @@ class Installation(RuleBasedStateMachine):
     def _doubt(self) -> None:
         """Record the present obstacles of jobs."""
         for job in self.model.jobs.values():
-            job.doubt |= {one for one in job.demos if not self.model.may_learn({one})}
+            job.doubt |= {one for one in job.demos if not self.model.may_learn({one}, job.of_any)}
 
     def _take_in(self, name: str) -> None:
         """Record the result of a job, and check it."""
@@ -404,7 +427,7 @@ class Installation(RuleBasedStateMachine):
         elif said["state"] == "succeeded" and job.state != "succeeded":
             made, style = said["result"], (said["request"]["surgeon"], said["request"]["suture"])
             version = self._learnt(made["sha256"], style)
-            assert (version.number, version.demos) == (made["policy_version"], job.demos)
+            assert (version.number, version.demos, version.of_any) == (made["policy_version"], job.demos, job.of_any)
             assert made["was_released"] == (job.release and version.releasable), made
             self._released(job, version, made["was_released"], made["not_released_because"])
         elif said["state"] == "failed" and job.state != "failed":
@@ -421,7 +444,7 @@ class Installation(RuleBasedStateMachine):
                 how, style = one["comparison"], (one["surgeon"], one["suture"])
                 before = self.model.standing(style)
                 version = self._learnt(one["sha256"], style)
-                assert one["demo"] in version.demos
+                assert one["demo"] in version.demos or not self.model.may_learn({one["demo"]})
                 if job.release and not before:
                     assert how["was_released"] == version.releasable, how
                 self._released(job, version, how["was_released"], how["not_released_because"])
@@ -433,11 +456,11 @@ class Installation(RuleBasedStateMachine):
         """Record a version that a job reports as stored."""
         said = self.call("GET", f"/policy-versions/{name}", 200)
         assert (said["surgeon"], said["suture"]) == style
-        version = Version(
-            name, style, said["version"], frozenset(said["demos"]), not said["grid_certificate"]["refused_because"]
-        )
+        releasable = not said["grid_certificate"]["refused_because"]
+        of_any = said.get("outcomes") is not None
+        version = Version(name, style, said["version"], frozenset(said["demos"]), releasable, of_any)
         if name not in self.model.versions:
-            assert self.model.may_learn(version.demos), "stored, and consent or a withdrawal forbids it"
+            assert self.model.may_serve(version), "stored, and consent, a withdrawal or a mark forbids it"
             assert version.number > max(
                 (one.number for one in self.model.versions.values() if one.style == style), default=0
             )
@@ -449,7 +472,7 @@ class Installation(RuleBasedStateMachine):
         """Record a job's report that it made a release, or did not."""
         if released:
             assert job.release
-            assert self.model.may_learn(version.demos), "released, and consent or a withdrawal forbids it"
+            assert self.model.may_serve(version), "released, and consent, a withdrawal or a mark forbids it"
             self.model.release(version)
         elif job.release:
             assert because, "not released, and no reason"
@@ -467,7 +490,7 @@ class Installation(RuleBasedStateMachine):
         if plan is not None:
             self.model.add_plan(plan.sha256, plan.policy.sha256)
         else:
-            assert served is None or not self.model.may_learn(served.demos), f"nothing stood in its way: {refused}"
+            assert served is None or not self.model.may_serve(served), f"nothing stood in its way: {refused}"
 
     def _atlas(self, suture: str, meanwhile: Meanwhile = None) -> None:
         with self._meanwhile(meanwhile), suppress(NotFound):
@@ -557,6 +580,7 @@ class Installation(RuleBasedStateMachine):
         for style, version in due.items():
             said = self.call("GET", f"/policies/{'/'.join(style)}", 200 if version else self._unknown(style[0]))
             assert version is None or (said["sha256"], said["version"]) == (version.sha256, version.number)
+            assert version is None or version.of_any or not any(model.demos[one].failed for one in version.demos)
 
     def _check_answers(self) -> None:
         """Check that every training reports whether its version is the served one."""
@@ -574,6 +598,10 @@ class Installation(RuleBasedStateMachine):
         assert {one.recording for one in stored["recording_chunks"]} == {one.row for one in stored["recordings"]}
         assert {one.sha256: one.withdrawn_at is not None for one in stored["demonstrations"]} == {
             one.sha256: one.withdrawn for one in model.demos.values()
+        }
+        marks = {one.demonstration_row: one.outcome for one in stored["demonstration_outcomes"]}  # the newest of each
+        assert {one.sha256: marks.get(one.row) for one in stored["demonstrations"]} == {
+            one.sha256: one.mark and one.mark[0] for one in model.demos.values()
         }
         slugs = {one.row: one.slug for one in stored["surgeons"]}
         assert {(one.sha256, slugs[one.surgeon_row], one.suture, one.version) for one in stored["policy_versions"]} == {
@@ -627,4 +655,7 @@ def distance_mm(one: str, other: str) -> float:
 def _plain_columns() -> dict[str, Any]:
     packed = (LargeBinary, Packed)
     tables = Base.metadata.tables.items()
-    return {name: select(*(c for c in table.c if not isinstance(c.type, packed))) for name, table in tables}
+    return {
+        name: select(*(c for c in table.c if not isinstance(c.type, packed))).order_by(*table.primary_key)
+        for name, table in tables
+    }

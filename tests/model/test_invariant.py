@@ -45,6 +45,27 @@ FOUND: dict[str, list[Step]] = {
         ("restore", 0),
     ],
     "a_demonstration_is_withdrawn_after_the_backup": [("back_up",), ("withdraw_demo", 0), ("restore", 0)],
+    "a_served_demonstration_is_marked_after_the_backup": [
+        TRAIN,
+        ("back_up",),
+        ("mark", 0, "failure"),
+        ("release", 0),
+        ("restore", 0),
+        ("release", 0),
+    ],
+    "a_demonstration_is_marked_while_it_is_learnt": [
+        (*TRAIN, (4, ("mark", 0, "failure"))),
+        (*TRAIN, None, True),
+        ("mark", 0, "recovery"),
+        ("retrain", "kestrel", False, True),
+    ],
+    "a_mark_is_taken_back_and_the_training_asked_for_again": [
+        TRAIN,
+        ("mark", 0, "failure"),
+        TRAIN,
+        ("mark", 0, "success"),
+        TRAIN,
+    ],
     "a_key_is_revoked_after_the_backup": [("make_key", None, None), ("back_up",), ("revoke", 0), ("restore", 0)],
     "consent_is_narrowed_after_the_backup": [("back_up",), NO_TRAINING, ("restore", 0)],
     "a_recording_is_deleted_then_lost_by_a_restore_and_brought_again": [

@@ -36,8 +36,9 @@ from skills.library.atlas import CONFOUNDED, DISTANCE, MOST, SESSIONS, atlas_of,
 from skills.library.catalogue import find_suture_type
 from skills.library.demos import demo_json, path_json, reward_map_json
 from skills.library.recordings import recording_json
+from skills.schemas import OutcomeAsked
 from skills.schemas.given import Atlas, Demonstration, DemoPath, Page, Recording, RecordingPreview, RewardMap, Score
-from skills.schemas.requests import COUNT, DIGEST, SLUG, DemoIn, ScoreIn, SlugField, TableReading
+from skills.schemas.requests import COUNT, DIGEST, SLUG, DemoIn, OutcomeIn, ScoreIn, SlugField, TableReading
 from skills.settings import MEBIBYTE
 
 uploads = APIRouter(tags=["demonstrations"])
@@ -129,12 +130,15 @@ def list_demos(
     active: Annotated[
         bool | None, Query(description="true: only active demonstrations; false: only withdrawn ones.")
     ] = None,
+    outcome: Annotated[
+        OutcomeAsked | None, Query(description="Only those that are marked so; unknown: only those without a mark.")
+    ] = None,
     limit: Limit = 50,
     cursor: RowCursor = None,
 ) -> Response:
     """List demonstrations, the newest first."""
     with db.reading() as session:
-        found = demos.list_demos(session, limit, cursor, surgeon, suture, recording, active)
+        found = demos.list_demos(session, limit, cursor, surgeon, suture, recording, active, outcome)
         return give.page([demo_json(row) for row in found], limit, found[-1].row if found else None)
 
 
@@ -193,6 +197,20 @@ def get_reward_map(demo: Digest, db: Db, give: Giving) -> Response:
         row = demos.find_demo(session, demo)
         kept = session.scalars(select(StoredRewardMap).where(StoredRewardMap.demonstration_row == row.row)).one()
         return give(reward_map_json(row, kept))
+
+
+@router.put("/demos/{demo}/outcome", dependencies=[needs("releaser")], **gives(Demonstration, 404, 412))
+def mark_demo(
+    demo: Digest, body: OutcomeIn, db: Db, give: Giving, actor: Actor, if_match: Condition = None
+) -> Response:
+    """Mark a demonstration as success, recovery or failure; the last two withdraw the releases that rest on it.
+
+    Releases of versions that were trained with outcomes "any" stay.
+    """
+    with db.writing() as session:
+        if if_match:
+            refuse_changed(demo_json(demos.find_demo(session, demo)), if_match)
+        return give(demo_json(demos.mark_demo(session, demo, body.outcome, body.reason, actor)))
 
 
 @router.delete("/demos/{demo}", dependencies=[needs("releaser"), erasing_is_for_admins], **ends(404, 409, 412))

@@ -70,8 +70,8 @@ export function jobLine(near) {
   };
 }
 
-async function act(button) {
-  const { call: what, json, ask: question, means, yes, word, then } = button.dataset;
+async function act(button, about = button.dataset) {
+  const { call: what, json, ask: question, means, yes, word, then } = about;
   if (question && !(await confirmed({ what: question, means, yes: yes ?? button.textContent.trim(), word }))) return;
   const [method, path] = what.split(" ");
   button.disabled = true;
@@ -111,6 +111,20 @@ document.addEventListener("click", (event) => {
   const button = event.target.closest?.("button[data-call], button[data-file]");
   if (button?.dataset.call) act(button);
   else if (button) saveFile(button);
+});
+
+// A form with a call sends its filled fields as JSON; {name} in the path stands for the value of a field.
+document.addEventListener("submit", (event) => {
+  const form = event.target;
+  if (!form.dataset.call) return;
+  event.preventDefault();
+  const fields = Object.fromEntries([...new FormData(form)].filter(([, value]) => value));
+  const path = form.dataset.call.replace(/{(\w+)}/g, (_, name) => {
+    const value = encodeURIComponent(fields[name]);
+    delete fields[name];
+    return value;
+  });
+  act(form.querySelector("button"), { ...form.dataset, call: path, json: JSON.stringify(fields) });
 });
 
 // A part of a page that changes by itself is fetched again as HTML until the server marks it as final.
