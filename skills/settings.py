@@ -162,7 +162,10 @@ def settings() -> Settings:
             + one["msg"].replace("Input should be", "it must be").partition(", unable")[0]
             for one in error.errors()
         ]
-        raise BadSettings(f"{'; '.join(said)}.", "Set it to such a value, or unset it.") from None
+        choices = [one for one in error.errors() if one["type"] == "literal_error"]  # their values are no secrets
+        known = [(str(one["input"]), re.findall("'([^']+)'", one["ctx"]["expected"])) for one in choices]
+        near = [meant for given, names in known for meant in did_you_mean(given, names)]
+        raise BadSettings(f"{'; '.join(said)}.", *near, "Set it to such a value, or unset it.") from None
 
 
 def refuse_unknown(environment: Iterable[str]) -> None:

@@ -226,6 +226,27 @@ def test_a_near_miss_of_an_arm_is_suggested(door: Client):
     assert "no pose for arm psm_2" in str(refused.value) and "Did you mean 'PSM2'?" in str(refused.value)
 
 
+@pytest.mark.parametrize(
+    ("ask", "meant"),
+    [
+        (lambda door: door.plot("0" * 64, "joint"), "of must be one of joints, clearance. Did you mean 'joints'?"),
+        (lambda door: door.animation("0" * 64, "MP4"), "kind must be one of mp4, gif. Did you mean 'mp4'?"),
+    ],
+)
+def test_a_near_miss_of_an_argument_that_is_part_of_a_path_is_suggested(door: Client, ask, meant: str):
+    with pytest.raises(errors.BadInput) as refused:
+        ask(door)
+    assert meant in str(refused.value)
+
+
+def test_a_call_that_the_service_does_not_have_is_refused_in_the_words_of_each_door(door: Client):
+    with pytest.raises(Problem) as refused:
+        door.get_json("/nothing")
+    assert foreign(Door.PYTHON, str(refused.value)) == []
+    assert "help(client)" in str(refused.value)
+    assert "openapi.json" in refused.value.body["detail"]
+
+
 def test_how_bytes_were_read_is_told_in_words(door: Client):
     door.add_recording(cases.hand_off(), frame="PSM1_base")
     with pytest.raises(Problem, match="stored already, read with no rate_hz and frame PSM1_base"):

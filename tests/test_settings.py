@@ -83,6 +83,15 @@ def test_samples_are_loaded_at_start_only_by_a_local_service(tmp_path: Path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_misspelt_choice_is_suggested(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("SKILLS_LOG_LEVEL", "warn")
+    settings.cache_clear()
+    with pytest.raises(BadSettings) as refused:
+        settings()
+    settings.cache_clear()
+    assert "Did you mean 'warning'?" in str(refused.value)
+
+
 def test_an_invalid_variable_is_named_without_repeating_its_value(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("SKILLS_PORT", "70000")
     monkeypatch.setenv("SKILLS_WORKERS", "s3cret")

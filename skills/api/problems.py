@@ -20,7 +20,7 @@ from pydantic import BaseModel
 from starlette.exceptions import HTTPException
 
 from skills import errors
-from skills.remedies import Door, did_you_mean
+from skills.remedies import Action, Door, Remedy, did_you_mean
 from skills.schemas.requests import in_words
 
 log = logging.getLogger("skills.api")
@@ -237,7 +237,10 @@ def answer_refusals(app: FastAPI) -> None:
     def http(_request: Request, error: HTTPException) -> Response:
         title = TITLES.get(error.status_code, "Refused")
         detail = DETAILS.get(error.status_code, str(error.detail))
-        return problem(error.status_code, f"http-{error.status_code}", title, detail, headers=dict(error.headers or {}))
+        kind, headers = f"http-{error.status_code}", dict(error.headers or {})
+        unknown = {"reason": f"{title}.", "remedies": [Remedy(Action.SEE_CALLS).as_json()]}
+        more = unknown if error.status_code in (404, 405) else {}
+        return problem(error.status_code, kind, title, detail, headers=headers, **more)
 
     @app.exception_handler(OSError)
     def full(_request: Request, error: OSError) -> Response:

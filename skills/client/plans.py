@@ -8,6 +8,7 @@ from skills.client.connection import Connection, at, call, given
 from skills.client.policies import Position
 from skills.client.transport import Progress
 from skills.errors import BadInput
+from skills.remedies import did_you_mean
 from skills.schemas.given import Comparison, Job, Plan, Playback, SuturePoints, Trajectory
 
 BAG = "application/zip"
@@ -147,12 +148,23 @@ class Plans(Connection):
     @call
     async def animation(self, playback: str, kind: Literal["mp4", "gif"] = "mp4") -> bytes:
         """Return the film of a playback, once it is drawn."""
-        return await self._bytes(at("playbacks", playback, f"animation.{kind}"))
+        return await self._bytes(at("playbacks", playback, f"animation.{_one_of('kind', kind, 'mp4', 'gif')}"))
 
     @call
     async def plot(self, playback: str, of: Literal["joints", "clearance"]) -> bytes:
         """Return a plot of a playback over time, a PNG, once it is drawn."""
-        return await self._bytes(at("playbacks", playback, f"{of}.png"))
+        return await self._bytes(at("playbacks", playback, f"{_one_of('of', of, 'joints', 'clearance')}.png"))
+
+
+def _one_of(name: str, given: str, *known: str) -> str:
+    """Return an argument that is a part of a path.
+
+    Raises:
+        BadInput: It is none of the known ones.
+    """
+    if given not in known:
+        raise BadInput(f"{name} must be one of {', '.join(known)}.", *did_you_mean(given, known))
+    return given
 
 
 def _point(given: Any) -> dict[str, Any]:
