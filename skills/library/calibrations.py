@@ -22,7 +22,8 @@ from skills import __version__
 from skills.arrays import Floats
 from skills.db.models import StoredCalibration
 from skills.db.service_tables import record_event
-from skills.demonstration.demonstration import Demo, Recording, cut_demo, propose_segments
+from skills.demonstration.demonstration import Demo, Recording, cut_demo
+from skills.demonstration.segments import Segment, propose_by_arm
 from skills.errors import BadInput, BadRecording, BadSegment, Corrupt, NotMetres
 from skills.formats import jigsaws
 from skills.formats.jigsaws import Trial
@@ -84,23 +85,26 @@ def read_cohort(
     ratings = _ratings(trials)
     empty = [trial for trial in trials if trial.kinematics.stat().st_size == 0]
     rated = [trial for trial in trials if trial.name in ratings and trial not in empty]
-    measured: dict[str, list[Floats]] = {}
+    measured: dict[str, _Measured] = {}
     for number, trial in enumerate(rated):
-        found = [modelled(measure(demo)) for demo in _motions(trial, arm, of)]
-        # A motion without all figures of the model is left out.
-        measured[trial.name] = [one for one in found if one is not None]
+        measured[trial.name] = _measured(trial, arm, of)
         told((number + 1) / len(rated))
-    kept = [trial for trial in rated if measured[trial.name]]
+    kept = [trial for trial in rated if measured[trial.name].motions]
     if not kept:
-        raise BadInput(f"None of {len(rated)} trials has a {of} that can be measured; try --of trial.")
+        raise BadInput(f"None of {len(rated)} trials has a {of} that can be measured.{_other_unit(of)}")
     users = sorted({trial.user for trial in kept})
-    counts = [len(measured[trial.name]) for trial in kept]
+    found = [measured[trial.name] for trial in kept]
+    counts = [len(one.motions) for one in found]
+    by_label = all(one.gestures for one in found)  # or hand-offs, because the two are not comparable
     cohort = Cohort(
-        values=np.concatenate([measured[trial.name] for trial in kept]),
+        values=np.concatenate([one.motions for one in found]),
         trials=np.repeat(np.arange(len(kept)), counts),
         surgeons=np.array([users.index(trial.user) for trial in kept]),
         ratings=np.array([float(ratings[trial.name].score) for trial in kept]),
         levels=np.array([LEVELS.index(ratings[trial.name].skill) for trial in kept]),
+        whole=np.array(
+            [(one.duration_s, one.path_mm, one.gestures if by_label else one.hand_offs) for one in found], np.float64
+        ),
     )
     data = {
         "task": kept[0].task,
@@ -111,9 +115,11 @@ def read_cohort(
         "motions": sum(counts),
         "left_out": len(trials) - len(kept),
         "levels": dict(sorted(Counter(ratings[trial.name].skill for trial in kept).items())),
+        "gestures": "labelled" if by_label else "proposed hand-offs",
         "files": sorted(map(_digest, _files(trials))),
     }
     left_out = {
+        "rated, but without a kinematics file": _without_file(trials),
         "unrated": [trial.name for trial in trials if trial.name not in ratings],
         "empty": [trial.name for trial in empty if trial.name in ratings],
         f"without a {of} that can be measured": [trial.name for trial in rated if not measured[trial.name]],
@@ -147,7 +153,7 @@ def keep(session: Session, about: dict[str, Any], actor: str) -> tuple[StoredCal
         raise BadInput(
             f"The model is not accepted, and nothing was stored. {' '.join(refused)} These figures are for "
             "surgeons left out of the fit. Calibrate on more rated trials of more surgeons, on one task in one "
-            "set-up, or try --of trial.",
+            f"set-up.{_other_unit(about['data']['of'])}",
             rho=about["validated"]["all_figures"]["rho"],
         )
     digest = sha256(canonical(about))
@@ -230,6 +236,12 @@ def _ratings(trials: Sequence[Trial]) -> dict[str, jigsaws.RatedTrial]:
     return rated
 
 
+def _without_file(trials: Sequence[Trial]) -> list[str]:
+    """Return the names of the trials that have a rating and no file."""
+    rated = jigsaws.read_meta(_meta(trials[0]).read_text(errors="replace"))
+    return sorted(rated.keys() - {trial.name for trial in trials})
+
+
 def _meta(trial: Trial) -> Path:
     return trial.kinematics.parents[2] / f"meta_file_{trial.task}.txt"
 
@@ -240,28 +252,65 @@ def _files(trials: Sequence[Trial]) -> set[Path]:
     return motions | {_meta(trial) for trial in trials}
 
 
-def _motions(trial: Trial, arm: str | None, of: Of) -> Iterator[Demo]:
-    """Yield the demonstrations to measure in a trial; a stretch that cannot be cut as a demonstration is skipped."""
+@dataclass(frozen=True)
+class _Measured:
+    """One trial: the figures of its motions, and trivial figures of all of it.
+
+    Attributes:
+        motions: The figures of each motion that has all of the model's.
+        duration_s: Duration, from the first sample to the last.
+        path_mm: Length of the path of all instruments, tremor and pauses included.
+        gestures: Number of labelled gestures; 0 without a transcription.
+        hand_offs: Number of proposed hand-offs of all instruments.
+    """
+
+    motions: list[Floats]
+    duration_s: float
+    path_mm: float
+    gestures: int
+    hand_offs: int
+
+
+def _measured(trial: Trial, arm: str | None, of: Of) -> _Measured:
+    """Measure a trial; a stretch that cannot be cut as a demonstration is skipped.
+
+    Raises:
+        BadRecording: A file cannot be read; the message names it.
+    """
     try:
         with trial.kinematics.open("rb") as file:
             transcription = "" if trial.transcription is None else trial.transcription.read_text(errors="replace")
             recording = jigsaws.read_jigsaws(file, transcription)
     except BadRecording as error:
         raise type(error)(f"{trial.kinematics}: {error.message}", *error.remedies, **error.numbers) from error
-    arms = recording.arms if arm is None else (arm,)
-    for one in arms:
-        for start_s, end_s in _spans(recording, one, of):
+    proposed = propose_by_arm(recording)
+    found = (modelled(measure(demo)) for demo in _motions(recording, proposed, arm, of))
+    tips_mm = [motion.tip_mm for motion in recording.motions]
+    return _Measured(
+        motions=[one for one in found if one is not None],
+        duration_s=recording.duration_s,
+        path_mm=float(sum(np.linalg.norm(np.diff(tip_mm, axis=0), axis=1).sum() for tip_mm in tips_mm)),
+        gestures=len(recording.labels),
+        hand_offs=len(proposed),
+    )
+
+
+def _motions(recording: Recording, proposed: Sequence[Segment], arm: str | None, of: Of) -> Iterator[Demo]:
+    spans: list[tuple[str, float | None, float | None]]
+    if of == "trial":
+        spans = [(one, None, None) for one in recording.arms]
+    else:
+        spans = [(one.arm, one.start_s, one.end_s) for one in proposed]
+    for one, start_s, end_s in spans:
+        if arm in (None, one):
             try:
                 yield cut_demo(recording, arm=one, start_s=start_s, end_s=end_s)
             except (BadSegment, NotMetres):
                 continue
 
 
-def _spans(recording: Recording, arm: str, of: Of) -> Iterator[tuple[float | None, float | None]]:
-    if of == "trial":
-        yield None, None
-    else:
-        yield from ((segment.start_s, segment.end_s) for segment in propose_segments(recording, arm))
+def _other_unit(of: Of) -> str:
+    return " Or try --of trial." if of == "hand-off" else ""
 
 
 def _digest(path: Path) -> str:

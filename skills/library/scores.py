@@ -34,7 +34,7 @@ from skills.library.demos import find_demo, newest_demo
 from skills.library.recordings import Reader, find_recording, recording_bytes
 from skills.schemas.comparison import CurvePoint, Percentiles, Reference, Score, ScoredStyle
 from skills.schemas.requests import ScoreIn
-from skills.scoring.calibration import LEVELS, Level, Skill, rate, refusals, unrated
+from skills.scoring.calibration import LEVELS, Level, Skill, level_refusals, rate, refusals, unrated
 from skills.scoring.deviation import as_recorded, laid, laid_on
 from skills.scoring.features import KINDS, Numbers, compare, measure
 
@@ -323,4 +323,5 @@ def _skill(calibration: StoredCalibration | None, numbers: Numbers) -> Skill:
         why = "Not rated: the stored model belongs to an older version, is not accepted by this one and was not used."
         again = "The operator of this installation can calibrate it again, on more rated trials."
         return unrated(" ".join([why, *refused, again]))
-    return rate(model, numbers, calibration.sha256, calibration.about)
+    levels_refused = level_refusals(calibration.about["validated"])
+    return rate(model, numbers, calibration.sha256, calibration.about, levels_refused)

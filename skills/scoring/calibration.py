@@ -18,10 +18,13 @@ Trials of one surgeon are alike, so a model is judged on surgeons all of whose t
 bias: without a good trial the mean of the others is lower, so that predictions of nothing but the mean fall as the
 truth rises, and rank correlation is below 0 where there is nothing to predict. Chance is therefore measured and not
 assumed: the same is repeated with the surgeons' ratings permuted among the surgeons.
+
+The model competes with trivial rivals on the same surgeons left out (`RIVALS`). The bias also lowers rivals that are
+fitted, a weak one most of all, so the duration competes without a fit too: the shorter the trial, the better.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -103,7 +106,7 @@ class Skill:
         words: The cohort of the calibration, the quality of the model there, and the rating; or why there is none.
         rating: The global rating score, 6 to 30.
         interval: Its interval at 90 %, as far as the motion is like those of the calibration.
-        levels: Probability of each skill level.
+        levels: Probability of each skill level; null if the model is not better at levels than chance and duration.
         terms: Contribution of each figure to the rating, in points from the mean's.
         outside: Sentences on the figures outside the range of the calibration; with any, do not rely on the rating.
     """
@@ -123,7 +126,13 @@ def unrated(why: str) -> Skill:
     return Skill(calibrated=False, calibration=None, words=(why,))
 
 
-def rate(model: SkillModel, numbers: Numbers, calibration: str, about: Mapping[str, Any]) -> Skill:
+def rate(
+    model: SkillModel,
+    numbers: Numbers,
+    calibration: str,
+    about: Mapping[str, Any],
+    levels_refused: Sequence[str] = (),
+) -> Skill:
     """Predict rating and level of a motion from its figures.
 
     Args:
@@ -131,6 +140,7 @@ def rate(model: SkillModel, numbers: Numbers, calibration: str, about: Mapping[s
         numbers: The motion's figures, as `skills.scoring.features.measure` returns them.
         calibration: Digest of the calibration that the model is part of.
         about: The calibration: its cohort as `data`, and `Validated` as the mapping `validated`.
+        levels_refused: Why the model's levels are not given, see `level_refusals`; if empty, they are.
 
     Returns:
         The rating; without one if a figure of the model was not recorded.
@@ -147,9 +157,15 @@ def rate(model: SkillModel, numbers: Numbers, calibration: str, about: Mapping[s
     outside = tuple(_outside(model, values))
     words = [
         _quality_in_words(about),
-        f"It would rate this motion {rating:.1f} of 30 (90 %: {low:.1f} to {high:.1f}), and predicts "
-        f"{likely} with a probability of {100 * levels[likely]:.0f} %.",
+        f"It would rate this motion {rating:.1f} of 30 (90 %: {low:.1f} to {high:.1f})"
+        + (
+            f", and predicts {likely} with a probability of {100 * levels[likely]:.0f} %."
+            if not levels_refused
+            else "."
+        ),
     ]
+    if levels_refused:
+        words.append(f"It gives no skill level. {' '.join(levels_refused)}")
     if outside:
         words.append(
             "This motion is unlike what it was calibrated on, so do not rely on this rating: " + " ".join(outside)
@@ -160,7 +176,7 @@ def rate(model: SkillModel, numbers: Numbers, calibration: str, about: Mapping[s
         words=tuple(words),
         rating=rating,
         interval=(float(low), float(high)),
-        levels=levels,
+        levels=None if levels_refused else levels,
         terms=dict(zip(model.figures, terms.tolist(), strict=True)),
         outside=outside,
     )
@@ -218,6 +234,16 @@ WITHIN = 0.90  # share of the ratings of unseen surgeons that are within the mar
 BOOTSTRAPS = 2000
 PERMUTATIONS = 200
 ACCEPTED_P = 0.05  # ours: greatest p-value of an accepted model against chance
+WHOLE = ("duration_s", "path_length_mm", "gestures")  # trivial figures of a complete trial
+RIVALS = {
+    "motion_duration": "duration of each motion",
+    "trial_duration": "duration of the trial",
+    "shorter_first": "shorter trials first, not fitted",
+    "path_length": "path length of the trial",
+    "gestures": "number of gestures",
+    "mean": "mean, and most frequent level",
+}
+DURATIONS = ("motion_duration", "trial_duration", "shorter_first")
 UNKNOWN = (np.nan, np.nan)
 NOTHING: Callable[[float], None] = lambda share: None  # noqa: E731
 
@@ -232,6 +258,8 @@ class Cohort:
         surgeons: Number of the surgeon of each trial, shape (T,).
         ratings: The global rating score of each trial, shape (T,).
         levels: Index in `LEVELS` of the surgeon's level in each trial, shape (T,).
+        whole: The figures `WHOLE` of each complete trial, shape (T, 3); by default durations and path lengths are the
+            sums over its motions, and gestures their number.
     """
 
     values: Floats
@@ -239,10 +267,13 @@ class Cohort:
     surgeons: Ints
     ratings: Floats
     levels: Ints
+    whole: Floats = field(default_factory=lambda: np.empty((0, len(WHOLE))))
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "values", frozen(self.values, np.float64, (None, len(MODELLED)), "values"))
         object.__setattr__(self, "trials", frozen(self.trials, np.int64, (len(self.values),), "trials"))
+        whole = self.whole if len(self.whole) else self._sums()
+        object.__setattr__(self, "whole", frozen(whole, np.float64, (len(self.surgeons), len(WHOLE)), "whole"))
         for name, dtype in (("surgeons", np.int64), ("ratings", np.float64), ("levels", np.int64)):
             object.__setattr__(self, name, frozen(getattr(self, name), dtype, (len(self.surgeons),), name))
         count = len(np.unique(self.surgeons))
@@ -256,6 +287,11 @@ class Cohort:
             raise BadInput("All surgeons are of one skill level; at least two levels are needed to distinguish them.")
         if len(np.unique(self.ratings)) < 2:
             raise BadInput("All trials have the same rating; ratings that differ are needed.")
+
+    def _sums(self) -> Floats:
+        counts = np.bincount(self.trials, minlength=len(self.surgeons))
+        figures = [self.values[:, MODELLED.index(name)] for name in WHOLE[:2]]
+        return np.stack([*(np.bincount(self.trials, one, len(counts)) for one in figures), counts], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -319,16 +355,22 @@ class Chance:
 
 @dataclass(frozen=True)
 class Validation:
-    """A model judged on surgeons left out, with the same for one that has the duration alone, and for chance.
+    """A model judged on surgeons left out, with the same for trivial rivals and for chance.
 
-    `over_duration` is the interval at 95 % of rho minus that of the duration alone: a bootstrap over surgeons, of both
-    on the same draws.
+    Attributes:
+        all_figures: The model.
+        duration_only: The best that the duration alone achieves, in any of `DURATIONS`, for the order and for levels.
+        chance: Permuted ratings and levels.
+        over_duration: Interval at 95 % of the model's rho minus the greatest of `DURATIONS`: a bootstrap over surgeons,
+            all on the same draws.
+        rivals: The predictions of trivial rivals, by the names of `RIVALS`.
     """
 
     all_figures: Judged
     duration_only: Judged
     chance: Chance
     over_duration: tuple[float, float]
+    rivals: dict[str, Judged]
 
 
 def calibrate(cohort: Cohort, *, columns: tuple[int, ...] | None = None) -> SkillModel:
@@ -358,32 +400,60 @@ def validate(
         told: Progress callback, called with the finished share, 0 to 1.
 
     Returns:
-        The quality of the model, of the duration alone, and of chance.
+        The quality of the model, of its trivial rivals, and of chance.
     """
-    rng = np.random.default_rng(seed)
-    ours, durations = held_out(cohort), held_out(cohort, columns=(MODELLED.index("duration_s"),))
-    all_figures, duration = _judge(cohort, ours, rng), _judge(cohort, durations, rng)
-    rhos, rights = [], []
-    for number in range(permutations):
-        dealt = shuffled(cohort, rng)
-        found = held_out(dealt)
-        rhos.append(spearman(found.ratings, dealt.ratings))
-        rights.append(float((found.levels == dealt.levels).mean()))
-        told((number + 1) / permutations)
-    chance = _chance(cohort, all_figures, np.array(rhos), np.array(rights))
-    more = [
-        spearman(ours.ratings[drawn], cohort.ratings[drawn]) - spearman(durations.ratings[drawn], cohort.ratings[drawn])
-        for drawn in _resampled(cohort.surgeons, np.random.default_rng(seed))
-    ]
+    found = {"": held_out(cohort), **rival_predictions(cohort)}
+    judged, rhos = _judge(cohort, found, np.random.default_rng(seed))
+    ours = judged.pop("")
+    by_order, by_level = (
+        max((judged[name] for name in DURATIONS), key=key) for key in (lambda of: of.rho, lambda of: of.accuracy)
+    )
+    more = rhos[""] - np.max([rhos[name] for name in DURATIONS], axis=0)
     low, high = np.quantile(more, (0.025, 0.975)).tolist()
-    return Validation(all_figures, duration, chance, (low, high))
+    return Validation(
+        all_figures=ours,
+        duration_only=replace(by_level, rho=by_order.rho, rho_interval=by_order.rho_interval),
+        chance=_chance(cohort, ours, np.random.default_rng([seed, 1]), permutations, told),
+        over_duration=(low, high),
+        rivals=judged,
+    )
+
+
+def rival_predictions(cohort: Cohort) -> dict[str, HeldOut]:
+    """Predict every trial by each of `RIVALS`, fitted without its surgeon except for `shorter_first`.
+
+    Args:
+        cohort: The rated trials.
+
+    Returns:
+        The predictions, by the names of `RIVALS`. `shorter_first` has no model: its "ratings" are the negative
+        durations, in s, and its levels are those of `trial_duration`.
+    """
+    duration_s, path_mm, gestures = cohort.whole.T
+    by_duration = _predict_by(cohort, duration_s)
+    return {
+        "motion_duration": held_out(cohort, columns=(MODELLED.index("duration_s"),)),
+        "trial_duration": by_duration,
+        "shorter_first": replace(by_duration, ratings=-duration_s),
+        "path_length": _predict_by(cohort, path_mm),
+        "gestures": _predict_by(cohort, gestures),
+        "mean": _predict_by(cohort, np.zeros_like(duration_s)),
+    }
+
+
+def _predict_by(cohort: Cohort, figure: Floats) -> HeldOut:
+    """Predict every trial from one number of it, (T,), by a model of the same kind."""
+    values = np.zeros((len(figure), len(MODELLED)))
+    values[:, 0] = figure
+    alone = Cohort(values, np.arange(len(figure)), cohort.surgeons, cohort.ratings, cohort.levels)
+    return held_out(alone, columns=(0,))
 
 
 def refusals(validated: Mapping[str, Any]) -> list[str]:
     """Return the reasons why a model is not accepted, one sentence each.
 
-    There is none if the model is better than chance and than the duration alone. Every comparison is written so that a
-    missing figure or NaN refuses the model.
+    There is none if its ratings are better than chance and than the duration alone. Every comparison is written so that
+    a missing figure or NaN refuses the model.
 
     Args:
         validated: `Validated` as a mapping, as it is stored with a model; an older one lacks `over_duration`.
@@ -392,10 +462,7 @@ def refusals(validated: Mapping[str, Any]) -> list[str]:
     rho, rho_by_duration = (of.get("rho", np.nan) for of in (ours, duration))
     low, high = ours.get("rho_interval", UNKNOWN)
     more_low, more_high = validated.get("over_duration", UNKNOWN)
-    rho_p, right_p = (chance.get(name, np.nan) for name in ("rho_p", "accuracy_p"))
-    right, commonest, by_duration = (
-        100 * of.get(name, np.nan) for of, name in ((ours, "accuracy"), (chance, "commonest"), (duration, "accuracy"))
-    )
+    rho_p = chance.get("rho_p", np.nan)
     why = []
     if not low > 0:
         why.append(f"Its rank correlation may be 0 or less ({rho:.2f}, 95 %: {low:.2f} to {high:.2f}).")
@@ -406,6 +473,23 @@ def refusals(validated: Mapping[str, Any]) -> list[str]:
             f"It may order trials no better than the duration alone ({rho_by_duration:.2f}; the difference is "
             f"{more_low:.2f} to {more_high:.2f})."
         )
+    return why
+
+
+def level_refusals(validated: Mapping[str, Any]) -> list[str]:
+    """Return the reasons why an accepted model's levels are not given; none if they are better than the rivals' too.
+
+    A surgeon's level is stated by the surgeon and need not follow the ratings, so it is judged by itself.
+
+    Args:
+        validated: As for `refusals`.
+    """
+    ours, duration, chance = (validated[name] for name in ("all_figures", "duration_only", "chance"))
+    right_p = chance.get("accuracy_p", np.nan)
+    right, commonest, by_duration = (
+        100 * of.get(name, np.nan) for of, name in ((ours, "accuracy"), (chance, "commonest"), (duration, "accuracy"))
+    )
+    why = []
     if not right_p <= ACCEPTED_P:
         why.append(f"Random levels are right as often (p = {right_p:.3f}; at most {ACCEPTED_P} is accepted).")
     if not (right > commonest and right > by_duration):
@@ -458,7 +542,7 @@ def shuffled(cohort: Cohort, rng: np.random.Generator) -> Cohort:
         mine, theirs = cohort.surgeons == to, cohort.surgeons == of
         ratings[mine] = np.resize(cohort.ratings[theirs], mine.sum())
         levels[mine] = np.resize(cohort.levels[theirs], mine.sum())
-    return Cohort(cohort.values, cohort.trials, cohort.surgeons, ratings, levels)
+    return replace(cohort, ratings=ratings, levels=levels)
 
 
 def spearman(one: Floats, other: Floats) -> float:
@@ -468,11 +552,16 @@ def spearman(one: Floats, other: Floats) -> float:
         one: Values, shape (T,).
         other: Values, shape (T,).
     """
+    return float(_spearman(one[None], other)[0])
+
+
+def _spearman(several: Floats, other: Floats) -> Floats:
+    """Return the rank correlations of several series, (K, T), with another, (T,)."""
     from scipy.stats import rankdata
 
-    a, b = (ranks - ranks.mean() for ranks in (rankdata(one), rankdata(other)))
-    length = float(np.sqrt((a @ a) * (b @ b)))
-    return float(a @ b) / length if length > 0 else 0.0
+    a, b = (ranks - ranks.mean(axis=-1, keepdims=True) for ranks in (rankdata(several, axis=1), rankdata(other)))
+    lengths = np.sqrt((a * a).sum(axis=1) * (b @ b))
+    return np.asarray(np.divide(a @ b, lengths, out=np.zeros(len(a)), where=lengths > 0))
 
 
 def _fitted(cohort: Cohort, inside: Flags, columns: tuple[int, ...] | None, margin: float = 0.0) -> SkillModel:
@@ -518,11 +607,20 @@ def _by_trial(cohort: Cohort, values: Floats) -> Floats:
     return np.asarray(np.bincount(cohort.trials, values, count) / np.bincount(cohort.trials, minlength=count))
 
 
-def _judge(cohort: Cohort, found: HeldOut, rng: np.random.Generator) -> Judged:
-    right, count = int((found.levels == cohort.levels).sum()), len(cohort.levels)
-    rhos = [spearman(found.ratings[drawn], cohort.ratings[drawn]) for drawn in _resampled(cohort.surgeons, rng)]
-    low, high = np.quantile(rhos, (0.025, 0.975)).tolist()
-    return Judged(spearman(found.ratings, cohort.ratings), (low, high), right, right / count, wilson(right, count))
+def _judge(
+    cohort: Cohort, found: Mapping[str, HeldOut], rng: np.random.Generator
+) -> tuple[dict[str, Judged], dict[str, Floats]]:
+    """Judge several predictions; return also the rank correlations of each on the same bootstrap draws, shape (B,)."""
+    count, predicted = len(cohort.levels), np.stack([one.ratings for one in found.values()])
+    drawn_rhos = [_spearman(predicted[:, drawn], cohort.ratings[drawn]) for drawn in _resampled(cohort.surgeons, rng)]
+    rhos = dict(zip(found, np.stack(drawn_rhos, axis=1), strict=True))
+    judged = {}
+    for name, one in found.items():
+        low, high = np.quantile(rhos[name], (0.025, 0.975)).tolist()
+        right = int((one.levels == cohort.levels).sum())
+        rho = spearman(one.ratings, cohort.ratings)
+        judged[name] = Judged(rho, (low, high), right, right / count, wilson(right, count))
+    return judged, rhos
 
 
 def _resampled(surgeons: Ints, rng: np.random.Generator) -> Iterator[Ints]:
@@ -532,15 +630,24 @@ def _resampled(surgeons: Ints, rng: np.random.Generator) -> Iterator[Ints]:
         yield np.concatenate([trials_of[drawn] for drawn in rng.integers(len(trials_of), size=len(trials_of))])
 
 
-def _chance(cohort: Cohort, judged: Judged, rhos: Floats, rights: Floats) -> Chance:
-    tried = len(rhos)
+def _chance(
+    cohort: Cohort, judged: Judged, rng: np.random.Generator, permutations: int, told: Callable[[float], None]
+) -> Chance:
+    of_order, of_levels = [], []
+    for number in range(permutations):
+        permuted = shuffled(cohort, rng)
+        found = held_out(permuted)
+        of_order.append(spearman(found.ratings, permuted.ratings))
+        of_levels.append(float((found.levels == permuted.levels).mean()))
+        told((number + 1) / permutations)
+    rhos, rights = np.array(of_order), np.array(of_levels)
     return Chance(
-        permutations=tried,
+        permutations=permutations,
         rho=float(rhos.mean()),
         rho_95=float(np.quantile(rhos, 0.95)),
-        rho_p=float(1 + (rhos >= judged.rho).sum()) / (1 + tried),
+        rho_p=float(1 + (rhos >= judged.rho).sum()) / (1 + permutations),
         accuracy=float(rights.mean()),
         accuracy_95=float(np.quantile(rights, 0.95)),
-        accuracy_p=float(1 + (rights >= judged.accuracy).sum()) / (1 + tried),
+        accuracy_p=float(1 + (rights >= judged.accuracy).sum()) / (1 + permutations),
         commonest=float(np.bincount(cohort.levels).max() / len(cohort.levels)),
     )

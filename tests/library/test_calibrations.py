@@ -17,7 +17,7 @@ from skills.db.session import Database
 from skills.errors import BadInput, Corrupt, NotAQuaternion, NotFinite, UnreadableRecording
 from skills.library.calibrations import Rated, calibrate_on, keep, newest, read_calibration, read_cohort
 from skills.library.inspection import inspect_installation
-from skills.scoring.calibration import as_numbers, held_out, refusals, shuffled, spearman
+from skills.scoring.calibration import as_numbers, held_out, level_refusals, refusals, shuffled, spearman
 from tests.formats.trials import kinematics
 from tests.formats.trials import text as as_text
 from tests.library import rated
@@ -172,7 +172,10 @@ def test_names_that_do_not_match_are_named(copied: Path) -> None:
     meta = copied / "Suturing" / META
     meta.write_text(meta.read_text().replace("Suturing_B001", "Suturing_B901"))
     found = read_cohort(copied)
-    assert found.left_out == {"unrated": ["Suturing_B001"]}
+    assert found.left_out == {
+        "rated, but without a kinematics file": ["Suturing_B901"],
+        "unrated": ["Suturing_B001"],
+    }
     assert (found.data["trials"], found.data["left_out"]) == (39, 1)
     meta.write_text("")
     with pytest.raises(BadInput, match="40 of 40 trials: Suturing_B001"):
@@ -275,16 +278,20 @@ def test_each_comparison_can_refuse_and_nan_does(
     judged = copy.deepcopy(about["validated"])
     assert refusals(judged) == []
     of = judged if part is None else judged[part]
+    assert level_refusals(judged) == []
     if wrong is None:  # as an older version stored it
         del of[field]
     else:
         of[field] = wrong
-    why = refusals(judged)
+    of_levels = "accuracy" in field
+    assert (refusals(judged) == []) == of_levels
+    why = level_refusals(judged) if of_levels else refusals(judged)
     assert len(why) == 1 and said in why[0]
 
 
 def test_a_model_without_any_figure_is_refused_in_words() -> None:
-    assert len(refusals({"all_figures": {}, "duration_only": {}, "chance": {}})) == 5
+    nothing: dict[str, Any] = {"all_figures": {}, "duration_only": {}, "chance": {}}
+    assert (len(refusals(nothing)), len(level_refusals(nothing))) == (3, 2)
 
 
 def test_trials_without_a_hand_off_are_left_out_and_counted(copied: Path) -> None:

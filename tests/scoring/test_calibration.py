@@ -1,5 +1,7 @@
 """Calibration on a cohort of known truth: skill is found, not invented, and reported correctly."""
 
+from dataclasses import asdict
+
 import numpy as np
 import pytest
 from scipy.stats import spearmanr
@@ -7,7 +9,19 @@ from sklearn.linear_model import LogisticRegression, Ridge
 from sklearn.preprocessing import StandardScaler
 
 from skills.errors import BadInput
-from skills.scoring.calibration import LOGISTIC, RIDGE, Cohort, calibrate, held_out, shuffled, spearman, validate
+from skills.scoring.calibration import (
+    LOGISTIC,
+    RIDGE,
+    RIVALS,
+    Cohort,
+    calibrate,
+    held_out,
+    refusals,
+    rival_predictions,
+    shuffled,
+    spearman,
+    validate,
+)
 from skills.scoring.features import MODELLED
 
 SURGEONS, TRIALS = 8, 5
@@ -75,6 +89,99 @@ def test_the_chance_of_a_small_p_is_small_where_nothing_shows() -> None:
     """Of 40 cohorts without any effect, at most a fifth may claim p < 0.1."""
     small = sum(validate(cohort(seed, told=0.0), permutations=40).chance.rho_p < 0.1 for seed in range(40))
     assert small <= 8
+
+
+# ---- acceptance, where the truth is known --------------------------------------------------------------------------
+
+
+def drawn_cohort(kind: str, seed: int) -> Cohort:
+    """Draw figures with an effect of the surgeon and one of the trial, and ratings by a known rule, with noise.
+
+    Args:
+        kind: The rule. "nothing", "surgeon" (an effect of the surgeon that no figure shows), "duration", "shared" (the
+            duration, which every figure shows with noise) or "smoothness".
+        seed: Seed of the draw.
+    """
+    rng = np.random.default_rng([seed, len(kind)])
+    whose = np.repeat(np.arange(SURGEONS), TRIALS)
+
+    def effects(size: float) -> np.ndarray:
+        return size * (rng.normal(size=SURGEONS)[whose] + rng.normal(size=len(whose)))
+
+    values = np.stack([effects(0.7) for _ in MODELLED], axis=1)
+    if kind == "shared":
+        values[:, 1:] = values[:, :1] + 0.5 * values[:, 1:]
+    told = {
+        "nothing": rng.normal(size=len(whose)),
+        "surgeon": effects(1.0),
+        "duration": effects(0.3) - values[:, 0],
+        "shared": effects(0.3) - values[:, 0],
+        "smoothness": effects(0.15) + values[:, 3],
+    }[kind]
+    ratings = np.rint(np.clip(18.0 + 5.0 * told / told.std(), 6, 30))
+    means = np.array([ratings[whose == surgeon].mean() for surgeon in range(SURGEONS)])
+    levels = means.argsort().argsort() * 3 // SURGEONS
+    return Cohort(values, np.arange(len(whose)), whose, ratings, levels[whose])
+
+
+def accepted(kind: str, draws: int) -> int:
+    """Return the number of draws whose model is accepted."""
+    judged = (validate(drawn_cohort(kind, seed), permutations=20) for seed in range(draws))
+    count = sum(not refusals(asdict(one)) for one in judged)
+    print(f"{kind}: {count} of {draws} accepted")
+    return count
+
+
+HOPELESS = ("nothing", "surgeon", "duration", "shared")
+
+
+def test_models_of_nothing_and_of_the_duration_alone_are_refused() -> None:
+    assert sum(accepted(kind, 1) for kind in HOPELESS) == 0
+
+
+def test_a_model_that_truly_predicts_is_accepted() -> None:
+    assert accepted("smoothness", 2) == 2
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("kind", HOPELESS)
+def test_of_many_hopeless_models_at_most_a_twentieth_is_accepted(kind: str) -> None:
+    assert accepted(kind, 100) <= 5
+
+
+@pytest.mark.nightly
+def test_of_many_predictive_models_most_are_accepted() -> None:
+    assert accepted("smoothness", 100) >= 95
+
+
+def test_the_duration_of_the_trial_competes_with_a_model_of_hand_offs() -> None:
+    """Hand-offs whose own durations say nothing, in trials whose duration says everything."""
+    drawn = drawn_cohort("smoothness", 0)
+    whole = np.stack([30.0 - drawn.ratings, np.ones(40), np.ones(40)], axis=1)
+    told = Cohort(drawn.values, drawn.trials, drawn.surgeons, drawn.ratings, drawn.levels, whole)
+    found = validate(told, permutations=20)
+    assert found.rivals["motion_duration"].rho < 0.5
+    assert found.duration_only.rho == found.rivals["shorter_first"].rho == pytest.approx(1.0)
+    assert found.over_duration[1] <= 0.0
+    assert any("no better than the duration alone (1.00" in why for why in refusals(asdict(found)))
+
+
+def test_rivals_are_the_trivial_predictions_and_have_not_seen_the_surgeon() -> None:
+    drawn = cohort(motions=2)
+    found = rival_predictions(drawn)
+    assert list(found) == list(RIVALS)
+    means = [drawn.ratings[drawn.surgeons != surgeon].mean() for surgeon in drawn.surgeons]
+    np.testing.assert_allclose(found["mean"].ratings, means)
+    duration_s = drawn.values[:, 0].reshape(-1, 2).sum(axis=1)  # of both motions, by default
+    np.testing.assert_allclose(drawn.whole[:, 0], duration_s)
+    np.testing.assert_allclose(found["shorter_first"].ratings, -duration_s)
+    np.testing.assert_allclose(found["gestures"].ratings, means)  # two in every trial
+    mine = drawn.surgeons == 3
+    theirs, trial = ~mine, np.flatnonzero(mine)[0]
+    standard = StandardScaler().fit(duration_s[theirs, None])
+    ridge = Ridge(alpha=RIDGE).fit(standard.transform(duration_s[theirs, None]), drawn.ratings[theirs])
+    expected = ridge.predict(standard.transform(duration_s[[trial], None]))
+    np.testing.assert_allclose(found["trial_duration"].ratings[trial], expected[0])
 
 
 def test_the_model_is_that_of_scikit_learn_as_one_would_write_it() -> None:

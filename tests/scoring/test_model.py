@@ -39,6 +39,15 @@ def model(**changed: object) -> SkillModel:
     return SkillModel(**(numbers | changed))
 
 
+def test_levels_that_are_refused_are_not_given_and_the_rating_is() -> None:
+    numbers = {"duration_s": 12.0, "path_length_mm": 120.0}
+    found = rate(model(), numbers, "0" * 64, ABOUT, ["Random levels are right as often."])
+    assert found.rating == rated(model(), numbers).rating
+    assert found.levels is None
+    said = " ".join(found.words)
+    assert "no skill level. Random levels are right as often." in said and "predicts" not in said
+
+
 def rated(by: SkillModel, numbers: Numbers) -> Skill:
     return rate(by, numbers, "0" * 64, ABOUT)
 
