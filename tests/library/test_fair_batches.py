@@ -56,6 +56,34 @@ def test_a_policy_of_three_demos_is_retrained_on_the_newest_three(database: Data
     assert comparison["now_released"] == not_worse(found) == (served(database).sha256 == trained.sha256)
 
 
+@pytest.mark.parametrize(
+    ("before_mm", "added_mm", "better"),
+    [((0.0, 0.4, 0.8), (14.0, 14.4), False), ((14.0, 14.4, 0.0), (0.4, 0.8), True)],
+    ids=["the two newest of three go astray", "the two newest of three return"],
+)
+def test_three_replace_three_only_where_they_follow_all_five_better(
+    before_mm: tuple[float, ...], added_mm: tuple[float, ...], better: bool, database: Database
+):
+    """Of five demonstrations three agree, and whichever policy follows these is nearer to all five."""
+    three = demos(database, *before_mm)
+    cases.train(database, demos=three, release=True)
+    old = served(database).sha256
+    added = demos(database, *added_mm)
+    comparison = compared(database)
+    assert comparison["trained"]["demos"] == [three[2], *added]
+    assert (comparison["released"]["rests_on"], comparison["trained"]["rests_on"]) == (3, 3)
+    fit = comparison["on_the_same"]
+    assert fit["demos"] == [*three, *added]
+    nearer, further = sorted((fit["released_mm"], fit["trained_mm"]))
+    assert further > 1.2 * nearer
+    assert (fit["trained_mm"] < fit["released_mm"]) == comparison["now_released"] == better
+    assert (served(database).sha256 == old) != better
+    assert len(served(database).manifest["demos"]) == 3
+    if not better:
+        (why,) = comparison["worse_because"]
+        assert why.startswith("DTW ") and why.endswith("on the same 5 demonstrations")
+
+
 def test_a_policy_of_the_newest_alone_does_not_replace_one_of_three(
     database: Database, monkeypatch: pytest.MonkeyPatch
 ):
