@@ -442,10 +442,10 @@ def _nearest_limit(tip: Floats, solutions: Floats, tool: InstrumentConstants) ->
     """Find the pose whose best solution, of shape (T, solutions, 6), is nearest a limit; NaN is furthest beyond."""
     margins = np.minimum(solutions - tool.lower, tool.upper - solutions)
     parts = np.where(np.isnan(margins), -np.inf, margins / (tool.upper - tool.lower))
-    best = parts.min(axis=2).argmax(axis=1)
-    of_best = parts[np.arange(len(parts)), best]
-    sample = int(of_best.min(axis=1).argmin())
-    joint = int(of_best[sample].argmin())
+    worst = parts.min(axis=2)
+    best = worst.argmax(axis=1)
+    sample = int(worst[np.arange(len(worst)), best].argmin())
+    joint = int(parts[sample, best[sample]].argmin())
     value, margin = (float(of[sample, best[sample], joint]) for of in (solutions, margins))
     x, y, z = tip[sample].tolist()
     nearer_upper = tool.upper[joint] - value < value - tool.lower[joint]

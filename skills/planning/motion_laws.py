@@ -18,7 +18,6 @@ The poses of both arms are in one frame, PSM_A's base. The arms move together: t
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from math import ceil, sqrt
 
 import numpy as np
@@ -73,12 +72,14 @@ def followed(line: Floats, mm_per_tick: float) -> tuple[Floats, float]:
 
 def _divided(line: Floats, piece_mm: float) -> Floats:
     """Divide the moves of a polyline evenly into pieces of at most this length, shape (K, 3)."""
-    pieces = [line[:1]]
-    for start, end in pairwise(line):
-        count = ceil(float(np.linalg.norm(end - start)) / piece_mm)
-        pieces.append(start + (end - start) * (np.arange(1, count + 1) / count)[:, None])
-        pieces[-1][-1] = end
-    return np.concatenate(pieces)
+    along = np.diff(line, axis=0)
+    counts = np.ceil(np.linalg.norm(along, axis=1) / piece_mm).astype(np.int64)
+    last = np.cumsum(counts)
+    move = np.repeat(np.arange(len(counts)), counts)
+    number = np.arange(1, len(move) + 1) - (last - counts)[move]
+    divided = np.concatenate([line[:1], line[move] + along[move] * (number / counts[move])[:, None]])
+    divided[last] = line[1:]  # exactly, as every given point falls on a tick
+    return divided
 
 
 def _run(line: Floats, mm_per_tick: float) -> tuple[Floats, float]:

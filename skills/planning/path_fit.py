@@ -242,11 +242,12 @@ def _smoothest(wanted: Floats, low: Floats, high: Floats) -> Floats:
     push = (1 - np.sqrt(rate)) / (1 + np.sqrt(rate))
     x = ahead = wanted.clip(low, high)
     for _ in range(_ROUNDS):
-        bend = np.diff(ahead, 2, axis=0)
+        step = ahead[1:] - ahead[:-1]
+        bend = STIFFNESS * (step[1:] - step[:-1])
         slope = ahead - wanted
-        slope[:-2] += STIFFNESS * bend
-        slope[1:-1] -= 2 * STIFFNESS * bend
-        slope[2:] += STIFFNESS * bend
-        x, before = (ahead - rate * slope).clip(low, high), x
+        slope[:-2] += bend
+        slope[2:] += bend
+        slope[1:-1] -= 2 * bend
+        x, before = np.minimum(np.maximum(ahead - rate * slope, low), high), x
         ahead = x + push * (x - before)
     return x
