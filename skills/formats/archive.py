@@ -67,6 +67,10 @@ class Archive:
             self._zip = zipfile.ZipFile(file)
         infos = [info for info in self._zip.infolist() if not info.is_dir()]
         _check_members(infos)
+        with refusing("The zip archive", "Pack it again."):
+            for info in infos:
+                # Compares its two names: a member with a damaged one would be missed and not missing.
+                self._zip.open(info).close()
         self._infos = {info.filename: info for info in infos}
         self._left = TOTAL_BYTES
 

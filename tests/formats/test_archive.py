@@ -11,6 +11,7 @@ import pytest
 from skills.errors import SkillsError, UnknownFormat, UnreadableRecording
 from skills.formats import read_recording, write_mcap
 from skills.formats.archive import Archive, pack
+from tests.formats import trials
 from tests.formats.bags import assert_same, recording
 from tests.formats.others import damaged, zipped
 
@@ -97,6 +98,13 @@ def test_a_damaged_archive_is_refused_or_says_the_same():
         else:
             assert what.startswith("bit")
     assert refused > 250
+
+
+def test_a_member_that_lost_its_name_in_one_place_is_refused():
+    data = zipped({"a.txt": trials.text(trials.kinematics(3)), "transcriptions/a.txt": b"1 2 G1\n"})
+    assert read(data).labels
+    with pytest.raises(UnreadableRecording, match="truncated or corrupt"):
+        read(b"transcriptions/a.tyt".join(data.rsplit(b"transcriptions/a.txt", 1)))
 
 
 def test_a_name_that_leads_out_of_the_folder_leads_nowhere(tmp_path, monkeypatch):
