@@ -80,6 +80,21 @@ class Action(Enum):
         command="Name another with --demo, or learn from it all the same: --outcomes any",
         python="Name another in demos, or learn from it all the same: client.train(..., outcomes='any')",
     )
+    NAME_TOOL = Words(
+        http="State it under `tools` in meta/suture-skills.json of the zip: PSM1 and its number.",
+        command="State it: --tool PSM1=400006",
+        python="State it: cut_episode(..., tools=dict(PSM1='400006')) of skills.formats.lerobot.cut",
+    )
+    NAME_FEATURES = Words(
+        http="State their meanings under `columns` in meta/suture-skills.json of the zip.",
+        command="State their meanings: --column psm1_pose.position.x=THEIRS, and so on",
+        python="State their meanings: cut_episode(..., columns=...) of skills.formats.lerobot.cut",
+    )
+    CUT_EPISODE = Words(
+        http="Send each episode as a zip of its own, with one .parquet file below data/.",
+        command="Name one, counted from 0 as in the dataset, or all: --episode N, --episode all",
+        python="Cut them: cut_episode of skills.formats.lerobot.cut makes the file to send.",
+    )
     ERASE_DEMOS = Words(
         http="It is deleted with the last of them: DELETE /demos/ID?erase=true.",
         command="It is deleted with the last of them: skills demo withdraw DEMO --erase",

@@ -19,7 +19,7 @@ from skills.formats import write_mcap
 from skills.library.catalogue import put_surgeon
 from skills.seeds.recordings import sample_recordings
 from skills.settings import settings
-from tests.formats import bags, trials
+from tests.formats import bags, lerobots, trials
 from tests.library import cases
 
 STYLE = ("wren", "simple-running")
@@ -256,6 +256,50 @@ def test_a_sessions_folder_is_joined_without_its_pictures(skills, tmp_path: Path
     stored = json.loads(said)
     assert (stored["format"], stored["integrity"], stored["media_type"]) == ("rosbag2", "full", "application/zip")
     assert json.loads(skills("recording", "add", str(session), "--json")[1])["sha256"] == stored["sha256"]
+
+
+def test_episodes_of_a_lerobot_dataset_are_recordings_of_their_own(skills, tmp_path: Path) -> None:
+    folder = str(lerobots.write(lerobots.dataset("v3.0"), tmp_path / "dataset"))
+    add = ("recording", "add", folder, "--frame", "ECM", "--json")
+    code, said = skills(*add)
+    assert (code, "has 3 episodes" in said, "--episode N" in said) == (1, True, True)
+    code, said = skills(*add, "--episode", "1")
+    assert code == 0, said
+    assert (json.loads(said)["format"], json.loads(said)["notes"]["episode"]) == ("lerobot", "1")
+    code, said = skills(*add, "--episode", "all")
+    stored = json.loads(said)
+    assert (code, [one["episode"] for one in stored]) == (0, [0, 1, 2])
+    assert stored[1]["recording"] == json.loads(skills(*add, "--episode", "1")[1])["sha256"]
+    assert len({one["recording"] for one in stored}) == 3
+    code, said = skills("recording", "add", folder, "--episode", "all", "--json")
+    assert code == 1
+    assert all("--frame NAME" in one["problem"] for one in json.loads(said))
+    code, said = skills(*add, "--episode", "7")
+    assert (code, "0 to 2" in said) == (1, True)
+
+
+def test_a_demonstration_is_cut_out_of_an_episode(skills, tmp_path: Path) -> None:
+    columns, names = lerobots.joint_columns([f"motor_{k}" for k in range(7)])
+    del columns["observation.meta.tool.psm1"]
+    folder = str(lerobots.write(lerobots.episode(columns, names=names), tmp_path / "dataset"))
+    said_columns = [word for k in range(6) for word in ("--column", f"psm1_joint_{k + 1}=motor_{k}")]
+    add = ("demo", "add", folder, "--surgeon", "wren", "--suture", "simple-running", "--segment", "whole", "--json")
+    skills("migrate")
+    skills("surgeon", "put", "wren")
+    code, said = skills(*add, *said_columns)
+    assert (code, "--tool PSM1=400006" in said) == (1, True)
+    code, said = skills(*add, *said_columns, "--tool", "PSM1=400006")
+    assert code == 0, said
+    assert (json.loads(said)["arm"], json.loads(said)["frame"]) == ("PSM1", "PSM1_base")
+    code, said = skills(*add, "--column", "psm1_jaw")
+    assert (code, "two names with = between them" in said) == (1, True)
+
+
+def test_what_is_said_about_a_dataset_is_refused_for_other_files(skills, tmp_path: Path) -> None:
+    (tmp_path / "bag.mcap").write_bytes(write_mcap(bags.recording()))
+    for more in (("--episode", "0"), ("--episode", "all"), ("--tool", "PSM1=400006")):
+        code, said = skills("recording", "add", str(tmp_path / "bag.mcap"), *more)
+        assert (code, "is no LeRobot dataset" in said.replace("\n", " ")) == (1, True)
 
 
 def test_the_content_says_what_a_file_is_and_not_its_name(skills, tmp_path: Path) -> None:

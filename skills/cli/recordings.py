@@ -1,11 +1,12 @@
 """Commands of surgeons, suture types, recordings and demonstrations."""
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
@@ -108,6 +109,8 @@ def erase(
 
 if TYPE_CHECKING:
     from skills.client import Progress
+    from skills.formats.lerobot.cut import Episode
+    from skills.formats.lerobot.dataset import Dataset
     from skills.schemas.given import Demonstration, Recording, RecordingPreview
 
     Part = Literal["whole"] | int | None
@@ -122,11 +125,19 @@ commands.add_typer(jigsaws, name="jigsaws")
 
 RateHz = Annotated[float | None, typer.Option(help="Samples per second, for a table without times.")]
 Frame = Annotated[
-    str | None, typer.Option(help="The frame of a table's positions; base, the default for one arm: the arm's base.")
+    str | None,
+    typer.Option(
+        help="The frame of the poses in a table or a LeRobot dataset; base, the default for a table of one arm: the "
+        "arm's base."
+    ),
 ]
 Columns = Annotated[
     list[str] | None,
-    typer.Option("--column", help="A table's column under another name, as x_mm=PosX; repeatable (docs/tables.md)."),
+    typer.Option(
+        "--column",
+        help="A column under another name, of a table as x_mm=PosX (docs/tables.md), of a LeRobot dataset as "
+        "psm1_jaw=observation.state[7]; repeatable.",
+    ),
 ]
 Units = Annotated[
     list[str] | None,
@@ -139,8 +150,15 @@ TableArm = Annotated[str | None, typer.Option(help="The arm of a table; PSM by d
 Instrument = Annotated[
     str | None, typer.Option(help="The instrument with which a table's joints become poses, such as 400006.")
 ]
+Tool = Annotated[
+    list[str] | None,
+    typer.Option(help="The instrument of an arm in a LeRobot dataset, such as PSM1=400006; repeatable."),
+]
 RecordingPath = Annotated[
-    Path, typer.Argument(help="A recording, a bag folder, or a session's folder with one; pictures are not sent.")
+    Path,
+    typer.Argument(
+        help="A recording, a bag folder, a session's folder with one, or a LeRobot dataset; pictures are not sent."
+    ),
 ]
 Demo = Annotated[str, typer.Argument(help="The demonstration's digest.")]
 Outcome = Literal["success", "recovery", "failure"]
@@ -166,6 +184,56 @@ def ready(path: Path) -> Iterator[tuple[Path, "Progress"]]:
             yield file, sending
 
 
+@contextmanager
+def ready_episode(
+    dataset: "Dataset", episode: "Episode", column: list[str] | None, tool: Sequence[str] | None
+) -> Iterator[tuple[Path, "Progress"]]:
+    """Yield the file to upload for an episode of a LeRobot dataset, and the callback for its progress."""
+    from skills.formats.lerobot.cut import cut_episode
+
+    with TemporaryDirectory() as folder, bar("sending") as sending:
+        file = Path(folder) / "episode.zip"
+        with file.open("wb") as out:
+            columns, tools = _pairs("--column", column), _pairs("--tool", tool)
+            cut_episode(dataset, episode, out, columns=columns, tools=tools)
+        yield file, sending
+
+
+@contextmanager
+def ready_one(
+    path: Path, episode: str | None, column: list[str] | None, tool: Sequence[str] | None
+) -> Iterator[tuple[Path, "Progress", list[str] | None]]:
+    """Yield the file to upload for a path, the callback for progress, and the columns that the service is to map.
+
+    The path is a recording, or a dataset with the episode; in the episode's file the columns are mapped already.
+    """
+    from skills.formats.lerobot.cut import choose_episodes, find_dataset
+
+    with find_dataset(path) as dataset:
+        if dataset is None:
+            _refuse_statements(path, episode, tool)
+            with ready(path) as (file, progress):
+                yield file, progress, column
+            return
+        if episode == "all":
+            raise BadInput("Name one episode: a demonstration is of one.")
+        with ready_episode(dataset, choose_episodes(dataset, episode)[0], column, tool) as (file, progress):
+            yield file, progress, None
+
+
+def _refuse_statements(path: Path, *given: object) -> None:
+    if any(given):
+        raise BadInput(f"{path} is no LeRobot dataset; --episode and --tool are about one.")
+
+
+def _pairs(option: str, given: Sequence[str] | None) -> dict[str, str]:
+    pairs = [one.partition("=") for one in given or ()]
+    wrong = next((one for one in pairs if not (one[0] and one[2])), None)
+    if wrong is not None:
+        raise BadInput(f"{option} takes two names with = between them, not {''.join(wrong)!r}.")
+    return {ours: theirs for ours, _, theirs in pairs}
+
+
 @recordings.command("add")
 @refusing
 def recording_add(
@@ -177,6 +245,11 @@ def recording_add(
     decimal: Decimal = None,
     table_arm: TableArm = None,
     instrument: Instrument = None,
+    episode: Annotated[
+        str | None,
+        typer.Option(help="An episode of a LeRobot dataset by its number, or all: each becomes a recording."),
+    ] = None,
+    tool: Tool = None,
     surgeon: Annotated[
         str | None,
         typer.Option(
@@ -186,12 +259,15 @@ def recording_add(
     as_json: AsJson = False,
 ) -> None:
     """Store a recording, and list the hand-offs proposed in it."""
-    with service() as client, ready(path) as (file, progress):
+    if episode == "all":
+        _add_all(path, frame, column, tool, surgeon, as_json)
+        return
+    with service() as client, ready_one(path, episode, column, tool) as (file, progress, sent_columns):
         stored = client.add_recording(
             file,
             rate_hz=rate_hz,
             frame=frame,
-            column=column,
+            column=sent_columns,
             unit=unit,
             decimal=decimal,
             table_arm=table_arm,
@@ -213,15 +289,19 @@ def recording_preview(
     decimal: Decimal = None,
     table_arm: TableArm = None,
     instrument: Instrument = None,
+    episode: Annotated[
+        str | None, typer.Option(help="The episode of a LeRobot dataset, by its number; needed if it has several.")
+    ] = None,
+    tool: Tool = None,
     as_json: AsJson = False,
 ) -> None:
     """Show what would be understood of a recording, above all of a table; nothing is stored."""
-    with service() as client, ready(path) as (file, progress):
+    with service() as client, ready_one(path, episode, column, tool) as (file, progress, sent_columns):
         seen = client.preview_recording(
             file,
             rate_hz=rate_hz,
             frame=frame,
-            column=column,
+            column=sent_columns,
             unit=unit,
             decimal=decimal,
             table_arm=table_arm,
@@ -247,6 +327,37 @@ def recording_preview(
     if not seen.timed:
         out.print("No times: it is stored only with a rate (--rate-hz) or a column of times.", soft_wrap=True)
     out.print("Nothing was stored.")
+
+
+def _add_all(
+    path: Path,
+    frame: str | None,
+    column: list[str] | None,
+    tool: Sequence[str] | None,
+    surgeon: str | None,
+    as_json: bool,
+) -> None:
+    """Store every episode of a LeRobot dataset; those that are refused do not stop the others, and give exit code 1."""
+    from skills.client import Problem
+    from skills.formats.lerobot.cut import choose_episodes, find_dataset
+
+    done: list[dict[str, Any]] = []
+    with service() as client, find_dataset(path) as dataset:
+        if dataset is None:
+            _refuse_statements(path, "all")
+            return
+        for episode in choose_episodes(dataset, "all"):
+            one: dict[str, Any] = {"episode": episode.number, "recording": None, "proposed": 0, "problem": None}
+            try:
+                with ready_episode(dataset, episode, column, tool) as (file, progress):
+                    stored = client.add_recording(file, frame=frame, surgeon=surgeon, progress=progress)
+                one |= {"recording": stored.sha256, "proposed": len(stored.segments)}
+            except (Problem, BadInput) as error:
+                one["problem"] = error.words(Door.COMMAND)
+            done.append(one)
+    show(done, as_json, ("episode", "recording", "proposed", "problem"))
+    if any(one["problem"] for one in done):
+        raise typer.Exit(1)
 
 
 @recordings.command("show")
@@ -333,6 +444,10 @@ def demo_add(
     decimal: Decimal = None,
     table_arm: TableArm = None,
     instrument: Instrument = None,
+    episode: Annotated[
+        str | None, typer.Option(help="The episode of a LeRobot dataset, by its number; needed if it has several.")
+    ] = None,
+    tool: Tool = None,
     as_json: AsJson = False,
 ) -> None:
     """Store a recording and one demonstration of it; if several hand-offs are proposed, name one with --segment."""
@@ -341,7 +456,7 @@ def demo_add(
     from skills.client import Problem
 
     part = proposal if segment is None else _part_of(segment)
-    with service() as client, ready(path) as (file, progress):
+    with service() as client, ready_one(path, episode, column, tool) as (file, progress, sent_columns):
 
         def add(part: "Part") -> "Demonstration":
             return client.add_demo(
@@ -361,7 +476,7 @@ def demo_add(
                 outcome_reason=reason,
                 rate_hz=rate_hz,
                 frame=frame,
-                column=column,
+                column=sent_columns,
                 unit=unit,
                 decimal=decimal,
                 table_arm=table_arm,

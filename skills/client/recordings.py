@@ -92,7 +92,7 @@ class Recordings(Connection):
             recording: A path, whose file is streamed and never held in memory, or bytes. The digest is sent along.
             media_type: The media type; default: determined by the content.
             rate_hz: Samples per second, of a table without times.
-            frame: Frame of a table's positions; "base": the base of each arm.
+            frame: Frame of the poses in a table or a LeRobot episode; "base": the base of each arm.
             column: A table's columns under other names (docs/tables.md), each as "x_mm=PosX".
             unit: Units of the columns that name none, such as "mm".
             decimal: A table's decimal mark.

@@ -160,7 +160,7 @@ WIDE_MM = 2.0  # ours: a rotation cannot be fitted to tips that move less than t
 
 _INVERSE = np.array([-1.0, -1.0, -1.0, 1.0])  # a unit quaternion x, y, z, w times this is its inverse
 
-Format = Literal["mcap", "csv", "jigsaws", "rosbag2", "rosbag1"]
+Format = Literal["mcap", "csv", "jigsaws", "rosbag2", "rosbag1", "lerobot"]
 Integrity = Literal["full", "partial", "none"]
 
 

@@ -1,4 +1,4 @@
-"""Readers of recordings: MCAP files of a dVRK, zipped bag folders, other bags (through rosbags), JIGSAWS, and tables.
+"""Readers of recordings: MCAP, zipped bag folders, other bags (through rosbags), LeRobot episodes, JIGSAWS, tables.
 
     bytes --read_recording--> Recording
 
@@ -16,7 +16,7 @@ from skills.formats import archive, ee_csv, jigsaws, rosbag, tables
 from skills.formats.bag_folder import read_one, read_zip
 from skills.formats.cells import SEPARATORS, Decimals, header_of, open_text
 from skills.formats.mcap.recording import MAGIC
-from skills.formats.tables import TableReading, read_table
+from skills.formats.tables import BASE, TableReading, read_table
 from skills.formats.writer import write_bag, write_mcap
 
 __all__ = ["BYTES", "MEDIA_TYPES", "SUFFIXES", "media_type_of", "read_recording", "write_bag", "write_mcap"]
@@ -26,7 +26,7 @@ ROSBAG1, SQLITE = "application/x-rosbag", "application/vnd.sqlite3"
 BYTES = "application/octet-stream"  # any of them: the format is detected from the content
 MEDIA_TYPES = {
     MCAP: "an MCAP file",
-    ZIP: "a bag folder or a trial of JIGSAWS, zipped",
+    ZIP: "a bag folder, an episode of LeRobot or a trial of JIGSAWS, zipped",
     TABLE: "a table",
     TEXT: "JIGSAWS kinematics",
     ROSBAG1: "a ROS 1 bag",
@@ -44,8 +44,11 @@ _OTHERS = (
         "zstd (a bag compressed as a file); unpack it with `zstd -d`, or send the bag folder as a zip",
     ),
     (b"\x89HDF", "HDF5; export a table"),
+    (b"PAR1", "Parquet; send it with the meta/info.json of its LeRobot dataset, as a zip"),
 )
-_READ = "MCAP, zipped bag folders, ROS 1 and .db3 bags, CSV and JIGSAWS kinematics can be read."
+_READ = (
+    "MCAP, zipped bag folders, ROS 1 and .db3 bags, zipped LeRobot episodes, CSV and JIGSAWS kinematics can be read."
+)
 
 
 def read_recording(
@@ -65,8 +68,9 @@ def read_recording(
     Args:
         file: Seekable; read from its beginning and left open.
         rate_hz: Samples per second, for a table without times.
-        frame: The frame of a table's positions, by default the base of its arm; an ee_csv needs it. Any other recording
-            names its own frames; it is refused if none of its motions is in the given frame.
+        frame: The frame of a table's positions, by default the base of its arm; an ee_csv and a LeRobot
+            episode need it. Any other recording names its own frames; it is refused if none of its motions is in the
+            given frame.
         column: The columns of a table, each as `x_mm=PosX` or `x=PosX`; see `skills.formats.tables`.
         unit: The units of columns without a unit, such as "mm".
         decimal: The decimal mark of a table.
@@ -93,7 +97,9 @@ def read_recording(
             raise BadSettings(
                 f"This is {MEDIA_TYPES[kind]}, which has its own stamps, columns and arms; omit {field.name}."
             )
-    return _in_frame(_READERS[kind](file), frame)
+    recording = read_zip(file, frame) if kind == ZIP else _READERS[kind](file)
+    own_bases = recording.format == "lerobot" and frame == BASE  # of each arm: PSM1_base, PSM2_base
+    return recording if own_bases else _in_frame(recording, frame)
 
 
 def _names(file: BinaryIO) -> list[str]:
@@ -152,7 +158,6 @@ def _is_extract(file: BinaryIO) -> bool:
 
 _READERS: dict[str, Callable[[BinaryIO], Recording]] = {
     MCAP: read_one,
-    ZIP: read_zip,
     TABLE: tables.read_extract,
     TEXT: jigsaws.read_jigsaws,
     ROSBAG1: lambda file: rosbag.read_rosbag([file], ".bag"),

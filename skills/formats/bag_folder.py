@@ -1,6 +1,7 @@
 """Bag folders: reading zips of them, and joining the parts of split bags.
 
-`read_zip` reads a zipped folder: a bag with the files that its recorder wrote next to it, or one JIGSAWS trial.
+`read_zip` reads a zipped folder: a bag with the files that its recorder wrote next to it, one episode of a LeRobot
+dataset (see `lerobot`), or one JIGSAWS trial.
 
     session/
         rosbag_1/metadata.yaml     the bag's files in order, and their numbers of messages
@@ -40,6 +41,8 @@ from skills.errors import MixedFrames, NoUsableTopic, UnknownFormat, UnreadableR
 from skills.formats import jigsaws
 from skills.formats.annotations import read_labels
 from skills.formats.archive import Archive, refusing, shown
+from skills.formats.lerobot.dataset import is_shadow, root_of
+from skills.formats.lerobot.recording import read_episode
 from skills.formats.mcap.recording import NeedsRosbags, read_mcap
 from skills.formats.rosbag import Suffix, read_rosbag
 from skills.remedies import Action, Remedy
@@ -189,29 +192,35 @@ class Metadata:
     counts: dict[str, int]
 
 
-def read_zip(file: BinaryIO) -> Recording:
-    """Read the bag, or the JIGSAWS trial, in a zip archive.
+def read_zip(file: BinaryIO, frame: str | None = None) -> Recording:
+    """Read the bag, the episode of a LeRobot dataset, or the JIGSAWS trial in a zip archive.
 
     Args:
         file: The archive, seekable.
+        frame: The frame of an episode's poses; the others name their own.
 
     Returns:
         The recording, in millimetres.
 
     Raises:
-        UnknownFormat: It contains neither.
+        UnknownFormat: It contains none of them.
         UnreadableRecording: The archive is damaged or dangerous, the bag incomplete, or a part of it unreadable.
         NoUsableTopic: No topic of the bag, or of a part of it, has the pose of a PSM.
         BadRecording: As for the files in it.
     """
     archive = Archive(file)
-    names = [name for name in archive.names if not _is_shadow(name)]
+    names = [name for name in archive.names if not is_shadow(name)]
     if bag := [name for name in names if suffix_of(name)]:
         return _read_bag(archive, names, bag)
+    if (root := root_of(names)) is not None:
+        return read_episode(archive, root, frame)
     texts = [name for name in names if name.lower().endswith(".txt")]
     if texts:
         return _read_trial(archive, texts)
-    raise UnknownFormat("The archive has no bag (.mcap, .mcap.zstd, .db3 or .bag) and no JIGSAWS kinematics (.txt).")
+    raise UnknownFormat(
+        "The archive has no bag (.mcap, .mcap.zstd, .db3 or .bag), no LeRobot dataset (meta/info.json) and no JIGSAWS "
+        "kinematics (.txt)."
+    )
 
 
 def suffix_of(name: str) -> str:
@@ -423,9 +432,3 @@ def _read_trial(archive: Archive, names: list[str]) -> Recording:
     rated = next((found for text in texts.values() if (found := jigsaws.read_meta(text).get(trial))), None)
     with archive.unpacked(kinematics[0]) as file:
         return jigsaws.read_jigsaws(file, "".join(texts[name] for name in transcriptions), rated)
-
-
-def _is_shadow(name: str) -> bool:
-    """Return whether a member holds only macOS metadata of another member."""
-    path = PurePosixPath(name)
-    return path.name.startswith("._") or "__MACOSX" in path.parts

@@ -44,6 +44,7 @@ from skills.demonstration.recording import (
 from skills.errors import BadColumns, BadSettings, MixedFrames, NoUsableTopic, SkillsError, UnreadableRecording
 from skills.formats.cells import header_of, open_text, read_numbers
 from skills.formats.tables import (
+    BASE,
     TableReading,
     base_of,
     check_joints,
@@ -199,8 +200,8 @@ def _recording(
             joints.append(recorded_joints(arm, topic, stamps_ns, positions))
             if (arm, "pose") not in parts:
                 tip_mm, rotation = posed(topic, positions, said.instrument)
-                motion = _motion(arm, topic, base_of(arm, said.frame), stamps_ns, tip_mm, rotation)
-                motions.append(replace(motion, from_joints=True))
+                posed_motion = _motion(arm, topic, base_of(arm, said.frame), stamps_ns, tip_mm, rotation)
+                motions.append(replace(posed_motion, from_joints=True))
         elif kind == "jaw":
             jaws.append((arm, recorded_signal(stamps_ns, values[:, 0], f"/{arm}/jaw/measured_js")))
         elif kind == "pose" and arm in posing:
@@ -257,7 +258,7 @@ def _frame(arm: str, arms: Sequence[str], said: TableReading) -> str:
     """
     if said.frame is None:
         raise BadColumns("The table does not say in which frame its poses are.", Remedy(Action.NAME_FRAME))
-    if said.frame == "base":
+    if said.frame == BASE:
         return f"{arm}_base"
     if said.frame.endswith("_base") and len(arms) > 1:
         raise MixedFrames(

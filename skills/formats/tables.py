@@ -70,6 +70,7 @@ from skills.remedies import Action, Remedy, did_you_mean
 
 TOPIC = "table"
 DEFAULT_ARM = "PSM"
+BASE = "base"  # as a frame: the base of each arm
 # The tip is further from the remote centre than the wrist, because the wrist bends by less than a right angle. A reach
 # of 290 mm is 11.4 inches, so a path in inches never exceeds this limit.
 OUTSIDE_MM = min(instrument.cannula_mm - instrument.wrist_offset_mm for instrument in INSTRUMENTS.values())
@@ -220,7 +221,7 @@ def _recording(table: _Table, said: TableReading, columns: tuple[Column, ...]) -
         check_joints(TOPIC, joints)
     if POSITION[0] in table.columns:
         tip_mm, rotation = table.stacked(POSITION), _rotation_xyzw(table)
-        frame = said.frame if said.frame not in (None, "base") else f"{arm}_base"
+        frame = said.frame if said.frame not in (None, BASE) else f"{arm}_base"
     else:
         assert joints is not None  # `_check_groups`
         tip_mm, rotation = posed(TOPIC, joints, said.instrument)
@@ -449,7 +450,7 @@ def base_of(arm: str, frame: str | None) -> str:
         MixedFrames: The caller names another frame.
     """
     base = f"{arm}_base"
-    if frame not in (None, "base", base):
+    if frame not in (None, BASE, base):
         raise MixedFrames(
             f"The poses that follow from the joints are in {base}, not in {frame!r}; omit the frame.", frames=[base]
         )

@@ -34,6 +34,7 @@ from skills.formats.annotations import read_labels
 from skills.formats.archive import pack
 from skills.formats.bag_folder import METADATA, TAGS_BYTES, check_counts, in_order, read_metadata, suffix_of, unzstd
 from skills.formats.jigsaws import trials
+from skills.formats.lerobot.dataset import INFO
 from skills.formats.mcap.reader import NOTES
 from skills.formats.mcap.recording import MAGIC
 from skills.formats.mcap.records import RECOVER
@@ -97,6 +98,8 @@ def find_bag(path: Path) -> Bag:
         )
     files = [file for file in sorted(path.rglob("*")) if file.is_file() and suffix_of(file.name)]
     homes = sorted({file.parent for file in files})
+    if not homes and (path / INFO).is_file():
+        raise BadInput(f"{path} is a LeRobot dataset.", Remedy(Action.CUT_EPISODE))
     if not homes and next(trials(path), None) is not None:
         raise BadInput(f"{path} is a folder with trials of JIGSAWS.", Remedy(Action.ADD_JIGSAWS, folder=str(path)))
     if not homes:

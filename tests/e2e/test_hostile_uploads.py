@@ -18,12 +18,13 @@ import pytest
 from skills.client import Client
 from tests.api.service import KESTREL, MCAP, assert_problem
 from tests.e2e.conftest import FORK_SERVER, Service, running
-from tests.formats import hostile
+from tests.formats import hostile, lerobots
 from tests.library import cases
 from tests.measured import peak_mib
 from tests.waiting import END_S, crowded
 
 BAG = cases.bag()
+EPISODE = lerobots.packed(lerobots.episode()).getvalue()
 BOMB_S = 5.0  # of processor time, so that other load does not matter
 OTHERS_S = 0.25
 GROWTH_MIB = 64
@@ -50,8 +51,11 @@ def http(service: Service) -> Iterator[httpx.Client]:
 
 
 def send(http: httpx.Client, data: bytes, path: str = "/recordings") -> httpx.Response:
-    query = KESTREL if path == "/demos" else {}
-    return http.post(path, params=query, content=data, headers={"Content-Type": MCAP})
+    query: dict[str, Any] = dict(KESTREL) if path == "/demos" else {}
+    if not data.startswith(b"PK"):
+        return http.post(path, params=query, content=data, headers={"Content-Type": MCAP})
+    query |= {"frame": "ECM"} | ({"arm": "PSM1", "segment": "whole"} if query else {})
+    return http.post(path, params=query, content=data, headers={"Content-Type": "application/zip"})
 
 
 def rows(service: Service) -> dict[str, int]:
@@ -111,8 +115,8 @@ def sweep(service: Service, http: httpx.Client, files: Iterable[bytes]) -> int:
     return len(accepted)
 
 
-def same_or_refused(http: httpx.Client, files: Iterable[bytes]) -> None:
-    whole = send(http, BAG, "/demos").json()
+def same_or_refused(http: httpx.Client, files: Iterable[bytes], sound: bytes = BAG) -> None:
+    whole = send(http, sound, "/demos").json()
     for data in files:
         answer = send(http, data, "/demos")
         if answer.status_code in (200, 201):
@@ -148,6 +152,19 @@ def test_a_flipped_bit_is_refused_or_changes_nothing(http):
 
 def test_bombs_are_refused_in_seconds_and_nobody_else_notices(service, http):
     defuse(service, http, QUICK_BOMBS)
+
+
+def test_damaged_and_hostile_lerobot_episodes_are_refused(service, http):
+    assert sweep(service, http, hostile.truncations(EPISODE, 10, seed=1)) == 0
+    same_or_refused(http, hostile.flips(EPISODE, 10, seed=1), EPISODE)
+    before = rows(service)
+    for name, bomb in lerobots.bombs().items():
+        began = reading_s(service)
+        assert "errors" not in assert_problem(send(http, bomb), range(400, 500)), name
+        assert reading_s(service) - began < BOMB_S, name
+    several = lerobots.packed(lerobots.dataset("v2.1")).getvalue()
+    assert "has 3 episodes" in assert_problem(send(http, several), range(400, 500))["detail"]
+    assert rows(service) == before
 
 
 @pytest.mark.nightly

@@ -61,7 +61,7 @@ AskedDemo = Annotated[
 
 
 class RecordingQuery(TableReading):
-    """Query parameters of an upload of a recording."""
+    """Query parameters of an upload of a recording, with what a table or a LeRobot episode leaves open."""
 
     surgeon: SlugField | None = Field(
         None, description="The surgeon who was recorded; erasing this surgeon deletes the recording."
@@ -69,7 +69,7 @@ class RecordingQuery(TableReading):
 
 
 class DemoUpload(DemoIn, TableReading):
-    """Query parameters of an upload of a demonstration: `DemoIn`, and what it says about a table."""
+    """Query parameters of an upload of a demonstration: `DemoIn`, and what a table or a LeRobot episode leaves open."""
 
 
 @uploads.post(

@@ -5,6 +5,7 @@ const get = (id) => document.getElementById(id);
 const form = get("upload");
 const KINDS = Object.fromEntries([...get("kind").options].map((one) => [one.dataset.suffix, one.value]));
 const TABLE = "text/csv";
+const FRAMELESS = [TABLE, "application/zip"]; // the latter: LeRobot
 const DIGESTED_BYTES = 512 * 2 ** 20; // the digest needs the complete file in memory; a larger file is sent without one
 const mebibytes = (bytes) => `${(bytes / 2 ** 20).toFixed(1)} MiB`;
 
@@ -14,11 +15,14 @@ function chosen() {
   const kind = KINDS[`.${file.name.split(".").pop().toLowerCase()}`];
   if (kind) get("kind").value = kind;
   get("chosen").textContent = `${file.name}, ${mebibytes(file.size)}`;
-  ofTable();
+  ofKind();
 }
-const ofTable = () => document.querySelectorAll(".of-table").forEach((one) => (one.hidden = get("kind").value !== TABLE));
+function ofKind() {
+  get("of-rate").hidden = get("kind").value !== TABLE;
+  get("of-frame").hidden = !FRAMELESS.includes(get("kind").value);
+}
 get("file").addEventListener("change", chosen);
-get("kind").addEventListener("change", ofTable);
+get("kind").addEventListener("change", ofKind);
 
 const drop = get("drop");
 for (const name of ["dragover", "dragleave", "drop"]) {
@@ -62,7 +66,7 @@ form.addEventListener("submit", async (event) => {
   const kind = get("kind").value;
   const query = new URLSearchParams();
   if (kind === TABLE && get("rate").value) query.set("rate_hz", get("rate").value);
-  if (kind === TABLE && get("frame").value) query.set("frame", get("frame").value);
+  if (FRAMELESS.includes(kind) && get("frame").value) query.set("frame", get("frame").value);
   const button = form.querySelector("button:not([type])");
   button.disabled = true;
   get("progress").hidden = get("stop").hidden = false;

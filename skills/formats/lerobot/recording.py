@@ -1,0 +1,418 @@
+"""Reader of one episode of a LeRobot dataset.
+
+A column's meaning is that of its name, or of the name that `columns` in `meta/suture-skills.json` gives it (N is the
+arm's number):
+
+    psmN_pose.position.x ... psmN_pose.orientation.w   pose of the tip, m and a unit quaternion; the frame is not in the
+                                                       dataset and must be stated
+    psmN_local_pose.position.x ...                     the same relative to the arm's own remote centre
+    psmN_joint_1 ... psmN_joint_6                      the measured joints, rad, the third in m
+    psmN_jaw                                           the jaw's angle, rad
+
+Separators may be dots, as in `observation.cartesian_state.psm1.pose.position.x`, and joints may be named, as in
+`observation.state.psm1.joint_position` with `yaw`. Where an arm has joints and no local pose, forward kinematics makes
+one, with the instrument whose number is in the dataset's tool name (`observation.meta.tool.psm1`), or in `tools` of our
+own file. Actions are not used. Motions are called by the topics of a dVRK from which recorders take such columns.
+"""
+
+import re
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from skills.arrays import Floats, Ints
+from skills.demonstration.recording import Joints, Motion, Recording, Signal, Topic, recorded_motion
+from skills.errors import BackwardStamps, BadColumns, NotFinite, NoUsableTopic, UnreadableRecording
+from skills.formats.lerobot.dataset import INFO, NUMBERS, SAID, VERSIONS, Dataset, Feature, Files, read_dataset
+from skills.formats.lerobot.parquet import Table, printable, read_columns
+from skills.formats.tables import BASE, check_outside
+from skills.kinematics import INSERTION, INSTRUMENTS, forward, quaternion_of
+from skills.remedies import Action, Remedy, did_you_mean
+
+NOTE_CHARACTERS = 200
+COARSE_S = 1e-3  # timestamps that are coarser, a float32 after 2.3 hours or in seconds since 1970, are no clock
+SAME_S = 1e-4  # LeRobot's own tolerance between timestamps and its rate
+
+_POSE = re.compile(
+    r"(?:observation\.cartesian_state\.)?(psm\d{1,2})[._](local_)?pose\.(position\.[xyz]|orientation\.[xyzw])", re.I
+)
+_JOINT = re.compile(
+    r"(?:observation\.state\.)?(psm\d{1,2})[._]joint(?:_position)?[._]"
+    r"([1-6]|yaw|pitch|insertion|roll|wrist_pitch|wrist_yaw)",
+    re.I,
+)
+_JAW = re.compile(r"(?:observation\.state\.)?(psm\d{1,2})[._](?:jaw|gripper)", re.I)
+_TOOL = re.compile(r"(?:observation\.meta\.tool\.)?(psm\d{1,2})(?:_tool_type)?", re.I)
+_NUMBER = re.compile(r"(?:^|:)(\d+)(?:\[|$)")  # of "LARGE_NEEDLE_DRIVER:400006[..11]", or alone
+_POSE_PARTS = (*(f"position.{axis}" for axis in "xyz"), *(f"orientation.{axis}" for axis in "xyzw"))
+_JOINT_NAMES = ("yaw", "pitch", "insertion", "roll", "wrist_pitch", "wrist_yaw")
+_SCALARS = ("timestamp", "frame_index", "episode_index", "task_index")
+_SEC, _NANOSEC = "observation.meta.ros_time_sec", "observation.meta.ros_time_nsec"
+_TOPICS = {
+    "local_pose": "/{}/local/measured_cp",
+    "pose": "/{}/measured_cp",
+    "joints": "/{}/measured_js",
+    "jaw": "/{}/jaw/measured_js",
+}
+
+Place = tuple[str, int]  # a feature, and the index of one of its numbers
+Quantity = tuple[str, str]  # an arm such as "PSM1", and a key of `_TOPICS`
+LeftOut = tuple[str, str]  # a topic or a feature, and why it is not used
+
+
+def read_episode(files: Files, root: str, frame: str | None = None) -> Recording:
+    """Read a dataset of one episode.
+
+    Args:
+        files: The dataset's files.
+        root: From `root_of`.
+        frame: The frame of the columns `psmN_pose`, such as "ECM"; "base" stands for the base of each arm.
+
+    Returns:
+        The recording, in millimetres.
+
+    Raises:
+        UnreadableRecording: It is damaged, incomplete or has several episodes.
+        NoUsableTopic: It has no pose and no joints of a PSM.
+        BadColumns: A column is missing or ambiguous, or the frame or the instrument is not stated.
+        BackwardStamps, RepeatedStamps, NotFinite, NotMetres, NotAQuaternion: As in `skills.demonstration.recording`.
+    """
+    dataset = read_dataset(files, root)
+    if len(dataset.data) != 1:
+        raise several_episodes(len(dataset.data))
+    meanings, unknown = _meanings(dataset)
+    used = {feature for places in meanings.values() for feature, _ in places.values()} | {*_SCALARS, _SEC, _NANOSEC}
+    features = [one for one in dataset.features if (one.name in used and not one.is_text) or _arms_of_tools(one)]
+    with files.unpacked(dataset.data[0]) as file:
+        table = read_columns(file, [one.column for one in features])
+    _check_one_episode(dataset, table)
+    stamps_ns, clock = _stamps_ns(dataset, table)
+    values = {
+        quantity: np.stack([table.numbers[feature][:, k] for _, (feature, k) in sorted(places.items())], axis=1)
+        for quantity, places in sorted(meanings.items())
+    }
+    tools = _tools(dataset, table)
+    joints = {
+        arm: Joints(arm, _topic(arm, kind), stamps_ns, _in_mm(one))
+        for (arm, kind), one in values.items()
+        if kind == "joints"
+    }
+    motions, left_out = _motions(values, joints, tools, stamps_ns, frame)
+    return Recording(
+        format="lerobot",
+        integrity="full",  # a zip archive has a checksum (CRC-32) of every file in it
+        motions=motions,
+        jaws=tuple(
+            (arm, Signal(stamps_ns, one[:, 0], _topic(arm, kind)))
+            for (arm, kind), one in values.items()
+            if kind == "jaw"
+        ),
+        topics=tuple(Topic(one.name[:NOTE_CHARACTERS], one.dtype[:20], table.rows) for one in dataset.features),
+        joints=tuple(joints.values()),
+        tools=tuple(sorted(tools.items())),
+        notes=(*_notes(dataset, table), ("stamps", clock)),
+        left_out=(*left_out, *unknown),
+    )
+
+
+def several_episodes(episodes: int) -> UnreadableRecording:
+    """Return the error that a dataset has no episode, or more than one."""
+    if not episodes:
+        return UnreadableRecording("The dataset has no .parquet file in its folder `data`; copy it again.")
+    return UnreadableRecording(
+        f"The dataset has {episodes} episodes. A recording is one of them, so that a surgeon's can be erased alone.",
+        Remedy(Action.CUT_EPISODE),
+        episodes=episodes,
+    )
+
+
+def _check_one_episode(dataset: Dataset, table: Table) -> None:
+    if not table.rows:
+        raise UnreadableRecording("The episode has no frames.")
+    numbers = table.column("episode_index")
+    if numbers is not None and len(found := np.unique(numbers)) > 1:
+        raise several_episodes(len(found))
+    claimed = dataset.info.get("total_frames")
+    if dataset.info.get("total_episodes") == 1 and claimed != table.rows:
+        raise UnreadableRecording(
+            f"{INFO} claims {printable(claimed)} frames, and the episode has {table.rows}: one of them is incomplete. "
+            "Copy the dataset again.",
+            found=table.rows,
+        )
+
+
+# ---- columns and their meanings ------------------------------------------------------------------------------------
+
+
+def _meanings(dataset: Dataset) -> tuple[dict[Quantity, dict[int, Place]], list[LeftOut]]:
+    """Return the columns of each quantity by component, and the observed columns without a meaning.
+
+    Raises:
+        BadColumns: A column is ambiguous, a quantity incomplete, or a stated column is not there.
+        NoUsableTopic: No quantity is a pose or the joints of a PSM.
+    """
+    numeric = [one for one in dataset.features if not one.is_text and not one.is_picture]
+    stated = _stated(dataset, numeric)
+    taken = set(stated.values())
+    found: dict[Quantity, dict[int, Place]] = {}
+    for (arm, kind, component), place in stated.items():
+        found.setdefault((arm, kind), {})[component] = place
+    unknown = []
+    for feature in numeric:
+        if not feature.name.startswith("observation.") or feature.name in (_SEC, _NANOSEC):
+            continue
+        nameless = []
+        for index in range(feature.width):
+            place, names = (feature.name, index), feature.called(index)
+            meaning = next((said for name in names if (said := meaning_of(name)) is not None), None)
+            if meaning is None:
+                nameless += [] if place in taken else [names[0]]
+            elif meaning not in stated and place not in taken:
+                arm, kind, component = meaning
+                if found.setdefault((arm, kind), {}).setdefault(component, place) != place:
+                    raise BadColumns(
+                        f"Two columns of the dataset are called {printable(names[0])}.", Remedy(Action.NAME_FEATURES)
+                    )
+        if nameless:
+            unknown.append((feature.name[:NOTE_CHARACTERS], f"not used: {', '.join(nameless)}"[:NOTE_CHARACTERS]))
+    _check_complete(found)
+    if not any(kind != "jaw" for _, kind in found):
+        listed = ", ".join(name for one in numeric for name in one.names or [one.name])[:1000]
+        raise NoUsableTopic(
+            f"No column of the dataset is known as a pose or the joints of a PSM. It has {printable_list(listed)}.",
+            Remedy(Action.NAME_FEATURES),
+        )
+    return found, unknown
+
+
+def printable_list(text: str) -> str:
+    """Return a list of names of a file as it may appear in a message."""
+    return "".join(letter if letter.isprintable() else "?" for letter in text) or "no named columns"
+
+
+def meaning_of(name: str) -> tuple[str, str, int] | None:
+    """Return the arm, the quantity and the component that a column's name stands for; None for any other name."""
+    if pose := _POSE.fullmatch(name):
+        return pose[1].upper(), "local_pose" if pose[2] else "pose", _POSE_PARTS.index(pose[3].lower())
+    if joint := _JOINT.fullmatch(name):
+        which = joint[2].lower()
+        return joint[1].upper(), "joints", int(which) - 1 if which.isdecimal() else _JOINT_NAMES.index(which)
+    if jaw := _JAW.fullmatch(name):
+        return jaw[1].upper(), "jaw", 0
+    return None
+
+
+def _stated(dataset: Dataset, numeric: Sequence[Feature]) -> dict[tuple[str, str, int], Place]:
+    """Return the columns that `columns` of our own file names, by meaning."""
+    said = dataset.said.get("columns", {})
+    if not isinstance(said, dict) or len(said) > NUMBERS:
+        raise BadColumns(f"`columns` in {SAID} is not an object of our names and the dataset's.")
+    places = {name: (one.name, k) for one in numeric for k in range(one.width) for name in reversed(one.called(k))}
+    stated = {}
+    for ours, theirs in said.items():
+        meaning = meaning_of(ours)
+        if meaning is None:
+            raise BadColumns(f"{printable(ours)} is no column of ours; psm1_pose.position.x and psm1_joint_1 are two.")
+        if not isinstance(theirs, str) or theirs not in places:
+            near = did_you_mean(str(theirs)[:80], [name for name in places if len(name) <= 80][:300])
+            raise BadColumns(f"The dataset has no column {printable(theirs)}.", *near)
+        stated[meaning] = places[theirs]
+    if len(set(stated.values())) < len(stated):
+        raise BadColumns(f"`columns` in {SAID} gives two meanings to one column.")
+    return stated
+
+
+def _check_complete(found: Mapping[Quantity, Mapping[int, Place]]) -> None:
+    """Refuse a pose without its position or with a part of an orientation, and joints of which one is missing.
+
+    Raises:
+        BadColumns: A column is missing.
+    """
+    for (arm, kind), places in sorted(found.items()):
+        if kind == "jaw":
+            continue
+        names = _JOINT_NAMES if kind == "joints" else _POSE_PARTS
+        count = 3 if kind != "joints" and max(places) < 3 else len(names)
+        missing = [names[k] for k in range(count) if k not in places]
+        if missing:
+            raise BadColumns(f"The {kind} of {arm} has no column {missing[0]}; all parts are needed.", missing=missing)
+
+
+def _topic(arm: str, kind: str) -> str:
+    return _TOPICS[kind].replace("{}", arm)
+
+
+# ---- motions -------------------------------------------------------------------------------------------------------
+
+
+def _motions(
+    values: Mapping[Quantity, Floats],
+    joints: Mapping[str, Joints],
+    tools: Mapping[str, str],
+    stamps_ns: Ints,
+    frame: str | None,
+) -> tuple[tuple[Motion, ...], list[LeftOut]]:
+    """Return the motions, and what makes none: poses without a stated frame, joints without an instrument.
+
+    Raises:
+        BadColumns: There is no motion at all.
+    """
+    motions, left_out = [], []
+    for arm in sorted({arm for arm, _ in values}):
+        local, pose, base = values.get((arm, "local_pose")), values.get((arm, "pose")), f"{arm}_base"
+        computed = local is None
+        if computed and arm in joints:
+            number = _number(tools.get(arm, ""))
+            if number is None:
+                left_out.append((joints[arm].topic, f"no pose from joints: the instrument of {arm} is not known"))
+            else:
+                local = _forward(joints[arm], number)
+        if local is not None:
+            motions.append(replace(_motion(arm, "local_pose", base, stamps_ns, local), from_joints=computed))
+        if pose is not None and frame is None:
+            left_out.append((_topic(arm, "pose"), "the dataset does not say in which frame it is"))
+        elif pose is not None:
+            motions.append(_motion(arm, "pose", base if frame == BASE else str(frame), stamps_ns, pose))
+    if motions:
+        return tuple(motions), left_out
+    if any(kind == "pose" for _, kind in values):
+        raise BadColumns(
+            "The dataset does not say in which frame its poses are: ECM for the camera's, base for each arm's "
+            "base, or another name.",
+            Remedy(Action.NAME_FRAME),
+        )
+    raise BadColumns(
+        "The dataset has joints, which give no pose without the number of the instrument; known are "
+        f"{', '.join(INSTRUMENTS)}.",
+        Remedy(Action.NAME_TOOL),
+    )
+
+
+def _motion(arm: str, kind: str, frame: str, stamps_ns: Ints, pose: Floats) -> Motion:
+    motion = recorded_motion(
+        arm=arm,
+        topic=_topic(arm, kind),
+        frame=frame,
+        stamps_ns=stamps_ns,
+        tip_mm=1000.0 * pose[:, :3],  # the recorders write metres
+        rotation_xyzw=pose[:, 3:] if pose.shape[1] > 3 else None,
+    )
+    check_outside(motion)
+    return motion
+
+
+def _in_mm(joints: Floats) -> Floats:
+    """Convert the insertion from metres."""
+    scaled = joints.copy()
+    scaled[:, INSERTION] *= 1000.0
+    return scaled
+
+
+def _forward(joints: Joints, instrument: str) -> Floats:
+    """Return the poses of the tip in m, shape (T, 7)."""
+    tip_mm, turned = forward(joints.positions, instrument)
+    return np.concatenate([tip_mm / 1000.0, quaternion_of(turned)], axis=1)
+
+
+def _arms_of_tools(feature: Feature) -> list[str | None]:
+    """Return the arm that each text of a feature names the tool of; [] if none does."""
+    names = [feature.name] if feature.width == 1 and _TOOL.fullmatch(feature.name) else feature.names
+    arms = [found[1].upper() if (found := _TOOL.fullmatch(name)) else None for name in names]
+    return arms if feature.is_text and feature.name.startswith("observation.meta.tool") and any(arms) else []
+
+
+def _tools(dataset: Dataset, table: Table) -> dict[str, str]:
+    """Return the tool of each arm: as `tools` of our own file states it, or else as the dataset names it.
+
+    Raises:
+        BadColumns: A stated tool is unknown, or is not the one of the dataset.
+        UnreadableRecording: A tool changes within the episode.
+    """
+    tools: dict[str, str] = {}
+    for feature in dataset.features:
+        for arm, names in zip(_arms_of_tools(feature), table.texts.get(feature.name, []), strict=False):
+            if len(names) > 1:
+                raise UnreadableRecording(f"The tool of {arm} changes within the episode; cut it there.")
+            tools |= {} if arm is None else {arm: next(iter(names))[:NOTE_CHARACTERS]}
+    said = dataset.said.get("tools", {})
+    if not isinstance(said, dict) or len(said) > NUMBERS:
+        raise BadColumns(f"`tools` in {SAID} is not an object of arms and their instruments.")
+    for arm, tool in said.items():
+        number, found = _number(str(tool)), _number(tools.get(arm, ""))
+        if number is None or not re.fullmatch(r"PSM\d{1,2}", arm):
+            known = ", ".join(INSTRUMENTS)
+            raise BadColumns(f"{printable(tool)} is no known instrument of {printable(arm)}; known are {known}.")
+        if found not in (None, number):
+            raise BadColumns(f"The instrument of {arm} was stated as {number}, and the dataset names {found}.")
+        tools[arm] = str(tool)[:NOTE_CHARACTERS]
+    return tools
+
+
+def _number(tool: str) -> str | None:
+    """Return the number in a tool's name; None where it has no known one."""
+    found = _NUMBER.search(tool)
+    return found[1] if found is not None and found[1] in INSTRUMENTS else None
+
+
+def _notes(dataset: Dataset, table: Table) -> list[tuple[str, str]]:
+    """Return the version, the robot, the episode's number and split, and its tasks."""
+    version = dataset.said.get("cut from", dataset.version)
+    notes = [("dataset", f"LeRobot {version if version in VERSIONS else dataset.version}")]
+    if isinstance(robot := dataset.info.get("robot_type"), str):
+        notes.append(("robot", robot[:NOTE_CHARACTERS]))
+    if (numbers := table.column("episode_index")) is not None and np.isfinite(numbers[0]):
+        notes.append(("episode", str(int(numbers[0]))))
+        notes += [("splits", ", ".join(found))] if (found := dataset.splits_of(int(numbers[0]))) else []
+    if (tasks := table.column("task_index")) is not None:
+        names = [dataset.tasks.get(task) for task in np.unique(tasks)[:10].tolist()]
+        notes += [("task", name[:NOTE_CHARACTERS]) for name in names if name is not None]
+    return notes
+
+
+# ---- stamps --------------------------------------------------------------------------------------------------------
+
+
+def _stamps_ns(dataset: Dataset, table: Table) -> tuple[Ints, str]:
+    """Return the stamps of the frames, shape (T,), and their source in words.
+
+    The source is, in this order: the recorder's clock; timestamps in double precision; a frame's number divided by
+    `fps`, where timestamps in single precision agree with it or are too coarse for a clock; those timestamps otherwise.
+
+    Raises:
+        BackwardStamps: A frame's number is not above the one before.
+        NotFinite: A timestamp is NaN or infinite.
+        UnreadableRecording: A number is not that of a frame or of a clock.
+    """
+    sec, nanosec = table.column(_SEC), table.column(_NANOSEC)
+    if sec is not None and nanosec is not None:
+        if not ((np.abs(sec) < 2**33) & (np.rint(sec) == sec) & (nanosec >= 0) & (nanosec < 1e9)).all():
+            raise UnreadableRecording(f"{_SEC} and {_NANOSEC} are not whole seconds and nanoseconds of a clock.")
+        return sec.astype(np.int64) * 1_000_000_000 + np.rint(nanosec).astype(np.int64), "the recorder's clock"
+    frames, seconds = table.column("frame_index"), table.column("timestamp")
+    frames = np.arange(table.rows, dtype=np.float64) if frames is None else frames
+    if not ((frames >= 0) & (frames < 2**40)).all():
+        raise UnreadableRecording("A frame_index of the episode is negative, too large, or no number.")
+    if (later := np.diff(frames) > 0).size and not later.all():
+        first = int(np.argmin(later)) + 1
+        raise BackwardStamps(f"The frame_index of row {first} is not above the one before it.", sample=first)
+    even_s, rate = frames / dataset.fps, f"frame_index at {dataset.fps:g} Hz"
+    if seconds is None:
+        return _in_ns(even_s), rate
+    if not np.isfinite(seconds).all():
+        first = int(np.argmin(np.isfinite(seconds)))
+        raise NotFinite(f"The timestamp of row {first} is NaN or infinite.", sample=first)
+    if "timestamp" not in table.single:
+        return _in_ns(seconds), "timestamp"
+    step_s = float(np.spacing(np.float32(np.abs(seconds).max())))
+    if (np.abs(seconds - even_s) <= max(SAME_S, step_s)).all():
+        return _in_ns(even_s), rate
+    if step_s > COARSE_S:
+        return _in_ns(even_s), f"{rate}; timestamp has steps of {step_s:g} s"
+    return _in_ns(seconds), "timestamp, in single precision"
+
+
+def _in_ns(seconds: Floats) -> Ints:
+    if not (np.abs(seconds) < 9e9).all():
+        raise UnreadableRecording("A timestamp is after the year 2255; give seconds.")
+    whole = np.floor(seconds)  # apart, so that the fraction keeps its digits
+    return whole.astype(np.int64) * 1_000_000_000 + np.rint((seconds - whole) * 1e9).astype(np.int64)

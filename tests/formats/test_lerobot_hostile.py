@@ -1,0 +1,167 @@
+"""Damaged and hostile LeRobot episodes: refused within limits, or read as exactly their content."""
+
+import io
+import os
+import random
+import stat
+import tempfile
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from skills.sandbox.limits import ProcessLimits
+
+from skills.demonstration.recording import Recording
+from skills.errors import SkillsError, UnreadableRecording
+from skills.formats import read_recording
+from skills.formats.reader_process import ConfinedReader
+from tests.formats import lerobots
+from tests.formats.lerobots import columns_of, episode, packed, parquet, poses
+from tests.formats.others import damaged, zipped
+
+MOST_CPU_S = 2.0
+LIMITS = ProcessLimits(
+    memory_bytes=1 << 30, wall_s=60.0, cpu_s=30, file_bytes=1 << 30, answer_bytes=256 << 20, children=False
+)
+BOMBS = lerobots.bombs()
+
+
+@pytest.fixture(scope="module")
+def reader() -> Iterator[ConfinedReader]:
+    with ConfinedReader(LIMITS, at_once=1) as reader:
+        yield reader
+
+
+def cpu_s(reader: ConfinedReader) -> float:
+    """Return the processor time of all forks so far."""
+    if not reader.server.pid:
+        return 0.0
+    fields = Path(f"/proc/{reader.server.pid}/stat").read_text().rpartition(")")[2].split()
+    return sum(map(int, fields[13:15])) / os.sysconf("SC_CLK_TCK")  # cutime and cstime of proc(5)
+
+
+def confined(reader: ConfinedReader, data: bytes) -> Recording:
+    with tempfile.TemporaryFile() as file:
+        file.write(data)
+        return reader(file, frame="ECM")
+
+
+def same(one: Recording, other: Recording) -> bool:
+    arrays = [(a.tip_mm, b.tip_mm) for a, b in zip(one.motions, other.motions, strict=True)]
+    arrays += [(a.rotation_xyzw, b.rotation_xyzw) for a, b in zip(one.motions, other.motions, strict=True)]
+    arrays += [(a.stamps_ns, b.stamps_ns) for a, b in zip(one.motions, other.motions, strict=True)]
+    arrays += [(a.values, b.values) for (_, a), (_, b) in zip(one.jaws, other.jaws, strict=True)]
+    return all(np.array_equal(a, b) for a, b in arrays) and (one.tools, one.notes) == (other.tools, other.notes)
+
+
+def mutated(count: int, seed: int) -> Iterator[bytes]:
+    """Yield episodes whose Parquet file has some bytes changed, cut or inserted, in a zip with correct checksums."""
+    rng = random.Random(seed)
+    data = parquet(columns_of(40), compression=rng.choice(["snappy", "none"]))
+    footer = int.from_bytes(data[-8:-4], "little")
+    for _ in range(count):
+        bad = bytearray(data)
+        for _ in range(rng.randint(1, 4)):
+            # half of them in the footer, where the sizes are
+            low = len(bad) - footer - 8 if rng.random() < 0.5 else 0
+            at = rng.randrange(low, len(bad))
+            match rng.randrange(4):
+                case 0:
+                    bad[at] ^= 1 << rng.randrange(8)
+                case 1:
+                    bad[at : at + 4] = rng.choice(
+                        [b"\xff\xff\xff\x7f", b"\0\0\0\0", b"\x80\x80\x80\x01", rng.randbytes(4)]
+                    )
+                case 2:
+                    del bad[at : at + rng.randint(1, 8)]
+                case 3:
+                    bad[at:at] = rng.randbytes(rng.randint(1, 8))
+        yield packed(episode(data=bytes(bad))).getvalue()
+
+
+@pytest.mark.parametrize("name", BOMBS)
+def test_a_bomb_is_refused_at_once(reader, name):
+    assert len(BOMBS[name]) < 1_000_000
+    confined(reader, packed(episode()).getvalue())
+    began = cpu_s(reader)
+    with pytest.raises(SkillsError) as refused:
+        confined(reader, BOMBS[name])
+    assert cpu_s(reader) - began < MOST_CPU_S
+    assert "processor time" not in str(refused.value)
+    assert "MiB" not in str(refused.value)  # it was analysed, and not stopped at a limit
+    assert len(str(refused.value)) < 500
+
+
+def test_thousands_of_columns_and_row_groups_are_read_within_the_limits(reader):
+    wide = columns_of(4) | {f"observation.x{k}": np.zeros(4) for k in range(2000)}
+    for data in (
+        zipped(episode(wide)),
+        zipped(episode(columns_of(2000), data=parquet(columns_of(2000), row_group_size=1))),
+    ):
+        began = cpu_s(reader)
+        assert len(confined(reader, data).motions) == 2
+        assert cpu_s(reader) - began < MOST_CPU_S
+
+
+def test_a_million_frames_are_read_within_the_limits(reader):
+    columns = {"observation.state": poses(1_000_000), "frame_index": np.arange(1_000_000)}
+    recording = confined(reader, zipped(episode(columns), zipfile.ZIP_STORED))
+    assert len(recording.motions[1].stamps_ns) == 1_000_000
+
+
+@pytest.mark.parametrize("count", [100, pytest.param(2000, marks=pytest.mark.nightly)])
+def test_a_damaged_zip_is_refused_or_says_the_same(count):
+    data = packed(episode()).getvalue()
+    whole, refused = read_recording(io.BytesIO(data), frame="ECM"), 0
+    for _, bad in damaged(data, count, seed=count):
+        try:
+            assert same(read_recording(io.BytesIO(bad), frame="ECM"), whole)
+        except SkillsError:
+            refused += 1
+    assert refused > 0.7 * count
+
+
+@pytest.mark.parametrize("count", [40, pytest.param(3000, marks=pytest.mark.nightly)])
+def test_a_mutated_parquet_file_is_refused_or_is_another_recording(reader, count):
+    """Without checksums of its own, a changed number is another number; everything else is a refusal within limits."""
+    refused = 0
+    for data in mutated(count, seed=count):
+        began = cpu_s(reader)
+        try:
+            confined(reader, data)
+        except SkillsError:
+            refused += 1
+        assert cpu_s(reader) - began < MOST_CPU_S
+    assert refused > 0.4 * count
+
+
+def test_claims_of_statistics_change_nothing():
+    columns = columns_of(40)
+    plain = read_recording(packed(episode(data=parquet(columns, write_statistics=False))), frame="ECM")
+    data = bytearray(parquet({name: columns[name] for name in columns}, use_dictionary=False))
+    least = np.float32(columns["observation.state"].min()).tobytes()
+    footer = len(data) - 8 - int.from_bytes(data[-8:-4], "little")
+    at = data.find(least, footer)
+    assert at > 0
+    while at > 0:  # every claimed minimum is infinite
+        data[at : at + 4] = np.float32(np.inf).tobytes()
+        at = data.find(least, footer)
+    assert same(read_recording(packed(episode(data=bytes(data))), frame="ECM"), plain)
+
+
+def test_paths_in_the_metadata_and_links_lead_nowhere(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    files = episode()
+    assert b"../../../etc" in files["meta/info.json"]
+    read_recording(packed(files), frame="ECM")
+    with io.BytesIO() as out:
+        with zipfile.ZipFile(out, "w") as archive:
+            archive.writestr("meta/info.json", files["meta/info.json"])
+            link = zipfile.ZipInfo("data/chunk-000/episode_000000.parquet")
+            link.external_attr = (stat.S_IFLNK | 0o777) << 16
+            archive.writestr(link, "/etc/passwd")
+        with pytest.raises(UnreadableRecording, match="truncated or corrupt"):
+            read_recording(out, frame="ECM")
+    assert list(tmp_path.iterdir()) == []
