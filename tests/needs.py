@@ -68,6 +68,16 @@ NEEDS = {
         "PyBullet is", "it has a wheel for Python 3.11 on Linux, x86_64, only", lambda: find_spec("pybullet")
     ),
     "deep": Need("the extra `deep` is", "make deep", lambda: all(find_spec(name) for name in NEEDED)),
+    "lerobot": Need(
+        "LeRobot is",
+        "set TESTS_LEROBOT to the interpreters of environments with lerobot 0.3.3 and 0.4.4, separated by `:`",
+        lambda: os.environ.get("TESTS_LEROBOT"),
+    ),
+    "openh": Need(
+        "Open-H's validator is",
+        "set TESTS_OPENH_VALIDATOR to scripts/validation/validate_formatting.py of open-h-embodiment/data-collection",
+        lambda: os.environ.get("TESTS_OPENH_VALIDATOR"),
+    ),
     "npm": Need("npm is", "install Node.js 20 or later", lambda: shutil.which("npm")),
     "openssl": Need("openssl is", "apt-get install openssl", lambda: shutil.which("openssl")),
     "systemd": Need("systemd-analyze is", "apt-get install systemd", lambda: shutil.which("systemd-analyze")),

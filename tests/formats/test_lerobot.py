@@ -84,8 +84,8 @@ def test_a_dataset_of_v3_with_one_episode_is_read():
 def test_poses_without_a_stated_frame_are_refused_with_the_words_of_each_door():
     with pytest.raises(BadColumns, match="does not say in which frame") as refused:
         read(episode(), frame=None)
-    assert "--frame NAME" in refused.value.words(Door.COMMAND)
-    assert "frame=NAME" in refused.value.words(Door.HTTP)
+    assert "--frame ECM" in refused.value.words(Door.COMMAND)
+    assert "frame=ECM" in refused.value.words(Door.HTTP)
 
 
 def test_the_base_of_each_arm_can_be_stated_as_the_frame():

@@ -2,7 +2,7 @@
 
     meta/info.json           the version, the rate `fps`, and the features: their types, lengths and names of numbers
     meta/tasks.jsonl         the tasks; in v3.0 `tasks.parquet`
-    meta/suture-skills.json  ours, optional: `columns`, meanings of columns under other names, and `tools` of arms
+    meta/suture-skills.json  ours, optional: `columns` under other names, and `tools` and `frames` of arms
     data/**/*.parquet        v2.1: one file per episode; v3.0: files of many episodes
     videos/, images          not used
 

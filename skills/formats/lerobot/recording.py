@@ -16,13 +16,14 @@ own file. Actions are not used. Motions are called by the topics of a dVRK from 
 """
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from skills.arrays import Floats, Ints
 from skills.demonstration.recording import Joints, Motion, Recording, Signal, Topic, recorded_motion
-from skills.errors import BackwardStamps, BadColumns, NotFinite, NoUsableTopic, UnreadableRecording
+from skills.errors import BackwardStamps, BadColumns, MixedFrames, NotFinite, NoUsableTopic, UnreadableRecording
 from skills.formats.lerobot.dataset import INFO, NUMBERS, SAID, VERSIONS, Dataset, Feature, Files, read_dataset
 from skills.formats.lerobot.parquet import Table, printable, read_columns
 from skills.formats.tables import BASE, check_outside
@@ -44,6 +45,7 @@ _JOINT = re.compile(
 _JAW = re.compile(r"(?:observation\.state\.)?(psm\d{1,2})[._](?:jaw|gripper)", re.I)
 _TOOL = re.compile(r"(?:observation\.meta\.tool\.)?(psm\d{1,2})(?:_tool_type)?", re.I)
 _NUMBER = re.compile(r"(?:^|:)(\d+)(?:\[|$)")  # of "LARGE_NEEDLE_DRIVER:400006[..11]", or alone
+_FRAME = re.compile(r"[A-Za-z0-9_./-]{1,64}")
 _POSE_PARTS = (*(f"position.{axis}" for axis in "xyz"), *(f"orientation.{axis}" for axis in "xyzw"))
 _JOINT_NAMES = ("yaw", "pitch", "insertion", "roll", "wrist_pitch", "wrist_yaw")
 _SCALARS = ("timestamp", "frame_index", "episode_index", "task_index")
@@ -66,7 +68,8 @@ def read_episode(files: Files, root: str, frame: str | None = None) -> Recording
     Args:
         files: The dataset's files.
         root: From `root_of`.
-        frame: The frame of the columns `psmN_pose`, such as "ECM"; "base" stands for the base of each arm.
+        frame: The frame of the columns `psmN_pose`, such as "ECM"; "base" stands for the base of each arm. Not
+            needed if `frames` in our own file says it.
 
     Returns:
         The recording, in millimetres.
@@ -97,7 +100,7 @@ def read_episode(files: Files, root: str, frame: str | None = None) -> Recording
         for (arm, kind), one in values.items()
         if kind == "joints"
     }
-    motions, left_out = _motions(values, joints, tools, stamps_ns, frame)
+    motions, left_out = _motions(values, joints, tools, stamps_ns, _frames(dataset, frame, {arm for arm, _ in values}))
     return Recording(
         format="lerobot",
         integrity="full",  # a zip archive has a checksum (CRC-32) of every file in it
@@ -250,7 +253,7 @@ def _motions(
     joints: Mapping[str, Joints],
     tools: Mapping[str, str],
     stamps_ns: Ints,
-    frame: str | None,
+    frames: Mapping[str, str],
 ) -> tuple[tuple[Motion, ...], list[LeftOut]]:
     """Return the motions, and what makes none: poses without a stated frame, joints without an instrument.
 
@@ -269,16 +272,15 @@ def _motions(
                 local = _forward(joints[arm], number)
         if local is not None:
             motions.append(replace(_motion(arm, "local_pose", base, stamps_ns, local), from_joints=computed))
-        if pose is not None and frame is None:
-            left_out.append((_topic(arm, "pose"), "the dataset does not say in which frame it is"))
+        if pose is not None and arm in frames:
+            motions.append(_motion(arm, "pose", frames[arm], stamps_ns, pose))
         elif pose is not None:
-            motions.append(_motion(arm, "pose", base if frame == BASE else str(frame), stamps_ns, pose))
+            left_out.append((_topic(arm, "pose"), "the dataset does not say in which frame it is"))
     if motions:
         return tuple(motions), left_out
     if any(kind == "pose" for _, kind in values):
         raise BadColumns(
-            "The dataset does not say in which frame its poses are: ECM for the camera's, base for each arm's "
-            "base, or another name.",
+            "The dataset does not say in which frame its poses are.",
             Remedy(Action.NAME_FRAME),
         )
     raise BadColumns(
@@ -286,6 +288,27 @@ def _motions(
         f"{', '.join(INSTRUMENTS)}.",
         Remedy(Action.NAME_TOOL),
     )
+
+
+def _frames(dataset: Dataset, frame: str | None, arms: Collection[str]) -> dict[str, str]:
+    """Return the frame of each arm's poses: as stated, or else as `frames` of our own file says.
+
+    Raises:
+        BadColumns: Our own file is not valid.
+        MixedFrames: The stated frame is another than in our own file.
+    """
+    said = dataset.said.get("frames", {})
+    if not isinstance(said, dict) or not all(isinstance(one, str) and _FRAME.fullmatch(one) for one in said.values()):
+        raise BadColumns(f"`frames` in {SAID} is not an object of arms and their frames.")
+    frames = {arm: said[arm] for arm in arms if arm in said}
+    stated = {} if frame is None else {arm: f"{arm}_base" if frame == BASE else frame for arm in arms}
+    wrong = sorted(arm for arm in frames if stated.get(arm, frames[arm]) != frames[arm])
+    if wrong:
+        raise MixedFrames(
+            f"The frame of {wrong[0]} was stated as {stated[wrong[0]]}, and the dataset says {frames[wrong[0]]}.",
+            frames=sorted(set(frames.values()))[:20],
+        )
+    return frames | stated
 
 
 def _motion(arm: str, kind: str, frame: str, stamps_ns: Ints, pose: Floats) -> Motion:
@@ -333,7 +356,8 @@ def _tools(dataset: Dataset, table: Table) -> dict[str, str]:
         for arm, names in zip(_arms_of_tools(feature), table.texts.get(feature.name, []), strict=False):
             if len(names) > 1:
                 raise UnreadableRecording(f"The tool of {arm} changes within the episode; cut it there.")
-            tools |= {} if arm is None else {arm: next(iter(names))[:NOTE_CHARACTERS]}
+            name = next(iter(names))[:NOTE_CHARACTERS]
+            tools |= {arm: name} if arm is not None and name else {}
     said = dataset.said.get("tools", {})
     if not isinstance(said, dict) or len(said) > NUMBERS:
         raise BadColumns(f"`tools` in {SAID} is not an object of arms and their instruments.")

@@ -1,0 +1,539 @@
+"""Writer of LeRobot datasets, v2.1 and v3.0, from recordings of one arm or several.
+
+    ExportedEpisode ... --dataset_files--> names and files, in the order in which they are finished
+
+Each episode is sampled at `fps` from the first time at which every arm and jaw is known to the last: for each frame the
+recorded sample that is nearest in time, never an interpolated one. So a recording made at this rate is written as it
+is. `observation.state` has for each arm the names of Open-H, `psmN_pose.position.x` ... and `psmN_jaw`, in m and rad;
+`action` is the next frame's state (the last one is repeated). The frames of the poses and the tools are in
+`meta/suture-skills.json`, which our reader reads. Kinematics only, so `videos/` is empty.
+
+Memory does not grow with the number of frames: files are temporary ones, and statistics are summed. Statistics are
+those of all values; quantiles of the dataset are the means of the episodes', weighted by frames, as LeRobot computes
+them.
+"""
+
+import hashlib
+import io
+import json
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from tempfile import TemporaryFile
+from typing import IO, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skills.arrays import Floats, Ints
+from skills.demonstration.recording import Motion, Recording, Signal
+from skills.errors import BadInput, MixedFrames, NoUsableTopic, UnreadableRecording
+from skills.formats.lerobot.dataset import INFO, SAID, TASK_LINES, TASK_TABLE, Json
+
+Version = Literal["v2.1", "v3.0"]
+Split = Literal["train", "val", "test", "recovery", "failure"]
+SPLITS: tuple[Split, ...] = ("train", "val", "test", "recovery", "failure")
+SHARES = {"train": 0.8, "val": 0.1, "test": 0.1}  # of the episodes; a surgeon is in one of them
+CHUNK = 1000  # episodes or files in a folder
+FILE_BYTES = 64 << 20  # of numbers in a data file of v3.0
+TABLE_ROWS = 50  # episodes that are written to the table of v3.0 together
+PARTS = (*(f"position.{axis}" for axis in "xyz"), *(f"orientation.{axis}" for axis in "xyzw"))
+QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
+MANIFEST = "SHA256SUMS"
+
+_V21_DATA = "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
+_V30_DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+_STAGE, _TASK, _TOOL = "observation.meta.stage", "instruction.text", "observation.meta.tool.{}"
+_PIECE = 1 << 20
+
+Singles = NDArray[np.float32]
+Numbers = NDArray[Any]
+Stats = dict[str, dict[str, list[float]]]
+
+
+@dataclass(frozen=True, eq=False)
+class ExportedEpisode:
+    """One episode of a dataset.
+
+    Attributes:
+        recording: The recording.
+        task: What is done in it, such as "simple interrupted suture".
+        split: Its split; episodes are given in the order of `SPLITS`.
+        start_ns: The first stamp that is written; None: the recording's first.
+        end_ns: The last stamp that is written; None: the recording's last.
+    """
+
+    recording: Recording
+    task: str
+    split: Split = "train"
+    start_ns: int | None = None
+    end_ns: int | None = None
+
+
+@dataclass(frozen=True)
+class AboutDataset:
+    """The description of a dataset, most of it for its README.
+
+    Attributes:
+        name: Its title.
+        arms: The arms of every episode, in the order of the state, such as ("PSM1", "PSM2").
+        fps: Frames per second.
+        licence: The licence, such as "CC-BY-4.0".
+        consent: The consent under which it is passed on, as a sentence.
+        description: What it contains, as sentences.
+        procedure: How it was collected, as sentences.
+    """
+
+    name: str
+    arms: tuple[str, ...]
+    fps: int = 30
+    licence: str = "unknown"
+    consent: str = "Not stated."
+    description: str = "Not stated."
+    procedure: str = "Not stated."
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.fps <= 1000 or not self.arms or len(set(self.arms)) < len(self.arms):
+            raise BadInput("A dataset has 1 to 1000 frames per second, and arms, each once.", fps=self.fps)
+
+    @property
+    def names(self) -> list[str]:
+        """The names of the state's numbers."""
+        return [
+            name for arm in map(str.lower, self.arms) for name in (*(f"{arm}_pose.{p}" for p in PARTS), f"{arm}_jaw")
+        ]
+
+
+def splits_by_surgeon(episodes: Mapping[str, int]) -> dict[str, Split]:
+    """Assign each surgeon to training, validation or test, so that nobody is in two of them.
+
+    Args:
+        episodes: Surgeons and their numbers of episodes.
+
+    Returns:
+        The split of each surgeon. The shares of the episodes approach `SHARES` as well as whole surgeons allow; one
+        surgeon alone is for training.
+    """
+    wanted: dict[Split, float] = {split: SHARES[split] * sum(episodes.values()) for split in SPLITS[:3]}
+    chosen: dict[str, Split] = {}
+    for surgeon, count in sorted(episodes.items(), key=lambda one: (-one[1], one[0])):
+        split = max(SPLITS[:3], key=lambda split: wanted[split])
+        chosen[surgeon] = split
+        wanted[split] -= count
+    return chosen
+
+
+def dataset_files(
+    episodes: Iterable[ExportedEpisode], about: AboutDataset, version: Version = "v2.1"
+) -> Iterator[tuple[str, IO[bytes]]]:
+    """Write a dataset.
+
+    Args:
+        episodes: In the order of their splits; each is used once, and not kept.
+        about: The description.
+        version: The version of the format.
+
+    Yields:
+        The name and the content of each file, at its beginning, which is valid until the next one. The manifest of the
+        SHA-256 of all others is the last.
+
+    Raises:
+        BadInput: There are no episodes, or not in the order of their splits.
+        NoUsableTopic: An episode lacks an arm, its orientation or its jaw, or these have no time in common.
+        MixedFrames: An arm's poses are in another frame than in the episodes before.
+        UnreadableRecording: An arm has no sample within one frame of a frame's time.
+    """
+    seen: dict[str, str] = {}
+    for name, file in _files(episodes, about, version):
+        file.seek(0)
+        digest = hashlib.sha256()
+        while data := file.read(_PIECE):
+            digest.update(data)
+        seen[name] = digest.hexdigest()
+        file.seek(0)
+        yield name, file
+    yield MANIFEST, io.BytesIO("".join(f"{seen[name]}  {name}\n" for name in sorted(seen)).encode())
+
+
+def _files(
+    episodes: Iterable[ExportedEpisode], about: AboutDataset, version: Version
+) -> Iterator[tuple[str, IO[bytes]]]:
+    store: _SingleFiles | _SharedFiles = _SingleFiles() if version == "v2.1" else _SharedFiles()
+    total = _Total(about)
+    with store:
+        for episode in episodes:
+            taken = total.take(episode)
+            yield from store.write(taken)
+        if not total.episodes:
+            raise BadInput("There are no episodes to write.")
+        yield from store.finish(total)
+    info = total.info(version)
+    yield INFO, _json(info)
+    yield SAID, _json({"frames": total.frames})
+    yield "meta/README.md", io.BytesIO(_readme(about, total).encode())
+    yield "videos/.keep", io.BytesIO()
+
+
+@dataclass(frozen=True, eq=False)
+class _Taken:
+    """An episode as columns, with its statistics."""
+
+    number: int
+    tasks: tuple[str, ...]
+    task_index: int
+    first: int  # frames of all episodes before it
+    columns: dict[str, Numbers | list[str]]
+    stats: Stats
+
+    @property
+    def rows(self) -> int:
+        return len(self.columns["frame_index"])
+
+
+@dataclass
+class _Total:
+    """The episodes so far: their numbers, tasks, frames of poses, splits and statistics."""
+
+    about: AboutDataset
+    episodes: int = 0
+    rows: int = 0
+    tasks: dict[str, int] = field(default_factory=dict)
+    frames: dict[str, str] = field(default_factory=dict)
+    splits: dict[Split, list[int]] = field(default_factory=dict)
+    stats: Stats = field(default_factory=dict)
+
+    def take(self, episode: ExportedEpisode) -> _Taken:
+        """Return an episode as columns, and add it."""
+        self._add_to_split(episode.split)
+        state, stamps_ns = self._sampled(episode)
+        rows, number = len(state), self.episodes
+        task = self.tasks.setdefault(episode.task, len(self.tasks))
+        tools = dict(episode.recording.tools)
+        columns: dict[str, Numbers | list[str]] = {
+            "observation.state": state,
+            "action": np.concatenate([state[1:], state[-1:]]),
+            **{_TOOL.format(arm.lower()): [tools.get(arm, "")] * rows for arm in self.about.arms},
+            _STAGE: _stages(episode.recording, stamps_ns),
+            _TASK: [episode.task] * rows,
+            "timestamp": (np.arange(rows) / self.about.fps).astype(np.float32),
+            "frame_index": np.arange(rows),
+            "episode_index": np.full(rows, number),
+            "index": np.arange(self.rows, self.rows + rows),
+            "task_index": np.full(rows, task),
+        }
+        stats = {name: _stats_of(column) for name, column in columns.items() if not isinstance(column, list)}
+        self.stats = {name: _joined(self.stats[name], one) for name, one in stats.items()} if number else stats
+        taken = _Taken(number, (episode.task,), task, self.rows, columns, stats)
+        self.episodes, self.rows = number + 1, self.rows + rows
+        return taken
+
+    def _add_to_split(self, split: Split) -> None:
+        if any(SPLITS.index(before) > SPLITS.index(split) for before in self.splits):
+            raise BadInput(f"Give the episodes in the order of their splits: {', '.join(SPLITS)}.", split=split)
+        self.splits.setdefault(split, [self.episodes, self.episodes])[1] += 1
+
+    def _sampled(self, episode: ExportedEpisode) -> tuple[Singles, Ints]:
+        """Return the state at each frame, shape (T, 8 per arm), and the frames' times, shape (T,)."""
+        pairs = [self._arm(episode.recording, arm) for arm in self.about.arms]
+        series = [stamps_ns for motion, jaw in pairs for stamps_ns in (motion.stamps_ns, jaw.stamps_ns)]
+        start, end = max(int(one[0]) for one in series), min(int(one[-1]) for one in series)
+        start = start if episode.start_ns is None else max(start, episode.start_ns)
+        end = end if episode.end_ns is None else min(end, episode.end_ns)
+        if end < start:
+            raise NoUsableTopic(f"The arms and jaws of episode {self.episodes} have no time in common; leave it out.")
+        period_ns = 1e9 / self.about.fps
+        count = int(np.floor((end - start) / period_ns + 1e-6)) + 1  # stamps are rounded to nanoseconds
+        times_ns = start + np.rint(np.arange(count) * period_ns).astype(np.int64)
+        states = [_at(times_ns, motion, jaw, period_ns) for motion, jaw in pairs]
+        return np.concatenate(states, axis=1).astype(np.float32), times_ns
+
+    def _arm(self, recording: Recording, arm: str) -> tuple[Motion, Signal]:
+        """Return an arm's motion and jaw, and note the frame of its poses."""
+        motion, jaw = recording.motion_of(arm=arm), recording.jaw_of(arm)
+        if motion.rotation_xyzw is None or jaw is None or not len(jaw.values):
+            missing = "orientation" if motion.rotation_xyzw is None else "jaw"
+            raise NoUsableTopic(f"Episode {self.episodes} has no {missing} of {arm}; leave it out.")
+        before = self.frames.setdefault(arm, motion.frame)
+        if before != motion.frame:
+            raise MixedFrames(
+                f"{arm} is in the frame {motion.frame} in episode {self.episodes}, and in {before} in the episodes "
+                "before; write a dataset for each frame."
+            )
+        return motion, jaw
+
+    def info(self, version: Version) -> Json:
+        """Return the contents of info.json."""
+        state = {"dtype": "float32", "shape": [len(self.about.names)], "names": [self.about.names]}
+        texts = [*(_TOOL.format(arm.lower()) for arm in self.about.arms), _STAGE, _TASK]
+        features: dict[str, Json] = {"observation.state": state, "action": state}
+        features |= {name: {"dtype": "string", "shape": [1], "names": ["value"]} for name in texts}
+        features["timestamp"] = {"dtype": "float32", "shape": [1], "names": None}
+        for name in ("frame_index", "episode_index", "index", "task_index"):
+            features[name] = {"dtype": "int64", "shape": [1], "names": None}
+        info = {
+            "codebase_version": version,
+            "robot_type": "dvrk",
+            "total_episodes": self.episodes,
+            "total_frames": self.rows,
+            "total_tasks": len(self.tasks),
+            "chunks_size": CHUNK,
+            "fps": self.about.fps,
+            "splits": {split: f"{first}:{end}" for split, (first, end) in self.splits.items()},
+            "data_path": _V21_DATA if version == "v2.1" else _V30_DATA,
+            "video_path": None,
+            "features": features,
+        }
+        if version == "v2.1":
+            return info | {"total_videos": 0, "total_chunks": -(-self.episodes // CHUNK)}
+        info["features"] = {name: one | {"fps": self.about.fps} for name, one in features.items()}
+        return info | {"data_files_size_in_mb": 100, "video_files_size_in_mb": 200}
+
+
+def _at(times_ns: Ints, motion: Motion, jaw: Signal, period_ns: float) -> Floats:
+    """Return an arm's pose in m and its jaw at some times, shape (T, 8): of each the sample that is nearest."""
+    assert motion.rotation_xyzw is not None
+    pose, opening = _nearest(times_ns, motion.stamps_ns), _nearest(times_ns, jaw.stamps_ns)
+    for what, stamps_ns, chosen in ((motion.topic, motion.stamps_ns, pose), (jaw.topic, jaw.stamps_ns, opening)):
+        off_ns = np.abs(stamps_ns[chosen] - times_ns)
+        if off_ns.max() > period_ns:
+            worst = int(np.argmax(off_ns))
+            raise UnreadableRecording(
+                f"{what} has no sample within one frame of {(times_ns[worst] - times_ns[0]) / 1e9:.3f} s in the "
+                "episode; write the parts before and after the gap as two episodes.",
+                gap_s=float(off_ns[worst]) / 1e9,
+            )
+    parts = motion.tip_mm[pose] / 1000.0, motion.rotation_xyzw[pose], jaw.values[opening, None]
+    return np.concatenate(parts, axis=1)
+
+
+def _nearest(times_ns: Ints, stamps_ns: Ints) -> Ints:
+    after = np.clip(np.searchsorted(stamps_ns, times_ns), 1, max(1, len(stamps_ns) - 1))
+    before = after - 1
+    after = np.minimum(after, len(stamps_ns) - 1)
+    chosen: Ints = np.where(times_ns - stamps_ns[before] <= stamps_ns[after] - times_ns, before, after)
+    return chosen
+
+
+def _stages(recording: Recording, times_ns: Ints) -> list[str]:
+    """Return the name of the stage or gesture at each time, "" where there is none; the later label counts."""
+    names = np.full(len(times_ns), "", dtype=object)
+    for label in recording.labels:
+        names[np.searchsorted(times_ns, label.start_ns) : np.searchsorted(times_ns, label.end_ns, "right")] = label.name
+    named: list[str] = names.tolist()
+    return named
+
+
+# ---- statistics ----------------------------------------------------------------------------------------------------
+
+
+def _stats_of(column: Numbers) -> dict[str, list[float]]:
+    """Return the statistics of a column, for each of its numbers."""
+    values = column.reshape(len(column), -1).astype(np.float64)
+    stats = {
+        "min": values.min(axis=0),
+        "max": values.max(axis=0),
+        "mean": values.mean(axis=0),
+        "std": values.std(axis=0),
+    }
+    quantiles = dict(zip(QUANTILES, np.quantile(values, list(QUANTILES.values()), axis=0), strict=True))
+    return {name: one.tolist() for name, one in (stats | quantiles).items()} | {"count": [len(values)]}
+
+
+def _joined(one: Mapping[str, list[float]], other: Mapping[str, list[float]]) -> dict[str, list[float]]:
+    """Return the statistics of two sets of rows from those of each."""
+    n, m = one["count"][0], other["count"][0]
+    a, b = ({name: np.array(values) for name, values in stats.items()} for stats in (one, other))
+    joined = {"min": np.minimum(a["min"], b["min"]), "max": np.maximum(a["max"], b["max"])}
+    joined |= {name: (n * a[name] + m * b[name]) / (n + m) for name in ("mean", *QUANTILES)}
+    spread = n * (a["std"] ** 2 + (a["mean"] - joined["mean"]) ** 2)
+    spread += m * (b["std"] ** 2 + (b["mean"] - joined["mean"]) ** 2)
+    joined["std"] = np.sqrt(spread / (n + m))
+    return {name: values.tolist() for name, values in joined.items()} | {"count": [n + m]}
+
+
+# ---- files of each version -----------------------------------------------------------------------------------------
+
+
+class _SingleFiles:
+    """The files of v2.1: one of data per episode, and lines about the episodes."""
+
+    def __enter__(self) -> "_SingleFiles":
+        self._episodes, self._stats = TemporaryFile(), TemporaryFile()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._episodes.close()
+        self._stats.close()
+
+    def write(self, taken: _Taken) -> Iterator[tuple[str, IO[bytes]]]:
+        """Yield the file of an episode."""
+        from pyarrow import parquet
+
+        with io.BytesIO() as file:
+            parquet.write_table(_table(taken), file)
+            yield _V21_DATA.format(episode_chunk=taken.number // CHUNK, episode_index=taken.number), file
+        about = {"episode_index": taken.number, "tasks": taken.tasks, "length": taken.rows}
+        plain = {name: {key: one[key] for key in one if key not in QUANTILES} for name, one in taken.stats.items()}
+        self._episodes.write(_line(about))
+        self._stats.write(_line({"episode_index": taken.number, "stats": plain}))
+
+    def finish(self, total: _Total) -> Iterator[tuple[str, IO[bytes]]]:
+        """Yield the files about all episodes."""
+        yield "meta/episodes.jsonl", self._episodes
+        yield "meta/episodes_stats.jsonl", self._stats
+        lines = (_line({"task_index": number, "task": task}) for task, number in total.tasks.items())
+        yield TASK_LINES, io.BytesIO(b"".join(lines))
+
+
+class _SharedFiles:
+    """The files of v3.0: data of many episodes in a file, each a row group, and a table of the episodes."""
+
+    def __enter__(self) -> "_SharedFiles":
+        self._data, self._table = TemporaryFile(), TemporaryFile()
+        self._writer: Any = None
+        self._table_writer: Any = None
+        self._waiting: list[Json] = []
+        self._file, self._bytes = 0, 0
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._data.close()
+        self._table.close()
+
+    def write(self, taken: _Taken) -> Iterator[tuple[str, IO[bytes]]]:
+        """Add an episode; yield the data file that is full."""
+        from pyarrow import parquet
+
+        table = _table(taken)
+        if self._writer is not None and self._bytes + table.nbytes > FILE_BYTES:
+            yield from self._finished_file()
+        if self._writer is None:
+            self._writer = parquet.ParquetWriter(self._data, table.schema)
+        self._writer.write_table(table, row_group_size=max(1, taken.rows))
+        self._bytes += table.nbytes
+        place = {
+            "episode_index": taken.number,
+            "tasks": list(taken.tasks),
+            "length": taken.rows,
+            "data/chunk_index": self._file // CHUNK,
+            "data/file_index": self._file % CHUNK,
+            "dataset_from_index": taken.first,
+            "dataset_to_index": taken.first + taken.rows,
+            "meta/episodes/chunk_index": 0,
+            "meta/episodes/file_index": 0,
+        }
+        stats = {f"stats/{name}/{key}": one for name, found in taken.stats.items() for key, one in found.items()}
+        self._waiting.append(place | stats)
+        if len(self._waiting) == TABLE_ROWS:
+            self._write_places()
+
+    def finish(self, total: _Total) -> Iterator[tuple[str, IO[bytes]]]:
+        """Yield the last data file, and the files about all episodes."""
+        import pyarrow as pa
+        from pyarrow import parquet
+
+        yield from self._finished_file()
+        self._write_places()
+        self._table_writer.close()
+        yield "meta/episodes/chunk-000/file-000.parquet", self._table
+        numbers, texts = pa.array(list(total.tasks.values())), pa.array(list(total.tasks))
+        tasks = pa.table({"task_index": numbers, "task": texts}).replace_schema_metadata({"pandas": _TASKS_FOR_PANDAS})
+        with io.BytesIO() as file:
+            parquet.write_table(tasks, file)
+            yield TASK_TABLE, file
+        yield "meta/stats.json", _json(total.stats)
+
+    def _finished_file(self) -> Iterator[tuple[str, IO[bytes]]]:
+        self._writer.close()
+        yield _V30_DATA.format(chunk_index=self._file // CHUNK, file_index=self._file % CHUNK), self._data
+        self._data.seek(0)
+        self._data.truncate()
+        self._writer, self._file, self._bytes = None, self._file + 1, 0
+
+    def _write_places(self) -> None:
+        import pyarrow as pa
+        from pyarrow import parquet
+
+        if not self._waiting:
+            return
+        table = pa.Table.from_pylist(self._waiting, None if self._table_writer is None else self._table_writer.schema)
+        if self._table_writer is None:
+            self._table_writer = parquet.ParquetWriter(self._table, table.schema)
+        self._table_writer.write_table(table)
+        self._waiting = []
+
+
+# LeRobot reads the tasks with pandas, whose index they are.
+_TASKS_FOR_PANDAS = json.dumps(
+    {
+        "index_columns": ["task"],
+        "column_indexes": [
+            {"name": None, "field_name": None, "pandas_type": "unicode", "numpy_type": "object", "metadata": None}
+        ],
+        "columns": [
+            {"name": "task_index", "field_name": "task_index", "pandas_type": "int64", "numpy_type": "int64"},
+            {"name": "task", "field_name": "task", "pandas_type": "unicode", "numpy_type": "object"},
+        ],
+        "pandas_version": "2.0.0",
+    }
+)
+
+
+def _table(taken: _Taken) -> Any:
+    """Return an episode as pyarrow's table."""
+    import pyarrow as pa
+
+    arrays = {}
+    for name, column in taken.columns.items():
+        if isinstance(column, np.ndarray) and column.ndim == 2:
+            arrays[name] = pa.FixedSizeListArray.from_arrays(pa.array(column.ravel()), column.shape[1])
+        else:
+            arrays[name] = pa.array(column)
+    return pa.table(arrays)
+
+
+def _json(value: object) -> IO[bytes]:
+    return io.BytesIO(json.dumps(value, indent=4, ensure_ascii=False, allow_nan=False).encode())
+
+
+def _line(value: object) -> bytes:
+    return json.dumps(value, ensure_ascii=False, allow_nan=False).encode() + b"\n"
+
+
+def _readme(about: AboutDataset, total: _Total) -> str:
+    """Return the README of a dataset, with the sections that Open-H asks for."""
+    frames = "".join(f"- {arm}: `{frame}`\n" for arm, frame in total.frames.items())
+    splits = "".join(f"- {split}: episodes {a} to {b - 1}\n" for split, (a, b) in total.splits.items())
+    tasks = "".join(f"- {task}\n" for task in total.tasks)
+    return f"""# {about.name}
+
+Licence: {about.licence}. Consent: {about.consent}
+
+## Dataset Description
+
+{about.description}
+
+{total.episodes} episodes, {total.rows} frames at {about.fps} Hz. Tasks:
+
+{tasks}
+Splits, by surgeon:
+
+{splits}
+## Collection Procedure
+
+{about.procedure}
+
+## Robot
+
+da Vinci Research Kit. `observation.state` has the measured pose and jaw of {", ".join(about.arms)}, in metres, unit
+quaternions x, y, z, w, and radians; `action` is the state of the next frame. The frames of the poses:
+
+{frames}
+## Sensors
+
+The arms' encoders. There are no pictures.
+
+## Synchronization
+
+For each frame the recorded sample of each arm and jaw that is nearest in time, at most {1000 / about.fps:.1f} ms from
+it; nothing is interpolated.
+"""
