@@ -92,7 +92,7 @@ class Action(Enum):
     )
     CUT_EPISODE = Words(
         http="Send each episode as a zip of its own, with one .parquet file below data/.",
-        command="Name one, counted from 0 as in the dataset, or all: --episode N, --episode all",
+        command="Store one of them, or all: skills recording add DATASET --episode N, or --episode all",
         python="Cut them: cut_episode of skills.formats.lerobot.cut makes the file to send.",
     )
     ERASE_DEMOS = Words(

@@ -1,5 +1,6 @@
 """The command line, on the application in its own process: a lab's commands, in order."""
 
+import io
 import json
 import os
 import subprocess
@@ -15,7 +16,8 @@ from typer.testing import CliRunner
 from skills.cli import app
 from skills.cli.shell import complete_surgeons, complete_sutures
 from skills.db.session import Database
-from skills.formats import write_mcap
+from skills.formats import read_recording, write_mcap
+from skills.formats.lerobot.writer import AboutDataset, ExportedEpisode, dataset_files
 from skills.library.catalogue import put_surgeon
 from skills.seeds.recordings import sample_recordings
 from skills.settings import settings
@@ -276,6 +278,31 @@ def test_episodes_of_a_lerobot_dataset_are_recordings_of_their_own(skills, tmp_p
     assert all("--frame NAME" in one["problem"] for one in json.loads(said))
     code, said = skills(*add, "--episode", "7")
     assert (code, "0 to 2" in said) == (1, True)
+
+
+def test_from_a_lerobot_folder_to_a_released_policy(skills, tmp_path: Path) -> None:
+    sample = next(one for one in sample_recordings() if one.surgeon == "wren")
+    given = [ExportedEpisode(read_recording(io.BytesIO(sample.data)), "simple running suture")]
+    for name, file in dataset_files(given, AboutDataset("Wren", ("PSM2",), fps=100), "v3.0"):
+        lerobots.write({name: file.read()}, tmp_path / "dataset")
+    assert skills("migrate")[0] == 0
+    assert skills("surgeon", "put", "wren", "--consent", "training")[0] == 0
+    add = (
+        "demo",
+        "add",
+        str(tmp_path / "dataset"),
+        "--episode",
+        "0",
+        "--surgeon",
+        "wren",
+        "--suture",
+        "simple-running",
+    )
+    code, said = skills(*add, "--json")
+    assert code == 0, said
+    assert json.loads(said)["frame"] == "PSM2_base"
+    code, said = skills("train", *STYLE, "--release", "--json")
+    assert (code, json.loads(said)["result"]["released"]) == (0, True), said
 
 
 def test_a_demonstration_is_cut_out_of_an_episode(skills, tmp_path: Path) -> None:

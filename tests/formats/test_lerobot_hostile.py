@@ -105,6 +105,7 @@ def test_thousands_of_columns_and_row_groups_are_read_within_the_limits(reader):
         assert cpu_s(reader) - began < MOST_CPU_S
 
 
+@pytest.mark.nightly
 def test_a_million_frames_are_read_within_the_limits(reader):
     columns = {"observation.state": poses(1_000_000), "frame_index": np.arange(1_000_000)}
     recording = confined(reader, zipped(episode(columns), zipfile.ZIP_STORED))
