@@ -364,7 +364,7 @@ def test_a_parquet_file_alone_is_refused_with_the_remedy():
 
 @pytest.mark.parametrize("version", ["v2.1", "v3.0"])
 def test_several_episodes_are_refused_with_their_number(version):
-    with pytest.raises(UnreadableRecording, match=r"has [23] episodes\. A recording is one of them") as refused:
+    with pytest.raises(UnreadableRecording, match=r"has 3 episodes\. A recording is one of them") as refused:
         read(dataset(version))
     assert "--episode" in refused.value.words(Door.COMMAND)
 
