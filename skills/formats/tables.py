@@ -254,7 +254,8 @@ def _uses(names: list[str], said: TableReading) -> dict[str, _Use]:
         BadColumns: A column is unknown or duplicate, or a mapping names one that does not exist.
         BadSettings: A mapping or a unit is impossible, or contradicts another.
     """
-    mapped, aliases = _mapped(names, said), _aliases(names)
+    units, needed, aliases = _units(said), set[str](), _aliases(names)
+    mapped = _mapped(names, said, units, needed)
     of_calibration = aliases is not _PAPER_NAMES
     taken, own, unknown = {use.index for use in mapped.values()}, dict[str, _Use](), list[str]()
     for index, name in enumerate(names):
@@ -276,6 +277,11 @@ def _uses(names: list[str], said: TableReading) -> dict[str, _Use]:
             Remedy(Action.NAME_COLUMNS),
             unknown=unknown[:20],
         )
+    unneeded = [unit for unit in units.values() if unit not in needed]
+    if unneeded:
+        raise BadSettings(
+            f"The unit {unneeded[0]} belongs to no mapped column without a unit; omit it, or map one, as in x=NAME."
+        )
     return dict(sorted({**mapped, **own}.items(), key=lambda one: one[1].index))
 
 
@@ -296,9 +302,8 @@ def _full(quantity: str, unit: str) -> str:
     return f"{quantity}_{unit}" if unit else quantity
 
 
-def _mapped(names: list[str], said: TableReading) -> dict[str, _Use]:
+def _mapped(names: list[str], said: TableReading, units: Mapping[int, str], needed: set[str]) -> dict[str, _Use]:
     """Return the columns that the caller maps, by quantity; raises as `_uses`."""
-    units, needed = _units(said), set[str]()
     mapped: dict[str, _Use] = {}
     for one in said.column:
         target, equals, column = one.partition("=")
@@ -319,11 +324,6 @@ def _mapped(names: list[str], said: TableReading) -> dict[str, _Use]:
                 f"The mapping {one[:80]!r} names {quantity} or its column a second time; keep one of them."
             )
         mapped[quantity] = _Use(names.index(column), _unit_of(quantity, unit, column, units, needed))
-    unneeded = [unit for unit in units.values() if unit not in needed]
-    if unneeded:
-        raise BadSettings(
-            f"The unit {unneeded[0]} belongs to no mapped column without a unit; omit it, or map one, as in x=NAME."
-        )
     return mapped
 
 

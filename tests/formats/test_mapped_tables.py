@@ -110,8 +110,7 @@ HEAD = "Time;PosX;PosY;PosZ\n"
         ({"column": XYZ[:2], "unit": ["mm"], "rate_hz": 1.0}, BadColumns, "z_mm is missing"),
         ({"column": [*XYZ, "t_ms=Time"], "unit": ["mm"], "rate_hz": 1.0}, BadColumns, "use one of them"),
         ({"column": XYZ, "unit": ["mm"]}, BadColumns, "no column t_s"),
-        ({"unit": ["mm"]}, BadSettings, "belongs to no mapped column"),
-        ({}, BadColumns, "unknown column 'Time'"),
+        ({"unit": ["mm"]}, BadColumns, "unknown column 'Time'"),
         ({"column": XYZ, "unit": ["mm"], "rate_hz": 1.0, "instrument": "1"}, Exception, "instrument '1' is unknown"),
     ],
 )

@@ -1,0 +1,137 @@
+"""Tables over HTTP: what is said about them once, previewed, stored and read again; and counts of dropped samples."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.api.service import CSV, KESTREL, Service, assert_problem
+from tests.formats import written
+from tests.formats.bags import sample_folder
+
+SAID = {"column": ["x=PosX", "y=PosY", "z=PosZ"], "unit": ["mm"], "rate_hz": 100.0}
+POSITIONS = written.positions().encode()
+
+
+@pytest.fixture
+def here(service: Service) -> Service:
+    service.client.put_surgeon("kestrel")
+    return service
+
+
+def send(service: Service, path: str, data: bytes, **query):
+    return service.http.post(path, params=query, content=data, headers={"Content-Type": CSV})
+
+
+def recordings(service: Service) -> int:
+    from sqlalchemy import func, select
+
+    from skills.db.models import StoredRecording
+
+    with service.database.reading() as session:
+        return session.scalar(select(func.count()).select_from(StoredRecording)) or 0
+
+
+def test_a_preview_says_what_was_understood_and_stores_nothing(here: Service):
+    seen = here.client.preview_recording(POSITIONS, **SAID | {"rate_hz": None})
+    assert (seen["timed"], seen["duration_s"], seen["quality"][0]["rate_hz"], seen["segments"]) == (
+        False,
+        None,
+        None,
+        [],
+    )
+    assert [tuple(one.values()) for one in seen["columns"]] == [
+        ("PosX", "x", "mm"),
+        ("PosY", "y", "mm"),
+        ("PosZ", "z", "mm"),
+    ]
+    timed = here.client.preview_recording(POSITIONS, **SAID, table_arm="PSM2", frame="ECM")
+    assert (timed["timed"], timed["duration_s"]) == (True, pytest.approx(9.39))
+    assert (timed["motions"][0]["arm"], timed["motions"][0]["frame"]) == ("PSM2", "ECM")
+    assert recordings(here) == 0
+    for said, question in ((SAID | {"unit": None}, "In which unit"), (SAID | {"column": None}, "unknown column")):
+        refused = {name: value for name, value in said.items() if value is not None}
+        assert question in assert_problem(send(here, "/recordings/preview", POSITIONS, **refused), 422)["detail"]
+    assert recordings(here) == 0
+
+
+@pytest.mark.parametrize(
+    ("query", "where"),
+    [
+        ({"unit": "inch"}, "unit"), ({"decimal": "dot"}, "decimal"), ({"table_arm": "2"}, "table_arm"),
+        ({"instrument": "1"}, "instrument"), ({"column": "x=\n"}, "column"), ({"rate_hz": "nan"}, "rate_hz"),
+        ({"column": ["x=a"] * 31}, "column"),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("path", ["/recordings", "/recordings/preview"])
+def test_an_impossible_parameter_is_refused_by_its_name(here: Service, path, query, where):
+    answer = send(here, path, POSITIONS, **query)
+    assert answer.status_code in (400, 422)
+    assert where in answer.text
+    assert recordings(here) == 0
+
+
+def test_what_was_said_is_stored_and_used_when_the_table_is_cut_again(here: Service):
+    stored = here.client.add_recording(POSITIONS, **SAID, frame="PSM2_base", table_arm="PSM2")
+    demo = here.client.cut_demo(stored["id"], **KESTREL)
+    assert (demo["arm"], demo["frame"], demo["report"]["path_states"]) == ("PSM2", "PSM2_base", 28)
+    again = here.client.add_demo(POSITIONS, **KESTREL, **SAID, frame="PSM2_base", table_arm="PSM2")
+    assert again["id"] == demo["id"]
+    assert_problem(send(here, "/recordings", POSITIONS, **SAID), 409)
+    with here.database.reading() as session:
+        from sqlalchemy import select
+
+        from skills.db.models import StoredRecording
+
+        reading = session.scalars(select(StoredRecording.reading)).one()
+    assert reading == {"rate_hz": 100.0, "frame": "PSM2_base", "table_arm": "PSM2",
+                       "column": SAID["column"], "unit": ["mm"]}  # fmt: skip
+
+
+def test_a_table_that_needs_no_answers_is_stored_as_before(here: Service):
+    here.client.add_recording(b"t_s,x_mm,y_mm,z_mm\n0,0,50,-120\n1,10,50,-120\n")
+    with here.database.reading() as session:
+        from sqlalchemy import select
+
+        from skills.db.models import StoredRecording
+
+        row = session.scalars(select(StoredRecording)).one()
+    assert row.reading == {"rate_hz": None, "frame": None}
+    assert not {"dropped", "columns", "timed"} & set(row.about)
+
+
+def test_both_arms_of_an_ee_csv_are_stored_and_one_is_cut(here: Service):
+    data = written.ee_csv(more=True).encode()
+    assert "in which frame" in assert_problem(send(here, "/recordings", data), 422)["detail"]
+    stored = here.client.add_recording(data, frame="ECM")
+    assert {(one["arm"], one["joints"]) for one in stored["joints"]} == {("PSM1", 6), ("PSM2", 6)}
+    demo = here.client.cut_demo(stored["id"], **KESTREL, arm="PSM2")
+    assert (demo["topic"], demo["frame"]) == ("/PSM2/local/measured_cp", "PSM2_base")
+
+
+def test_counts_of_dropped_and_equal_samples_are_in_the_answer_the_report_and_on_the_page(here: Service):
+    rows = [f"{k * 0.01:.2f},{min(k, 150) * 0.2:.2f},50,-120" for k in range(200)]
+    rows[50] = rows[50].replace("0.50,", "0.48,")
+    data = "\n".join(["t_s,x_mm,y_mm,z_mm", *rows]).encode()
+    stored = here.client.add_recording(data)
+    assert stored["dropped"] == [{"topic": "table", "backward_stamps": 1}]
+    assert stored["quality"][0]["equal_samples"] == 49
+    demo = here.client.cut_demo(stored["id"], **KESTREL, segment="whole")
+    for report in (demo["report"], here.client.demo_report(demo["id"])["report"]):
+        assert (report["backward_stamps"], report["equal_samples"]) == (1, 49)
+        assert any("1 sample had a stamp that went back" in line for line in report["advice"])
+        assert any("49 of 199 samples (25%) repeat the pose" in line for line in report["advice"])
+    page = here.http.get(f"/pages/recordings/{stored['id']}", headers={"Accept": "text/html"})
+    assert page.status_code == 200
+    assert "Stamps that went back" in page.text
+    assert "Equal samples" in page.text
+    assert "Stamps that went back" in here.client.demo_report_page(demo["id"]).decode()
+
+
+@pytest.mark.needs("recordings")
+def test_the_real_bag_with_a_stamp_that_goes_back_is_stored_with_its_counts(here: Service):
+    stored = here.client.add_recording(Path(sample_folder() / "calibration" / "pitch_exp_traj_02_test_cropped.bag"))
+    assert {one["topic"]: one["backward_stamps"] for one in stored["dropped"]} == {
+        "/PSM2/measured_cp": 1,
+        "/PSM2/measured_js": 1,
+    }
+    assert stored["motions"][0]["samples"] == 3299
