@@ -3,10 +3,13 @@
 from pathlib import Path
 
 import pytest
+from sqlalchemy import func, select
 
+from skills.db.models import StoredRecording
 from tests.api.service import CSV, KESTREL, Service, assert_problem
-from tests.formats import written
+from tests.formats import hostile, written
 from tests.formats.bags import sample_folder
+from tests.formats.test_tables_hostile import FILES, mutations
 
 SAID = {"column": ["x=PosX", "y=PosY", "z=PosZ"], "unit": ["mm"], "rate_hz": 100.0}
 POSITIONS = written.positions().encode()
@@ -23,10 +26,6 @@ def send(service: Service, path: str, data: bytes, **query):
 
 
 def recordings(service: Service) -> int:
-    from sqlalchemy import func, select
-
-    from skills.db.models import StoredRecording
-
     with service.database.reading() as session:
         return session.scalar(select(func.count()).select_from(StoredRecording)) or 0
 
@@ -78,10 +77,6 @@ def test_what_was_said_is_stored_and_used_when_the_table_is_cut_again(here: Serv
     assert again["id"] == demo["id"]
     assert_problem(send(here, "/recordings", POSITIONS, **SAID), 409)
     with here.database.reading() as session:
-        from sqlalchemy import select
-
-        from skills.db.models import StoredRecording
-
         reading = session.scalars(select(StoredRecording.reading)).one()
     assert reading == {"rate_hz": 100.0, "frame": "PSM2_base", "table_arm": "PSM2",
                        "column": SAID["column"], "unit": ["mm"]}  # fmt: skip
@@ -90,10 +85,6 @@ def test_what_was_said_is_stored_and_used_when_the_table_is_cut_again(here: Serv
 def test_a_table_that_needs_no_answers_is_stored_as_before(here: Service):
     here.client.add_recording(b"t_s,x_mm,y_mm,z_mm\n0,0,50,-120\n1,10,50,-120\n")
     with here.database.reading() as session:
-        from sqlalchemy import select
-
-        from skills.db.models import StoredRecording
-
         row = session.scalars(select(StoredRecording)).one()
     assert row.reading == {"rate_hz": None, "frame": None}
     assert not {"dropped", "columns", "timed"} & set(row.about)
@@ -135,3 +126,15 @@ def test_the_real_bag_with_a_stamp_that_goes_back_is_stored_with_its_counts(here
         "/PSM2/measured_js": 1,
     }
     assert stored["motions"][0]["samples"] == 3299
+
+
+@pytest.mark.parametrize("name", ["ee_csv with joints", "mapped with decimal commas"])
+def test_a_damaged_table_is_no_error_of_the_service(here: Service, name: str):
+    text, said = FILES[name]
+    data = text.encode()
+    damaged = [*mutations(text, 25, seed=7), *hostile.truncations(data, 10, seed=7), *hostile.flips(data, 10, seed=7)]
+    for one in damaged:
+        answer = send(here, "/recordings/preview", one, **said)
+        assert answer.status_code in (200, 415, 422), answer.text
+    assert recordings(here) == 0
+    assert send(here, "/recordings/preview", data, **said).status_code == 200

@@ -146,7 +146,7 @@ def test_every_call_of_the_service_is_one_of_the_client(tmp_path: Path):
         wanted = inspect.signature(getattr(Client, name).method).parameters.values()
         needed = [one.name for one in wanted if one.default is one.empty and one.kind is not one.VAR_KEYWORD]
         words = {one: WORDS.get(one) for one in needed if one != "self"}
-        if "recording" in words and name.startswith("add_"):
+        if "recording" in words and name.startswith(("add_", "preview_")):
             words["recording"] = write_mcap(bags.recording())
         if "to" in words:
             words["to"] = tmp_path / "file.json"
