@@ -119,7 +119,7 @@ def header_of(text: TextIO) -> tuple[list[str], str]:
     """Read the header of a table; return the names of its columns, without spaces around them, and the separator.
 
     Raises:
-        BadColumns: It has two kinds of separators, too many columns, or a column twice.
+        BadColumns: It has two kinds of separators, or too many columns.
     """
     line = next(_lines(text, 1), "")
     separator = separator_of(line)

@@ -18,6 +18,7 @@ from skills.seeds.recordings import sample_recordings
 from tests.api.service import GOAL_MM
 from tests.e2e.browsers import Watched, browsing
 from tests.e2e.conftest import Service, running
+from tests.formats import written
 from tests.waiting import END_S
 
 SAMPLE = next(s for s in sample_recordings() if len(s.segments) > 1)
@@ -392,3 +393,27 @@ def test_a_call_with_a_key_is_tried_out_behind_a_prefix(browser: Browser, tmp_pa
 def without_prefix(route: Route) -> None:
     """Pass a request on as a reverse proxy does that takes its prefix off."""
     route.continue_(url=route.request.url.replace(PREFIX, "", 1))
+
+
+@pytest.mark.nightly  # the commands and the calls are tested by day
+@pytest.mark.parametrize("phone", [False, True])
+def test_a_table_under_other_names_is_sent_with_what_is_said_about_it(
+    browser: Browser, url: str, tmp_path: Path, phone: bool
+) -> None:
+    table = tmp_path / "hand-off.csv"
+    table.write_text(written.positions("wren" if phone else "heron"))
+    with visiting(browser, url, phone=phone) as tab:
+        tab.open("/pages/recordings/new")
+        tab.page.get_by_label("Choose a file, or drop it here").set_input_files(table)
+        tab.page.get_by_role("button", name="Send").click()
+        expect(tab.page.locator("#upload-said")).to_contain_text("unknown column 'PosX'")
+        tab.page.get_by_label("Columns under other names").fill("x=PosX\ny=PosY\nz=PosZ\n")
+        tab.page.get_by_label("Their units").fill("mm")
+        tab.page.get_by_label("Rate").fill("100")
+        tab.page.get_by_label("Arm").fill("PSM2")
+        assert tab.too_wide() <= 0
+        tab.shoot(f"upload-table-{'phone' if phone else 'desk'}")
+        tab.complaints.clear()  # the refusal above is a response of 422, which the console shows
+        tab.page.get_by_role("button", name="Send").click()
+        tab.page.wait_for_url(re.compile("/pages/recordings/[0-9a-f]{64}"))
+        expect(tab.page.get_by_role("heading", name="Quality")).to_be_visible()

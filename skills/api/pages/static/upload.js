@@ -18,7 +18,7 @@ function chosen() {
   ofKind();
 }
 function ofKind() {
-  get("of-rate").hidden = get("kind").value !== TABLE;
+  for (const one of form.querySelectorAll(".of-table")) one.hidden = get("kind").value !== TABLE;
   get("of-frame").hidden = !FRAMELESS.includes(get("kind").value);
 }
 get("file").addEventListener("change", chosen);
@@ -60,12 +60,19 @@ function send(file, headers, query) {
   return done;
 }
 
+function sayAbout(query) {
+  if (get("rate").value) query.set("rate_hz", get("rate").value);
+  for (const name of ["table_arm", "decimal"]) if (get(name).value) query.set(name, get(name).value);
+  for (const line of get("column").value.split("\n")) if (line.trim()) query.append("column", line.trim());
+  for (const unit of get("unit").value.split(/[\s,]+/)) if (unit) query.append("unit", unit);
+}
+
 form.addEventListener("submit", async (event) => {
   event.preventDefault();
   const [file] = get("file").files;
   const kind = get("kind").value;
   const query = new URLSearchParams();
-  if (kind === TABLE && get("rate").value) query.set("rate_hz", get("rate").value);
+  if (kind === TABLE) sayAbout(query);
   if (FRAMELESS.includes(kind) && get("frame").value) query.set("frame", get("frame").value);
   const button = form.querySelector("button:not([type])");
   button.disabled = true;
