@@ -30,6 +30,7 @@ NEEDED = {
     "DELETE /surgeons/{surgeon}": ADMIN,
     "PUT /suture-types/{suture}": ADMIN,
     "POST /recordings": UPLOADER,
+    "POST /recordings/preview": UPLOADER,
     "POST /demos": UPLOADER,
     "POST /recordings/{recording}/demos": UPLOADER,
     "DELETE /recordings/{recording}": UPLOADER,
