@@ -171,9 +171,9 @@ class Action(Enum):
         python="Name each quantity's column: column=['x_mm=NAME', ...] (docs/tables.md); the others are then not used.",
     )
     NAME_UNIT = Words(
-        http="Name it: unit={one} or unit={other}.",
-        command="Name it: --unit {one} or --unit {other}",
-        python="Name it: unit=[{one}] or unit=[{other}]",
+        http="Name it, such as unit={one} or unit={other}.",
+        command="Name it, such as --unit {one} or --unit {other}",
+        python="Name it, such as unit=[{one}] or unit=[{other}]",
     )
     NAME_RATE = Words(
         http="Send it with rate_hz, or name the column of times: column=t_s=NAME, t_ms, t_us or t_ns.",

@@ -338,10 +338,9 @@ def _unit_of(quantity: str, unit: str, column: str, units: Mapping[int, str], ne
             f"The column {column[:80]!r} is mapped in {unit}, and the unit is {given}; which is it? Omit the other."
         )
     if not unit and not given and possible is not PLAIN:
-        one, other, *_ = possible
-        raise BadSettings(
-            f"In which unit is the column {column[:80]!r}?", Remedy(Action.NAME_UNIT, one=one, other=other)
-        )
+        one, *_, other = possible
+        remedy = Remedy(Action.NAME_UNIT, one=one, other=other)
+        raise BadSettings(f"In which unit is the column {column[:80]!r}: {', '.join(possible)}?", remedy)
     return unit or given
 
 
