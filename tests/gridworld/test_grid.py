@@ -5,8 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from skills.gridworld.path_report import discretisation_rmse
 
-from skills.errors import BadInput, BadSettings, EmptyPath, NeverLeavesGoal, OutsideGrid
+from skills.errors import BadInput, BadPath, BadSettings, EmptyPath, NeverLeavesGoal, OutsideGrid
 from skills.gridworld.grid import (
     MARGIN_CELLS,
     PAPER_GRID,
@@ -292,3 +293,9 @@ def test_a_path_is_one_row_of_states_and_cannot_be_changed():
     path = GridPath(LINE, np.array([0, 1]))
     with pytest.raises(ValueError, match="read-only"):
         path.states[0] = 5
+
+
+@pytest.mark.parametrize("shape", [(5, 2), (5,), (3, 5, 3)])
+def test_a_path_of_another_shape_is_refused_in_words(shape):
+    with pytest.raises(BadPath, match=r"give a row of x, y and z in mm for each sample"):
+        discretize(np.zeros(shape), GridWorld(ORIGIN, 5.0, (11, 11, 11)))
