@@ -55,6 +55,7 @@ LEVER_MM = 30.0
 LATEST_S = 0.05  # a larger delay is no delay; and the joints are moved by it along their speeds, not along their path
 DELAYED_MM = 5.0  # at 100 mm/s the largest delay is this far; with a larger residual no delay is sought
 MOST_SAMPLES = 6000  # evenly spread; more samples of one motion do not change the fit
+TRIED_SAMPLES = 1500  # all hypotheses are fitted to so many of them, the best one to all
 FEWEST_SAMPLES = 10
 PIECES = 8  # if the frame moved, each eighth of the recording may fit by itself
 MOVING_PIECES = 2  # and in so many of these it may have been moving
@@ -239,15 +240,17 @@ class _Poses:
 
     def part(self, samples: slice) -> "_Poses":
         """Return some of the samples."""
-        rotation = None if self.rotation is None else self.rotation[samples]
         return _Poses(
             joints=self.joints[samples],
             shaft=self.shaft[samples],
             wrist=self.wrist[samples],
             turned=self.turned[samples],
             tip_mm=self.tip_mm[samples],
-            rotation=rotation,
+            rotation=None if self.rotation is None else self.rotation[samples],
             in_base=self.in_base,
+            speeds=None if self.speeds is None else self.speeds[samples],
+            delay_s=self.delay_s,
+            beyond_mm=self.beyond_mm,
         )
 
 
@@ -313,13 +316,17 @@ def identify(
     if not (np.abs(q) <= _WILD).all() or not (speed is None or (np.abs(speed) <= _WILD).all()):
         return _unexplained(len(q), number, in_base, "a joint's value or speed is beyond a million rad or mm")
     poses = _Poses(q, *axes_of(q), tip, turned, in_base, speed)
-    fits = sorted(_fits(poses), key=_misfit)
+    few = poses.part(slice(None, None, -(-len(q) // TRIED_SAMPLES)))
+    fits = sorted(_fits(few), key=_misfit)
     if speed is not None and FLOOR_MM < fits[0].residual_mm <= DELAYED_MM:
-        poses = _without_delay(poses, fits[0].of)
-        fits = sorted(_fits(poses), key=_misfit)
-    if not fits[0].is_good:
-        return _not_explained(poses, fits[0], number)
-    return _decided(poses, fits, number)
+        few = _without_delay(few, fits[0].of)
+        fits = sorted(_fits(few), key=_misfit)
+        if few.delay_s:
+            poses = replace(poses.moved(q + few.delay_s * speed), delay_s=few.delay_s)
+    best = _fit(poses, fits[0].of)
+    if not (fits[0].is_good and best.is_good):
+        return _not_explained(few, fits[0], number)
+    return _decided(poses, best, fits, number)
 
 
 def _fits(poses: _Poses) -> Iterator[_Fit]:
@@ -380,10 +387,9 @@ def _turn(poses: _Poses, rotation: Floats) -> float:
 # ---- the decision -----------------------------------------------------------------------------------------------
 
 
-def _decided(poses: _Poses, fits: list[_Fit], stated: str | None) -> Identification:
-    """Decide among hypotheses of which the first fits."""
-    best = fits[0]
-    least_mm = max(MARGIN * best.residual_mm, best.residual_mm + FLOOR_MM)
+def _decided(poses: _Poses, best: _Fit, fits: list[_Fit], stated: str | None) -> Identification:
+    """Decide among the hypotheses, fitted to some samples, of which the first fits; `best` is fitted to all."""
+    least_mm = max(MARGIN * fits[0].residual_mm, fits[0].residual_mm + FLOOR_MM)
     near = [fit for fit in fits if fit.is_good and fit.residual_mm < least_mm]
     others = [fit for fit in fits if fit not in near]
     if poses.in_base and (moved := _beside_the_base(poses, best)) is not None:
