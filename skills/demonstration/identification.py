@@ -24,7 +24,8 @@ fitted, and the base must be there.
 the joints are known, the delay of the joints that fits best is found, and all hypotheses are fitted again without it.
 
 *Decision.* A hypothesis fits with a residual of at most `FIT_MM` and `FIT_RAD`. Another one that fits nearly as well
-(`MARGIN`, `FLOOR_MM`) is not told apart: if their offsets differ, the motion was too small, and nothing is identified.
+(`MARGIN`, `PIECES`, `FLOOR_MM`) is not told apart: if their lengths differ by more than `SAME_MM`, the motion was too
+small, and nothing is identified. If nothing fits as a whole, but each piece by itself, the frame of the poses moved.
 
 Sources: jhu-dvrk/sawIntuitiveResearchKit @9e535e68, share/tool/*.json (numbers, lengths of shaft and wrist) and
 share/kinematic/PSM.json and PSM_Si.json. The snake-like instruments and the stapler there have other wrists, which are
@@ -46,9 +47,10 @@ from skills.kinematics import CLASSIC, INSERTION, JAW_TIP_MM, SI, ArmConstants, 
 
 FIT_MM = 1.0  # a recorder that writes the last joints it has at 30 Hz is off by 0.5 mm at 50 mm/s
 FIT_RAD = 0.03  # the same of a wrist that turns at 3 rad/s
-# A hypothesis is told apart if its residual is three times the best one's. With a smaller factor a systematic error of
-# the recorder, as large as the best residual and in the direction of the difference, could exchange the two.
-MARGIN = 3.0
+# A hypothesis is told apart if its residual is three times the best one's: an error of the recorder, as large as the
+# best residual and in the direction of the difference, could otherwise exchange the two. Or if it is larger in each
+# eighth of the recording: errors of stamps go with the speed of the joints, which has another sign and size in each.
+MARGIN, PIECES = 3.0, 8
 FLOOR_MM = 0.02  # and by as much more: the residual of sound recordings with stamps of their own is 0.02 mm
 SAME_MM = 0.5  # hypotheses nearer to each other than this need not be told apart: the tip is known to as much
 LEVER_MM = 30.0
@@ -57,7 +59,6 @@ DELAYED_MM = 5.0  # at 100 mm/s the largest delay is this far; with a larger res
 MOST_SAMPLES = 6000  # evenly spread; more samples of one motion do not change the fit
 TRIED_SAMPLES = 1500  # all hypotheses are fitted to so many of them, the best one to all
 FEWEST_SAMPLES = 10
-PIECES = 8  # if the frame moved, each eighth of the recording may fit by itself
 MOVING_PIECES = 2  # and in so many of these it may have been moving
 STILL_SHARE = 0.05  # of a piece's own extent: a piece that hardly moves fits everything
 BEYOND_RAD, BEYOND_MM = 0.05, 5.0  # a measured joint may be this far beyond the limits with which its arm is driven
@@ -389,8 +390,7 @@ def _turn(poses: _Poses, rotation: Floats) -> float:
 
 def _decided(poses: _Poses, best: _Fit, fits: list[_Fit], stated: str | None) -> Identification:
     """Decide among the hypotheses, fitted to some samples, of which the first fits; `best` is fitted to all."""
-    least_mm = max(MARGIN * fits[0].residual_mm, fits[0].residual_mm + FLOOR_MM)
-    near = [fit for fit in fits if fit.is_good and fit.residual_mm < least_mm]
+    near = [fit for fit in fits if not _is_told_apart(fit, fits[0])]
     others = [fit for fit in fits if fit not in near]
     if poses.in_base and (moved := _beside_the_base(poses, best)) is not None:
         return moved
@@ -405,6 +405,17 @@ def _decided(poses: _Poses, best: _Fit, fits: list[_Fit], stated: str | None) ->
         reason = f"the motion is too small to tell {len(found.candidates)} instruments apart ({names})"
         return replace(found, verdict="undetermined", instrument=None, generation=None, reason=reason)
     return replace(found, reason=f"joints and poses fit {names}")
+
+
+def _is_told_apart(other: _Fit, best: _Fit) -> bool:
+    """Return whether a hypothesis explains the poses so much worse than the best one that it is not the right one."""
+    if not other.is_good:
+        return True
+    worse_mm = other.residual_mm - best.residual_mm
+    if worse_mm < FLOOR_MM:
+        return False
+    pieces = np.array_split(other.away_mm**2 - best.away_mm**2, PIECES)
+    return other.residual_mm >= MARGIN * best.residual_mm or all(piece.mean() > 0.0 for piece in pieces)
 
 
 def _matching(names: list[str], stated: str) -> list[str]:

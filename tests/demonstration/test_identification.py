@@ -150,6 +150,26 @@ def test_late_joints_are_told_and_do_not_hide_the_length_of_the_wrist(delay_s, i
     assert wrong.verdict == "wrong instrument"
 
 
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("in_base", [True, False])
+def test_a_recorder_at_30_hz_that_writes_the_last_it_has_is_sound_and_hides_no_wrist(seed, in_base):
+    rng = np.random.default_rng(seed)
+    seconds, phase = np.arange(900) / 30.0, rng.uniform(0, 2 * np.pi, 6)
+
+    def held():
+        times = seconds - rng.uniform(0.0, 0.033, 900)  # up to one sample old, joints and pose apart
+        moved = np.sin(np.array([0.3, 0.2, 0.25, 0.15, 0.35, 0.4]) * 2 * np.pi * times[:, None] + phase)
+        return np.array([0.1, 0.2, 140.0, 0.3, 0.1, -0.2]) + [0.1, 0.1, 20.0, 0.5, 0.5, 0.5] * moved
+
+    joints, (tip_mm, rotation) = held(), forward(held())
+    speeds = np.gradient(joints, 1 / 30.0, axis=0)
+    found = identify(joints, tip_mm, rotation, speeds=speeds, in_base=in_base, stated="400006")
+    assert (found.verdict, found.instrument) == ("identified", "400006"), found.reason
+    for wrong in ("400309", "400194", "400006-Si"):
+        again = identify(joints, tip_mm, rotation, speeds=speeds, in_base=in_base, stated=wrong)
+        assert again.verdict == "wrong instrument"
+
+
 def test_names_of_tools_are_read_as_the_console_writes_them():
     assert stated_instrument("LARGE_NEEDLE_DRIVER:400006") == "400006"
     assert stated_instrument("LARGE_NEEDLE_DRIVER:420006[..11]") == "420006"
