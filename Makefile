@@ -44,11 +44,14 @@ $(READY): requirements.lock pyproject.toml
 demo: $(READY)
 	@$(BIN)/python -m skills.demo
 
+# Types are checked beside the tests, which wait for processes now and then: a fifth of two processors is idle.
 test: $(READY)
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
-	@$(BIN)/mypy
-	@$(BIN)/python -m pytest
+	@$(BIN)/mypy > $(VENV)/types.txt 2>&1 & types=$$!; trap 'kill $$types 2>/dev/null' INT TERM; \
+	$(BIN)/python -m pytest; tests=$$?; \
+	wait $$types; types=$$?; cat $(VENV)/types.txt; \
+	[ $$tests -eq 0 ] && [ $$types -eq 0 ]
 
 serve: $(READY)
 	@$(BIN)/skills serve --samples

@@ -5,11 +5,13 @@ Both are copies of a template that is migrated once: a copied file, or CREATE DA
 
 import atexit
 import shutil
+import sqlite3
 import subprocess
 import tempfile
 import uuid
 import warnings
 from collections.abc import Callable
+from contextlib import closing
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -54,7 +56,22 @@ def drop(url: str) -> None:
 @cache
 def migrated_file() -> Path:
     """Return the file of a migrated database; it is created once in a run."""
-    return shared("template", lambda folder: _migrate(f"sqlite:///{folder / 'migrated.sqlite'}")) / "migrated.sqlite"
+    return template("migrated", _migrate)
+
+
+def template(name: str, fill: Callable[[str], None]) -> Path:
+    """Return a SQLite file to copy, which is created once in a run by a function of the URL of a new file.
+
+    SQLite copies what the function has written: the file alone lacks the rows that are still in its write-ahead log.
+    """
+
+    def make(folder: Path) -> None:
+        fill(f"sqlite:///{folder / 'filled.sqlite'}")
+        filled, copied = (sqlite3.connect(folder / f"{one}.sqlite") for one in ("filled", name))
+        with closing(filled), closing(copied):
+            filled.backup(copied)
+
+    return shared(f"template-{name}", make) / f"{name}.sqlite"
 
 
 @cache

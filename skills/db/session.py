@@ -37,6 +37,7 @@ from sqlalchemy.engine import ExceptionContext, make_url
 from sqlalchemy.engine.interfaces import DBAPIConnection
 from sqlalchemy.exc import ArgumentError, DatabaseError, DBAPIError, OperationalError, TimeoutError
 from sqlalchemy.orm import Session, sessionmaker
+from sqlalchemy.pool import ConnectionPoolEntry
 
 from skills.db.row_visibility import ONLY, Only
 from skills.errors import BadSettings, Busy, Conflict, Corrupt, DatabaseUnusable, SkillsError, StorageFull
@@ -149,11 +150,16 @@ class Database:
             connection.exec_driver_sql("PRAGMA wal_checkpoint(TRUNCATE)")
 
     def close(self) -> None:
-        """Close all connections."""
+        """Close all connections; one that a thread still uses is closed when the thread returns it."""
+        event.listen(self.engine.pool, "checkin", _close_returned)  # to a pool that nobody disposes of any more
         self.engine.dispose()
 
     def _in_words(self) -> AbstractContextManager[None]:
         return _in_words(self.engine.url)
+
+
+def _close_returned(_connection: DBAPIConnection | None, entry: ConnectionPoolEntry) -> None:
+    entry.close()
 
 
 @contextmanager

@@ -2,7 +2,6 @@
 
 import shutil
 from collections.abc import Iterator
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -44,11 +43,13 @@ def routes(service: Service) -> Iterator[tuple[str, str, list[Any]]]:
             yield method, str(route.path), list(getattr(route, "dependencies", None) or [])
 
 
-@cache
-def told_file() -> Path:
-    """Return a database in which kestrel has everything up to a playback with pictures, and heron a demonstration."""
-    folder = backends.migrated_file().parent
-    url = backends.fresh("sqlite", folder)
+def copy_of_told(folder: Path) -> str:
+    """Copy a database in which kestrel has everything up to a playback with pictures, and heron a demonstration."""
+    shutil.copy(backends.template("told", _tell), folder / "skills.sqlite")
+    return f"sqlite:///{folder / 'skills.sqlite'}"
+
+
+def _tell(url: str) -> None:
     with serving(url) as service:
         client = service.client
         client.put_surgeon("kestrel", skill_level="expert")
@@ -63,9 +64,3 @@ def told_file() -> Path:
         plan = client.plan(**KESTREL, suture_points=[{"position_mm": GOAL_MM}], handoff="none")
         client.play(plan["sha256"])
         service.work()
-    return Path(url.removeprefix("sqlite:///"))
-
-
-def copy_of_told(folder: Path) -> str:
-    shutil.copy(told_file(), folder / "skills.sqlite")
-    return f"sqlite:///{folder / 'skills.sqlite'}"

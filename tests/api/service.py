@@ -3,7 +3,6 @@
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -87,22 +86,18 @@ def serving(url: str, **settings: Any) -> Iterator[Service]:
         yield service
 
 
-@cache
-def trained_file() -> Path:
-    """Return a database in which kestrel's style is learnt and released; it is built once."""
-    folder = backends.migrated_file().parent
-    url = backends.fresh("sqlite", folder)
+def copy_of_trained(folder: Path) -> str:
+    """Copy a database in which kestrel's style is learnt and released; it is built once in a run."""
+    shutil.copy(backends.template("trained", _train), folder / "skills.sqlite")
+    return f"sqlite:///{folder / 'skills.sqlite'}"
+
+
+def _train(url: str) -> None:
     with serving(url) as service:
         service.client.put_surgeon("kestrel", skill_level="expert")
         service.client.add_demo(cases.hand_off(), media_type=CSV, **KESTREL)
         job = service.train(release=True)
         assert job["result"]["released"], job
-    return Path(url.removeprefix("sqlite:///"))
-
-
-def copy_of_trained(folder: Path) -> str:
-    shutil.copy(trained_file(), folder / "skills.sqlite")
-    return f"sqlite:///{folder / 'skills.sqlite'}"
 
 
 def assert_problem(answer: httpx.Response, status: int | range, kind: str | None = None) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable
-from datetime import timedelta
+from datetime import date, timedelta
 from pathlib import Path
 
 import httpx2 as httpx
@@ -10,7 +10,6 @@ import pytest
 
 from skills.api.authentication import REMEMBERED_S
 from skills.api.responses import NPZ
-from skills.db import now
 from skills.library import consent
 from tests import backends
 from tests.api.keyed import As, copy_of_told, key
@@ -48,10 +47,10 @@ def test_exports_need_export_consent_and_training_needs_training_consent(tmp_pat
 def test_expired_consent_stops_serving_without_a_database_change(
     backend: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    url = backends.fresh(backend, tmp_path)
+    url, last = backends.fresh(backend, tmp_path), date(2031, 3, 31)
+    monkeypatch.setattr(consent, "today", lambda: last)  # the test may go on past midnight
     with serving(url) as service:
         client, http = service.client, service.http
-        last = now().date()
         client.put_surgeon("kestrel", consent={"uses": ["training", "export"], "until": last.isoformat()})
         client.add_demo(cases.hand_off(), media_type=CSV, **KESTREL)
         digest = service.train(release=True)["result"]["sha256"]

@@ -51,6 +51,16 @@ def test_300_read_then_write_transactions_lose_nothing_and_never_fail(database: 
     assert count(database) == THREADS * TIMES
 
 
+def test_a_connection_in_use_when_its_database_is_closed_does_not_stay_open(database: Database):
+    """Otherwise it stays open until it is collected as garbage, and with SQLite the write-ahead log is not merged."""
+    with database.reading() as session:
+        used = session.connection().connection.dbapi_connection
+        database.close()
+        assert session.scalar(text("SELECT 1")) == 1
+    with pytest.raises(database.engine.dialect.loaded_dbapi.Error, match="closed"):
+        used.execute("SELECT 1")
+
+
 def test_a_block_that_raises_leaves_nothing(database: Database):
     add_counter(database)
 

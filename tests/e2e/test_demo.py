@@ -1,4 +1,4 @@
-"""`make demo`, as a new user runs it."""
+"""`make demo`: with two suture points by day, as a new user runs it at night."""
 
 import os
 import re
@@ -8,16 +8,24 @@ from pathlib import Path
 
 import pytest
 
+AS_IT_IS = ["-m", "skills.demo"]
+SHORT = ["-c", "from skills import demo; demo.N_POINTS = 2; raise SystemExit(demo.main())"]
+
 
 @pytest.mark.needs("simulator")
 @pytest.mark.parametrize(
-    "real", [False, pytest.param(True, marks=[pytest.mark.nightly, pytest.mark.needs("recordings")])]
+    ("how", "real"),
+    [
+        pytest.param(SHORT, False, id="two suture points"),
+        pytest.param(AS_IT_IS, False, marks=pytest.mark.nightly, id="five"),
+        pytest.param(AS_IT_IS, True, marks=[pytest.mark.nightly, pytest.mark.needs("recordings")], id="a recording"),
+    ],
 )
-def test_the_demo_does_the_main_job_and_exits_with_0(tmp_path: Path, real: bool) -> None:
+def test_the_demo_does_the_main_job_and_exits_with_0(tmp_path: Path, how: list[str], real: bool) -> None:
     environment = (
         os.environ | {"COLUMNS": "160", "SKILLS_WORKERS": "1"} | ({} if real else {"SKILLS_SAMPLE_RECORDINGS": ""})
     )
-    ended = subprocess.run([sys.executable, "-m", "skills.demo"], env=environment, cwd=tmp_path, capture_output=True)
+    ended = subprocess.run([sys.executable, *how], env=environment, cwd=tmp_path, capture_output=True)
     printed = ended.stdout.decode()
     assert ended.returncode == 0, printed + ended.stderr.decode()
     styles = re.findall(

@@ -90,9 +90,9 @@ def test_the_late_result_of_a_stopped_worker_changes_nothing(records: Records, t
                 continue
             until(partial(has_ended, records, job), PATIENCE_S)
             before = everything(records)
-            until(lambda job=job: told(tmp_path, job) == 1, PATIENCE_S)  # logged a little after the row has ended
+            until(partial(has_told, tmp_path, job, 1), PATIENCE_S)  # the line follows the commit of the job's end
             stopped.send_signal(signal.SIGCONT)
-            until(partial(both_told, tmp_path, job), PATIENCE_S)
+            until(partial(has_told, tmp_path, job, 2), PATIENCE_S)
             assert everything(records) == before
             assert records.state(job.row) == "succeeded"
             late += 1
@@ -114,8 +114,8 @@ def stopped_in_the_middle(records: Records, started: dict[int, Worker], job: Job
     return worker
 
 
-def both_told(folder: Path, job: Job) -> bool:
-    return told(folder, job) == 2
+def has_told(folder: Path, job: Job, attempts: int) -> bool:
+    return told(folder, job) == attempts
 
 
 def has_ended(records: Records, job: Job) -> bool:

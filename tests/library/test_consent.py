@@ -7,7 +7,6 @@ from typing import Any
 import pytest
 from sqlalchemy import select
 
-from skills.db import now
 from skills.db.models import Release
 from skills.db.service_tables import Event
 from skills.db.session import Database
@@ -23,7 +22,13 @@ from tests.library.styles import add_styles, ask_retraining, counted, parts_of, 
 
 ALL = {"uses": ["training", "export", "atlas"], "until": None}
 NO_TRAINING = {"uses": ["export", "atlas"], "until": None}
-TODAY = now().date()
+TODAY = date(2031, 3, 31)
+
+
+@pytest.fixture(autouse=True)
+def on_one_day(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let it be the same day in every test: a run, or a test, may go on past midnight."""
+    monkeypatch.setattr(consent, "today", lambda: TODAY)
 
 
 def agree(database: Database, to: dict[str, Any] | None, surgeon: str = "kestrel") -> None:
