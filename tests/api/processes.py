@@ -13,8 +13,9 @@ from skills.serving import environment
 from skills.settings import Settings
 from tests.api.service import CSV, KESTREL, serving
 from tests.library import cases
+from tests.waiting import END_S
 
-PATIENCE_S = 180.0  # a server starts slowly on a busy machine
+PATIENCE_S = END_S
 
 
 @contextmanager

@@ -224,15 +224,15 @@ def test_erased_policies_leave_all_processes_memory_without_a_request(backend: s
         assert sha256 in integrity.remembered()
         other.client.erase_surgeon("kestrel")
         assert_problem(service.http.get(f"/policy-versions/{sha256}"), 404)
-        until(lambda: gc.collect() >= 0 and not any(body() for body in bodies), 20)
-        until(lambda: sha256 not in integrity.remembered(), 20)
+        until(lambda: gc.collect() >= 0 and not any(body() for body in bodies))
+        until(lambda: sha256 not in integrity.remembered())
         assert_problem(service.http.get(POLICY), 410)
     backends.drop(url)
 
 
 def seeing(service: Service) -> None:
     """Wait until a service receives the changes of its database."""
-    until(lambda: version(service) is not None, 20)
+    until(lambda: version(service) is not None)
 
 
 def version(service: Service) -> int | None:
@@ -426,5 +426,5 @@ def test_whatever_changes_what_is_served_is_told_on_postgresql(tmp_path: Path):
         ):
             before = version(service)
             work()
-            until(lambda before=before: version(service) not in (None, before), 20)
+            until(lambda before=before: version(service) not in (None, before))
     backends.drop(url)

@@ -15,7 +15,7 @@ import pytest
 from skills.client import AsyncClient, Client, JobFailed, JobTakesLonger, NotReached, Problem, Retrying
 from skills.schemas.given import Job
 from tests.client.peers import BOTH, Script, Time, answer, refusal
-from tests.waiting import crowded
+from tests.waiting import END_S, crowded
 
 ID = "0123456789abcdef"
 AGAIN = Retrying(attempts=2, first_s=0.01)
@@ -115,7 +115,7 @@ def test_every_change_is_told_once_as_it_comes(talker: Talker, wait):
         say(event(RUNNING))
         say(b": a sign of life\n\n")
         say(event(HALF))
-        assert half.wait(30), "the next is not sent before this was heard"
+        assert half.wait(END_S), "the next is not sent before this was heard"
         say(event(DONE))
 
     talker.tell = tell

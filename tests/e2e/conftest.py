@@ -19,10 +19,10 @@ WORKER, FORK_SERVER = "skills.jobs.worker", "skills.sandbox.fork_server"
 REPLACED = 2  # workers that may die while a service starts, as where its database is not yet reachable
 
 
-def answers(client: Client) -> bool:
-    """Return whether a starting service is ready."""
+def answers(client: Client, path: str) -> bool:
+    """Return whether a starting service answers a request for a path with success."""
     try:
-        return client.http.get("/readyz").is_success
+        return client.http.get(path).is_success
     except httpx.TransportError:
         return False
 
@@ -50,13 +50,14 @@ class Service:
 
     def start(self) -> None:
         self.launch()
+        path = "/healthz" if self.environment["SKILLS_WORKERS"] == "0" else "/readyz"  # ready only with a worker
         workers: set[int] = set()
 
         def ready() -> bool:
             with suppress(OSError):  # a thread or a child may end while it is looked at
                 workers.update(self.children(WORKER))
             assert len(workers) <= int(self.environment["SKILLS_WORKERS"]) + REPLACED, "its workers die at their start"
-            return answers(client)
+            return answers(client, path)
 
         with Client(self.url) as client:
             until(ready, by=[self.process])

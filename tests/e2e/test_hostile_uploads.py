@@ -39,7 +39,7 @@ QUICK_BOMBS = [
 
 @pytest.fixture(scope="module")
 def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
-    with running(tmp_path_factory.mktemp("hostile")) as service, Client(service.url) as client:
+    with running(tmp_path_factory.mktemp("hostile"), workers=0) as service, Client(service.url) as client:
         client.put_surgeon("kestrel")
         yield service
 

@@ -23,7 +23,7 @@ from tests.waiting import END_S
 def installation(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[Service, Database]]:
     """Yield a service, and its database in this process."""
     url = backends.fresh(request.param, tmp_path)
-    with running(tmp_path, database_url=url, workers=1) as service, closing(Database(url)) as database:
+    with running(tmp_path, database_url=url, workers=0) as service, closing(Database(url)) as database:
         yield service, database
     backends.drop(url)
 

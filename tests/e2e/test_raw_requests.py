@@ -24,8 +24,8 @@ TABLE = cases.hand_off()
 
 @pytest.fixture(scope="module")
 def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
-    folder = tmp_path_factory.mktemp("raw")
-    with running(folder, max_upload_bytes=LIMIT, upload_patience_s=PATIENCE_S, upload_bytes_per_s=100_000) as service:
+    limits = {"max_upload_bytes": LIMIT, "upload_patience_s": PATIENCE_S, "upload_bytes_per_s": 100_000}
+    with running(tmp_path_factory.mktemp("raw"), workers=0, **limits) as service:
         yield service
 
 

@@ -12,6 +12,7 @@ from skills.errors import SkillsError
 from skills.formats.mcap.recording import read_mcap
 from skills.gridworld.grid import discretize, fit_grid
 from tests.measured import peak_mib
+from tests.waiting import END_S
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,7 @@ class Weight:
 def weigh(file: Path) -> Weight:
     """Read a file in a separate process."""
     command = [sys.executable, "-m", "tests.formats.weigh", str(file)]
-    done = subprocess.run(command, cwd=Path(__file__).parents[2], stdout=subprocess.PIPE, check=True, timeout=120)
+    done = subprocess.run(command, cwd=Path(__file__).parents[2], stdout=subprocess.PIPE, check=True, timeout=END_S)
     return Weight(**json.loads(done.stdout))
 
 

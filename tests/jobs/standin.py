@@ -23,6 +23,8 @@ def perform(database: Database, row: int, attempt: int, settings: Settings) -> N
     if job.kind == "broken":
         raise RuntimeError("no such file: /srv/secret/surgeon-7.mcap")
     time.sleep(job.request.get("seconds", 0.0))
+    while "held_by" in job.request and Path(job.request["held_by"]).exists():
+        time.sleep(0.02)
     with database.writing() as session:
         mine = (Job.row == row, Job.state == "running", Job.attempt == attempt)
         ended = {"state": "succeeded", "result": {"by": os.getpid()}}

@@ -6,6 +6,8 @@ import sys
 
 import pytest
 
+from tests.waiting import END_S
+
 CODE = """
 import resource, sys
 import numpy as np
@@ -23,7 +25,7 @@ print(kept, resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="a C library other than glibc")
 def test_arrays_of_megabytes_cost_no_pages_the_second_time():
-    run = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True, check=True, timeout=60)
+    run = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True, check=True, timeout=END_S)
     kept, faults = run.stdout.split()
     a_pass = 50 * 4 * 400_000 * 8 // resource.getpagesize()
     assert kept == "True"

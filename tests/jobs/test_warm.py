@@ -13,6 +13,7 @@ from skills.formats.mcap._kernels import follow_compiled
 from skills.learning._kernels import warp_compiled
 from tests.api.processes import free_port
 from tests.learning.test_kernel_cache import start, told
+from tests.waiting import END_S
 
 WARM = """
 from threading import enumerate as threads
@@ -114,7 +115,7 @@ def test_no_command_starts_with_a_world_writable_machine_code_cache(tmp_path, co
         "SKILLS_DATABASE_URL": f"sqlite:///{tmp_path / 'skills.sqlite'}",
     }
     run = [sys.executable, "-m", "skills", command]
-    refused = subprocess.run(run, env={**os.environ, **environment}, capture_output=True, text=True, timeout=60)
+    refused = subprocess.run(run, env={**os.environ, **environment}, capture_output=True, text=True, timeout=END_S)
     assert refused.returncode == 1
     assert refused.stderr.startswith("Machine code is loaded from")
     assert list(tmp_path.iterdir()) == [open_to_all]
@@ -125,7 +126,7 @@ def test_a_running_server_exits_if_its_compiled_loops_would_be_refused(tmp_path)
     environment = {"NUMBA_CACHE_DIR": "/dev/null/cache", "SKILLS_DATABASE_URL": f"sqlite:///{tmp_path / 'a.sqlite'}"}
     environment |= {"SKILLS_PORT": str(free_port())}
     run = [sys.executable, "-m", "skills", "serve"]
-    ended = subprocess.run(run, env={**os.environ, **environment}, capture_output=True, text=True, timeout=60)
+    ended = subprocess.run(run, env={**os.environ, **environment}, capture_output=True, text=True, timeout=END_S)
     assert ended.returncode == 1
     assert "NUMBA_CACHE_DIR=/dev/null/cache is not writable" in ended.stderr
 

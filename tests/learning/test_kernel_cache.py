@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 import skills
+from tests.waiting import END_S
 
 PROJECT = Path(skills.__file__).parents[1]
 NOWHERE = "/dev/null"  # as a folder: nothing can be created in it, not even by root
@@ -50,7 +51,7 @@ def start(code: str, installed: Path = PROJECT, home: str = NOWHERE, **environme
 
 def told(process: subprocess.Popen[str]) -> dict:
     """Wait for a process, and return its output."""
-    out, err = process.communicate(timeout=120)
+    out, err = process.communicate(timeout=END_S)
     assert process.returncode == 0, err
     return {**json.loads(out), "logged": err}
 

@@ -1,7 +1,5 @@
 """Workers shared by key: one is reserved for other keys, and waiting callers are served round-robin."""
 
-import time
-from collections.abc import Callable
 from contextlib import ExitStack
 from threading import Event, Thread
 
@@ -9,6 +7,7 @@ import pytest
 
 from skills.errors import Busy
 from skills.sandbox.forked import Turns
+from tests.waiting import END_S, until
 
 
 class Work:
@@ -27,7 +26,7 @@ class Work:
         def work() -> None:
             with self.turns.turn(key):
                 self.begun.append(name)
-                self.ends[name].wait(10)
+                self.ends[name].wait(END_S)
 
         before = self.turns.asked
         self.threads.append(Thread(target=work, daemon=True))
@@ -42,13 +41,6 @@ class Work:
     def has_begun(self, *names: str) -> None:
         until(lambda: len(self.begun) >= len(names))
         assert self.begun == [*names]
-
-
-def until(so: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + 10
-    while not so():
-        assert time.monotonic() < deadline
-        time.sleep(0.001)
 
 
 def test_one_key_leaves_a_worker_to_the_others():
