@@ -77,25 +77,27 @@ def test_a_key_watches_so_many_jobs_at_once(asked: tuple[Service, str, str]):
             one.close()
 
 
-def looks_of(service: Service, http: httpx.Client, path: str, watchers: int, seconds: float) -> int:
-    """Count a service's transactions while a number of clients watch a job."""
+def looks_of(service: Service, http: httpx.Client, path: str, watchers: int, seconds: float) -> tuple[int, float]:
+    """Count a service's transactions while a number of clients watch a job; return also for how many seconds."""
     streams = [http.send(http.build_request("GET", path), stream=True) for _ in range(watchers)]
     begun: list[object] = []
     count = begun.append
     event.listen(service.database.engine, "begin", count)
+    since = time.monotonic()
     time.sleep(seconds)
+    counted, lasted_s = len(begun), time.monotonic() - since  # on a busy machine it sleeps longer
     event.remove(service.database.engine, "begin", count)
     for one in streams:
         one.close()
-    return len(begun)
+    return counted, lasted_s
 
 
 def test_fifty_watchers_cost_no_more_looks_than_one(asked: tuple[Service, str, str]):
     service, address, path = asked
     limits = httpx.Limits(max_connections=None)
     with httpx.Client(base_url=address, timeout=PATIENCE_S, limits=limits) as http:
-        looks = looks_of(service, http, path, 50, 2.0)
-    assert looks <= 15, looks  # ten from watching on PostgreSQL, and the sweep of the cache
+        looks, lasted_s = looks_of(service, http, path, 50, 2.0)
+    assert looks <= 7.5 * lasted_s, looks  # five a second from watching on PostgreSQL, and the sweep of the cache
 
 
 def test_a_change_is_told_to_all_who_watch(asked: tuple[Service, str, str]):
