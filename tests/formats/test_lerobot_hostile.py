@@ -11,12 +11,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from skills.sandbox.limits import ProcessLimits
 
 from skills.demonstration.recording import Recording
 from skills.errors import SkillsError, UnreadableRecording
 from skills.formats import read_recording
 from skills.formats.reader_process import ConfinedReader
+from skills.sandbox import ProcessLimits
 from tests.formats import lerobots
 from tests.formats.lerobots import columns_of, episode, packed, parquet, poses
 from tests.formats.others import damaged, zipped

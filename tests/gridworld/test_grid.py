@@ -5,7 +5,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from skills.gridworld.path_report import discretisation_rmse
 
 from skills.errors import BadInput, BadPath, BadSettings, EmptyPath, NeverLeavesGoal, OutsideGrid
 from skills.gridworld.grid import (
