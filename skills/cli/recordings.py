@@ -109,8 +109,8 @@ def erase(
 
 if TYPE_CHECKING:
     from skills.client import Progress
+    from skills.formats.lerobot import Dataset
     from skills.formats.lerobot.cut import Episode
-    from skills.formats.lerobot.dataset import Dataset
     from skills.schemas.given import Demonstration, Recording, RecordingPreview
 
     Part = Literal["whole"] | int | None

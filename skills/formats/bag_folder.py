@@ -41,7 +41,7 @@ from skills.errors import MixedFrames, NoUsableTopic, UnknownFormat, UnreadableR
 from skills.formats import jigsaws
 from skills.formats.annotations import read_labels
 from skills.formats.archive import Archive, refusing, shown
-from skills.formats.lerobot.dataset import is_shadow, root_of
+from skills.formats.lerobot import is_shadow, root_of
 from skills.formats.lerobot.recording import read_episode
 from skills.formats.mcap.recording import NeedsRosbags, read_mcap
 from skills.formats.rosbag import Suffix, read_rosbag

@@ -34,7 +34,7 @@ from skills.formats.annotations import read_labels
 from skills.formats.archive import pack
 from skills.formats.bag_folder import METADATA, TAGS_BYTES, check_counts, in_order, read_metadata, suffix_of, unzstd
 from skills.formats.jigsaws import trials
-from skills.formats.lerobot.dataset import INFO
+from skills.formats.lerobot import INFO
 from skills.formats.mcap.reader import NOTES
 from skills.formats.mcap.recording import MAGIC
 from skills.formats.mcap.records import RECOVER

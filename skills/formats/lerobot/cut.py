@@ -19,7 +19,7 @@ from typing import IO, Any, BinaryIO
 
 from skills.errors import BadInput, UnreadableRecording
 from skills.formats.archive import MAGIC, Archive, pack, refusing
-from skills.formats.lerobot.dataset import INFO, SAID, TASK_LINES, Dataset, Json, read_dataset, root_of
+from skills.formats.lerobot import INFO, SAID, TASK_LINES, Dataset, Json, read_dataset, root_of
 from skills.formats.lerobot.parquet import open_parquet, read_rows
 from skills.formats.lerobot.recording import several_episodes
 

@@ -24,7 +24,7 @@ import numpy as np
 from skills.arrays import Floats, Ints
 from skills.demonstration.recording import Joints, Motion, Recording, Signal, Topic, recorded_motion
 from skills.errors import BackwardStamps, BadColumns, MixedFrames, NotFinite, NoUsableTopic, UnreadableRecording
-from skills.formats.lerobot.dataset import INFO, NUMBERS, SAID, VERSIONS, Dataset, Feature, Files, read_dataset
+from skills.formats.lerobot import INFO, NUMBERS, SAID, VERSIONS, Dataset, Feature, Files, read_dataset
 from skills.formats.lerobot.parquet import Table, printable, read_columns
 from skills.formats.tables import BASE, check_outside
 from skills.kinematics import INSERTION, INSTRUMENTS, forward, quaternion_of

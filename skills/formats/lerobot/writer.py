@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from skills.arrays import Floats, Ints
 from skills.demonstration.recording import Motion, Recording, Signal
 from skills.errors import BadInput, MixedFrames, NoUsableTopic, UnreadableRecording
-from skills.formats.lerobot.dataset import INFO, SAID, TASK_LINES, TASK_TABLE, Json
+from skills.formats.lerobot import INFO, SAID, TASK_LINES, TASK_TABLE, Json
 
 Version = Literal["v2.1", "v3.0"]
 Split = Literal["train", "val", "test", "recovery", "failure"]
