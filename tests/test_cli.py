@@ -183,6 +183,8 @@ def test_a_failure_is_marked_listed_and_learnt_from_on_request(skills, tmp_path:
     assert (code, "learn from it all the same: --outcomes any" in said) == (1, True)
     code, said = skills("train", *style, "--outcomes", "any", "--json")
     assert (code, json.loads(said)["request"]["outcomes"]) == (0, "any")
+    said = skills("erasures", str(tmp_path / "erasures.json"))[1]
+    assert "1 demonstrations marked recovery or failure." in " ".join(said.split())
     code, said = skills(*add, "--outcome", "success")
     assert (code, f"skills demo mark {demo['id']} success" in said.replace("\n", "")) == (1, True), said
     assert skills("demo", "mark", demo["id"], "success") == (0, "marked success\n")

@@ -29,6 +29,7 @@ _LISTED = {
     "withdrawn": "demonstrations withdrawn",
     "releases": "policies no longer served",
     "keys": "keys revoked",
+    "failed": "demonstrations marked recovery or failure",
 }
 
 
@@ -145,9 +146,9 @@ def restore(
     if not sources:
         err.print(
             f"NO LIST OF ERASURES: surgeons who were erased after {taken} ARE BACK, policies that were withdrawn "
-            "or superseded since ARE SERVED, revoked keys ARE VALID and withdrawn consent IS IN FORCE. Restore "
-            "into an empty database with --erasures, or erase, withdraw and revoke all of this again before you "
-            "use this database.",
+            "or superseded since ARE SERVED, demonstrations that were marked failure since ARE LEARNT FROM, revoked "
+            "keys ARE VALID and withdrawn consent IS IN FORCE. Restore into an empty database with --erasures, or "
+            "erase, withdraw, mark and revoke all of this again before you use this database.",
             style="red",
         )
 
@@ -167,6 +168,7 @@ def erasures(
         listed = keep_erasures(database, to)
     surgeons, demos = len(listed.surgeons), len(listed.demos)
     others = {kind: len(names) for kind, names in listed.ended.items() if kind != "demonstrations"}
+    others["failed"] = sum(outcome != "success" for _, outcome in listed.outcomes.values())
     more = ", ".join(f"{count} {_LISTED[kind]}" for kind, count in others.items())
     sentence = f"{to}: {surgeons} surgeons and {demos} demonstrations erased, {more}."
     _say(sentence, as_json, file=to, surgeons=surgeons, demos=demos, **others)
