@@ -277,7 +277,7 @@ def test_episodes_of_a_lerobot_dataset_are_recordings_of_their_own(skills, tmp_p
     assert len({one["recording"] for one in stored}) == 3
     code, said = skills("recording", "add", folder, "--episode", "all", "--json")
     assert code == 1
-    assert all("--frame NAME" in one["problem"] for one in json.loads(said))
+    assert all("--frame ECM" in one["problem"] for one in json.loads(said))
     code, said = skills(*add, "--episode", "7")
     assert (code, "0 to 2" in said) == (1, True)
 
