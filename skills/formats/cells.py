@@ -1,6 +1,6 @@
 """The text of a table as columns of numbers: separators, decimal marks and exact times.
 
-    bytes --open_text, header_of--> names of the columns --read_numbers--> Numbers
+    bytes --open_text, header_of--> names of the columns --read_numbers--> ParsedNumbers
 
 Cells are separated by commas, semicolons or tabs; the header says by which. A decimal comma is only read where the
 caller says so, because a comma in a number may as well group thousands. `np.float64(0.5)`, which some recorders write,
@@ -45,7 +45,7 @@ _FIRST_ROW = 2  # the header is row 1
 
 
 @dataclass(frozen=True)
-class Numbers:
+class ParsedNumbers:
     """The numbers of the columns that are used, shape (T, columns), and exact stamps where one of them has times."""
 
     values: Floats
@@ -139,7 +139,7 @@ def read_numbers(
     separator: str = ",",
     decimal: Decimals = "point",
     time: tuple[int, str] | None = None,
-) -> Numbers:
+) -> ParsedNumbers:
     """Read the rows of a table below its header.
 
     Args:
@@ -172,7 +172,7 @@ class _NotPlain(Exception):
 
 def _plain_numbers(
     text: TextIO, columns: int, used: Sequence[int], separator: str, decimal: Decimals, time: tuple[int, str] | None
-) -> Numbers | None:
+) -> ParsedNumbers | None:
     """Read a table whose rows are plain with numpy's parser, in a third of the time; None for any other table.
 
     Numpy accepts no number that Python does not, control characters aside, and then the same one. Arguments are those
@@ -187,7 +187,7 @@ def _plain_numbers(
         values = np.loadtxt(chain([first], rows), delimiter=separator, usecols=used, comments=None, ndmin=2)
     except (ValueError, ArithmeticError, _NotPlain):  # the reason is found by `_any_numbers`
         return None
-    return Numbers(values, None if time is None else np.frombuffer(stamps_ns, dtype=np.int64))
+    return ParsedNumbers(values, None if time is None else np.frombuffer(stamps_ns, dtype=np.int64))
 
 
 def _plain_rows(
@@ -232,7 +232,7 @@ def _any_numbers(
     separator: str,
     decimal: Decimals,
     time: tuple[int, str] | None,
-) -> Numbers:
+) -> ParsedNumbers:
     """Read the rows one by one; arguments and errors are those of `read_numbers`."""
     rows = csv_rows(text, first_line=_FIRST_ROW, separator=separator)
     cells, stamps_ns, count, blank_line = array("d"), array("q"), 0, 0
@@ -261,7 +261,7 @@ def _any_numbers(
     if not count:
         raise UnreadableRecording("The table has a header and no rows.")
     values = np.frombuffer(cells).reshape(count, len(used))
-    return Numbers(values, None if time is None else np.frombuffer(stamps_ns, dtype=np.int64))
+    return ParsedNumbers(values, None if time is None else np.frombuffer(stamps_ns, dtype=np.int64))
 
 
 def is_number(cell: str) -> bool:

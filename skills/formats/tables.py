@@ -115,7 +115,7 @@ _OTHERS_OF_CALIBRATIONS = re.compile(r"traj_index|(marker|setpoint)_\w+")
 
 @dataclass(frozen=True)
 class TableReading:
-    """What the caller says about a table, as far as the table does not say it.
+    """Statements about a table that the table itself does not make.
 
     Attributes:
         rate_hz: Samples per second, for a table without times.

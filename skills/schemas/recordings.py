@@ -192,7 +192,7 @@ class PreviewedQuality:
 
 
 class RecordingPreview(Described):
-    """What would be understood of a raw file; nothing of it is stored."""
+    """The content of a raw file as it would be read; nothing of it is stored."""
 
     timed: bool = Field(description="Whether the samples have times; a table without them is stored only with a rate.")
     duration_s: float | None

@@ -166,7 +166,7 @@ class DemoIn(Schema):
 
 
 class OutcomeIn(Schema):
-    """What became of a demonstration's hand-off, and why."""
+    """The outcome of a demonstration's hand-off, and its reason."""
 
     model_config = shown({"outcome": "failure", "reason": "The needle fell."}, {"outcome": "success"})
 
@@ -185,7 +185,7 @@ def _require_reason(outcome: DemoOutcome | None, reason: str | None) -> None:
 
 
 class Reading(Schema):
-    """What an upload says about a recording, as far as the recording does not say it."""
+    """Statements about a recording that the recording itself does not make."""
 
     rate_hz: Annotated[float, Field(gt=0, le=10_000)] | None = Field(
         default=None, description="Samples per second, of a table without times."
@@ -203,8 +203,8 @@ class Reading(Schema):
         return {"rate_hz": self.rate_hz, "frame": self.frame, **given}
 
 
-class TableReading(Reading):
-    """What an upload says about a table (docs/tables.md)."""
+class TableIn(Reading):
+    """Statements about a table (docs/tables.md)."""
 
     column: Annotated[list[Annotated[str, Field(max_length=200, pattern=LINE)]], Field(max_length=30)] | None = Field(
         default=None, description="A table's columns under other names, each as x_mm=NAME, or x=NAME with a unit."

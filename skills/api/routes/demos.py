@@ -38,7 +38,7 @@ from skills.library.demos import demo_json, path_json, reward_map_json
 from skills.library.recordings import recording_json
 from skills.schemas import OutcomeAsked
 from skills.schemas.given import Atlas, Demonstration, DemoPath, Page, Recording, RecordingPreview, RewardMap, Score
-from skills.schemas.requests import COUNT, DIGEST, SLUG, DemoIn, OutcomeIn, ScoreIn, SlugField, TableReading
+from skills.schemas.requests import COUNT, DIGEST, SLUG, DemoIn, OutcomeIn, ScoreIn, SlugField, TableIn
 from skills.settings import MEBIBYTE
 
 uploads = APIRouter(tags=["demonstrations"])
@@ -60,7 +60,7 @@ AskedDemo = Annotated[
 ]
 
 
-class RecordingQuery(TableReading):
+class RecordingQuery(TableIn):
     """Query parameters of an upload of a recording, with what a table or a LeRobot episode leaves open."""
 
     surgeon: SlugField | None = Field(
@@ -68,7 +68,7 @@ class RecordingQuery(TableReading):
     )
 
 
-class DemoUpload(DemoIn, TableReading):
+class DemoUpload(DemoIn, TableIn):
     """Query parameters of an upload of a demonstration: `DemoIn`, and what a table or a LeRobot episode leaves open."""
 
 
@@ -84,7 +84,7 @@ def add_recording(
 
 
 @uploads.post("/recordings/preview", dependencies=[needs("uploader")], openapi_extra=RAW_BODY, **says(RecordingPreview))
-def preview_recording(upload: Incoming, asked: Annotated[TableReading, Query()], read: Tell) -> Response:
+def preview_recording(upload: Incoming, asked: Annotated[TableIn, Query()], read: Tell) -> Response:
     """Read a recording and return what would be understood of it, a table's columns included; nothing is stored."""
     return say(recordings.preview(upload.read_as(asked.said), read))
 

@@ -25,7 +25,7 @@ from typing import Any, BinaryIO, Protocol
 
 from skills.errors import UnreadableRecording
 from skills.formats.archive import shown
-from skills.formats.lerobot.parquet import Column, open_parquet, printable, read_rows
+from skills.formats.lerobot.parquet import ParquetColumn, open_parquet, printable, read_rows
 
 INFO, SAID, TASK_LINES, TASK_TABLE = (
     *("meta/info.json", "meta/suture-skills.json"),
@@ -83,9 +83,9 @@ class Feature:
         return self.dtype in ("image", "video")
 
     @property
-    def column(self) -> Column:
+    def column(self) -> ParquetColumn:
         """Its column in the data."""
-        return Column(self.name, self.width, self.is_text)
+        return ParquetColumn(self.name, self.width, self.is_text)
 
     def called(self, index: int) -> list[str]:
         """Return the names by which one of its values can be meant, its own first."""

@@ -58,7 +58,7 @@ class Folder:
 
 @dataclass(frozen=True)
 class Episode:
-    """Where an episode is: the file, its first row in it and its number of rows; None: the whole file."""
+    """The place of an episode: the file, its first row in it and its number of rows; None: the whole file."""
 
     number: int
     file: str

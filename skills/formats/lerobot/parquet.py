@@ -26,7 +26,7 @@ _WHAT, _ADVICE = "A Parquet file of the dataset", "Copy the dataset again."
 
 
 @dataclass(frozen=True)
-class Column:
+class ParquetColumn:
     """A column: `width` numbers or texts in every row."""
 
     name: str
@@ -35,7 +35,7 @@ class Column:
 
 
 @dataclass(frozen=True, eq=False)
-class Table:
+class ParquetTable:
     """Columns of a file.
 
     Attributes:
@@ -79,7 +79,7 @@ def open_parquet(file: BinaryIO) -> Any:
         )
 
 
-def read_columns(file: BinaryIO, columns: Sequence[Column], *, most_rows: int = ROWS) -> Table:
+def read_columns(file: BinaryIO, columns: Sequence[ParquetColumn], *, most_rows: int = ROWS) -> ParquetTable:
     """Read some columns of a file.
 
     Args:
@@ -113,7 +113,7 @@ def read_columns(file: BinaryIO, columns: Sequence[Column], *, most_rows: int = 
             at = end
     if at != rows:
         raise UnreadableRecording(f"{_WHAT} has {at} rows and claims {rows}. {_ADVICE}")
-    return Table(rows, numbers, texts, frozenset(single))
+    return ParquetTable(rows, numbers, texts, frozenset(single))
 
 
 def read_rows(file: BinaryIO, names: Sequence[str], *, most_rows: int) -> list[dict[str, Any]]:
@@ -164,7 +164,7 @@ def _is_below(path: str, names: Collection[str]) -> bool:
     return any(path == name or path.startswith(f"{name}.") for name in names)
 
 
-def _flat(values: Any, column: Column) -> Any:
+def _flat(values: Any, column: ParquetColumn) -> Any:
     """Return a column of a batch as an array, shape (rows, width).
 
     Raises:

@@ -25,7 +25,7 @@ from skills.arrays import Floats, Ints
 from skills.demonstration.recording import Joints, Motion, Recording, Signal, Topic, recorded_motion
 from skills.errors import BackwardStamps, BadColumns, MixedFrames, NotFinite, NoUsableTopic, UnreadableRecording
 from skills.formats.lerobot import INFO, NUMBERS, SAID, VERSIONS, Dataset, Feature, Files, read_dataset
-from skills.formats.lerobot.parquet import Table, printable, read_columns
+from skills.formats.lerobot.parquet import ParquetTable, printable, read_columns
 from skills.formats.tables import BASE, check_outside
 from skills.kinematics import INSERTION, INSTRUMENTS, forward, quaternion_of
 from skills.remedies import Action, Remedy, did_you_mean
@@ -132,7 +132,7 @@ def several_episodes(episodes: int) -> UnreadableRecording:
     )
 
 
-def _check_one_episode(dataset: Dataset, table: Table) -> None:
+def _check_one_episode(dataset: Dataset, table: ParquetTable) -> None:
     if not table.rows:
         raise UnreadableRecording("The episode has no frames.")
     numbers = table.column("episode_index")
@@ -347,7 +347,7 @@ def _arms_of_tools(feature: Feature) -> list[str | None]:
     return arms if feature.is_text and feature.name.startswith("observation.meta.tool") and any(arms) else []
 
 
-def _tools(dataset: Dataset, table: Table) -> dict[str, str]:
+def _tools(dataset: Dataset, table: ParquetTable) -> dict[str, str]:
     """Return the tool of each arm: as `tools` of our own file states it, or else as the dataset names it.
 
     Raises:
@@ -381,7 +381,7 @@ def _number(tool: str) -> str | None:
     return found[1] if found is not None and found[1] in INSTRUMENTS else None
 
 
-def _notes(dataset: Dataset, table: Table) -> list[tuple[str, str]]:
+def _notes(dataset: Dataset, table: ParquetTable) -> list[tuple[str, str]]:
     """Return the version, the robot, the episode's number and split, and its tasks."""
     version = dataset.said.get("cut from", dataset.version)
     notes = [("dataset", f"LeRobot {version if version in VERSIONS else dataset.version}")]
@@ -399,7 +399,7 @@ def _notes(dataset: Dataset, table: Table) -> list[tuple[str, str]]:
 # ---- stamps --------------------------------------------------------------------------------------------------------
 
 
-def _stamps_ns(dataset: Dataset, table: Table) -> tuple[Ints, str]:
+def _stamps_ns(dataset: Dataset, table: ParquetTable) -> tuple[Ints, str]:
     """Return the stamps of the frames, shape (T,), and their source in words.
 
     The source is, in this order: the recorder's clock; timestamps in double precision; a frame's number divided by
