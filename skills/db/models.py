@@ -288,7 +288,7 @@ class PolicyVersion(Base):
 
     @property
     def objections(self) -> list[str]:
-        """The change of a demonstration since the training that forbids a release: "was withdrawn" or "was marked failure"."""
+        """The change of a demonstration that forbids a release: "was withdrawn" or "was marked failure"."""
         demos = self.demonstrations
         withdrawn = ["was withdrawn"] if any(one.withdrawn_at is not None for one in demos) else []
         marked = set() if self.of_any_outcome else {f"was marked {one.outcome}" for one in demos if one.failed}
