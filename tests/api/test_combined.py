@@ -65,7 +65,7 @@ def test_withdrawing_one_of_them_takes_the_policy_away(trained: Service):
 
 @pytest.mark.parametrize(
     ("combine", "why"),
-    [({"kind": "mean"}, "kind"), ({"kind": "medoid", "rounds": 3}, "no such field"), ("medoid", "combine")],
+    [({"kind": "mean"}, "kind"), ({"kind": "medoid", "rounds": 3}, "has an unknown field"), ("medoid", "combine")],
 )
 def test_a_way_of_combining_that_there_is_not_is_refused(trained: Service, combine, why):
     answer = trained.http.post("/trainings", json=KESTREL | {"demos": demos_of(trained), "combine": combine})

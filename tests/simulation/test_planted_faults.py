@@ -22,7 +22,7 @@ from skills.library.playbacks import find_playback, request_playback, standing_o
 from skills.packing import canonical
 from skills.planning.handoff import OtherArm
 from skills.planning.trajectory import A1, PassPath, Trajectory, time_parametrise
-from skills.schemas.requests import DemoIn
+from skills.schemas.requests import DemoIn, Reading
 from skills.settings import Settings
 from skills.simulation.player import play
 from skills.verification.verdict import Limits, PlaybackReport, judge
@@ -224,7 +224,7 @@ def test_a_plan_in_another_frame_than_the_arms_base_is_refused(databases):
     database, _ = databases
     upload_demo(
         database,
-        cases.upload(cases.hand_off((5.0, 0.0, 0.0)), frame="ECM"),
+        cases.upload(cases.hand_off((5.0, 0.0, 0.0)), reading=Reading(frame="ECM").said),
         DemoIn(surgeon="kestrel", suture=cases.SUTURE),
         "test",
     )
