@@ -322,6 +322,7 @@ def recording_preview(
         out.print(f"{where}: {motion.samples} samples{rate}; {extent}", markup=False, soft_wrap=True)
     for left in seen.left_out:
         out.print(f"left out {left.topic}: {left.because}", markup=False, soft_wrap=True)
+    _tell_identified(seen)
     for line in _counted(seen):
         out.print(line, markup=False, soft_wrap=True)
     if not seen.timed:
@@ -394,9 +395,13 @@ def _tell(stored: "Recording", as_json: bool) -> None:
         out.print(f"{name}: {value}", markup=False, soft_wrap=True)
     for line in _counted(stored):
         out.print(line, markup=False, soft_wrap=True)
-    for one in stored.identifications:
-        out.print(f"{one.topic}: {one.found.verdict}: {one.found.reason}", markup=False, soft_wrap=True)
+    _tell_identified(stored)
     show(stored.segments, False, ("arm", "start_s", "end_s", "reason"))
+
+
+def _tell_identified(found: "Recording | RecordingPreview") -> None:
+    for one in found.identifications:
+        out.print(f"{one.topic}: {one.found.verdict}: {one.found.reason}", markup=False, soft_wrap=True)
 
 
 def _counted(stored: "Recording | RecordingPreview") -> list[str]:

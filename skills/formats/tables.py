@@ -119,7 +119,7 @@ class TableReading:
 
     Attributes:
         rate_hz: Samples per second, for a table without times.
-        frame: The frame of the positions; by default the base of the arm.
+        frame: The frame of the positions, or `BASE`; by default the base of the arm, but needed for mapped positions.
         column: The columns under other names, each as `x_mm=PosX` or `x=PosX`.
         unit: The units of columns without a unit: of lengths, angles and times, one each.
         decimal: The decimal mark.
@@ -220,6 +220,7 @@ def _recording(table: _Table, said: TableReading, columns: tuple[Column, ...]) -
         joints = table.stacked(JOINT_NAMES)
         check_joints(TOPIC, joints)
     if POSITION[0] in table.columns:
+        _check_frame(said)
         tip_mm, rotation = table.stacked(POSITION), _rotation_xyzw(table)
         frame = said.frame if said.frame not in (None, BASE) else f"{arm}_base"
     else:
@@ -395,6 +396,17 @@ def _usual(joint: str) -> str:
 
 
 # ---- what tables of every kind share -----------------------------------------------------------------------------
+
+
+def _check_frame(said: TableReading) -> None:
+    """Refuse positions under another name without a frame: only our own names mean the base of the arm.
+
+    Raises:
+        BadColumns: There is none.
+    """
+    mapped = {one.partition("=")[0].partition("_")[0] for one in said.column}
+    if said.frame is None and mapped & set(POSITION):
+        raise BadColumns("The table does not say in which frame its positions are.", Remedy(Action.NAME_FRAME))
 
 
 def check_time(column: str | None, said: TableReading) -> None:

@@ -11,7 +11,7 @@ from tests.formats import hostile, written
 from tests.formats.bags import sample_folder
 from tests.formats.test_tables_hostile import FILES, mutations
 
-SAID = {"column": ["x=PosX", "y=PosY", "z=PosZ"], "unit": ["mm"], "rate_hz": 100.0}
+SAID = {"column": ["x=PosX", "y=PosY", "z=PosZ"], "unit": ["mm"], "frame": "base", "rate_hz": 100.0}
 POSITIONS = written.positions().encode()
 
 
@@ -43,7 +43,7 @@ def test_a_preview_says_what_was_understood_and_stores_nothing(here: Service):
         ("PosY", "y", "mm"),
         ("PosZ", "z", "mm"),
     ]
-    timed = here.client.preview_recording(POSITIONS, **SAID, table_arm="PSM2", frame="ECM")
+    timed = here.client.preview_recording(POSITIONS, **SAID | {"table_arm": "PSM2", "frame": "ECM"})
     assert (timed["timed"], timed["duration_s"]) == (True, pytest.approx(9.39))
     assert (timed["motions"][0]["arm"], timed["motions"][0]["frame"]) == ("PSM2", "ECM")
     assert recordings(here) == 0
@@ -70,10 +70,10 @@ def test_an_impossible_parameter_is_refused_by_its_name(here: Service, path, que
 
 
 def test_what_was_said_is_stored_and_used_when_the_table_is_cut_again(here: Service):
-    stored = here.client.add_recording(POSITIONS, **SAID, frame="PSM2_base", table_arm="PSM2")
+    stored = here.client.add_recording(POSITIONS, **SAID | {"frame": "PSM2_base", "table_arm": "PSM2"})
     demo = here.client.cut_demo(stored["id"], **KESTREL)
     assert (demo["arm"], demo["frame"], demo["report"]["path_states"]) == ("PSM2", "PSM2_base", 28)
-    again = here.client.add_demo(POSITIONS, **KESTREL, **SAID, frame="PSM2_base", table_arm="PSM2")
+    again = here.client.add_demo(POSITIONS, **KESTREL, **SAID | {"frame": "PSM2_base", "table_arm": "PSM2"})
     assert again["id"] == demo["id"]
     assert_problem(send(here, "/recordings", POSITIONS, **SAID), 409)
     with here.database.reading() as session:

@@ -164,5 +164,5 @@ def test_what_cannot_be_meant_is_refused(text, how, error, message):
 
 def test_a_mapping_reads_one_arm_of_it():
     column = [f"{axis}_m=psm2_pose.position.{axis}" for axis in "xyz"]
-    recording = read(PLAIN, column=[*column, "t_ns=timestamp"], table_arm="PSM2", frame=None)
+    recording = read(PLAIN, column=[*column, "t_ns=timestamp"], table_arm="PSM2", frame="base")
     np.testing.assert_array_equal(recording.motion_of().tip_mm, read(PLAIN).motion_of(arm="PSM2").tip_mm)

@@ -26,6 +26,8 @@ ROWS = "0;1.5;50.25;-120\n10;2.5;50.25;-120\n20;3.5;50.25;-120\n"
 
 
 def read(text, **how):
+    if any(one[0] in "xyz" for one in how.get("column", ())):
+        how = {"frame": "base", **how}
     return read_recording(io.BytesIO(text.encode()), **how)
 
 
@@ -41,6 +43,14 @@ def test_columns_are_read_under_the_names_that_the_caller_gives(separator):
     np.testing.assert_array_equal(motion.tip_mm, wanted())
     assert (motion.arm, motion.frame, motion.stamps_ns[1]) == ("PSM2", "PSM2_base", 10_000_000)
     assert recording.columns[0] == Column("PosX", "x", "mm")
+
+
+def test_positions_under_other_names_need_a_frame():
+    how = {"column": XYZ, "unit": ["mm"], "rate_hz": 100.0}
+    with pytest.raises(BadColumns, match="in which frame its positions are"):
+        read(written.positions(), **how, frame=None)
+    assert read(written.positions(), **how, frame="ECM").motion_of().frame == "ECM"
+    assert read("t_s,x_mm,y_mm,z_mm\n0,0,50,-120\n1,1,50,-120\n").motion_of().frame == "PSM_base"
 
 
 @pytest.mark.parametrize("separator", [";", "\t"])
