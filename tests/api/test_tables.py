@@ -1,11 +1,14 @@
 """Tables over HTTP: what is said about them once, previewed, stored and read again; and counts of dropped samples."""
 
+import io
 from pathlib import Path
 
+import numpy as np
 import pytest
 from sqlalchemy import func, select
 
 from skills.db.models import StoredRecording
+from skills.kinematics import forward, quaternion_of
 from tests.api.service import CSV, KESTREL, Service, assert_problem
 from tests.formats import hostile, written
 from tests.formats.bags import sample_folder
@@ -51,6 +54,24 @@ def test_a_preview_says_what_was_understood_and_stores_nothing(here: Service):
         refused = {name: value for name, value in said.items() if value is not None}
         assert question in assert_problem(send(here, "/recordings/preview", POSITIONS, **refused), 422)["detail"]
     assert recordings(here) == 0
+
+
+def test_joints_beside_poses_say_which_instrument_it_was(here: Service):
+    joints = np.loadtxt(io.StringIO(written.joints()), delimiter=",", skiprows=1)
+    tip_mm, turned = forward(joints * [1, 1, 1000, 1, 1, 1], "400006")
+    rows = np.column_stack([joints, tip_mm / 1000.0, quaternion_of(turned)])
+    names = "q1_rad,q2_rad,q3_m,q4_rad,q5_rad,q6_rad,x_m,y_m,z_m,qx,qy,qz,qw"
+    data = "\n".join([names, *(",".join(map(repr, row)) for row in rows.tolist())]).encode()
+    stored = here.client.add_recording(data, rate_hz=30.0)
+    (one,) = stored["identifications"]
+    assert (one["found"]["verdict"], one["found"]["instrument"]) == ("identified", "400006")
+    assert one["found"]["greatest_mm"] < 1e-6
+    page = here.http.get(f"/pages/recordings/{stored['sha256']}").text
+    assert "identified" in page and one["found"]["reason"] in page
+    other = data + b"\n" + data.splitlines()[-1]  # other bytes: these are stored already, without an instrument
+    said = {"rate_hz": 30.0, "instrument": "420006-Classic", "segment": "whole"}
+    problem = assert_problem(send(here, "/demos", other, **KESTREL, **said), 422, "joints-disagree")
+    assert "420006-Classic" in problem["detail"] and problem["numbers"]["residual_mm"] < 1e-6
 
 
 @pytest.mark.parametrize(

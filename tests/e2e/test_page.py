@@ -409,6 +409,7 @@ def test_a_table_under_other_names_is_sent_with_what_is_said_about_it(
         expect(tab.page.locator("#upload-said")).to_contain_text("unknown column 'PosX'")
         tab.page.get_by_label("Columns under other names").fill("x=PosX\ny=PosY\nz=PosZ\n")
         tab.page.get_by_label("Their units").fill("mm")
+        tab.page.get_by_label("Frame of a table").fill("base")
         tab.page.get_by_label("Rate").fill("100")
         tab.page.get_by_label("Arm").fill("PSM2")
         assert tab.too_wide() <= 0

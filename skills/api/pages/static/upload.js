@@ -62,7 +62,7 @@ function send(file, headers, query) {
 
 function sayAbout(query) {
   if (get("rate").value) query.set("rate_hz", get("rate").value);
-  for (const name of ["table_arm", "decimal"]) if (get(name).value) query.set(name, get(name).value);
+  for (const name of ["table_arm", "instrument", "decimal"]) if (get(name).value) query.set(name, get(name).value);
   for (const line of get("column").value.split("\n")) if (line.trim()) query.append("column", line.trim());
   for (const unit of get("unit").value.split(/[\s,]+/)) if (unit) query.append("unit", unit);
 }
