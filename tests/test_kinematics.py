@@ -113,7 +113,7 @@ def test_the_si_with_its_own_tool_gives_the_classics_poses():
 @pytest.mark.parametrize(
     ("mixed", "own", "further_in_mm"), [("400006-Si", "420006", 50.8), ("420006-Classic", "400006", -50.8)]
 )
-def test_a_tool_on_an_arm_of_the_other_generation_is_the_difference_of_the_shafts_off(mixed, own, further_in_mm):
+def test_a_tool_on_the_other_arm_is_off_by_the_difference_of_the_shafts(mixed, own, further_in_mm):
     joints = any_joints(100)
     deeper = joints + np.array([0.0, 0.0, further_in_mm, 0.0, 0.0, 0.0])
     for one, other in zip(forward(deeper, mixed), forward(joints, own), strict=True):

@@ -239,7 +239,7 @@ def test_a_near_miss_of_an_argument_that_is_part_of_a_path_is_suggested(door: Cl
     assert meant in str(refused.value)
 
 
-def test_a_call_that_the_service_does_not_have_is_refused_in_the_words_of_each_door(door: Client):
+def test_an_unknown_call_is_refused_in_the_words_of_each_door(door: Client):
     with pytest.raises(Problem) as refused:
         door.get_json("/nothing")
     assert foreign(Door.PYTHON, str(refused.value)) == []

@@ -202,7 +202,7 @@ def test_marking_a_demonstration_as_a_failure_withdraws_what_rests_on_it(trained
     assert_problem(trained.http.put(f"/demos/{'0' * 64}/outcome", json=failed), 404, "not-found")
 
 
-def test_an_uploader_states_the_outcome_and_does_not_change_it_by_adding_again(here: Service):
+def test_an_uploader_does_not_change_an_outcome_by_adding_again(here: Service):
     how = {"params": {"outcome": "failure", "outcome_reason": "It fell.", **KESTREL}, "content": cases.hand_off()}
     added = here.http.post("/demos", headers={"Content-Type": CSV}, **how)
     assert (added.status_code, added.json()["outcome"]) == (201, "failure")

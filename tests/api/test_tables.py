@@ -120,7 +120,7 @@ def test_both_arms_of_an_ee_csv_are_stored_and_one_is_cut(here: Service):
     assert (demo["topic"], demo["frame"]) == ("/PSM2/local/measured_cp", "PSM2_base")
 
 
-def test_counts_of_dropped_and_equal_samples_are_in_the_answer_the_report_and_on_the_page(here: Service):
+def test_counts_of_samples_are_in_the_answer_the_report_and_on_the_page(here: Service):
     rows = [f"{k * 0.01:.2f},{min(k, 150) * 0.2:.2f},50,-120" for k in range(200)]
     rows[50] = rows[50].replace("0.50,", "0.48,")
     data = "\n".join(["t_s,x_mm,y_mm,z_mm", *rows]).encode()
@@ -140,7 +140,7 @@ def test_counts_of_dropped_and_equal_samples_are_in_the_answer_the_report_and_on
 
 
 @pytest.mark.needs("recordings")
-def test_the_real_bag_with_a_stamp_that_goes_back_is_stored_with_its_counts(here: Service):
+def test_a_real_bag_with_a_stamp_that_goes_back_is_stored_with_counts(here: Service):
     stored = here.client.add_recording(Path(sample_folder() / "calibration" / "pitch_exp_traj_02_test_cropped.bag"))
     assert {one["topic"]: one["backward_stamps"] for one in stored["dropped"]} == {
         "/PSM2/measured_cp": 1,

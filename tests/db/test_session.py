@@ -51,7 +51,7 @@ def test_300_read_then_write_transactions_lose_nothing_and_never_fail(database: 
     assert count(database) == THREADS * TIMES
 
 
-def test_a_connection_in_use_when_its_database_is_closed_does_not_stay_open(database: Database):
+def test_a_connection_in_use_at_close_does_not_stay_open(database: Database):
     """Otherwise it stays open until it is collected as garbage, and with SQLite the write-ahead log is not merged."""
     with database.reading() as session:
         used = session.connection().connection.dbapi_connection

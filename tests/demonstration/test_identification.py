@@ -43,7 +43,7 @@ def test_a_real_arm_is_identified(name, instrument, greatest_mm, in_base):
 
 
 @pytest.mark.needs("recordings")
-def test_the_si_tool_of_a_real_table_is_on_a_classic_arm_and_not_the_reverse():
+def test_the_si_tool_of_a_real_table_is_on_a_classic_arm():
     one = real("Si_tool_fixed")
     away = {
         lengths: np.linalg.norm(forward(one.joints, name)[0] - one.tip_mm, axis=1)
@@ -152,7 +152,7 @@ def test_late_joints_are_told_and_do_not_hide_the_length_of_the_wrist(delay_s, i
 
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("in_base", [True, False])
-def test_a_recorder_at_30_hz_that_writes_the_last_it_has_is_sound_and_hides_no_wrist(seed, in_base):
+def test_a_recorder_that_repeats_values_is_sound_and_hides_no_wrist(seed, in_base):
     rng = np.random.default_rng(seed)
     seconds, phase = np.arange(900) / 30.0, rng.uniform(0, 2 * np.pi, 6)
 
@@ -179,7 +179,7 @@ def test_names_of_tools_are_read_as_the_console_writes_them():
         assert stated_instrument(unknown) is None
 
 
-def test_too_few_samples_or_joints_show_nothing_and_wild_numbers_are_a_contradiction():
+def test_few_samples_show_nothing_and_wild_numbers_contradict():
     joints = random_joints(FEWEST_SAMPLES, 6)
     tip_mm, rotation = forward(joints)
     assert identify(joints[:-1], tip_mm[:-1], rotation[:-1]) is None

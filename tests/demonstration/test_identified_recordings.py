@@ -42,7 +42,7 @@ def only(value: Recording, word: str) -> Recording:
     return replace(value, motions=tuple(m for m, kept in zip(value.motions, keep, strict=True) if kept))
 
 
-def test_poses_in_the_cameras_frame_become_those_of_the_base_and_so_does_the_partner(recorded):
+def test_poses_and_partner_in_a_cameras_frame_become_those_of_the_base(recorded):
     camera = only(recorded, "-local")
     (part,) = propose_segments(recorded, A)
     wanted, got = (cut_demo(one, arm=A, start_s=part.start_s, end_s=part.end_s) for one in (recorded, camera))
@@ -64,7 +64,7 @@ def test_the_bases_of_a_recording_in_the_cameras_frame_are_found(recorded):
         np.testing.assert_allclose(base.position_mm, paired[arm].position_mm, atol=0.05)
 
 
-def test_without_joints_a_demonstration_is_in_the_frame_of_its_poses_as_before(recorded):
+def test_without_joints_a_demonstration_is_in_the_frame_of_its_poses(recorded):
     assert cut_demo(replace(only(recorded, "-local"), joints=()), arm=A).frame == "ECM"
 
 
@@ -117,7 +117,7 @@ def test_poses_that_are_not_in_the_base_as_stated_are_refused(recorded):
             cut_demo(replace(recorded, motions=(stated,)))
 
 
-def test_joints_in_degrees_are_a_contradiction_of_poses_in_the_base_and_reported_of_a_cameras(recorded):
+def test_joints_in_degrees_contradict_poses_and_are_reported(recorded):
     (joints, *_) = recorded.joints
     degrees = replace(joints, positions=joints.positions * np.degrees([1, 1, np.pi / 180, 1, 1, 1]))
     value = replace(recorded, joints=(degrees,))
@@ -127,7 +127,7 @@ def test_joints_in_degrees_are_a_contradiction_of_poses_in_the_base_and_reported
     assert {one.found.verdict for one in value.identifications} == {"contradiction"}
 
 
-def test_stamps_of_joints_that_are_far_from_those_of_the_poses_show_nothing(recorded):
+def test_joints_far_in_time_from_the_poses_show_nothing(recorded):
     (joints, *_) = recorded.joints
     elsewhere = replace(joints, stamps_ns=joints.stamps_ns + 10**12)
     sparse = replace(joints, stamps_ns=joints.stamps_ns[::20], positions=joints.positions[::20])  # 0.2 s apart

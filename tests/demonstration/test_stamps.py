@@ -144,7 +144,7 @@ def table(stamps_ns):
     return read_recording(io.BytesIO(("t_s,x_mm,y_mm,z_mm\n" + "".join(rows)).encode()))
 
 
-def test_the_description_names_what_was_dropped_and_is_the_earlier_one_without():
+def test_the_description_names_dropped_samples_only_if_there_are_any():
     sound = tell(table(even(91))).about
     assert "dropped" not in sound
     assert "equal_samples" not in sound["quality"][0]

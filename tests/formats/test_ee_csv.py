@@ -106,7 +106,7 @@ def test_a_pose_that_no_fixed_transform_confirms_is_left_out():
     assert "No fixed transform" in dict(recording.left_out)["/PSM2/local/measured_cp"]
 
 
-def test_an_arm_of_zeros_was_not_recorded_and_one_zero_quaternion_is_refused():
+def test_an_arm_of_zeros_is_left_out_and_a_zero_quaternion_refused():
     zeros = PLAIN
     lines = [line.split(",") for line in zeros.splitlines()]
     of_arm = [k for k, name in enumerate(lines[0]) if name.startswith("psm1_pose")]

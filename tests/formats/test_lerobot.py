@@ -81,7 +81,7 @@ def test_a_dataset_of_v3_with_one_episode_is_read():
 # ---- frames and instruments are stated
 
 
-def test_poses_without_a_stated_frame_are_refused_with_the_words_of_each_door():
+def test_poses_without_a_frame_are_refused_in_the_words_of_each_door():
     with pytest.raises(BadColumns, match="does not say in which frame") as refused:
         read(episode(), frame=None)
     assert "--frame ECM" in refused.value.words(Door.COMMAND)

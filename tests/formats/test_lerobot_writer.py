@@ -202,7 +202,7 @@ def test_a_gap_and_arms_without_a_common_time_are_refused(tmp_path):
         written(tmp_path, [], "v3.0")
 
 
-def test_the_frames_of_our_own_datasets_are_known_and_cannot_be_contradicted(tmp_path):
+def test_the_frames_of_our_own_datasets_cannot_be_contradicted(tmp_path):
     folder = written(tmp_path, episodes((40,)), "v2.1")
     with find_dataset(folder) as dataset, io.BytesIO() as out:
         cut_episode(dataset, episodes_of(dataset)[0], out)

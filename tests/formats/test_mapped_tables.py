@@ -54,7 +54,7 @@ def test_positions_under_other_names_need_a_frame():
 
 
 @pytest.mark.parametrize("separator", [";", "\t"])
-def test_decimal_commas_are_read_where_the_caller_says_so_and_questioned_otherwise(separator):
+def test_decimal_commas_are_read_if_stated_and_questioned_otherwise(separator):
     text = written.positions(separator=separator, comma=True)
     how = {"column": XYZ, "unit": ["mm"], "rate_hz": 100.0}
     np.testing.assert_array_equal(read(text, **how, decimal="comma").motion_of().tip_mm, wanted())
@@ -76,7 +76,7 @@ def test_times_are_read_in_the_unit_that_the_caller_gives(unit, step_ns):
         assert np.diff(read(text, **how).motion_of().stamps_ns).tolist() == [step_ns] * 2
 
 
-def test_nanoseconds_since_1970_are_exact_and_times_of_another_unit_questioned():
+def test_nanoseconds_are_exact_and_times_of_another_unit_questioned():
     times = [1760000000123456789, 1760000000133456790]
     text = "t_ns,x_m,y_m,z_m\n" + "".join(f"{t},0,0,-0.1\n" for t in times)
     assert read(text).motion_of().stamps_ns.tolist() == times
@@ -153,7 +153,7 @@ def test_a_bag_takes_no_option_of_a_table(option):
         read_recording(io.BytesIO(bag), **option)
 
 
-def test_quoted_names_may_contain_separators_and_a_stamp_that_goes_back_is_dropped_here_too():
+def test_quoted_names_may_contain_separators_and_stamps_go_back():
     text = '"Pos X, mm";"Pos Y, mm";"Pos Z, mm";t_s\n' + "".join(f"{k};50;-120;{k * 0.01}\n" for k in range(200))
     text = text.replace("100;50;-120;1.0\n", "100;50;-120;0.98\n")
     column = [f"{axis}_mm=Pos {axis.upper()}, mm" for axis in "xyz"]
@@ -219,7 +219,7 @@ def test_joints_beyond_the_limits_of_the_arm_are_refused(instrument):
         ("Si_tool_fixed.csv", 4473, 50.9, "420006-Classic"),
     ],
 )
-def test_real_tables_of_joints_and_poses_agree_with_the_kinematics_and_need_a_rate(name, rows, off_mm, instrument):
+def test_real_tables_agree_with_the_kinematics_and_need_a_rate(name, rows, off_mm, instrument):
     table = (sample_folder() / "calibration" / name).read_bytes()
     with pytest.raises(BadColumns, match="rate_hz"):
         read_recording(io.BytesIO(table))

@@ -93,7 +93,7 @@ def test_the_papers_table_and_its_bag_agree_on_position_and_orientation(old):
     np.testing.assert_allclose(motion.rotation_xyzw[every_fifth], old.motion_of().rotation_xyzw, rtol=0, atol=1e-12)
 
 
-def test_a_real_bag_with_one_stamp_that_goes_back_is_read_with_that_sample_dropped_and_counted():
+def test_the_sample_of_a_real_bag_that_goes_back_is_dropped_and_counted():
     with (sample_folder() / "calibration" / "pitch_exp_traj_02_test_cropped.bag").open("rb") as file:
         bag = read_recording(file)
     motion, joints = bag.motion_of(), bag.joints[0]

@@ -228,7 +228,7 @@ def test_after_a_long_outage_the_worker_restarts_and_finishes_its_job(postgres: 
 
 
 @pytest.mark.nightly
-def test_a_sync_that_fails_on_postgresql_is_503_and_nothing_acknowledged_is_lost(postgres: Postgres, tmp_path: Path):
+def test_a_failed_sync_of_postgresql_is_503_and_loses_nothing(postgres: Postgres, tmp_path: Path):
     """PostgreSQL ends itself and all its sessions; the service stays, and goes on when the server does."""
     postgres.start_on_a_failing_disk()
     with site_at(postgres.url, tmp_path, workers=1, log_level="error") as place:

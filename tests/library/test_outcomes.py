@@ -94,7 +94,7 @@ def test_a_recovery_or_a_failure_needs_a_reason(outcome: str):
     assert OutcomeIn(outcome="success").reason is None
 
 
-def test_a_demonstration_is_stored_with_its_outcome_and_a_repetition_does_not_change_it(database: Database):
+def test_an_outcome_is_stored_and_a_repetition_does_not_change_it(database: Database):
     demo = add(database, outcome="failure", outcome_reason=WHY)
     assert (demo.outcome, demo.outcome_reason) == ("failure", WHY)
     assert add(database, outcome="failure", outcome_reason=WHY).row == add(database).row == demo.row
@@ -165,7 +165,7 @@ def test_what_failed_is_learnt_from_only_if_told(database: Database, outcome: st
         assert newest_demo(session, good.surgeon_row, cases.SUTURE) is None
 
 
-def test_a_training_of_successes_keeps_the_identity_and_the_manifest_of_older_versions(database: Database):
+def test_a_training_of_successes_keeps_identity_and_manifest(database: Database):
     demo = add(database)
     unmarked = cases.train(database)
     mark(database, demo, "success", None)
@@ -196,7 +196,7 @@ def test_a_policy_of_any_outcome_names_the_outcomes(database: Database):
 
 
 @FAILED
-def test_a_mark_withdraws_the_releases_that_rest_on_it_and_keeps_them_from_coming_back(database: Database, outcome):
+def test_a_mark_withdraws_the_releases_that_rest_on_it(database: Database, outcome):
     first, demo = add(database), add(database, 2.5)
     cases.train(database, demos=[first.sha256], release=True)
     version = cases.train(database, release=True)
@@ -215,7 +215,7 @@ def test_a_mark_withdraws_the_releases_that_rest_on_it_and_keeps_them_from_comin
     assert served(database) == [2]
 
 
-def test_a_mark_of_any_of_several_demonstrations_withdraws_and_an_older_release_alone_ends_alone(database: Database):
+def test_a_mark_of_one_of_several_demonstrations_withdraws_the_release(database: Database):
     first, second, third = add(database), add(database, 2.5), add(database, 5.0)
     cases.train(database, demos=[first.sha256, second.sha256], combine=Medoid(), release=True)
     cases.train(database, demos=[third.sha256], release=True)
@@ -225,7 +225,7 @@ def test_a_mark_of_any_of_several_demonstrations_withdraws_and_an_older_release_
     assert served(database) == []
 
 
-def test_what_was_trained_from_any_outcome_stays_released_and_is_released_again(database: Database):
+def test_a_policy_trained_from_any_outcome_stays_released(database: Database):
     demo = add(database)
     version = cases.train(database, outcomes="any", release=True)
     mark(database, demo, "failure")
@@ -317,7 +317,7 @@ def test_a_newer_failure_is_not_waited_for(database: Database):
         mark(database, bad, "failure")
 
 
-def test_a_failure_is_compared_with_only_if_named_and_counts_in_no_percentile(database: Database):
+def test_a_failure_is_compared_only_if_named_and_in_no_percentile(database: Database):
     good, bad = add(database), add(database, 2.5)
     mark(database, bad, "failure")
     asked = {"surgeon": "kestrel", "suture": cases.SUTURE, "demo": bad.sha256}
@@ -371,7 +371,7 @@ def test_a_mark_made_after_the_backup_is_made_again(database: Database, tmp_path
         backends.drop(after.url)
 
 
-def test_a_mark_that_was_taken_back_before_the_list_was_written_is_not_made_again(database: Database, tmp_path: Path):
+def test_a_mark_taken_back_before_the_list_is_not_made_again(database: Database, tmp_path: Path):
     demo = add(database)
     cases.train(database, release=True)
     back_up(database, tmp_path / "b.zip")

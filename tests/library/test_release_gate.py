@@ -101,7 +101,7 @@ def test_a_release_refused_by_an_older_gate_is_learnt_again_on_request(database,
 
 
 @pytest.mark.parametrize("instrument", ["400006", "400006-Si"])
-def test_poses_in_a_cameras_frame_are_released_if_the_joints_show_where_the_base_stands(database, instrument):
+def test_poses_in_a_cameras_frame_are_released_if_joints_show_the_base(database, instrument):
     turn = matrix_of([[0.3, -0.2, 0.1, 0.9]])[0]
     tip_mm = cases.points_mm()
     stamps_ns = cases.START_NS + np.arange(len(tip_mm)) * (10**9 // cases.RATE_HZ)

@@ -137,7 +137,7 @@ def test_a_policy_of_several_demos_cannot_be_downgraded_to_one_demo(database: Da
         assert session.scalar(text("SELECT count(*) FROM policy_demonstrations")) == 1
 
 
-def test_failures_block_the_downgrade_to_a_version_that_would_learn_from_them(database: Database):
+def test_failures_block_the_downgrade_that_would_learn_from_them(database: Database):
     database.migrate()
     cases.add_surgeon(database)
     demo = cases.add_demo(database)

@@ -42,7 +42,7 @@ def test_with_the_phase_the_seed_decides_nothing_so_one_seed_is_enough(user_rewa
     assert is_the_demonstration(policies[0], true_values)
 
 
-def test_in_the_papers_state_the_seed_matters_and_none_of_50_gives_the_demonstration(user_reward):
+def test_in_the_papers_state_no_seed_of_50_gives_the_demonstration(user_reward):
     policies = [learn_tabular(user_reward, CellQLearning(), seed) for seed in range(50)]
     assert len({policy.q.tobytes() for policy in policies}) == 50
     followed = [rollout(policy, paper.USER_START_MM) for policy in policies]

@@ -154,7 +154,7 @@ def test_the_si_plays_beyond_the_classics_limits():
 
 @needs_simulator
 @pytest.mark.parametrize(("instrument", "further_in_mm"), [("400006-Si", 50.8), ("420006-Classic", -50.8)])
-def test_an_instrument_on_an_arm_of_the_other_generation_plays_the_same_motion(played, instrument, further_in_mm):
+def test_an_instrument_on_the_other_arm_plays_the_same_motion(played, instrument, further_in_mm):
     motion = time_parametrise([hand_off(-8.0 * k) for k in range(2)], instrument=instrument, rate_hz=60.0)
     np.testing.assert_allclose(motion.joints[:, 2], TRAJECTORY.joints[:, 2] + further_in_mm, atol=1e-9)
     report = judge(play(motion), motion)
@@ -165,7 +165,7 @@ def test_an_instrument_on_an_arm_of_the_other_generation_plays_the_same_motion(p
 
 
 @needs_simulator
-def test_an_instrument_that_is_still_in_the_cannula_is_infeasible_whatever_the_arm():
+def test_an_instrument_still_in_the_cannula_is_infeasible_on_any_arm():
     # The wrist is 18 mm deep: for a 400006 on a Si that is an insertion of 84 mm, which is not out of the cannula.
     high = PassPath([[0, 4, -26.5], [0, 3, -27.0]], POINTING_DOWN)
     for instrument, insertion_mm in (("400006", 33), ("400006-Si", 84)):
