@@ -150,6 +150,9 @@ TableArm = Annotated[str | None, typer.Option(help="The arm of a table; PSM by d
 Instrument = Annotated[
     str | None, typer.Option(help="The instrument with which a table's joints become poses, such as 400006.")
 ]
+OneEpisode = Annotated[
+    str | None, typer.Option(help="The episode of a LeRobot dataset, by its number; needed if it has several.")
+]
 Tool = Annotated[
     list[str] | None,
     typer.Option(help="The instrument of an arm in a LeRobot dataset, such as PSM1=400006; repeatable."),
@@ -289,9 +292,7 @@ def recording_preview(
     decimal: Decimal = None,
     table_arm: TableArm = None,
     instrument: Instrument = None,
-    episode: Annotated[
-        str | None, typer.Option(help="The episode of a LeRobot dataset, by its number; needed if it has several.")
-    ] = None,
+    episode: OneEpisode = None,
     tool: Tool = None,
     as_json: AsJson = False,
 ) -> None:
@@ -449,9 +450,7 @@ def demo_add(
     decimal: Decimal = None,
     table_arm: TableArm = None,
     instrument: Instrument = None,
-    episode: Annotated[
-        str | None, typer.Option(help="The episode of a LeRobot dataset, by its number; needed if it has several.")
-    ] = None,
+    episode: OneEpisode = None,
     tool: Tool = None,
     as_json: AsJson = False,
 ) -> None:
