@@ -119,7 +119,7 @@ def fail(database: Database, row: int, attempt: int, reason: str, state: str = "
 def register(work: Work) -> None:
     """Register the workflow and its steps with the engine, before it is launched.
 
-    The steps are the tries and, after the last, giving up. Change `engine.STEPS` when that sequence changes.
+    The steps are the tries and, after the last, giving up. Change `jobs.STEPS` when that sequence changes.
     """
     attempts = work.settings.job_attempts
 

@@ -279,7 +279,7 @@ def arrives(walks: Walks) -> Flags:
 
 
 def follows(walks: Walks) -> Flags:
-    """Return for each run whether it enters all waypoints in order and ends at the goal; see `Outcome.followed`.
+    """Return for each run whether it enters all waypoints in order and ends at the goal; see `SlipOutcome.followed`.
 
     Args:
         walks: The walks.

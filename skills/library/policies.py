@@ -160,7 +160,7 @@ def followable(policy: PolicyVersion) -> PolicyVersion:
 
 
 def about_policy(policy: PolicyVersion, release: Release | None) -> dict[str, Any]:
-    """Return the JSON of a policy (interface.md) without its actions."""
+    """Return the JSON of a policy (`schemas.policies.Policy`) without its actions."""
     return {
         "version": policy.version,
         "sha256": policy.sha256,

@@ -390,7 +390,7 @@ def _version(learnt: Learnt, version: int) -> dict[str, Any]:
 
 
 def refusals(policy: Policy, certificate: Certificate) -> list[str]:
-    """Return the reasons on the grid against a release: the gate of interface.md, written so that NaN fails."""
+    """Return the reasons on the grid against a release; the comparisons are written so that NaN fails."""
     reasons = []
     if not certificate.every_action_optimal:
         reasons.append(f"{certificate.suboptimal} of {certificate.checked} greedy actions are not optimal")
@@ -445,7 +445,7 @@ def describe_policy(
     refused_because: list[str],
     driven: DrivenPass | None,
 ) -> dict[str, Any]:
-    """Return the manifest of a policy (interface.md): its JSON without version, digest, release and arrays.
+    """Return the manifest of a policy: the JSON of `schemas.policies.Policy` without version, digest, release, arrays.
 
     Args:
         policy: The policy.

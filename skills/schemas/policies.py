@@ -252,8 +252,15 @@ class PolicySummary(Version):
 class Policy(PolicyName):
     """A policy, complete enough that a client can run it.
 
-    Action = 9a + 3b + c with a, b, c in {0, 1, 2} for -1, 0, +1 cell along x, y, z; -1: finished; -2: outside the
-    certified domain, a client stops there.
+    In a grid of shape (nx, ny, nz) the state of cell (i, j, k) is (i ny + j) nz + k. Action = 9a + 3b + c with a, b, c
+    in {0, 1, 2} for -1, 0, +1 cell along x, y, z; a move off the grid stays. -1: finished; -2: outside the certified
+    domain, a client stops there.
+
+    Phases and waypoints are counted from 0; the goal is the last waypoint. With one phase a pass ends at the goal. With
+    more, phase 0 means that the path is not joined yet, and phase p that waypoint p is next. A pass that starts on a
+    waypoint is in the phase after its first visit, and finished if that is the last waypoint. In phase 0 a move onto
+    the goal ends the pass, and one onto another waypoint leads to the phase after its first visit. In phase p > 0 a
+    move onto waypoint p leads to phase p + 1, or ends the pass if it is the last.
     """
 
     surgeon: Slug

@@ -88,7 +88,7 @@ def _without_gaps(cells: list[np.ndarray]) -> np.ndarray:
 def follow(
     actions: np.ndarray, shape: tuple[int, int, int], waypoints: list[int], start: int
 ) -> tuple[list[int], bool]:
-    """Follow served actions, (phases, n_states), as `interface.md` describes: the states, and whether it finishes.
+    """Follow served actions, (phases, n_states), as the OpenAPI document describes: states, and whether it finishes.
 
     Written from that text alone.
     """

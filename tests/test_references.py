@@ -1,0 +1,161 @@
+"""Names in documents, docstrings and comments: each file, link and name of code that they refer to exists."""
+
+import ast
+import io
+import re
+import subprocess
+import sys
+import tokenize
+from collections import defaultdict
+from collections.abc import Iterator
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+PAGES = [ROOT / name for name in ("README.md", "ARCHITECTURE.md", "CONTRIBUTING.md", "urdf/README.md")]
+PAGES += sorted((ROOT / "docs").glob("*.md"))
+CODE = sorted(file for folder in ("skills", "seeds", "migrations", "tests") for file in (ROOT / folder).rglob("*.py"))
+PACKAGES = {file.parent.name for file in CODE}
+NAMES_FILE = re.compile(r"(?<![\w./*{}-])(?:[\w-]+/)*[\w-]+\.(?:py|md)\b")
+DOTTED = re.compile(r"`([A-Za-z]\w*(?:\.[A-Za-z_]\w*)+)(?:\(\))?`")
+SLASHED = re.compile(r"`([a-z_]+(?:/[a-z_]+)+)((?:\.\w+)*)`")
+LINK = re.compile(r"\]\((?!https?:)([^)#]*)(?:#([^)]*))?\)")
+OF_OTHERS = {  # files of other projects, a pattern, and one that was rejected
+    *("dvrk_bag_replay.py", "launch_crtk_interface.py", "simulator.launch.py", "docs/scene_coordinate_frames.md"),
+    *("scripts/validation/validate_formatting.py", "0001_what_it_does.py", "bytes.py"),
+}
+ELSEWHERE = {  # other libraries, columns and JSON, by the first part of the name
+    *("DBOS", "Rotation", "csv", "httpx", "np", "sys", "yaml"),
+    *("a", "lineage", "nearest_limit", "observation", "psmN_local_pose", "psmN_pose", "result"),
+}
+ALSO_ELSEWHERE = {"policy.model_dump", "report.path_states"}  # pydantic's and JSON's, beginning as names of ours do
+SUFFIXES = {"csv", "json", "jsonl", "lock", "md", "parquet", "py", "sqlite", "toml", "txt", "urdf", "yaml", "zip"}
+
+
+@cache
+def members() -> dict[str, set[str]]:
+    """Return the names that are defined in all modules, packages and classes of one name."""
+    found: dict[str, set[str]] = defaultdict(set)
+    bases: list[tuple[str, str]] = []
+    for file in CODE:
+        tree = ast.parse(file.read_text())
+        module = file.parent.name if file.stem == "__init__" else file.stem
+        found[file.parent.name].add(file.stem)
+        found[file.parent.parent.name].add(file.parent.name)
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ClassDef):
+                found[node.name] |= set(defined(node))
+                bases += [(node.name, base.id) for base in node.bases if isinstance(base, ast.Name)]
+        found[module] |= set(defined(tree))
+    for name, base in bases * 3:  # a class has the names of its bases, and of theirs
+        found[name] |= found[base]
+    return found
+
+
+def defined(scope: ast.AST) -> Iterator[str]:
+    """Yield every name that is defined or imported in a module or class, those inside its functions included."""
+    for node in ast.walk(scope):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+            yield node.name
+        elif isinstance(node, ast.Name | ast.Attribute) and isinstance(node.ctx, ast.Store):
+            yield node.id if isinstance(node, ast.Name) else node.attr
+        elif isinstance(node, ast.alias):
+            yield (node.asname or node.name).partition(".")[0]
+
+
+def is_defined(name: str) -> bool:
+    """Return whether each part of a dotted name is defined in the part before it."""
+    parts = name.split(".")
+    return all(part in members().get(before, ()) for before, part in pairwise(parts))
+
+
+@cache
+def files() -> set[str]:
+    """Return every end of the path of every file, such as `grid.py` and `gridworld/grid.py`."""
+    paths = [file.relative_to(ROOT).parts for file in (*CODE, *PAGES, ROOT / "CHANGELOG.md")]
+    return {"/".join(parts[at:]) for parts in paths for at in range(len(parts))}
+
+
+def is_place(path: str, attributes: str) -> bool:
+    """Return whether `room/module` or `room/module.name` exists; other words with a slash are not of the code."""
+    first, *_, last = path.split("/")
+    if first not in PACKAGES or attributes.removeprefix(".") in SUFFIXES:
+        return True
+    there = any((folder / path).exists() or (folder / f"{path}.py").exists() for folder in folders())
+    return there and is_defined(f"{last}{attributes}")
+
+
+@cache
+def folders() -> set[Path]:
+    return {ROOT} | {parent for file in CODE for parent in file.parents if ROOT in parent.parents}
+
+
+def prose(file: Path) -> str:
+    """Return a page, or the docstrings and comments of a file of code."""
+    text = file.read_text()
+    if file.suffix == ".md":
+        return text
+    nodes = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
+    told = [ast.get_docstring(node) or "" for node in ast.walk(ast.parse(text)) if isinstance(node, nodes)]
+    tokens = tokenize.generate_tokens(io.StringIO(text).readline)
+    return "\n".join([*told, *(token.string for token in tokens if token.type == tokenize.COMMENT)])
+
+
+def dangling(text: str) -> list[str]:
+    """List the references of a text that lead nowhere."""
+    dotted = {name for name in DOTTED.findall(text) if name.rpartition(".")[2] not in SUFFIXES} - ALSO_ELSEWHERE
+    dotted = {name for name in dotted if name.partition(".")[0] not in ELSEWHERE}
+    return [
+        *set(NAMES_FILE.findall(text)) - OF_OTHERS - files(),
+        *(name for name in dotted if not is_defined(name)),
+        *("".join(found) for found in SLASHED.findall(text) if not is_place(*found)),
+    ]
+
+
+def test_every_file_and_name_that_is_referred_to_exists() -> None:
+    found = {str(file.relative_to(ROOT)): dangling(prose(file)) for file in [*PAGES, *CODE]}
+    assert {file: names for file, names in found.items() if names} == {}
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "as interface.md says",
+        "in `tests/jobs/test_nothing.py`",
+        "see `engine.STEPS`",
+        "see `jobs.NO_STEPS`",
+        "`skills.style.dtw` aligns",
+        "calls `planning/plan.heap`",
+        "in `library/nothing`",
+    ],
+)
+def test_a_reference_that_leads_nowhere_is_found(text: str) -> None:
+    assert dangling(text)
+
+
+def anchors(page: Path) -> set[str]:
+    """Return the anchors of a page's headings, as GitHub makes them."""
+    headings = re.findall(r"^#+ (.*)$", page.read_text(), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_every_link_of_a_page_leads_to_a_file_and_a_heading(page: Path) -> None:
+    for target, anchor in LINK.findall(page.read_text()):
+        to = page.parent / target if target else page
+        assert to.exists(), target
+        assert not anchor or anchor in anchors(to), f"{target}#{anchor}"
+
+
+@pytest.mark.nightly  # 10 s of processor time
+@pytest.mark.needs("simulator")
+def test_the_walks_of_the_architecture_are_those_that_are_traced() -> None:
+    page = (ROOT / "ARCHITECTURE.md").read_text()
+    page = page[page.index("## Three walks") : page.index("## Around every")]
+    run = subprocess.run([sys.executable, "-m", "tests.walks"], cwd=ROOT, capture_output=True, text=True, check=True)
+    counts, stations = r"(\d+) stations in (\d+) files", re.findall(r"^ *\d+ (\w+) +(\S+)$", run.stdout, re.MULTILINE)
+    assert re.findall(r"`(\w+)`\s+\(([\w/.]+)\)", page) == stations
+    assert re.findall(counts, page) == re.findall(counts, run.stdout)
