@@ -263,7 +263,7 @@ def _open(url: str, patience_ms: int) -> Engine:
             f"journal_size_limit={WAL_LIMIT_BYTES}",
         ):
             connection.execute(f"PRAGMA {pragma}")
-        _write_ahead(connection, patience_ms)
+        write_ahead(connection, patience_ms)
 
     @event.listens_for(engine, "begin")
     def _begin(connection: Connection) -> None:
@@ -341,11 +341,14 @@ class Returning:
                 return connection
 
 
-def _write_ahead(connection: sqlite3.Connection, patience_ms: int) -> None:
+def write_ahead(connection: sqlite3.Connection, patience_ms: int = BUSY_TIMEOUT_MS) -> None:
     """Switch a file to WAL mode, retrying while other processes that open the same new file do the same.
 
     SQLite does not apply its busy timeout to this change, because both processes would hold a lock that the other
     needs.
+
+    Raises:
+        sqlite3.OperationalError: The file is locked for longer than the timeout, or cannot be used.
     """
     deadline = monotonic() + patience_ms / 1000
     while True:

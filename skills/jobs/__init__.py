@@ -17,6 +17,7 @@ ever unpickled. Importing DBOS takes over a second, so it is imported where it i
 import logging
 import sqlite3
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from queue import SimpleQueue
 from threading import Thread
@@ -24,7 +25,7 @@ from typing import TYPE_CHECKING
 
 from sqlalchemy.engine import make_url
 
-from skills.db.session import make_private
+from skills.db.session import make_private, write_ahead
 from skills.library.jobs import PART
 from skills.settings import Settings
 
@@ -94,11 +95,8 @@ def prepare(settings: Settings) -> None:
     if url.get_backend_name() != "sqlite" or url.database is None:
         return
     make_private(Path(url.database))
-    connection = sqlite3.connect(url.database)
-    try:
-        connection.execute("PRAGMA journal_mode=WAL")
-    finally:
-        connection.close()
+    with closing(sqlite3.connect(url.database)) as connection:
+        write_ahead(connection)
 
 
 def queue_of(kind: str) -> str:

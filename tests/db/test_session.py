@@ -8,7 +8,7 @@ import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
@@ -286,6 +286,19 @@ def test_files_of_a_database_are_its_users_alone(tmp_path: Path):
         assert {path.name: mode(path) for path in files} == {path.name: 0o600 for path in files}
     assert mode(tmp_path / "made") == 0o700
     database.close()
+
+
+def test_the_engines_file_waits_for_another_process_that_opens_it(tmp_path: Path):
+    """SQLite refuses the change to WAL mode at once while another connection writes, or makes the same change."""
+    settings = Settings(database_url=f"sqlite:///{tmp_path / 'skills.sqlite'}")
+    file = settings.engine_url.removeprefix("sqlite:///")
+    with closing(sqlite3.connect(file, isolation_level=None, check_same_thread=False)) as other:
+        other.execute("BEGIN IMMEDIATE")
+        ends = threading.Timer(0.2, other.execute, ["COMMIT"])
+        ends.start()
+        prepare(settings)
+        ends.join()
+        assert other.execute("PRAGMA journal_mode").fetchone() == ("wal",)
 
 
 def test_a_file_that_others_could_read_is_tightened_and_the_log_says_so(
