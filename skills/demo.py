@@ -28,6 +28,7 @@ from skills.settings import settings
 
 PICTURES = Path("build/demo")
 START_S = 180.0
+END_S = 60.0  # the service and its workers finish their work within half of it, unless the machine has much other load
 SPACING_MM = (6.0, 0.0, 0.0)  # between suture points, along the wound
 N_POINTS = 5
 SAMPLE_PSM_M = {  # invented, and the plan says so: the approach and the base of PSM_M
@@ -78,8 +79,17 @@ def running_service(folder: Path) -> Iterator[Client]:
             os.environ["SKILLS_SERVER"] = f"http://127.0.0.1:{port}"  # for the commands that are run as subprocesses
             yield client
     finally:
-        server.terminate()
-        server.wait(30)
+        end(server)
+
+
+def end(server: subprocess.Popen[bytes]) -> None:
+    """Stop the service, and kill it if it has not ended within `END_S`; its workers end when it does."""
+    server.terminate()
+    try:
+        server.wait(END_S)
+    except subprocess.TimeoutExpired:
+        server.kill()
+        server.wait()
 
 
 def wait_until_ready(client: Client, server: subprocess.Popen[bytes]) -> None:

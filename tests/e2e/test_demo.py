@@ -2,11 +2,14 @@
 
 import os
 import re
+import signal
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+
+from skills import demo
 
 AS_IT_IS = ["-m", "skills.demo"]
 SHORT = ["-c", "from skills import demo; demo.N_POINTS = 2; raise SystemExit(demo.main())"]
@@ -45,3 +48,16 @@ def test_the_demo_does_the_main_job_and_exits_with_0(tmp_path: Path, how: list[s
     ]
     assert f"The film of kestrel-simple-running and its plots over time: {', '.join(drawn)}" in printed
     assert all((pictures / name).is_file() for name in drawn)
+
+
+STUBBORN = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print(flush=True); time.sleep(600)"
+
+
+def test_a_service_that_does_not_end_is_killed_and_does_not_outlive_the_demo(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The service holds the demo's output open, so that a caller that reads it would wait for the service."""
+    monkeypatch.setattr(demo, "END_S", 0.2)
+    with subprocess.Popen([sys.executable, "-c", STUBBORN], stdout=subprocess.PIPE) as server:
+        assert server.stdout is not None
+        server.stdout.readline()
+        demo.end(server)
+        assert server.poll() == -signal.SIGKILL
