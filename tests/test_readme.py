@@ -16,19 +16,3 @@ def test_the_python_of_the_readme_runs_and_ends_with_a_feasible_playback(capsys:
     assert "suboptimal=0" in printed[0]
     assert "starts_reaching=1331" in printed[0]
     assert printed[-1] == "True"
-
-
-def test_every_command_of_the_readme_exists() -> None:
-    from typer.testing import CliRunner
-
-    from skills.cli import app
-
-    commands = {tuple(m.split()) for m in re.findall(r"^skills ((?:demo |policy )?[a-z]+)", README, re.MULTILINE)}
-    assert ("train",) in commands
-    for command in commands:
-        assert CliRunner().invoke(app, [*command, "--help"]).exit_code == 0, command
-
-
-def test_every_page_that_the_readme_links_to_is_there() -> None:
-    for page in re.findall(r"\]\(([^)#]+)\)", README):
-        assert (Path(__file__).parent.parent / page).exists(), page

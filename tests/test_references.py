@@ -1,4 +1,4 @@
-"""Names in documents, docstrings and comments: each file, link and name of code that they refer to exists."""
+"""Names in documents, docstrings and comments: each file, link, command and name of code that they refer to exists."""
 
 import ast
 import io
@@ -13,6 +13,10 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
+from typer.main import get_command
+
+from skills.cli import app
+from tests.api.conformance import conformance
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / name for name in ("README.md", "ARCHITECTURE.md", "CONTRIBUTING.md", "urdf/README.md")]
@@ -22,6 +26,9 @@ PACKAGES = {file.parent.name for file in CODE}
 NAMES_FILE = re.compile(r"(?<![\w./*{}-])(?:[\w-]+/)*[\w-]+\.(?:py|md)\b")
 DOTTED = re.compile(r"`([A-Za-z]\w*(?:\.[A-Za-z_]\w*)+)(?:\(\))?`")
 SLASHED = re.compile(r"`([a-z_]+(?:/[a-z_]+)+)((?:\.\w+)*)`")
+COMMAND = re.compile(r"(?:^(?:\$ )?|`)skills ([a-z][^`\n#|]*)", re.MULTILINE)
+CALL = re.compile(r"\b(?:GET|POST|PUT|DELETE) (/[^\s`\"'?,)|]+)")
+WRONG = ROOT / "docs" / "mistakes.md"  # its commands are misspelt on purpose
 LINK = re.compile(r"\]\((?!https?:)([^)#]*)(?:#([^)]*))?\)")
 OF_OTHERS = {  # files of other projects, a pattern, and one that was rejected
     *("dvrk_bag_replay.py", "launch_crtk_interface.py", "simulator.launch.py", "docs/scene_coordinate_frames.md"),
@@ -148,6 +155,48 @@ def test_every_link_of_a_page_leads_to_a_file_and_a_heading(page: Path) -> None:
         to = page.parent / target if target else page
         assert to.exists(), target
         assert not anchor or anchor in anchors(to), f"{target}#{anchor}"
+
+
+def unknown_words(line: str) -> list[str]:
+    """List the words of a command line that are no command or option, without those that are values."""
+    words, command = line.split(), get_command(app)
+    while hasattr(command, "commands"):
+        if not words or words[0] not in command.commands:
+            return words[:1] or [line]
+        command = command.commands[words.pop(0)]
+    options = {option for one in command.params for option in (*one.opts, *one.secondary_opts)} | {"--help"}
+    named = [word.partition("=")[0].rstrip(".,;:)") for word in words if word.startswith("--")]
+    return [option for option in named if option not in options]
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if page != WRONG], ids=lambda page: page.stem)
+def test_every_command_of_a_page_exists_with_its_options(page: Path) -> None:
+    found = {line: unknown_words(line) for line in COMMAND.findall(page.read_text())}
+    assert {line: words for line, words in found.items() if words} == {}
+
+
+@pytest.mark.parametrize(
+    "line", ["surgen list", "demo", "demo list --surgon kestrel", "plan a b --point=0,0,0 --handof"]
+)
+def test_a_command_that_does_not_exist_is_found(line: str) -> None:
+    assert unknown_words(line)
+
+
+def is_call(path: str) -> bool:
+    """Return whether the service has a path, as a page writes it: `/demos/{id}`, `/demos[/{id}]` or `/policies/...`."""
+    given = re.sub(r"\{[^}]*\}", "x", re.sub(r"\[.*?\]", "", path)).rstrip(".:;/")
+    served = [re.sub(r"\{[^}]*\}", "[^/]+", one) for one in conformance().document["paths"]]
+    return any(re.fullmatch(one, given) for one in served)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_every_call_of_a_page_exists(page: Path) -> None:
+    assert [path for path in CALL.findall(page.read_text()) if not is_call(path)] == []
+
+
+@pytest.mark.parametrize("path", ["/atlas/{suture}", "/demos/{id}/reading", "/policy"])
+def test_a_call_that_does_not_exist_is_found(path: str) -> None:
+    assert not is_call(path)
 
 
 @pytest.mark.nightly  # 10 s of processor time
