@@ -2,6 +2,8 @@
 
 import ast
 import logging
+import re
+import tomllib
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -60,6 +62,16 @@ def test_imports_lead_downwards_only_and_every_module_has_its_floor(monkeypatch,
     monkeypatch.chdir(PROJECT)
     failed = lint_imports(config_filename=str(LAYERS), no_cache=True, no_logo=True)
     assert not failed, capsys.readouterr().out
+
+
+def test_the_table_of_rooms_names_each_after_those_that_it_imports():
+    contract = tomllib.loads(LAYERS.read_text())["tool"]["importlinter"]["contracts"][0]["layers"]
+    heights = {name: height for height, layer in enumerate(reversed(contract)) for name in re.findall(r"\w+", layer)}
+    page = (PROJECT / "ARCHITECTURE.md").read_text()
+    rows = re.findall(r"^\| (`[^|]*) \|", page[page.index("| room |") :], re.MULTILINE)
+    rooms = [max(heights[room] for room in re.findall(r"`(\w+)", row)) for row in rows]
+    assert len(rooms) > 10
+    assert rooms == sorted(rooms)
 
 
 @pytest.mark.parametrize(
