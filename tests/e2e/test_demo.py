@@ -53,7 +53,7 @@ def test_the_demo_does_the_main_job_and_exits_with_0(tmp_path: Path, how: list[s
 STUBBORN = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print(flush=True); time.sleep(600)"
 
 
-def test_a_service_that_does_not_end_is_killed_and_does_not_outlive_the_demo(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_service_that_does_not_end_is_killed_at_the_end_of_the_demo(monkeypatch: pytest.MonkeyPatch) -> None:
     """The service holds the demo's output open, so that a caller that reads it would wait for the service."""
     monkeypatch.setattr(demo, "END_S", 0.2)
     with subprocess.Popen([sys.executable, "-c", STUBBORN], stdout=subprocess.PIPE) as server:
