@@ -13,7 +13,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from skills.errors import BadInput
-from skills.report.drawings import draw_all
 from skills.report.numbers import ABSENT, Effort, compute, paper_source, sample_source
 from skills.report.page import Chapter, Table, printed_rmse, tables_of, write_page
 
@@ -50,6 +49,8 @@ def write_report(
     """
     if to.exists() and not to.is_dir():
         raise BadInput(f"{to} is a file; name a folder to write the report to.")
+    from skills.report.drawings import draw_all  # here, because it imports matplotlib
+
     theirs = paper_source(paper_data)
     to.mkdir(parents=True, exist_ok=True)
     parts = []

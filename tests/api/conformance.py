@@ -3,7 +3,7 @@
 import json
 import re
 from functools import cache
-from tempfile import TemporaryDirectory
+from pathlib import Path
 from typing import Any
 
 import httpx2 as httpx
@@ -11,16 +11,23 @@ import jsonschema_rs
 
 from skills.api.app import create_app
 from skills.settings import Settings
+from tests.leftovers import shared
 
 PARAMETER = re.compile(r"\{\w+\}")
 
 
 @cache
-def conformance(database_url: str | None = None) -> "Conformance":
-    """Return the judge that all tests share: the OpenAPI document is the same for all applications."""
-    with TemporaryDirectory() as folder:
-        settings = Settings(database_url=database_url or f"sqlite:///{folder}/nothing.sqlite")
-        return Conformance(create_app(settings).openapi())
+def conformance() -> "Conformance":
+    """Return the judge that all tests share: the OpenAPI document is the same for all applications.
+
+    It is made once in a run: that takes a second.
+    """
+
+    def make(folder: Path) -> None:
+        app = create_app(Settings(database_url=f"sqlite:///{folder}/nothing.sqlite"))
+        (folder / "openapi.json").write_text(json.dumps(app.openapi()))
+
+    return Conformance(json.loads((shared("openapi", make) / "openapi.json").read_text()))
 
 
 class Conformance:

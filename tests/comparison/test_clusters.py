@@ -4,8 +4,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from sklearn.cluster import AgglomerativeClustering
-from sklearn.metrics import adjusted_rand_score, silhouette_score
 
 from skills.comparison.distances import WORTH, dendrogram, distances, how_many, shape_of, silhouette
 from skills.errors import BadInput
@@ -29,6 +27,9 @@ def test_four_places_on_a_line_by_hand():
 
 @given(st.integers(0, 500), st.integers(3, 25), st.data())
 def test_they_are_those_of_another_library(seed, size, data):
+    from sklearn.cluster import AgglomerativeClustering  # here, because the import takes a second
+    from sklearn.metrics import adjusted_rand_score, silhouette_score
+
     points = np.random.default_rng(seed).normal(0, 1, (size, 3))
     apart = np.abs(points[:, None] - points[None, :]).sum(axis=2)
     tree = dendrogram(apart)
@@ -44,6 +45,8 @@ def test_they_are_those_of_another_library(seed, size, data):
 
 
 def test_a_cohorts_surgeons_are_its_clusters():
+    from sklearn.metrics import adjusted_rand_score
+
     drawn = cohort(1)
     shapes = [shape_of(demo) for demo in drawn.demos]
     apart = distances(shapes, shapes)

@@ -4,14 +4,13 @@ truncations    cut at random places
 boundary_cuts  cut at every record's beginning, one byte before it and one after it
 flips          one bit flipped
 mutations      records swapped, doubled, dropped, edited, with lengths, numbers and checksums corrected or not
-bombs          small files that would cost much time or memory
+BOMBS          small files that would cost much time or memory, and LARGE_BOMBS
 """
 
 import random
 import struct
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import cache
 
 import lz4.frame
 import numpy as np
@@ -162,42 +161,50 @@ _CHANGES = [*_SIMPLE, *[_inside_a_chunk] * 8, _change_compression]
 # ---- bombs ------------------------------------------------------------------------------------------------------
 
 
-@cache
-def bombs() -> dict[str, bytes]:
-    """Return the files that would cost much time or memory, by name; most are below 1 MB, none above 60 MB."""
-    chunk, whole = records.chunk, records.whole
-    zeros, small = zstd_of(1 << 30), records.packed(bytes(100), "zstd")
-    lz4_zeros = lz4_of(256 << 20)
+_SMALL_CHUNK = records.packed(bytes(100), "zstd")
+BOMBS: dict[str, Callable[[], bytes]] = {  # each makes one file; most are below 1 MB
+    "zstd of 1 GiB that claims 100 bytes": lambda: _stored(zstd_of(1 << 30), 100),
+    "zstd of 1 GiB that claims 64 MiB": lambda: _stored(zstd_of(1 << 30), 64 << 20),
+    "zstd of 1 GiB without its size in the frame": lambda: _stored(zstd_of(1 << 30, told=False), 64 << 20),
+    "zstd of 1 GiB that says so": lambda: _stored(zstd_of(1 << 30), 1 << 30),
+    "zstd of 100 bytes that claims 64 MiB": lambda: _stored(_SMALL_CHUNK, 64 << 20),
+    "zstd of 100 bytes that claims 2^63": lambda: _stored(_SMALL_CHUNK, 2**63),
+    "lz4 of 256 MiB that claims 100 bytes": lambda: _stored(lz4_of(256 << 20), 100, "lz4"),
+    "lz4 of 256 MiB that claims 64 MiB": lambda: _stored(lz4_of(256 << 20), 64 << 20, "lz4"),
+    "64 MiB of empty records, zstd": lambda: records.whole(empty_records("zstd")),
+    "64 MiB of empty records, lz4": lambda: records.whole(empty_records("lz4")),
+    "64 MiB of empty messages": lambda: records.whole(POSES_DEFINED + empty_messages(64 << 20)),
+    "100 chunks of 64 MiB": lambda: records.whole(
+        100 * records.chunk(b"", stored=zstd_of(64 << 20), size=64 << 20, crc=0)
+    ),
+    "chunks in chunks": lambda: records.whole(nested_chunks(200)),
+    "an array of 2^32 joints": lambda: records.whole(JOINTS_DEFINED + records.message(2, 1, ENDLESS_JOINTS)),
+    "a record of 2^63 bytes": lambda: records.MAGIC + records.header() + records.record(0x80, bytes(64), 2**63),
+    "a message of 2^63 bytes": lambda: records.whole(POSES_DEFINED + records.record(records.MESSAGE, bytes(64), 2**63)),
+    "a definition of 2^40 fields": lambda: records.whole(records.schema(1, topics.POSE, doubling(40)) + ONE_POSE),
+    "a definition that holds itself": lambda: records.whole(records.schema(1, topics.POSE, doubling(0)) + ONE_POSE),
+}
+LARGE_BOMBS: dict[str, Callable[[], bytes]] = {  # from 16 to 60 MB
+    "a million tiny chunks": lambda: records.whole(1_000_000 * records.chunk(b"", compression="")),
+    "a million empty metadata records": lambda: records.whole(1_000_000 * records.record(records.METADATA, bytes(8))),
+    "65,535 channels, each 20 times": lambda: records.whole(20 * many_channels()),
+}
+
+
+def _stored(data: bytes, claimed: int, compression: str = "zstd") -> bytes:
+    """Return a file of one chunk, as it is stored and with the size that it claims."""
+    return records.whole(records.chunk(b"", compression=compression, stored=data, size=claimed, crc=0))
+
+
+def nested_chunks(levels: int) -> bytes:
     nested = POSES
-    for _ in range(200):
-        nested = chunk(nested)
-    return {
-        "zstd of 1 GiB that claims 100 bytes": whole(chunk(b"", stored=zeros, size=100, crc=0)),
-        "zstd of 1 GiB that claims 64 MiB": whole(chunk(b"", stored=zeros, size=64 << 20, crc=0)),
-        "zstd of 1 GiB without its size in the frame": whole(
-            chunk(b"", stored=zstd_of(1 << 30, told=False), size=64 << 20, crc=0)
-        ),
-        "zstd of 1 GiB that says so": whole(chunk(b"", stored=zeros, size=1 << 30, crc=0)),
-        "zstd of 100 bytes that claims 64 MiB": whole(chunk(b"", stored=small, size=64 << 20, crc=0)),
-        "zstd of 100 bytes that claims 2^63": whole(chunk(b"", stored=small, size=2**63, crc=0)),
-        "lz4 of 256 MiB that claims 100 bytes": whole(chunk(b"", compression="lz4", stored=lz4_zeros, size=100, crc=0)),
-        "lz4 of 256 MiB that claims 64 MiB": whole(
-            chunk(b"", compression="lz4", stored=lz4_zeros, size=64 << 20, crc=0)
-        ),
-        "64 MiB of empty records, zstd": whole(empty_records("zstd")),
-        "64 MiB of empty records, lz4": whole(empty_records("lz4")),
-        "64 MiB of empty messages": whole(POSES_DEFINED + empty_messages(64 << 20)),
-        "100 chunks of 64 MiB": whole(100 * chunk(b"", stored=zstd_of(64 << 20), size=64 << 20, crc=0)),
-        "chunks in chunks": whole(nested),
-        "a million tiny chunks": whole(1_000_000 * chunk(b"", compression="")),
-        "a million empty metadata records": whole(1_000_000 * records.record(records.METADATA, bytes(8))),
-        "65,535 channels, each 20 times": whole(20 * MANY_CHANNELS),
-        "a record of 2^63 bytes": records.MAGIC + records.header() + records.record(0x80, bytes(64), 2**63),
-        "a message of 2^63 bytes": whole(POSES_DEFINED + records.record(records.MESSAGE, bytes(64), 2**63)),
-        "an array of 2^32 joints": whole(JOINTS_DEFINED + records.message(2, 1, ENDLESS_JOINTS)),
-        "a definition of 2^40 fields": whole(records.schema(1, topics.POSE, doubling(40)) + ONE_POSE),
-        "a definition that holds itself": whole(records.schema(1, topics.POSE, doubling(0)) + ONE_POSE),
-    }
+    for _ in range(levels):
+        nested = records.chunk(nested)
+    return nested
+
+
+def many_channels() -> bytes:
+    return b"".join(records.channel(number, 0, f"/{number}") for number in range(1, 65536))
 
 
 def zstd_of(size: int, *, told: bool = True) -> bytes:
@@ -246,4 +253,3 @@ JOINTS_DEFINED = records.schema(2, topics.JOINT_STATE, DEFINITIONS[topics.JOINT_
     2, 2, "/PSM2/measured_js"
 )
 ENDLESS_JOINTS = b"\0\1\0\0" + struct.pack("<iIIBxxxII", 1, 0, 1, 0, 0, 2**32 - 1) + bytes(64)
-MANY_CHANNELS = b"".join(records.channel(number, 0, f"/{number}") for number in range(1, 65536))

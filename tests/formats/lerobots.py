@@ -2,7 +2,7 @@
 
 import io
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -201,34 +201,27 @@ def write(files: Mapping[str, bytes], folder: Path) -> Path:
 # ---- hostile files -------------------------------------------------------------------------------------------------
 
 
-def bombs() -> dict[str, bytes]:
-    """Return zips of one episode, each below 1 MB, that would cost much time or memory, by name."""
-    rows = 1_000_000
-    zeros = np.zeros((rows, 16), dtype=np.float32)
-    deep: Any = pa.array([0.0] * 4)
-    for _ in range(200):
-        deep = pa.ListArray.from_arrays(pa.array(range(5), pa.int32()), deep)
-    return {
-        "a million rows of one value": made({"observation.state": zeros}),
-        "ten million rows of one number": made({"observation.state": poses(4)}, data=_endless("observation.state")),
-        "a dictionary of one text of 60 MB": made(
-            columns_of(4), data=parquet(columns_of(4) | {"observation.meta.tool.psm1": ["x" * (60 << 20)] * 4})
-        ),
-        "lists of a million numbers": made({"observation.state": poses(4)}, data=_long_lists()),
-        "200 levels": made({"observation.state": poses(4)}, data=parquet(pa.table({"observation.state": deep}))),
-        "a footer of 2 GiB": made(columns_of(4), data=b"PAR1" + bytes(100) + b"\xff\xff\xff\x7fPAR1"),
-        "a footer of zeros": made(columns_of(4), data=b"PAR1" + bytes(100) + b"\x40\0\0\0PAR1"),
-        "a schema of 5000 levels": made(columns_of(4), data=_deep_footer(5000)),
-        "a schema of 200,000 levels": made(columns_of(4), data=_deep_footer(200_000)),
-        "JSON of brackets": zipped(episode(count=4) | {"meta/info.json": b"[" * 1_000_000}),
-        "a feature of 10^30 numbers": zipped(
-            episode(count=4) | {"meta/info.json": info_of({"observation.state": numbers(None, 10**30)}, 1, 4)}
-        ),
-        "5000 features of 5000 numbers": zipped(
-            episode(count=4) | {"meta/info.json": info_of({f"x{k}": numbers(None, 5000) for k in range(5000)}, 1, 4)}
-        ),
-        "a rate of NaN": zipped(episode(count=4, fps=float("nan"))),
-    }
+BOMBS: dict[str, Callable[[], bytes]] = {  # each makes a zip of one episode, below 1 MB
+    "a million rows of one value": lambda: made({"observation.state": np.zeros((1_000_000, 16), dtype=np.float32)}),
+    "ten million rows of one number": lambda: made({"observation.state": poses(4)}, data=_endless("observation.state")),
+    "a dictionary of one text of 60 MB": lambda: made(
+        columns_of(4), data=parquet(columns_of(4) | {"observation.meta.tool.psm1": ["x" * (60 << 20)] * 4})
+    ),
+    "lists of a million numbers": lambda: made({"observation.state": poses(4)}, data=_long_lists()),
+    "200 levels": lambda: made({"observation.state": poses(4)}, data=_deep_lists(200)),
+    "a footer of 2 GiB": lambda: made(columns_of(4), data=b"PAR1" + bytes(100) + b"\xff\xff\xff\x7fPAR1"),
+    "a footer of zeros": lambda: made(columns_of(4), data=b"PAR1" + bytes(100) + b"\x40\0\0\0PAR1"),
+    "a schema of 5000 levels": lambda: made(columns_of(4), data=_deep_footer(5000)),
+    "a schema of 200,000 levels": lambda: made(columns_of(4), data=_deep_footer(200_000)),
+    "JSON of brackets": lambda: zipped(episode(count=4) | {"meta/info.json": b"[" * 1_000_000}),
+    "a feature of 10^30 numbers": lambda: zipped(
+        episode(count=4) | {"meta/info.json": info_of({"observation.state": numbers(None, 10**30)}, 1, 4)}
+    ),
+    "5000 features of 5000 numbers": lambda: zipped(
+        episode(count=4) | {"meta/info.json": info_of({f"x{k}": numbers(None, 5000) for k in range(5000)}, 1, 4)}
+    ),
+    "a rate of NaN": lambda: zipped(episode(count=4, fps=float("nan"))),
+}
 
 
 def made(columns: Mapping[str, Any], **how: Any) -> bytes:
@@ -245,6 +238,13 @@ def _long_lists() -> bytes:
     zeros = pa.array(np.zeros(8_000_000, dtype=np.float32))
     lists = pa.ListArray.from_arrays(pa.array([0, 2_000_000, 4_000_000, 6_000_000, 8_000_000], pa.int32()), zeros)
     return parquet(pa.table({"observation.state": lists}), compression="zstd")
+
+
+def _deep_lists(levels: int) -> bytes:
+    deep: Any = pa.array([0.0] * 4)
+    for _ in range(levels):
+        deep = pa.ListArray.from_arrays(pa.array(range(5), pa.int32()), deep)
+    return parquet(pa.table({"observation.state": deep}))
 
 
 def _deep_footer(levels: int) -> bytes:

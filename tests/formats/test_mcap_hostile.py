@@ -8,6 +8,7 @@ import io
 import time
 from collections import Counter
 from collections.abc import Iterable
+from functools import cache
 
 import pytest
 
@@ -20,12 +21,17 @@ from tests.formats.weigh import weigh
 
 MEMORY_MIB = 512.0
 SECONDS = 5.0
-FILES = {
-    "one topic in 6 chunks": bags.pose_bag(bags.straight(60)),
-    "every signal in one chunk": write_mcap(bags.recording(60)),
-    "no chunks": bags.unchunked(bags.straight(60), checksum=True),
+MAKE = {
+    "one topic in 6 chunks": lambda: bags.pose_bag(bags.straight(60)),
+    "every signal in one chunk": lambda: write_mcap(bags.recording(60)),
+    "no chunks": lambda: bags.unchunked(bags.straight(60), checksum=True),
 }
 QUICK, WHOLE = 100, 2000
+
+
+@cache
+def file(name: str) -> bytes:
+    return MAKE[name]()
 
 
 def read(data: bytes) -> Recording:
@@ -44,60 +50,59 @@ def swept(files: Iterable[bytes]) -> tuple[Counter[str], list[Recording]]:
     return counts, accepted
 
 
-@pytest.mark.parametrize("name", FILES)
+@pytest.mark.parametrize("name", MAKE)
 def test_a_file_cut_at_any_record_or_beside_it_is_refused(name):
-    _, accepted = swept(hostile.boundary_cuts(FILES[name]))
+    _, accepted = swept(hostile.boundary_cuts(file(name)))
     assert not accepted
 
 
-@pytest.mark.parametrize("name", FILES)
+@pytest.mark.parametrize("name", MAKE)
 @pytest.mark.parametrize("count", [QUICK, pytest.param(1000, marks=pytest.mark.nightly)])
 def test_a_file_cut_anywhere_is_refused(name, count):
-    counts, accepted = swept(hostile.truncations(FILES[name], count, seed=count))
+    counts, accepted = swept(hostile.truncations(file(name), count, seed=count))
     assert not accepted
     assert counts == {"UnreadableRecording": count}
 
 
-@pytest.mark.parametrize("name", FILES)
+@pytest.mark.parametrize("name", MAKE)
 @pytest.mark.parametrize("count", [QUICK, pytest.param(WHOLE, marks=pytest.mark.nightly)])
 def test_a_flipped_bit_is_refused_or_changes_nothing(name, count):
-    whole = read(FILES[name])
-    _, accepted = swept(hostile.flips(FILES[name], count, seed=count))
+    whole = read(file(name))
+    _, accepted = swept(hostile.flips(file(name), count, seed=count))
     for other in accepted:
         bags.assert_same(other, whole)
     assert len(accepted) < 0.4 * count
 
 
-@pytest.mark.parametrize("name", FILES)
+@pytest.mark.parametrize("name", MAKE)
 @pytest.mark.parametrize("count", [QUICK, pytest.param(WHOLE, marks=pytest.mark.nightly)])
 def test_misassembled_records_are_refused_or_form_another_complete_file(name, count):
-    counts, _ = swept(hostile.mutations(FILES[name], count, seed=count))
+    counts, _ = swept(hostile.mutations(file(name), count, seed=count))
     assert counts["UnreadableRecording"] > 0.6 * count
 
 
 def test_the_mutations_of_a_seed_are_always_the_same():
-    data = FILES["one topic in 6 chunks"]
+    data = file("one topic in 6 chunks")
     assert list(hostile.mutations(data, 50, 3)) == list(hostile.mutations(data, 50, 3))
     assert list(hostile.mutations(data, 50, 3)) != list(hostile.mutations(data, 50, 4))
 
 
-SMALL = [name for name, data in hostile.bombs().items() if len(data) < 2 * 2**20]
-
-
-@pytest.mark.parametrize("name", SMALL)
+@pytest.mark.parametrize("name", hostile.BOMBS)
 def test_a_small_bomb_is_refused_at_once(name):
+    bomb = hostile.BOMBS[name]()
+    assert len(bomb) < 2 << 20
     began = time.process_time()
     with pytest.raises(SkillsError):
-        read(hostile.bombs()[name])
+        read(bomb)
     assert time.process_time() - began < SECONDS
 
 
 @pytest.mark.nightly
-@pytest.mark.parametrize("name", hostile.bombs())
+@pytest.mark.parametrize("name", [*hostile.BOMBS, *hostile.LARGE_BOMBS])
 def test_a_bomb_costs_little_time_and_memory(name, tmp_path):
-    file = tmp_path / "bomb.mcap"
-    file.write_bytes(hostile.bombs()[name])
-    weight = weigh(file)
+    bomb = tmp_path / "bomb.mcap"
+    bomb.write_bytes((hostile.BOMBS | hostile.LARGE_BOMBS)[name]())
+    weight = weigh(bomb)
     print(f"{name}: {weight.seconds:.2f} s, {weight.peak_mib:.0f} MiB, {weight.outcome}")
     assert weight.outcome in ("UnreadableRecording", "NoUsableTopic")
     assert weight.seconds < SECONDS

@@ -4,9 +4,6 @@ from dataclasses import asdict
 
 import numpy as np
 import pytest
-from scipy.stats import spearmanr
-from sklearn.linear_model import LogisticRegression, Ridge
-from sklearn.preprocessing import StandardScaler
 
 from skills.errors import BadInput
 from skills.scoring.calibration import (
@@ -167,6 +164,9 @@ def test_the_duration_of_the_trial_competes_with_a_model_of_hand_offs() -> None:
 
 
 def test_rivals_are_the_trivial_predictions_and_have_not_seen_the_surgeon() -> None:
+    from sklearn.linear_model import Ridge  # here and below, because the import takes a second
+    from sklearn.preprocessing import StandardScaler
+
     drawn = cohort(motions=2)
     found = rival_predictions(drawn)
     assert list(found) == list(RIVALS)
@@ -185,6 +185,9 @@ def test_rivals_are_the_trivial_predictions_and_have_not_seen_the_surgeon() -> N
 
 
 def test_the_model_is_that_of_scikit_learn_as_one_would_write_it() -> None:
+    from sklearn.linear_model import LogisticRegression, Ridge
+    from sklearn.preprocessing import StandardScaler
+
     drawn = cohort()
     model = calibrate(drawn)
     standard = StandardScaler().fit_transform(drawn.values)
@@ -196,6 +199,9 @@ def test_the_model_is_that_of_scikit_learn_as_one_would_write_it() -> None:
 
 
 def test_of_two_levels_the_probability_is_that_of_scikit_learn_too() -> None:
+    from sklearn.linear_model import LogisticRegression
+    from sklearn.preprocessing import StandardScaler
+
     drawn = cohort()
     two = Cohort(drawn.values, drawn.trials, drawn.surgeons, drawn.ratings, np.where(drawn.levels == 0, 0, 2))
     model = calibrate(two)
@@ -241,6 +247,8 @@ def test_a_figure_that_never_varies_weighs_nothing() -> None:
 
 
 def test_rank_correlation_is_that_of_scipy_ties_included() -> None:
+    from scipy.stats import spearmanr
+
     rng = np.random.default_rng(2)
     for _ in range(20):
         one, other = rng.integers(0, 6, 15).astype(float), rng.integers(0, 6, 15).astype(float)

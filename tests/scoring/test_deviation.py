@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tslearn.metrics import dtw_path_from_metric
 
 from skills.demonstration.demonstration import Demo
 from skills.errors import BadPath
@@ -67,6 +66,8 @@ def test_nothing_lies_from_itself() -> None:
 
 @pytest.mark.nightly  # its library compiles for 12 s
 def test_the_total_is_that_of_another_library_and_the_axes_add_up_to_it() -> None:
+    from tslearn.metrics import dtw_path_from_metric  # here, because it imports much
+
     found = laid_on(made(hump(7.0, -4.0)), made(hump(-3.0, 6.0)))
     other = dtw_path_from_metric(found.path_mm, found.reference_mm, metric="cityblock")[1]
     assert found.total_mm == pytest.approx(other)

@@ -5,10 +5,10 @@ import subprocess
 import sys
 from dataclasses import replace
 from functools import cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 from PIL import Image
 
 from skills.kinematics import CLASSIC, JOINTS
@@ -17,6 +17,9 @@ from skills.planning.trajectory import A2, TRANSFER, Trajectory, time_parametris
 from skills.simulation import pictures
 from skills.verification.playback import PAD, PSM_A, Playback, link_pairs
 from tests.planning.motions import PSM_M, hand_off, ideal_playback, small_trajectory
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 TILT = np.radians(35) / 2
 BESIDE = PsmM(PSM_M, (160.0, 20.0, 20.0), (0.0, float(np.sin(TILT)), 0.0, float(np.cos(TILT))))  # invented
@@ -48,7 +51,7 @@ def measured(motion: Trajectory) -> Playback:
     )
 
 
-def lines(figure: Figure, panel: int) -> dict[str, np.ndarray]:
+def lines(figure: "Figure", panel: int) -> dict[str, np.ndarray]:
     """Read the lines of a panel by their labels, each of shape (2, K); of equal labels the last."""
     return {line.get_label(): np.array(line.get_data()) for line in figure.axes[panel].lines}
 
