@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +15,14 @@ from typer.main import get_command
 from typer.testing import CliRunner
 
 from skills.cli import app
-from skills.cli.shell import complete_surgeons, complete_sutures
+from skills.cli.policies import MANY
+from skills.cli.shell import complete_surgeons, complete_sutures, connect
 from skills.db.session import Database
 from skills.formats import read_recording, write_mcap
 from skills.formats.lerobot.writer import AboutDataset, ExportedEpisode, dataset_files
 from skills.library.catalogue import put_surgeon
 from skills.seeds.recordings import sample_recordings
-from skills.settings import settings
+from skills.settings import Settings, settings
 from tests.formats import bags, lerobots, trials
 from tests.library import cases
 
@@ -31,6 +33,7 @@ STYLE = ("wren", "simple-running")
 def skills(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Yield a function that runs a command on a separate database and returns its exit code and its output."""
     monkeypatch.setenv("SKILLS_DATABASE_URL", f"sqlite:///{tmp_path / 'skills.sqlite'}")
+    monkeypatch.setenv("SKILLS_WORKERS", "1")  # tests/jobs has several
     monkeypatch.delenv("SKILLS_SERVER", raising=False)
     settings.cache_clear()
 
@@ -40,6 +43,22 @@ def skills(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 
     yield run
     settings.cache_clear()
+
+
+def test_a_command_that_waits_for_one_job_starts_one_worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    crews: list[int] = []
+
+    @contextmanager
+    def working(given: Settings) -> Iterator[None]:
+        crews.append(given.workers)
+        yield
+
+    monkeypatch.setattr("skills.serving.working", working)
+    of_four = Settings(database_url=f"sqlite:///{tmp_path / 'skills.sqlite'}", workers=4)
+    for given, workers in ((of_four, 0), (of_four, 1), (of_four, MANY), (of_four.model_copy(update={"workers": 0}), 1)):
+        with connect(given, workers=workers):
+            pass
+    assert crews == [1, 4, 0]
 
 
 def test_from_a_bag_folder_to_a_released_policy_and_a_plan(skills, tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ import json
 from collections.abc import Iterable
 from typing import Any
 
-from fastapi import Response
+from fastapi import APIRouter, Response
 
 from skills.api.authentication import is_open
 from skills.schemas import Given
@@ -50,6 +50,11 @@ HEADERS = {
     "Link": {"description": 'The next page, as `rel="next"` (RFC 8288).', "schema": {"type": "string"}},
     "Retry-After": {"description": "Seconds.", "schema": {"type": "string"}},
 }
+
+
+def router_of(**options: Any) -> APIRouter:
+    """Return a router whose operations have the names of their functions as ids."""
+    return APIRouter(generate_unique_id_function=lambda route: route.name, **options)
 
 
 def gives(model: Any, *refused: int, as_well: tuple[str, ...] = ()) -> dict[str, Any]:

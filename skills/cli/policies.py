@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from skills.schemas.given import RetrainedStyle, Retraining
 
 WATCH_S = 0.3
+MANY = 64  # workers for a batch: as many as the settings say, which allow no more
 ABOUT = ("id", "kind", "state", "progress", "created_at", "error")
 
 learning_commands = typer.Typer()
@@ -74,7 +75,7 @@ def train(
     With --release, the exit code is 1 if the style does not serve the version afterwards.
     """
     chosen = _learner(learner, setting or [])
-    with service(works=True) as client:
+    with service(workers=1) as client:
         asked = client.train(
             surgeon,
             suture,
@@ -105,7 +106,7 @@ def retrain(
 ) -> None:
     """Learn many styles again, and wait for them; exit code 1 if one failed, or with --release was not released."""
     chosen = _learner(learner, setting or [])
-    with service(works=True) as client:
+    with service(workers=MANY) as client:
         job = client.retrain(surgeon=surgeon, suture=suture, only_stale=only_stale, learner=chosen, release=release)
         ended = _watched(client, job.id)
         styles = client.retrained(job.id)
@@ -197,7 +198,7 @@ def job_wait(
     as_json: AsJson = False,
 ) -> None:
     """Wait until a job has ended; exit code 1 if it did not succeed."""
-    with service(works=True) as client:
+    with service(workers=MANY) as client:
         show(finished(client, client.job(job), timeout_s), as_json, ABOUT)
 
 
@@ -405,7 +406,7 @@ def play(
     as_json: AsJson = False,
 ) -> None:
     """Play a plan in the simulator, and print the verdict; exit code 1 if it is not feasible."""
-    with service(works=True) as client:
+    with service(workers=1) as client:
         playback = client.playback(result_of(finished(client, client.play(plan_id)))["playback"])
         if picture is not None:
             picture.write_bytes(client.picture(playback.id))

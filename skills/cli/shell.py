@@ -231,19 +231,20 @@ def _problem(error: SkillsError, detail: str) -> dict[str, Any]:
 
 
 @contextmanager
-def service(*, works: bool = False) -> Iterator["Client"]:
-    """Connect to the service, or to the application in this process."""
+def service(*, workers: int = 0) -> Iterator["Client"]:
+    """Connect to the service, or to the application in this process with up to a number of workers (`connect`)."""
     from skills.settings import settings
 
-    with connect(settings(), works=works) as client:
+    with connect(settings(), workers=workers) as client:
         yield client
 
 
 @contextmanager
-def connect(settings: "Settings", *, works: bool = False) -> Iterator["Client"]:
+def connect(settings: "Settings", *, workers: int = 0) -> Iterator["Client"]:
     """Connect to the service at SKILLS_SERVER, or else to the application in this process.
 
-    In-process, jobs need a worker: `works` runs one while the connection is open.
+    In-process, jobs need a worker. While the connection is open as many run as the settings say, but not more than
+    `workers`: a further one does nothing for a single job, and takes processor time from the first.
     """
     from skills.client import Client
 
@@ -262,7 +263,8 @@ def connect(settings: "Settings", *, works: bool = False) -> Iterator["Client"]:
     # no check of a key is needed: the caller has access to the database anyway
     key = {"X-API-Key": app.state.access.own_key}
     in_process = TestClient(app, base_url="http://localhost", headers=key)
-    with in_process as http, working(settings) if works else nullcontext():
+    crew = settings.model_copy(update={"workers": min(workers, settings.workers)})
+    with in_process as http, working(crew) if workers else nullcontext():
         try:
             yield Client(http)
         finally:

@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+from tests.api.conformance import conformance
 from tests.api.service import KESTREL, POLICY, Service, assert_problem
 
 CANARY = "Zaphod-42"
@@ -78,8 +79,8 @@ SEGMENTS = (
 )
 
 
-def routes(service: Service) -> Iterator[tuple[str, str, dict[str, Any]]]:
-    for path, calls in service.http.get("/openapi.json").json()["paths"].items():
+def routes() -> Iterator[tuple[str, str, dict[str, Any]]]:
+    for path, calls in conformance().document["paths"].items():
         for method, call in calls.items():
             yield method.upper(), path, call
 
@@ -122,10 +123,10 @@ def untouched(still: Service) -> Iterator[None]:
     assert still.counts() | CACHED == before
 
 
-def test_every_route_that_takes_json_is_in_the_table_above(still: Service):
+def test_every_route_that_takes_json_is_in_the_table_above():
     with_json = {
         (method, path)
-        for method, path, call in routes(still)
+        for method, path, call in routes()
         if "application/json" in call.get("requestBody", {}).get("content", {})
     }
     assert with_json == set(SOUND)
@@ -161,7 +162,7 @@ def test_an_unknown_field_is_refused_and_not_repeated(still: Service, untouched:
 
 @pytest.mark.parametrize("segment", SEGMENTS, ids=lambda segment: segment[:12])
 def test_no_path_is_ours_to_blame(still: Service, untouched: None, segment: str):
-    for method, path, _ in routes(still):
+    for method, path, _ in routes():
         for name in [part[1:-1] for part in path.split("/") if part.startswith("{")]:
             if segment in ("..", "%2e%2e") and path.endswith(f"{{{name}}}"):
                 continue  # the client itself resolves it to the parent folder
@@ -202,15 +203,15 @@ NOT_JSON = (
 )  # fmt: skip
 
 
-def lists(service: Service) -> list[str]:
+def lists() -> list[str]:
     """Name the routes that return lists, according to their documentation."""
-    found = (path for method, path, call in routes(service) if method == "GET" and "Link" in str(call["responses"]))
+    found = (path for method, path, call in routes() if method == "GET" and "Link" in str(call["responses"]))
     return [filled(path) for path in found]
 
 
 def test_no_limit_and_no_cursor_is_ours_to_blame(still: Service, untouched: None):
-    assert len(lists(still)) == 8
-    for path in lists(still):
+    assert len(lists()) == 8
+    for path in lists():
         for name, values in (("limit", LIMITS), ("cursor", CURSORS)):
             for value in values:
                 answer = still.http.get(path, params={name: value.encode("utf-8", "surrogatepass")})
@@ -221,9 +222,9 @@ def test_no_limit_and_no_cursor_is_ours_to_blame(still: Service, untouched: None
 
 
 def test_the_cursor_of_one_list_is_refused_by_another_or_is_a_place_in_it(still: Service):
-    given = {str(still.http.get(path, params={"limit": 1}).json().get("next")) for path in lists(still)} - {"None"}
+    given = {str(still.http.get(path, params={"limit": 1}).json().get("next")) for path in lists()} - {"None"}
     assert len(given) > 1
-    for path in lists(still):
+    for path in lists():
         for cursor in given:
             answer = still.http.get(path, params={"cursor": cursor})
             if answer.status_code != 200:
@@ -231,7 +232,7 @@ def test_the_cursor_of_one_list_is_refused_by_another_or_is_a_place_in_it(still:
 
 
 def test_a_parameter_that_there_is_not_or_that_comes_twice_harms_nobody(still: Service, untouched: None):
-    for method, path, _ in routes(still):
+    for method, path, _ in routes():
         for query in (
             "?limit=1&limit=200&limit=-1",
             "?" + "a=b&" * 1000,
@@ -249,7 +250,7 @@ def test_a_parameter_that_there_is_not_or_that_comes_twice_harms_nobody(still: S
 
 @pytest.mark.parametrize("header", HEADERS, ids=lambda header: str(header)[:30])
 def test_no_header_is_ours_to_blame(still: Service, untouched: None, header: dict[str, str]):
-    for method, path, _ in routes(still):
+    for method, path, _ in routes():
         if method == "DELETE":
             continue  # an unsupported header does not cause a refusal
         answer = still.http.request(method, filled(path), headers=header, json=None if method == "GET" else [])

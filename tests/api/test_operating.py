@@ -20,6 +20,7 @@ from skills.errors import NotReady
 from skills.jobs.readiness import refuse_left_over, refuse_unready
 from skills.settings import Settings
 from tests import backends
+from tests.api.conformance import conformance
 from tests.api.service import KESTREL, POLICY, Service, assert_problem, serving
 from tests.jobs.house import House
 from tests.waiting import END_S, crowded
@@ -221,6 +222,13 @@ def figures(scraped: str) -> dict[str, float]:
         for family in text_string_to_metric_families(scraped)
         for one in family.samples
     }
+
+
+def test_applications_share_the_routes_that_were_analysed_once(service: Service, still: Service):
+    """Analysing them again would cost the first request of each application 90 ms."""
+    same = {id(route) for route in service.app.routes} & {id(route) for route in still.app.routes}
+    shared = {getattr(route, "path", "") for route in service.app.routes if id(route) in same}
+    assert shared >= {*conformance().document["paths"]}
 
 
 def test_requests_are_counted_by_route_method_and_status(trained: Service):

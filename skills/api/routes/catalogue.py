@@ -2,11 +2,11 @@
 
 from typing import Annotated
 
-from fastapi import APIRouter, Path, Query, Request, Response
+from fastapi import Path, Query, Request, Response
 
 from skills.api.authorisation import needs
 from skills.api.dependencies import Actor, Db, Jobs, Limit, RowCursor, Slug, SlugCursor, Strict
-from skills.api.openapi import ends, gives, gives_page, makes, says
+from skills.api.openapi import ends, gives, gives_page, makes, router_of, says
 from skills.api.responses import Condition, Giving, refuse_changed, say, stored
 from skills.library import catalogue, erasure
 from skills.library.catalogue import surgeon_json, suture_json
@@ -16,7 +16,7 @@ from skills.schemas.given import Key, NewKey, Page, Surgeon, SutureType
 from skills.schemas.requests import KEY, LINE, KeyIn, SurgeonIn, SutureTypeIn
 from skills.settings import MEBIBYTE
 
-router = APIRouter(route_class=Strict, tags=["catalogue"], max_body_size=MEBIBYTE)
+router = router_of(route_class=Strict, tags=["catalogue"], max_body_size=MEBIBYTE)
 
 Search = Annotated[str | None, Query(min_length=1, max_length=64, pattern=LINE)]
 
@@ -99,7 +99,7 @@ def get_suture_type(suture: Slug, db: Db, give: Giving) -> Response:
         return give(suture_json(catalogue.find_suture_type(session, suture)))
 
 
-key_router = APIRouter(route_class=Strict, tags=["keys"], max_body_size=MEBIBYTE)
+key_router = router_of(route_class=Strict, tags=["keys"], max_body_size=MEBIBYTE)
 
 KeyId = Annotated[str, Path(pattern=KEY)]
 

@@ -12,7 +12,7 @@ from sqlalchemy import select
 
 from skills.api.authorisation import Asking, erasing_is_for_admins, needs
 from skills.api.dependencies import Actor, Db, Digest, Incoming, Jobs, Limit, Read, RowCursor, Slug, Strict, Tell
-from skills.api.openapi import ends, gives, gives_file, gives_page, makes, says
+from skills.api.openapi import ends, gives, gives_file, gives_page, makes, router_of, says
 from skills.api.pages import HTML, drawings, render, standalone_headers, wants_page
 from skills.api.pages.drawings import report_page
 from skills.api.responses import (
@@ -41,8 +41,8 @@ from skills.schemas.given import Atlas, Demonstration, DemoPath, Page, Recording
 from skills.schemas.requests import COUNT, DIGEST, SLUG, DemoIn, OutcomeIn, ScoreIn, SlugField, TableIn
 from skills.settings import MEBIBYTE
 
-uploads = APIRouter(tags=["demonstrations"])
-router = APIRouter(route_class=Strict, tags=["demonstrations"], max_body_size=MEBIBYTE)
+uploads = router_of(tags=["demonstrations"])
+router = router_of(route_class=Strict, tags=["demonstrations"], max_body_size=MEBIBYTE)
 
 RAW_BODY = {
     "requestBody": {
@@ -50,7 +50,7 @@ RAW_BODY = {
         "content": {kind: {"schema": {"type": "string", "format": "binary"}} for kind in (BYTES, *MEDIA_TYPES)},
     }
 }
-atlas_router = APIRouter(tags=["atlas"], max_body_size=MEBIBYTE)
+atlas_router = router_of(tags=["atlas"], max_body_size=MEBIBYTE)
 
 Clusters = Annotated[
     int | None, Query(ge=1, le=MOST, description="Number of clusters; by default as many as are found.")
@@ -305,7 +305,7 @@ def show_atlas(
         )
 
 
-score_router = APIRouter(route_class=Strict, tags=["scores"], max_body_size=MEBIBYTE)
+score_router = router_of(route_class=Strict, tags=["scores"], max_body_size=MEBIBYTE)
 
 
 @score_router.post("/scores", dependencies=[needs("reader")], **says(Score, 404, 409, 410))

@@ -11,7 +11,7 @@ from skills.api.authentication import COOKIE, Access, refuse_without_token
 from skills.api.authorisation import Asking, needs, open_to_all
 from skills.api.dependencies import Configured
 from skills.api.metrics import CONTENT_TYPE, ServiceMetrics
-from skills.api.openapi import says
+from skills.api.openapi import router_of, says
 from skills.api.pages import render
 from skills.api.responses import say
 from skills.errors import BadInput, NotSignedIn
@@ -20,7 +20,7 @@ from skills.library.keys import sign_in, sign_out
 from skills.schemas.given import Alive, Ready
 from skills.settings import MEBIBYTE, Settings
 
-router = APIRouter(tags=["operating"])
+router = router_of(tags=["operating"])
 FORM_BYTES, FIELDS = 4096, 4
 HERE = re.compile(r"/(?![/\\])[^\\\x00-\x20\x7f]*")  # a path of this service, never the URL of another
 

@@ -11,11 +11,11 @@ from collections.abc import Callable
 from typing import Annotated, Any, Literal
 
 import orjson
-from fastapi import APIRouter, Query, Response
+from fastapi import Query, Response
 
 from skills.api.authorisation import needs
 from skills.api.dependencies import Actor, Configured, Db, Digest, Incoming, Jobs, Read, Strict, room_for_a_job
-from skills.api.openapi import gives, gives_file, makes, says, starts_job
+from skills.api.openapi import gives, gives_file, makes, router_of, says, starts_job
 from skills.api.responses import JSON, Giving, accepted, as_asked, say, stored
 from skills.api.routes.demos import RAW_BODY
 from skills.api.routes.policies import Accept
@@ -36,7 +36,7 @@ from skills.schemas.requests import DIGEST, Name, PlanIn, PlaybackIn, Reading
 from skills.settings import MEBIBYTE, Settings
 from skills.verification.playback import Pictures
 
-router = APIRouter(route_class=Strict, tags=["plans"], max_body_size=MEBIBYTE)
+router = router_of(route_class=Strict, tags=["plans"], max_body_size=MEBIBYTE)
 
 
 @router.post("/plans", dependencies=[needs("trainer")], **makes(Plan, 404, 410))
@@ -75,7 +75,7 @@ def get_playback(playback: Digest, db: Db, give: Giving, settings: Configured) -
         return give(written | {"policy": playbacks.standing_of(session, row)})
 
 
-suture_point_router = APIRouter(tags=["plans"])
+suture_point_router = router_of(tags=["plans"])
 
 
 class SuturePointsUpload(Reading):
@@ -96,7 +96,7 @@ def read_suture_points(upload: Incoming, asked: Annotated[SuturePointsUpload, Qu
     return say(find_suture_points(upload.read_as(asked.said), asked.arm, read).model_dump(mode="json"))
 
 
-trajectory_router = APIRouter(tags=["plans"])
+trajectory_router = router_of(tags=["plans"])
 
 BAG, TABLE = "application/zip", "text/csv"
 COLUMNS = (
@@ -201,7 +201,7 @@ def _json(rows: list[list[Any]], rate_hz: float) -> bytes:
     return orjson.dumps({"rate_hz": rate_hz, "columns": COLUMNS.split(","), "rows": rows})
 
 
-picture_router = APIRouter(prefix="/playbacks/{playback}", tags=["plans"], max_body_size=MEBIBYTE)
+picture_router = router_of(prefix="/playbacks/{playback}", tags=["plans"], max_body_size=MEBIBYTE)
 
 PNG, GIF, MP4 = "image/png", "image/gif", "video/mp4"
 

@@ -6,12 +6,12 @@ values only.
 
 from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter, Header, Path, Query, Request, Response
+from fastapi import Header, Path, Query, Request, Response
 from sqlalchemy.orm import Session
 
 from skills.api.authorisation import Asking, needs, refuse_release
 from skills.api.dependencies import Actor, Db, Digest, Jobs, Limit, RowCursor, Slug, Strict, room_for_a_job
-from skills.api.openapi import ends, gives, gives_page, gives_stream, says, starts_job
+from skills.api.openapi import ends, gives, gives_page, gives_stream, router_of, says, starts_job
 from skills.api.pages import HTML, standalone_headers, wants_page
 from skills.api.pages.drawings import card_page
 from skills.api.policy_cache import PolicyCache
@@ -49,12 +49,12 @@ from skills.schemas.given import Version as GivenVersion
 from skills.schemas.requests import JOB, SLUG, NextIn, RetrainingIn, RolloutIn, TrainingIn
 from skills.settings import MEBIBYTE
 
-job_router = APIRouter(route_class=Strict, tags=["jobs"], max_body_size=MEBIBYTE)
+job_router = router_of(route_class=Strict, tags=["jobs"], max_body_size=MEBIBYTE)
 
 JobId = Annotated[str, Path(pattern=JOB)]
 EVENTS = gives_stream("job", Job, "The job at every change, until it has ended.", 404)
 
-router = APIRouter(route_class=Strict, tags=["policies"], max_body_size=MEBIBYTE)
+router = router_of(route_class=Strict, tags=["policies"], max_body_size=MEBIBYTE)
 
 Version = Annotated[int, Path(ge=1, le=2**31)]
 Accept = Annotated[str, Header(max_length=500)]
@@ -126,7 +126,7 @@ def _look(db: Database, job: str) -> dict[str, Any]:
         return job_json(found, outcomes_of(session, [found])[found.row])
 
 
-retraining_router = APIRouter(route_class=Strict, tags=["jobs"], max_body_size=MEBIBYTE)
+retraining_router = router_of(route_class=Strict, tags=["jobs"], max_body_size=MEBIBYTE)
 
 
 @retraining_router.post("/retrainings", dependencies=[needs("trainer"), room_for_a_job], **starts_job(404, 409, 410))
@@ -320,7 +320,7 @@ def _refuse_overtaken(session: Session, encoded: Encoded, surgeon: str, suture: 
         raise PreconditionFailed("Another policy is released now; read it, then repeat the request.")
 
 
-card_router = APIRouter(tags=["policies"], max_body_size=MEBIBYTE)
+card_router = router_of(tags=["policies"], max_body_size=MEBIBYTE)
 
 
 @card_router.get(
