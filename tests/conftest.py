@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 from hypothesis import settings as hypothesis_settings
@@ -13,6 +14,9 @@ from hypothesis import settings as hypothesis_settings
 from skills.settings import Settings
 from tests import leftovers
 from tests.needs import need, required
+
+if TYPE_CHECKING:
+    from skills.formats.reader_process import ConfinedReader, ForkServer
 
 GUARD = pytest.StashKey[leftovers.subprocess.Popen[bytes]]()
 PACKAGE = Path(__file__).parents[1] / "skills"
@@ -49,25 +53,33 @@ def compile_loops() -> None:
             return
 
 
-@pytest.fixture(scope="session", autouse=True)
-def shared_fork_server() -> Iterator[object]:
-    """Yield one fork server for all applications of a process: each takes a second to start, and 500 tests need one."""
-    from skills.api import app as application  # late, so that `--collect-only` and usage errors are fast
-    from skills.formats.reader_process import READY, ConfinedReader, ForkServer
+@pytest.fixture(scope="session")
+def reading_server() -> Iterator["ForkServer"]:
+    """Yield one fork server for all readers of a process: each takes a second to start, and 500 tests need one."""
+    from skills.formats.reader_process import READY, ForkServer  # late: `--collect-only` and usage errors are fast
 
-    own, server = application.confined_reader, ForkServer(READY)
+    server = ForkServer(READY)
+    yield server
+    server.close()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def shared_fork_server(reading_server: "ForkServer") -> Iterator[object]:
+    """Let all applications of a process share its fork server."""
+    from skills.api import app as application
+
+    own = application.confined_reader
 
     @contextmanager
-    def shared(settings: Settings) -> Iterator[ConfinedReader]:
+    def shared(settings: Settings) -> Iterator["ConfinedReader"]:
         reader = own(settings)
-        reader.server = server
-        server.start()
+        reader.server = reading_server
+        reading_server.start()
         yield reader
 
     application.confined_reader = shared
     yield own
     application.confined_reader = own
-    server.close()
 
 
 @pytest.fixture

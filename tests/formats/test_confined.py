@@ -4,7 +4,6 @@ import io
 import json
 import logging
 import tempfile
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields, is_dataclass
 from typing import IO, Any, BinaryIO
@@ -19,6 +18,7 @@ from skills.formats import read_recording, reader_process, write_mcap
 from skills.formats.mcap import _kernels
 from skills.formats.reader_process import KNOWN, ConfinedReader, Refusal, Told, read_told
 from skills.sandbox import ProcessLimits
+from skills.sandbox.forked import ForkServer
 from tests.formats import bags
 
 LIMITS = ProcessLimits(
@@ -30,9 +30,16 @@ TABLE = b"t_s,x_mm,y_mm,z_mm,jaw_rad\n" + b"".join(b"%f,1,2,-100.5,0.25\n" % (k 
 
 
 @pytest.fixture(scope="module")
-def reader() -> Iterator[ConfinedReader]:
-    with ConfinedReader(LIMITS, at_once=4) as reader:
-        yield reader
+def reader(reading_server: ForkServer) -> ConfinedReader:
+    reading_server.start()
+    return on(reading_server, at_once=4)
+
+
+def on(server: ForkServer, limits: ProcessLimits = LIMITS, **how: Any) -> ConfinedReader:
+    """Return a reader on a fork server that runs already; `reader` tests that one starts its own."""
+    made = ConfinedReader(limits, **{"at_once": 1, **how})
+    made.server = server
+    return made
 
 
 def read(reader: ConfinedReader, data: bytes, **how: Any) -> values.Recording:
@@ -148,13 +155,10 @@ NONSENSE = [
 
 
 @pytest.mark.parametrize("fault", NONSENSE)
-def test_nonsense_is_a_refusal(fault, caplog, monkeypatch):
+def test_nonsense_is_a_refusal(reader, fault, caplog, monkeypatch):
     monkeypatch.setattr(reader_process.log, "disabled", False)  # import-linter, in another test, disables all loggers
-    with (
-        ConfinedReader(LIMITS, at_once=1, target=f"tests.sandbox.faults:{fault}") as wrong,
-        pytest.raises(UnreadableRecording) as caught,
-    ):
-        read(wrong, BAG)
+    with pytest.raises(UnreadableRecording) as caught:
+        read(on(reader.server, target=f"tests.sandbox.faults:{fault}"), BAG)
     assert caught.value.numbers == {"cause": "nonsense"}
     assert "unreadable data" in caplog.text
 
@@ -169,13 +173,12 @@ def test_nonsense_is_a_refusal(fault, caplog, monkeypatch):
         ("spin", "hung", "1 s of processor time; cut the recording"),
     ],
 )
-def test_what_becomes_of_a_reader_is_a_refusal_that_says_what_to_do(fault, cause, advice):
+def test_what_becomes_of_a_reader_is_a_refusal_that_says_what_to_do(reader, fault, cause, advice):
     limits = ProcessLimits(**vars(LIMITS) | {"cpu_s": 1})
-    with ConfinedReader(limits, at_once=1, target=f"tests.sandbox.faults:{fault}") as wrong:
-        with pytest.raises(UnreadableRecording, match=advice) as caught:
-            read(wrong, BAG)
-        assert isinstance(caught.value, BadInput)
-        assert caught.value.numbers == {"cause": cause}
+    with pytest.raises(UnreadableRecording, match=advice) as caught:
+        read(on(reader.server, limits, target=f"tests.sandbox.faults:{fault}"), BAG)
+    assert isinstance(caught.value, BadInput)
+    assert caught.value.numbers == {"cause": cause}
 
 
 def test_a_fault_of_ours_is_logged_without_the_file_in_it(monkeypatch):
@@ -189,41 +192,32 @@ def test_a_fault_of_ours_is_logged_without_the_file_in_it(monkeypatch):
     assert caught.traceback[-1].name == "broken"
 
 
-def test_too_many_at_once_are_told_to_come_back(caplog):
+def test_too_many_at_once_are_told_to_come_back(reader, caplog):
     caplog.set_level(logging.CRITICAL)
     limits = ProcessLimits(**vars(LIMITS) | {"wall_s": 0.5})
-    with (
-        ConfinedReader(limits, at_once=12, target="tests.sandbox.faults:hang") as slow,
-        ThreadPoolExecutor(40) as threads,
-    ):
+    slow = on(reader.server, limits, at_once=12, target=HANG)
+    with ThreadPoolExecutor(40) as threads:
         refused = list(threads.map(lambda k: refusal(slow, f"key {k % 2}"), range(40)))
     assert set(refused) == {UnreadableRecording, Busy}
     assert refused.count(UnreadableRecording) == reader_process.WAITING
 
 
-def test_one_key_does_not_hold_all_readers():
-    limits = ProcessLimits(**vars(LIMITS) | {"wall_s": 0.7})
-    with (
-        ConfinedReader(limits, at_once=3) as reader,
-        ThreadPoolExecutor(8) as threads,
-        tempfile.TemporaryFile() as file,
-    ):
+def test_one_key_does_not_hold_all_readers(reader):
+    three = on(reader.server, ProcessLimits(**vars(LIMITS) | {"wall_s": 0.7}), at_once=3)
+    with ThreadPoolExecutor(8) as threads, tempfile.TemporaryFile() as file:
         file.write(BAG)
-        assert reader(file, key="other").motions  # the fork server has started
-        held = [threads.submit(read, reader, BAG, key="greedy", target=HANG) for _ in range(8)]
+        assert three(file, key="other").motions  # the fork server has started
+        held = [threads.submit(read, three, BAG, key="greedy", target=HANG) for _ in range(8)]
         for _ in range(3):
-            assert reader(file, key="other").motions
+            assert three(file, key="other").motions
         assert sum(one.done() for one in held) <= 2  # eight requests in two readers take four times 0.7 s
         assert {type(one.exception()) for one in held} == {UnreadableRecording}
 
 
-def test_a_small_file_may_not_use_the_processor_time_of_a_large_one(monkeypatch):
+def test_a_small_file_may_not_use_the_processor_time_of_a_large_one(reader, monkeypatch):
     monkeypatch.setattr(reader_process, "SMALL_FILE_CPU_S", 1)
-    with (
-        ConfinedReader(LIMITS, at_once=1, target="tests.sandbox.faults:spin") as wrong,
-        pytest.raises(UnreadableRecording, match="used up its 1 s of processor time"),
-    ):
-        read(wrong, BAG)
+    with pytest.raises(UnreadableRecording, match="used up its 1 s of processor time"):
+        read(on(reader.server, target="tests.sandbox.faults:spin"), BAG)
 
 
 def refusal(reader: ConfinedReader, key: str) -> type[SkillsError]:

@@ -3,7 +3,7 @@
 import io
 import os
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -12,6 +12,7 @@ from skills.errors import SkillsError, UnreadableRecording
 from skills.formats import read_recording
 from skills.formats.reader_process import ConfinedReader
 from skills.sandbox import ProcessLimits
+from skills.sandbox.forked import ForkServer
 from tests.formats import costly
 
 MOST_CPU_S = 5.0  # for a file below 1 MB
@@ -21,9 +22,11 @@ LIMITS = ProcessLimits(
 
 
 @pytest.fixture(scope="module")
-def reader() -> Iterator[ConfinedReader]:
-    with ConfinedReader(LIMITS, at_once=1) as reader:
-        yield reader
+def reader(reading_server: ForkServer) -> ConfinedReader:
+    reader = ConfinedReader(LIMITS, at_once=1)
+    reader.server = reading_server
+    reader.server.start()
+    return reader
 
 
 def cpu_s(reader: ConfinedReader) -> float:

@@ -17,6 +17,7 @@ from skills.errors import SkillsError, UnreadableRecording
 from skills.formats import read_recording
 from skills.formats.reader_process import ConfinedReader
 from skills.sandbox import ProcessLimits
+from skills.sandbox.forked import ForkServer
 from tests.formats import lerobots
 from tests.formats.lerobots import columns_of, episode, packed, parquet, poses
 from tests.formats.others import damaged, zipped
@@ -28,9 +29,11 @@ LIMITS = ProcessLimits(
 
 
 @pytest.fixture(scope="module")
-def reader() -> Iterator[ConfinedReader]:
-    with ConfinedReader(LIMITS, at_once=1) as reader:
-        yield reader
+def reader(reading_server: ForkServer) -> ConfinedReader:
+    reader = ConfinedReader(LIMITS, at_once=1)
+    reader.server = reading_server
+    reader.server.start()
+    return reader
 
 
 def cpu_s(reader: ConfinedReader) -> float:
