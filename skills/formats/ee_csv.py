@@ -96,13 +96,15 @@ def read_ee_csv(file: BinaryIO, said: TableReading) -> Recording:
 
     Raises:
         BadColumns: A column is missing or duplicate, the frame is not named, or `timestamp` is not in nanoseconds.
-        BadSettings: The caller names the arm, which the columns name already.
+        BadSettings: The caller names the arm or a unit, which the format names already.
         NoUsableTopic: No arm was recorded, or one has joints and no poses, and no instrument is stated.
         UnreadableRecording: A row of another length, a cell that is not a number, no rows.
         MixedFrames, NotFinite, NotMetres, BackwardStamps, RepeatedStamps, NotAQuaternion: See `skills.errors`.
     """
     if said.table_arm is not None:
         raise BadSettings("The columns name their arms; omit table_arm.")
+    if said.unit:
+        raise BadSettings("The columns of an ee_csv are in m, rad and ns; omit unit, or map the columns of one arm.")
     _check_end(file)
     with open_text(file) as text:
         names, separator = header_of(text)

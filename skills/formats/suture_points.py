@@ -19,7 +19,7 @@ import numpy as np
 
 from skills.arrays import Floats, xyz
 from skills.demonstration.recording import Motion, Recording, recorded_motion
-from skills.errors import BadSettings, MixedFrames, NotMetres, NoUsableTopic, SkillsError, UnreadableRecording
+from skills.errors import MixedFrames, NotMetres, NoUsableTopic, SkillsError, UnreadableRecording
 from skills.formats.mcap.cdr import WANTED_POSE, Columns, Decoder, fields_of
 from skills.formats.mcap.reader import Channel, Walker
 from skills.formats.mcap.records import RECOVER
@@ -79,13 +79,8 @@ def suture_points(scene: Recording, *, arm: str | None = None, frame: str | None
     return SuturePoints(arm=whose, frame=frame or f"{whose}_base", points=tuple(points))
 
 
-def read_scene(file: BinaryIO, *, rate_hz: float | None = None, frame: str | None = None) -> Recording:
-    """Read the poses of marks and of arm bases from an MCAP file.
-
-    Args:
-        file: The file, at its beginning.
-        rate_hz: Must be None; it exists for the signature of `read_recording`.
-        frame: Not used here, but in `suture_points`; it exists for the signature of `read_recording`.
+def read_scene(file: BinaryIO) -> Recording:
+    """Read the poses of marks and of arm bases from an MCAP file, at its beginning.
 
     Returns:
         The poses as motions, in millimetres.
@@ -93,11 +88,8 @@ def read_scene(file: BinaryIO, *, rate_hz: float | None = None, frame: str | Non
     Raises:
         UnreadableRecording: Truncated, corrupt, over a size limit, or in an unsupported encoding.
         NoUsableTopic: It has no mark.
-        BadSettings: A rate was given.
         MixedFrames, BackwardStamps, RepeatedStamps, NotFinite, NotMetres, NotAQuaternion: See `skills.errors`.
     """
-    if rate_hz is not None:
-        raise BadSettings("An MCAP file has its own stamps; omit rate_hz.")
     try:
         walker = Walker(file)
         motions = tuple(_motions(walker))
@@ -110,9 +102,9 @@ def read_scene(file: BinaryIO, *, rate_hz: float | None = None, frame: str | Non
     return Recording(format="mcap", integrity=walker.integrity, motions=motions)
 
 
-def parse(file: BinaryIO, answer: BinaryIO, **how: str | float | None) -> None:
+def parse(file: BinaryIO, answer: BinaryIO) -> None:
     """Read a scene, and write it or its refusal; runs in a fork under limits."""
-    answered(read_scene, file, answer, **how)
+    answered(read_scene, file, answer)
 
 
 # ---- from the file ----------------------------------------------------------------------------------------------

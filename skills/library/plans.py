@@ -32,18 +32,20 @@ from skills.remedies import Action, Remedy
 from skills.schemas.requests import PlanIn, PsmMIn
 
 
-def find_suture_points(upload: Upload, arm: str | None, read: Reader) -> SuturePoints:
+def find_suture_points(upload: Upload, arm: str | None, frame: str | None, read: Reader) -> SuturePoints:
     """Read the marks of a scene in a separate process, and transform them to an arm's base frame.
 
     Args:
-        upload: An MCAP file; its `frame` names the arm's base frame.
+        upload: An MCAP file.
         arm: The arm; None if the file has the base of a single one.
+        frame: The name of the arm's base frame.
         read: The reader: `ConfinedReader` or a compatible callable.
 
     Raises:
         BadRecording: It cannot be used; `skills.errors` lists the kinds.
     """
-    return suture_points(read_upload(upload, partial(read, target=PARSE)), arm=arm, frame=upload.reading["frame"])
+    scene = read_upload(upload.read_as({}), partial(read, target=PARSE))
+    return suture_points(scene, arm=arm, frame=frame)
 
 
 LEAST_MM = 0.1  # ours: a speed (mm/s) or an offset below it was given in metres

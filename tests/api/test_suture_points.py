@@ -32,7 +32,6 @@ def test_the_exits_of_a_scene_become_the_suture_points_of_a_plan(still: Service)
         (scene([("/CRTK/psm2/measured_cp", (0, 0.05, -0.1), UNTURNED, "b")]), {}, 422, "Entry or Exit"),
         (scene(world())[:500], {}, 422, "truncated"),
         (b"t_s,x_mm\n1,2\n", {}, 415, "table"),
-        (scene(world()), {"rate_hz": 30}, 422, "rate_hz"),
         (scene(world()), {"colour": "red"}, 422, ""),
     ],
 )
@@ -40,6 +39,17 @@ def test_what_holds_no_suture_points_for_an_arm_is_refused(still: Service, body,
     answer = still.http.post("/suture-points", content=body, params=query, headers={"Content-Type": MCAP})
     problem = assert_problem(answer, status)
     assert words in problem["detail"], problem["detail"]
+
+
+def test_a_statement_about_tables_is_no_parameter_of_a_scene(still: Service):
+    for name, said in (("rate_hz", 30), ("unit", "mm"), ("decimal", "comma"), ("table_arm", "PSM2")):
+        answer = still.http.post(
+            "/suture-points", content=scene(world()), params={name: said}, headers={"Content-Type": MCAP}
+        )
+        (error,) = assert_problem(answer, 422)["errors"]
+        assert "unknown field" in error["why"]
+    call = still.http.get("/openapi.json").json()["paths"]["/suture-points"]["post"]
+    assert {one["name"] for one in call["parameters"] if one["in"] == "query"} == {"arm", "frame"}
 
 
 def test_the_frame_may_be_named_as_the_arms(still: Service):

@@ -6,7 +6,7 @@ import tempfile
 import numpy as np
 import pytest
 
-from skills.errors import BadSettings, MixedFrames, NotAQuaternion, NotMetres, NoUsableTopic, UnreadableRecording
+from skills.errors import MixedFrames, NotAQuaternion, NotMetres, NoUsableTopic, UnreadableRecording
 from skills.formats import writer
 from skills.formats.reader_process import ConfinedReader
 from skills.formats.suture_points import PARSE, SuturePoints, read_scene, suture_points
@@ -158,8 +158,6 @@ def test_a_message_of_another_type_is_refused():
     write_messages([writer.boolean("/Exit1/measured_cp", START_NS, True)], file)
     with pytest.raises(UnreadableRecording, match="PoseStamped"):
         read_scene(io.BytesIO(file.getvalue()))
-    with pytest.raises(BadSettings):
-        read_scene(io.BytesIO(scene(world())), rate_hz=30.0)
 
 
 def test_a_file_that_is_cut_off_is_refused_at_every_length():

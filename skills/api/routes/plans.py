@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 
 import orjson
 from fastapi import Query, Response
+from pydantic import Field
 
 from skills.api.authorisation import needs
 from skills.api.dependencies import Actor, Configured, Db, Digest, Incoming, Jobs, Read, Strict, room_for_a_job
@@ -32,7 +33,7 @@ from skills.planning.plan import MAX_PASSES
 from skills.planning.trajectory import Trajectory
 from skills.schemas.given import Comparison, Plan, Playback, SuturePoints
 from skills.schemas.given import Trajectory as GivenTrajectory
-from skills.schemas.requests import DIGEST, Name, PlanIn, PlaybackIn, Reading
+from skills.schemas.requests import DIGEST, FRAME, Name, PlanIn, PlaybackIn, Schema
 from skills.settings import MEBIBYTE, Settings
 from skills.verification.playback import Pictures
 
@@ -78,10 +79,13 @@ def get_playback(playback: Digest, db: Db, give: Giving, settings: Configured) -
 suture_point_router = router_of(tags=["plans"])
 
 
-class SuturePointsUpload(Reading):
+class SuturePointsUpload(Schema):
     """Query parameters of a scene upload: the arm whose base frame is used, and the frame's name."""
 
     arm: Name | None = None
+    frame: Annotated[str, Field(pattern=FRAME)] | None = Field(
+        default=None, description="The name of the arm's base frame, in which marks without a base of the arm are."
+    )
 
 
 @suture_point_router.post(
@@ -93,7 +97,7 @@ def read_suture_points(upload: Incoming, asked: Annotated[SuturePointsUpload, Qu
     `is_goal` proposes the exits as goals of passes: there the needle comes out and is handed over. A suture point of a
     plan takes `position_mm`, and as its rotation `turn_xyzw` if the style was demonstrated at the first of them.
     """
-    return say(find_suture_points(upload.read_as(asked.said), asked.arm, read).model_dump(mode="json"))
+    return say(find_suture_points(upload, asked.arm, asked.frame, read).model_dump(mode="json"))
 
 
 trajectory_router = router_of(tags=["plans"])
