@@ -284,6 +284,7 @@ MISTAKES = [
     Mistake("a report to a folder that is not writable", "report --to /proc/report"),
     Mistake("a report to a file", "report --to notes.txt"),
     Mistake("a folder without rated trials", "calibrate nothing-in-it"),
+    Mistake("too few permutations", "calibrate jigsaws --permutations 10"),
     # settings
     Mistake("a misspelt setting", "surgeon list", env={"SKILLS_DATBASE_URL": "sqlite:////data/skills.sqlite"}),
     Mistake("a port that is not a number", "surgeon list", env={"SKILLS_PORT": "eighty"}),

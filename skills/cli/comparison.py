@@ -204,17 +204,19 @@ def calibrate(
     ] = "hand-off",
     seed: Annotated[int, typer.Option(help="Seed of the bootstrap and the permutations.", min=0)] = 0,
     permutations: Annotated[
-        int, typer.Option(help="Number of permutations for the chance level.", min=20, max=10_000)
+        int,
+        typer.Option(help="Number of permutations for the chance level: p is the share that does as well.", max=10_000),
     ] = 200,
     as_json: AsJson = False,
 ) -> None:
     """Fit a model of skill ratings to a folder of rated trials, and store it: every score uses the newest model."""
     from skills.db.session import Database
     from skills.library.calibrations import calibrate_on, keep, read_cohort
-    from skills.scoring.calibration import level_refusals
+    from skills.scoring.calibration import check_permutations, level_refusals
     from skills.serving import prepare
     from skills.settings import settings
 
+    check_permutations(permutations)
     prepare(settings())
     with err.status("reading") as status:
         rated = read_cohort(folder, task=task, arm=arm, of=of, told=lambda share: status.update(f"reading {share:.0%}"))

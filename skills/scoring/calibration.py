@@ -234,6 +234,7 @@ WITHIN = 0.90  # share of the ratings of unseen surgeons that are within the mar
 BOOTSTRAPS = 2000
 PERMUTATIONS = 200
 ACCEPTED_P = 0.05  # ours: greatest p-value of an accepted model against chance
+LEAST_PERMUTATIONS = 19  # p is at least 1 / (permutations + 1): of fewer, it is above `ACCEPTED_P` for every model
 WHOLE = ("duration_s", "path_length_mm", "gestures")  # trivial figures of a complete trial
 RIVALS = {
     "motion_duration": "duration of each motion",
@@ -401,7 +402,11 @@ def validate(
 
     Returns:
         The quality of the model, of its trivial rivals, and of chance.
+
+    Raises:
+        BadInput: As in `check_permutations`.
     """
+    check_permutations(permutations)
     found = {"": held_out(cohort), **rival_predictions(cohort)}
     judged, rhos = _judge(cohort, found, np.random.default_rng(seed))
     ours = judged.pop("")
@@ -449,6 +454,20 @@ def _predict_by(cohort: Cohort, figure: Floats) -> HeldOut:
     return held_out(alone, columns=(0,))
 
 
+def check_permutations(permutations: int) -> None:
+    """Refuse a number of permutations with which no model could be accepted.
+
+    Raises:
+        BadInput: There are fewer than `LEAST_PERMUTATIONS`.
+    """
+    if permutations < LEAST_PERMUTATIONS:
+        raise BadInput(
+            f"{permutations} permutations can accept no model: p is at least 1 of {permutations + 1}, and at most "
+            f"{ACCEPTED_P} is accepted. Give at least {LEAST_PERMUTATIONS}, better {PERMUTATIONS}.",
+            permutations=permutations,
+        )
+
+
 def refusals(validated: Mapping[str, Any]) -> list[str]:
     """Return the reasons why a model is not accepted, one sentence each.
 
@@ -467,7 +486,7 @@ def refusals(validated: Mapping[str, Any]) -> list[str]:
     if not low > 0:
         why.append(f"Its rank correlation may be 0 or less ({rho:.2f}, 95 %: {low:.2f} to {high:.2f}).")
     if not rho_p <= ACCEPTED_P:
-        why.append(f"A random order does as well (p = {rho_p:.3f}; at most {ACCEPTED_P} is accepted).")
+        why.append(f"A random order does as well ({_in_words(rho_p, chance)}).")
     if not more_low > 0:
         why.append(
             f"It may order trials no better than the duration alone ({rho_by_duration:.2f}; the difference is "
@@ -491,13 +510,28 @@ def level_refusals(validated: Mapping[str, Any]) -> list[str]:
     )
     why = []
     if not right_p <= ACCEPTED_P:
-        why.append(f"Random levels are right as often (p = {right_p:.3f}; at most {ACCEPTED_P} is accepted).")
+        why.append(f"Random levels are right as often ({_in_words(right_p, chance)}).")
     if not (right > commonest and right > by_duration):
         why.append(
             f"It is right about the level in {right:.0f} % of the trials, the most frequent level in "
             f"{commonest:.0f} %, the duration alone in {by_duration:.0f} %."
         )
     return why
+
+
+def _in_words(p: float, chance: Mapping[str, Any]) -> str:
+    """Return a p-value above `ACCEPTED_P` in words, and whether it may be above it for want of permutations."""
+    said, permutations = f"p = {p:.3f}; at most {ACCEPTED_P} is accepted", chance.get("permutations")
+    if permutations is None or np.isnan(p):
+        return said
+    as_good = round(p * (permutations + 1)) - 1
+    low, high = wilson(as_good, permutations)
+    if low > ACCEPTED_P:
+        return said
+    return (
+        f"{said}; it may be {low:.3f} to {high:.3f}, because {permutations} permutations are few: calibrate again with "
+        "more"
+    )
 
 
 def held_out(cohort: Cohort, *, columns: tuple[int, ...] | None = None) -> HeldOut:

@@ -1,18 +1,22 @@
 """Calibration on a cohort of known truth: skill is found, not invented, and reported correctly."""
 
 from dataclasses import asdict
+from typing import Any
 
 import numpy as np
 import pytest
 
 from skills.errors import BadInput
 from skills.scoring.calibration import (
+    ACCEPTED_P,
+    LEAST_PERMUTATIONS,
     LOGISTIC,
     RIDGE,
     RIVALS,
     Cohort,
     calibrate,
     held_out,
+    level_refusals,
     refusals,
     rival_predictions,
     shuffled,
@@ -161,6 +165,52 @@ def test_the_duration_of_the_trial_competes_with_a_model_of_hand_offs() -> None:
     assert found.duration_only.rho == found.rivals["shorter_first"].rho == pytest.approx(1.0)
     assert found.over_duration[1] <= 0.0
     assert any("no better than the duration alone (1.00" in why for why in refusals(asdict(found)))
+
+
+# ---- few permutations ------------------------------------------------------------------------------------------------
+
+
+def judged_by(as_good: int, permutations: int) -> dict[str, Any]:
+    """Return the figures of an excellent model, with p from the permutations that do as well."""
+    p = (1 + as_good) / (1 + permutations)
+    return {
+        "all_figures": {"rho": 0.9, "rho_interval": (0.8, 0.95), "accuracy": 0.9},
+        "duration_only": {"rho": 0.1, "accuracy": 0.3},
+        "chance": {"permutations": permutations, "rho_p": p, "accuracy_p": p, "commonest": 0.4},
+        "over_duration": (0.5, 0.8),
+    }
+
+
+@pytest.mark.parametrize(
+    ("as_good", "permutations", "said"),
+    [
+        (1, 20, "p = 0.095; at most 0.05 is accepted; it may be 0.009 to 0.236, because 20 permutations are few"),
+        (10, 200, "p = 0.055; at most 0.05 is accepted; it may be 0.027 to 0.090, because 200 permutations are few"),
+    ],
+)
+def test_a_refusal_that_few_permutations_may_have_made_says_so(as_good: int, permutations: int, said: str) -> None:
+    judged = judged_by(as_good, permutations)
+    (order,), (levels,) = refusals(judged), level_refusals(judged)
+    assert order == f"A random order does as well ({said}: calibrate again with more)."
+    assert levels == f"Random levels are right as often ({said}: calibrate again with more)."
+
+
+def test_a_refusal_that_more_permutations_would_confirm_asks_for_none() -> None:
+    for as_good, permutations in ((10, 20), (20, 200), (600, 10_000)):
+        judged = judged_by(as_good, permutations)
+        (one,), (other,) = refusals(judged), level_refusals(judged)
+        assert "with more" not in one + other
+    older = judged_by(1, 20)
+    del older["chance"]["permutations"]
+    assert ["with more" in why for why in (*refusals(older), *level_refusals(older))] == [False, False]
+    assert refusals(judged_by(0, 20)) == level_refusals(judged_by(0, 20)) == []
+
+
+@pytest.mark.parametrize("permutations", [0, 1, 18])
+def test_permutations_that_could_accept_no_model_are_refused(permutations: int) -> None:
+    with pytest.raises(BadInput, match=rf"{permutations} permutations .* at least 19"):
+        validate(cohort(), permutations=permutations)
+    assert 1 / (1 + LEAST_PERMUTATIONS) <= ACCEPTED_P < 1 / LEAST_PERMUTATIONS
 
 
 def test_rivals_are_the_trivial_predictions_and_have_not_seen_the_surgeon() -> None:
