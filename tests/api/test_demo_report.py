@@ -100,6 +100,17 @@ def test_a_page_runs_nothing_and_fetches_nothing(here: Service, plover: dict):
     assert here.http.get(f"/demos/{plover['id']}/report").headers["content-security-policy"].startswith("default-src")
 
 
+def test_the_page_states_the_outcome_and_what_it_means(here: Service, plover: dict):
+    def said() -> str:
+        return " ".join(Page(here.http.get(f"/demos/{plover['id']}/report", headers=PAGE).text).text.split())
+
+    assert "Outcome: not known." in said()
+    here.client.mark_demo(plover["id"], "success")
+    assert "Outcome: success." in said()
+    here.client.mark_demo(plover["id"], "recovery", reason="It <b>slipped</b>, and was caught.")
+    assert "The hand-off was a recovery: It <b>slipped</b>, and was caught. Nothing is learnt from it" in said()
+
+
 def test_what_a_recording_calls_itself_is_no_mark_up(here: Service):
     """A table's frame may be any word of its pattern; an MCAP file's topic may be any text."""
     value, _ = sessions.session(sessions.Kind(seed=5, passes=1, both_arms=False))

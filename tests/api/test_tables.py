@@ -136,7 +136,9 @@ def test_counts_of_samples_are_in_the_answer_the_report_and_on_the_page(here: Se
     assert page.status_code == 200
     assert "Stamps that went back" in page.text
     assert "Equal samples" in page.text
-    assert "Stamps that went back" in here.client.demo_report_page(demo["id"]).decode()
+    text = here.client.demo_report_page(demo["id"]).decode()
+    assert "Stamps that went back" in text
+    assert "49, 24.6 %" in text
 
 
 @pytest.mark.needs("recordings")
