@@ -243,6 +243,7 @@ MISTAKES = [
     Mistake("a setting without a value", f"train {STYLE} --learner dqn --setting steps"),
     Mistake("an invalid digest", f"train {STYLE} --demo newest"),
     Mistake("a style without a demonstration", "train wren simple-running"),
+    Mistake("learning from a failure", "train linnet simple-running"),
     Mistake("a batch without a demonstration", "retrain --surgeon wren"),
     Mistake("an unknown job", "job show 0000000000000000"),
     # policies
@@ -331,6 +332,11 @@ def fill(folder: Path) -> None:
     url = service.copy_of_trained(folder)
     with service.serving(url) as installation:
         installation.client.put_surgeon("wren")
+        installation.client.put_surgeon("linnet")
+        failed = {"outcome": "failure", "outcome_reason": "The needle fell."}
+        installation.client.add_demo(
+            cases.hand_off((2.5, 0.0, 0.0)), surgeon="linnet", suture="simple-running", **failed
+        )
         place = {"position_mm": (5.0, 55.0, -125.0)}
         plan = installation.client.plan("kestrel", "simple-running", [place], handoff="none")
         (folder / "plan.txt").write_text(plan["id"] if isinstance(plan, dict) else plan.id)

@@ -152,6 +152,7 @@ def quality(report: dict[str, Any]) -> list[str]:
     said = [
         f"{report['duration_s']:.2f} s, {report['samples']} samples at {report['rate_hz']:.0f} Hz; the longest gap is "
         f"{1000 * report['longest_gap_s']:.0f} ms.",
+        *_dropped(report),
         f"The tip moves {report['path_length_mm']:.1f} mm in a box of {size} mm, at {report['speed_median_mm_s']:.1f} "
         f"mm/s in the median and {report['speed_peak_mm_s']:.1f} mm/s at most; {report['idle_share']:.0%} of the time "
         "it is idle.",
@@ -164,6 +165,17 @@ def quality(report: dict[str, Any]) -> list[str]:
             f"Smoothness (log dimensionless jerk): {smooth:.1f}; one smooth stroke has -5.3, a hesitant motion less."
         )
     return said + [f"Advice to the surgeon: {one}" for one in report["advice"]]
+
+
+def _dropped(report: dict[str, Any]) -> list[str]:
+    """Return the sentence on the samples that were dropped for their stamps; none if there are none."""
+    repeated, back = (report.get(name) or 0 for name in ("duplicate_stamps", "backward_stamps"))
+    if not repeated + back:
+        return []
+    return [
+        f"Samples dropped from the whole recording: {repeated} for repeating a stamp, "
+        f"{back} for a stamp that went back."
+    ]
 
 
 def lost(report: dict[str, Any]) -> str:
@@ -179,13 +191,14 @@ def lost(report: dict[str, Any]) -> str:
     )
 
 
-def learner(phases: int, settled: bool, outcomes: Sequence[str | None] | None) -> str:
+def learner(phases: int, settled: bool, outcomes: Sequence[str | None] | None, marked: bool) -> str:
     """Return the sentences on a learner's state, on whether learning converged, and on the outcomes it learnt from.
 
     Args:
         phases: The number of phases of its state.
         settled: Whether learning converged.
         outcomes: Of a training from demonstrations of any outcome: that of each as it was then.
+        marked: Whether one of its demonstrations is marked with an outcome now.
     """
     state = (
         "Its state is the cell and the phase (how far along the demonstration), so a path that crosses itself can be "
@@ -196,7 +209,8 @@ def learner(phases: int, settled: bool, outcomes: Sequence[str | None] | None) -
     ended = "It ended when the values no longer changed." if settled else "It ended before it had converged."
     same = "The same demonstration, settings, seed and learner version give the same numbers."
     if outcomes is None:
-        return f"{state} {ended} {same}"
+        none = " When it was learnt, no demonstration of it was marked recovery or failure." if marked else ""
+        return f"{state} {ended} {same}{none}"
     known = ", ".join("not known" if one is None else one for one in outcomes)
     return f"{state} {ended} {same} It was asked to learn from any outcome; that of its demonstrations was: {known}."
 

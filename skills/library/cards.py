@@ -254,7 +254,12 @@ def _learner(version: PolicyVersion) -> CardLearner:
         kind=manifest["learner"],
         version=manifest["learner_version"],
         **{name: manifest[name] for name in told},
-        in_words=words.learner(manifest["phases"], manifest["training"]["settled"], manifest.get("outcomes")),
+        in_words=words.learner(
+            manifest["phases"],
+            manifest["training"]["settled"],
+            manifest.get("outcomes"),
+            any(one.outcome is not None for one in version.demonstrations),
+        ),
     )
 
 

@@ -192,6 +192,34 @@ def test_a_policy_of_any_outcome_names_the_outcomes(database: Database):
     assert wrong(database) == []
 
 
+def test_a_card_states_the_outcomes_of_its_demonstrations_and_an_unmarked_one_none(database: Database):
+    def learner() -> str:
+        with database.reading() as session:
+            return str(card_of(session, find_by_digest(session, version.sha256)).written()["learner"]["in_words"])
+
+    demo = add(database)
+    version = cases.train(database)
+    before = learner()
+    assert before.endswith("the same numbers.")
+    mark(database, demo, "success", None)
+    assert learner() == f"{before} When it was learnt, no demonstration of it was marked recovery or failure."
+
+
+def test_a_card_states_the_samples_that_were_dropped(database: Database):
+    rows = [f"{k * 0.01:.2f},{min(k, 150) * 0.2:.2f},50,-120" for k in range(200)]
+    rows[50] = rows[50].replace("0.50,", "0.48,")
+    demo = cases.add_demo(database, "\n".join(["t_s,x_mm,y_mm,z_mm", *rows, rows[-1]]).encode(), segment="whole")
+    sound = add(database, 2.5)
+    version = cases.train(database, demos=[demo.sha256, sound.sha256], combine=Medoid())
+    with database.reading() as session:
+        card = card_of(session, find_by_digest(session, version.sha256)).written()
+    said, none = (one["quality_in_words"] for one in card["demonstrations"])
+    assert said[1] == (
+        "Samples dropped from the whole recording: 1 for repeating a stamp, 1 for a stamp that went back."
+    )
+    assert not any("ropped" in one for one in none)
+
+
 # ---- what a mark ends
 
 
