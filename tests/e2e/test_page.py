@@ -103,7 +103,9 @@ def send_a_recording(tab: Watched, folder: Path) -> None:
     recording.write_bytes(SAMPLE.data)
     tab.open(f"/pages/recordings/new?surgeon={SAMPLE.surgeon}&suture={SAMPLE.suture}")
     tab.page.get_by_label("Choose a file, or drop it here").set_input_files(recording)
-    tab.page.get_by_role("button", name="Send").click()
+    tab.page.get_by_role("button", name="Preview").click()
+    expect(tab.page.locator("#seen")).to_contain_text("hand-offs are proposed")
+    tab.page.get_by_role("button", name="Store it").click()
     tab.page.wait_for_url(re.compile("/pages/recordings/[0-9a-f]{64}"))
 
 
@@ -395,26 +397,86 @@ def without_prefix(route: Route) -> None:
     route.continue_(url=route.request.url.replace(PREFIX, "", 1))
 
 
-@pytest.mark.nightly  # the commands and the calls are tested by day
-@pytest.mark.parametrize("phone", [False, True])
-def test_a_table_under_other_names_is_sent_with_what_is_said_about_it(
-    browser: Browser, url: str, tmp_path: Path, phone: bool
+@pytest.mark.parametrize("phone", [False, pytest.param(True, marks=pytest.mark.nightly)])
+def test_a_table_is_previewed_with_what_is_said_of_it_and_then_stored(
+    browser: Browser, url: str, client: Client, tmp_path: Path, phone: bool
 ) -> None:
     table = tmp_path / "hand-off.csv"
     table.write_text(written.positions("wren" if phone else "heron"))
+    surgeon = "linnet" if phone else "siskin"
+    client.put_surgeon(surgeon)
     with visiting(browser, url, phone=phone) as tab:
+        page, asked = tab.page, tab.asked
         tab.open("/pages/recordings/new")
-        tab.page.get_by_label("Choose a file, or drop it here").set_input_files(table)
-        tab.page.get_by_role("button", name="Send").click()
-        expect(tab.page.locator("#upload-said")).to_contain_text("unknown column 'PosX'")
-        tab.page.get_by_label("Columns under other names").fill("x=PosX\ny=PosY\nz=PosZ\n")
-        tab.page.get_by_label("Their units").fill("mm")
-        tab.page.get_by_label("Frame of a table").fill("base")
-        tab.page.get_by_label("Rate").fill("100")
-        tab.page.get_by_label("Arm").fill("PSM2")
+        page.get_by_label("Choose a file, or drop it here").set_input_files(table)
+        page.get_by_role("button", name="Preview").press("Enter")
+        expect(page.locator("#upload-said")).to_contain_text("unknown column 'PosX'")
+        tab.complaints.clear()  # the refusal is a response of 422, which the console shows
+        page.get_by_label("Columns under other names").fill("x=PosX\ny=PosY\nz=PosZ\n")
+        page.get_by_label("Lengths").select_option("mm")
+        page.get_by_label("Frame of the positions").fill("base")
+        page.get_by_label("Arm", exact=True).fill("PSM2")
+        page.get_by_role("button", name="Preview").click()
+        seen = page.get_by_role("region", name="What was understood")
+        expect(seen).to_be_focused()
+        expect(seen).to_contain_text("it is stored only with a rate")
+        expect(seen.get_by_role("button", name="Store it")).to_be_disabled()
+        seen.get_by_role("button", name="Change something").click()
+        expect(page.get_by_label("Frame of the positions")).to_be_focused()
+        page.get_by_label("Rate").fill("100")
+        expect(seen).to_be_hidden()  # the preview was of other answers
+        page.get_by_role("button", name="Preview").click()
+        expect(seen.locator("tr", has_text="PosX")).to_have_text("PosXxmm")
+        expect(seen).to_contain_text("1 hand-off is proposed")
         assert tab.too_wide() <= 0
         tab.shoot(f"upload-table-{'phone' if phone else 'desk'}")
-        tab.complaints.clear()  # the refusal above is a response of 422, which the console shows
-        tab.page.get_by_role("button", name="Send").click()
-        tab.page.wait_for_url(re.compile("/pages/recordings/[0-9a-f]{64}"))
-        expect(tab.page.get_by_role("heading", name="Quality")).to_be_visible()
+        assert not [one for one in asked if "/recordings?" in one], "nothing is stored before the button is pressed"
+        seen.get_by_role("button", name="Store it").click()
+        page.wait_for_url(re.compile("/pages/recordings/[0-9a-f]{64}"))
+        expect(page.get_by_role("heading", name="Quality")).to_be_visible()
+        accept_as_a_failure(tab, surgeon)
+    (demo,) = client.demos(surgeon=surgeon)
+    assert (demo.arm, demo.outcome, demo.outcome_reason) == ("PSM2", "failure", "The needle fell.")
+
+
+def accept_as_a_failure(tab: Watched, surgeon: str) -> None:
+    """Accept the proposed hand-off as a failure, which needs a reason, and ask to learn from it."""
+    page = tab.page
+    accept = page.get_by_role("button", name="Accept this hand-off")
+    form = page.locator("#accept")
+    expect(page.locator("#timeline svg")).to_have_attribute("data-drawn", "true")
+    form.get_by_label("Surgeon").select_option(surgeon)
+    form.get_by_label("Suture type").select_option(SAMPLE.suture)
+    expect(form.get_by_label("Why, for a recovery or a failure")).to_be_hidden()
+    form.get_by_label("Outcome").select_option("failure")
+    accept.click()  # refused by the browser: the reason is needed
+    expect(page.locator("#made")).to_be_hidden()
+    form.get_by_label("Why, for a recovery or a failure").fill("The needle fell.")
+    tab.shoot("outcome")
+    assert tab.too_wide() <= 0
+    accept.click()
+    expect(page.locator("#made").get_by_role("row", name=re.compile("^Outcome failure"))).to_contain_text(
+        "The needle fell."
+    )
+    page.locator("#made").get_by_role("button", name="Train", exact=True).click()
+    dialog = page.get_by_role("dialog")
+    expect(dialog).to_contain_text("marked failure")
+    dialog.get_by_role("button", name="Cancel").click()
+    page.reload()
+    expect(page.locator(".badge", has_text="failure")).to_be_visible()
+    expect(page.get_by_text("Mark the outcome of a demonstration")).to_be_visible()
+
+
+@pytest.mark.nightly  # by day, of a table
+def test_joints_beside_poses_are_identified_in_the_preview(browser: Browser, url: str, tmp_path: Path) -> None:
+    recording = tmp_path / "session.csv"
+    recording.write_text(written.ee_csv(more=True))
+    with visiting(browser, url) as tab:
+        tab.open("/pages/recordings/new")
+        tab.page.get_by_label("Choose a file, or drop it here").set_input_files(recording)
+        tab.page.get_by_text("What the file does not say").click()
+        tab.page.get_by_label("Frame of the positions").fill("base")
+        tab.page.get_by_role("button", name="Preview").click()
+        seen = tab.page.get_by_role("region", name="What was understood")
+        expect(seen.get_by_role("row", name="PSM2 /PSM2/measured_cp identified Classic, 400006")).to_be_visible()
+        tab.shoot("upload-identified")

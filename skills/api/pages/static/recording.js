@@ -1,6 +1,6 @@
 // A recording's timeline, and the form that cuts a hand-off out of it and trains it.
 import { call, root, watch } from "./api.js";
-import { jobLine } from "./site.js";
+import { confirmed, jobLine, rowOf } from "./site.js";
 
 const get = (id) => document.getElementById(id);
 const cut = get("cut");
@@ -160,13 +160,14 @@ let demo;
 form.addEventListener("submit", async (event) => {
   event.preventDefault();
   const button = form.querySelector("button");
-  const { surgeon, suture, arm, grid, cell_mm: cell } = form.elements;
+  const { surgeon, suture, arm, grid, cell_mm: cell, outcome, outcome_reason: why } = form.elements;
   tell("accept-said", "");
   button.disabled = true;
   try {
     demo = await call("POST", `/recordings/${cut.dataset.recording}/demos`, {
       surgeon: surgeon.value, suture: suture.value, arm: arm.value, grid: grid.value,
       start_s: Number(first.value), end_s: Number(last.value), ...(cell.value && { cell_mm: Number(cell.value) }),
+      ...(outcome.value && { outcome: outcome.value }), ...(why.value && { outcome_reason: why.value }),
     });
     taken.push([demo.start_s, demo.end_s]);
     draw();
@@ -184,6 +185,7 @@ const triple = (values) => `${values.map((one) => one.toFixed(2)).join(", ")} mm
 function made() {
   const report = demo.report;
   const rows = [
+    ["Outcome", demo.outcome ?? "not known", demo.outcome_reason ?? ""],
     ["Duration", number(report.duration_s, "s"), `${report.samples} samples at ${number(report.rate_hz, "Hz", 0)}`],
     ["Path length", number(report.path_length_mm, "mm", 1), "tremor included"],
     ["Extent x, y, z", triple(report.extent_mm), ""],
@@ -191,21 +193,7 @@ function made() {
     ["Lost to the grid x, y, z", triple(report.discretisation_rmse_mm), "RMSE between the recording and its cells"],
     ["Clutch", `${report.clutch_presses} presses`, `${number(report.undriven_s, "s")} not driven, left out`],
   ];
-  get("made-numbers").replaceChildren(...rows.map(([name, value, meaning]) => {
-    const row = document.createElement("tr");
-    const head = document.createElement("th");
-    head.scope = "row";
-    head.textContent = name;
-    const cell = document.createElement("td");
-    cell.append(...[[value, "number"], [` ${meaning}`, "meaning"]].map(([text, kind]) => {
-      const part = document.createElement("span");
-      part.className = kind;
-      part.textContent = text;
-      return part;
-    }));
-    row.append(head, cell);
-    return row;
-  }));
+  get("made-numbers").replaceChildren(...rows.map((row) => rowOf(...row)));
   get("advice").replaceChildren(advice(report.advice));
   get("report").href = `${root}/demos/${demo.id}/report`;
   get("score").href = `${root}/pages/demos/${demo.id}/score`;
@@ -230,11 +218,14 @@ function advice(said) {
 let version;
 get("train").addEventListener("click", async () => {
   const button = get("train");
+  const failed = ["recovery", "failure"].includes(demo.outcome);
+  const means = "The version and its card name the outcome. It is not released by this.";
+  if (failed && !(await confirmed({ what: `Learn from a demonstration that is marked ${demo.outcome}?`, means, yes: "Train" }))) return;
   button.disabled = true;
   button.parentElement.querySelectorAll(":scope ~ .running").forEach((one) => one.remove());
   tell("train-said", "");
   try {
-    const job = await call("POST", "/trainings", { surgeon: demo.surgeon, suture: demo.suture, demos: [demo.id] });
+    const job = await call("POST", "/trainings", { surgeon: demo.surgeon, suture: demo.suture, demos: [demo.id], ...(failed && { outcomes: "any" }) });
     const ended = await watch(job.id, jobLine(button.parentElement));
     if (ended.state !== "succeeded") return;
     version = ended.result.policy_version;

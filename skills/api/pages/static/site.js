@@ -33,6 +33,19 @@ export function say(near, text, kind = "wrong") {
   if (text) place.scrollIntoView({ block: "nearest" });
 }
 
+// Make an element of the page with properties and with texts or elements in it.
+export function element(name, properties, ...inside) {
+  const made = Object.assign(document.createElement(name), properties);
+  made.append(...inside);
+  return made;
+}
+
+// Make a row of a table of figures, as the macro `row` does.
+export function rowOf(name, value, meaning) {
+  const cell = element("td", {}, element("span", { className: "number" }, value), element("span", { className: "meaning" }, ` ${meaning}`));
+  return element("tr", {}, element("th", { scope: "row" }, name), cell);
+}
+
 // Confirm an action that is hard to undo; if there is a word, it must be typed.
 export function confirmed({ what, means, yes, word }) {
   const dialog = document.getElementById("ask");
@@ -111,6 +124,15 @@ document.addEventListener("click", (event) => {
   const button = event.target.closest?.("button[data-call], button[data-file]");
   if (button?.dataset.call) act(button);
   else if (button) saveFile(button);
+});
+
+// The reason of an outcome is asked for where it is needed.
+document.addEventListener("change", ({ target }) => {
+  if (!target.matches?.('select[name="outcome"]')) return;
+  const why = target.form.querySelector(".why");
+  why.hidden = !["recovery", "failure"].includes(target.value);
+  why.querySelector("input").required = !why.hidden;
+  if (why.hidden) why.querySelector("input").value = "";
 });
 
 // A form with a call sends its filled fields as JSON; {name} in the path stands for the value of a field.

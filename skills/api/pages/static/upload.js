@@ -1,13 +1,15 @@
-// Upload of a recording as raw bytes with their digest, with a progress bar.
+// Upload of a recording as raw bytes with their digest: a preview of what is understood, and then, unchanged, its storage.
 import { changing, problemOf, root } from "./api.js";
+import { understood } from "./preview.js";
 
 const get = (id) => document.getElementById(id);
 const form = get("upload");
+const said = get("said");
 const KINDS = Object.fromEntries([...get("kind").options].map((one) => [one.dataset.suffix, one.value]));
 const TABLE = "text/csv";
 const FRAMELESS = [TABLE, "application/zip"]; // the latter: LeRobot
 const DIGESTED_BYTES = 512 * 2 ** 20; // the digest needs the complete file in memory; a larger file is sent without one
-const mebibytes = (bytes) => `${(bytes / 2 ** 20).toFixed(1)} MiB`;
+const mebibytes = (bytes) => `${(bytes / 2 ** 20).toFixed(bytes < 2 ** 20 ? 3 : 1)} MiB`;
 
 function chosen() {
   const [file] = get("file").files;
@@ -15,14 +17,24 @@ function chosen() {
   const kind = KINDS[`.${file.name.split(".").pop().toLowerCase()}`];
   if (kind) get("kind").value = kind;
   get("chosen").textContent = `${file.name}, ${mebibytes(file.size)}`;
-  ofKind();
 }
-function ofKind() {
-  for (const one of form.querySelectorAll(".of-table")) one.hidden = get("kind").value !== TABLE;
-  get("of-frame").hidden = !FRAMELESS.includes(get("kind").value);
+
+function changed() {
+  const kind = get("kind").value;
+  said.hidden = !FRAMELESS.includes(kind);
+  for (const one of said.querySelectorAll(".of-table")) one.hidden = kind !== TABLE;
+  get("seen").hidden = true;  // it was of another file, or read with other answers
+  tell("upload-said", "");
 }
+
+function tell(id, text) {
+  get(id).textContent = text;
+  get(id).className = text ? "said wrong" : "said";
+}
+
 get("file").addEventListener("change", chosen);
-get("kind").addEventListener("change", ofKind);
+form.addEventListener("input", changed);
+form.addEventListener("change", changed);
 
 const drop = get("drop");
 for (const name of ["dragover", "dragleave", "drop"]) {
@@ -32,6 +44,7 @@ for (const name of ["dragover", "dragleave", "drop"]) {
     if (name !== "drop" || !event.dataTransfer.files.length) return;
     get("file").files = event.dataTransfer.files;
     chosen();
+    changed();
   });
 }
 
@@ -41,7 +54,18 @@ async function digestOf(file) {
   return { "Content-Digest": `sha-256=:${btoa(String.fromCharCode(...new Uint8Array(digest)))}:` };
 }
 
-function send(file, headers, query) {
+// The answers to what the file does not say, of the fields that its format has.
+function answers() {
+  const query = new URLSearchParams();
+  if (said.hidden) return query;
+  for (const field of said.querySelectorAll("[name]")) {
+    if (field.closest("[hidden]")) continue;
+    for (const line of field.value.split("\n")) if (line.trim()) query.append(field.name, line.trim());
+  }
+  return query;
+}
+
+function send(path, file, headers, query) {
   const request = new XMLHttpRequest();
   const done = new Promise((resolve, reject) => {
     request.upload.onprogress = ({ loaded, total }) => {
@@ -53,42 +77,58 @@ function send(file, headers, query) {
     request.onerror = () => reject(new Error("The connection was lost; send it again. Nothing was stored."));
     request.onabort = () => reject(new Error("Stopped; nothing was stored."));
   });
-  request.open("POST", `${root}/recordings?${query}`);
+  request.open("POST", `${root}${path}?${query}`);
   for (const [name, value] of Object.entries({ ...headers, ...changing() })) request.setRequestHeader(name, value);
   get("stop").onclick = () => request.abort();
   request.send(file);
   return done;
 }
 
-function sayAbout(query) {
-  if (get("rate").value) query.set("rate_hz", get("rate").value);
-  for (const name of ["table_arm", "instrument", "decimal"]) if (get(name).value) query.set(name, get(name).value);
-  for (const line of get("column").value.split("\n")) if (line.trim()) query.append("column", line.trim());
-  for (const unit of get("unit").value.split(/[\s,]+/)) if (unit) query.append("unit", unit);
-}
-
-form.addEventListener("submit", async (event) => {
-  event.preventDefault();
+// Send the file with everything locked, so that what is stored is what was previewed.
+async function sent(path, where, then) {
   const [file] = get("file").files;
   const kind = get("kind").value;
-  const query = new URLSearchParams();
-  if (kind === TABLE) sayAbout(query);
-  if (FRAMELESS.includes(kind) && get("frame").value) query.set("frame", get("frame").value);
-  const button = form.querySelector("button:not([type])");
-  button.disabled = true;
+  const query = answers();
+  const fields = [...form.elements, get("store"), get("change")].filter((one) => !one.disabled && one !== get("stop"));
+  for (const one of fields) one.disabled = true;
+  get("progress").value = 0;
   get("progress").hidden = get("stop").hidden = false;
-  get("upload-said").textContent = "";
-  get("upload-said").className = "said";
+  tell(where, "");
   try {
-    const stored = await send(file, { "Content-Type": kind, ...(await digestOf(file)) }, query);
-    const more = new URLSearchParams(Object.entries({ surgeon: form.dataset.surgeon, suture: form.dataset.suture }).filter(([, value]) => value));
-    location.assign(`${root}/pages/recordings/${stored.id}${more.size ? `?${more}` : ""}`);
+    const answer = await send(path, file, { "Content-Type": kind, ...(await digestOf(file)) }, query);
+    for (const one of fields) one.disabled = false;
+    then(answer);
   } catch (problem) {
-    get("upload-said").textContent = problem.message;
-    get("upload-said").className = "said wrong";
-    get("sent").textContent = "";
+    for (const one of fields) one.disabled = false;
+    tell(where, problem.message);
+    if (!said.hidden && problem.status === 422) said.open = true;
   } finally {
-    button.disabled = false;
+    get("sent").textContent = "";
     get("progress").hidden = get("stop").hidden = true;
   }
+}
+
+form.addEventListener("submit", (event) => {
+  event.preventDefault();
+  get("seen").hidden = true;
+  sent("/recordings/preview", "upload-said", (seen) => {
+    get("understood").replaceChildren(...understood(seen));
+    get("store").disabled = !seen.timed;
+    tell("store-said", seen.timed ? "" : "It has no times, so it is stored only with a rate, or with the column of its times.");
+    get("seen").hidden = false;
+    get("seen").focus();
+  });
 });
+
+get("store").addEventListener("click", () => sent("/recordings", "store-said", (stored) => {
+  const more = new URLSearchParams(Object.entries({ surgeon: form.dataset.surgeon, suture: form.dataset.suture }).filter(([, value]) => value));
+  location.assign(`${root}/pages/recordings/${stored.id}${more.size ? `?${more}` : ""}`);
+}));
+
+get("change").addEventListener("click", () => {
+  if (!said.hidden) said.open = true;
+  (said.hidden ? get("file") : said.querySelector("[name]")).focus();
+});
+
+if (get("file").files.length) chosen();  // kept by the browser when the page is opened again
+changed();
