@@ -81,7 +81,7 @@ def test_the_table_of_rooms_names_each_after_those_that_it_imports():
         ("mcap_ros2", "formats/"),
         ("rosbags", "formats/rosbag.py"),
         ("yaml", "formats/bag_folder.py"),
-        ("pyarrow", "formats/lerobot/"),
+        ("pyarrow", ("formats/lerobot/", "formats/cells.py")),
         ("pybullet", "simulation/"),
         ("pybullet_data", "simulation/"),
         ("numba", "compiled.py"),

@@ -323,8 +323,9 @@ def recording_preview(
         out.print(f"{where}: {motion.samples} samples{rate}; {extent}", markup=False, soft_wrap=True)
     for left in seen.left_out:
         out.print(f"left out {left.topic}: {left.because}", markup=False, soft_wrap=True)
+    _tell_notes(seen)
     _tell_identified(seen)
-    for line in _counted(seen):
+    for line in count_dropped(seen):
         out.print(line, markup=False, soft_wrap=True)
     if not seen.timed:
         out.print("No times: it is stored only with a rate (--rate-hz) or a column of times.", soft_wrap=True)
@@ -392,12 +393,16 @@ def _tell(stored: "Recording", as_json: bool) -> None:
         return
     about = f"{stored.format}, {stored.duration_s:.1f} s, integrity {stored.integrity}"
     out.print(f"{stored.sha256}  {about}", soft_wrap=True)
-    for name, value in stored.notes.items():
-        out.print(f"{name}: {value}", markup=False, soft_wrap=True)
-    for line in _counted(stored):
+    _tell_notes(stored)
+    for line in count_dropped(stored):
         out.print(line, markup=False, soft_wrap=True)
     _tell_identified(stored)
     show(stored.segments, False, ("arm", "start_s", "end_s", "reason"))
+
+
+def _tell_notes(found: "Recording | RecordingPreview") -> None:
+    for name, value in found.notes.items():
+        out.print(f"{name}: {value}", markup=False, soft_wrap=True)
 
 
 def _tell_identified(found: "Recording | RecordingPreview") -> None:
@@ -405,7 +410,7 @@ def _tell_identified(found: "Recording | RecordingPreview") -> None:
         out.print(f"{one.topic}: {one.found.verdict}: {one.found.reason}", markup=False, soft_wrap=True)
 
 
-def _counted(stored: "Recording | RecordingPreview") -> list[str]:
+def count_dropped(stored: "Recording | RecordingPreview") -> list[str]:
     """Return a line for each count of samples that were dropped, or repeat the one before."""
     repeated = [(one.duplicate_stamps, one.topic, "with a repeated stamp dropped") for one in stored.motions]
     back = [(one.backward_stamps, one.topic, "with a stamp that went back dropped") for one in stored.dropped]

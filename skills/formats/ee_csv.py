@@ -19,7 +19,6 @@ read as the tip if it moves, and one fixed transform leads from it to the other 
 whose pose is 0 in every row, quaternion included, was not recorded, and is left out.
 """
 
-import os
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -41,8 +40,8 @@ from skills.demonstration.recording import (
     recorded_motion,
     recorded_signal,
 )
-from skills.errors import BadColumns, BadSettings, MixedFrames, NoUsableTopic, SkillsError, UnreadableRecording
-from skills.formats.cells import header_of, open_text, read_numbers
+from skills.errors import BadColumns, BadSettings, MixedFrames, NoUsableTopic, SkillsError
+from skills.formats.cells import check_whole, header_of, open_text, read_numbers
 from skills.formats.tables import (
     BASE,
     TableReading,
@@ -105,7 +104,7 @@ def read_ee_csv(file: BinaryIO, said: TableReading) -> Recording:
         raise BadSettings("The columns name their arms; omit table_arm.")
     if said.unit:
         raise BadSettings("The columns of an ee_csv are in m, rad and ns; omit unit, or map the columns of one arm.")
-    _check_end(file)
+    check_whole(file)
     with open_text(file) as text:
         names, separator = header_of(text)
         groups = _groups(names)
@@ -121,15 +120,6 @@ def read_ee_csv(file: BinaryIO, said: TableReading) -> Recording:
     stamps_ns = stamps_of(numbers.stamps_ns, len(numbers.values), said)
     parts = {(one.arm, one.kind): numbers.values[:, [place[k] for k in one.columns]] for one in groups}
     return _recording(parts, stamps_ns, said, _columns(names, groups, time))
-
-
-def _check_end(file: BinaryIO) -> None:
-    """Refuse a file that ends within a row, which would change its last number; the recorders end every line."""
-    file.seek(-1, os.SEEK_END)
-    last = file.read(1)
-    file.seek(0)
-    if last not in (b"\n", b"\r"):
-        raise UnreadableRecording("The last row of the table has no line end: the file was cut. Copy it again.")
 
 
 def _groups(names: Sequence[str]) -> list[_Group]:

@@ -64,7 +64,18 @@ from skills.errors import (
     UnreadableRecording,
 )
 from skills.formats import topics
-from skills.formats.cells import LINE_CHARACTERS, NS_PER, Decimals, csv_rows, header_of, open_text, read_numbers
+from skills.formats.cells import (
+    LINE_CHARACTERS,
+    NS_PER,
+    Decimals,
+    check_last_number,
+    check_whole,
+    csv_rows,
+    ends_with_line,
+    header_of,
+    open_text,
+    read_numbers,
+)
 from skills.kinematics import INSTRUMENTS, JOINTS, UNITS, forward, instrument_of, quaternion_of
 from skills.remedies import Action, Remedy, did_you_mean
 
@@ -75,6 +86,7 @@ BASE = "base"  # as a frame: the base of each arm
 # of 290 mm is 11.4 inches, so a path in inches never exceeds this limit.
 OUTSIDE_MM = min(instrument.cannula_mm - instrument.wrist_offset_mm for instrument in INSTRUMENTS.values())
 BEYOND_LIMIT = {"rad": 0.1, "mm": 10.0}  # ours: encoders overshoot a joint's limit by less; degrees and metres do not
+NOT_ENDED = ("last row", "It has no line end: if the file was cut, its last number lacks digits.")
 _FASTEST_HZ = 100_000.0
 _TURN_RAD = 2 * np.pi
 _JOINT_RAD = 7.0  # ours: more than any joint turns, less than 8 degrees
@@ -181,10 +193,12 @@ def read_table(file: BinaryIO, reading: TableReading | None = None) -> Recording
         BadColumns: A column is unknown, duplicate, missing or ambiguous, or time is given twice or not at all.
         BadSettings: A mapping or a unit is impossible or contradicts a column.
         NoUsableTopic: There are neither positions nor joints with a stated instrument.
-        UnreadableRecording: A row of another length, a cell that is not a number, no rows.
+        UnreadableRecording: A row of another length, a cell that is not a number, no rows, or a last number that was
+            cut; without a line end after it, the recording has a note that it may have been.
         NotFinite, NotMetres, BackwardStamps, RepeatedStamps, NotAQuaternion: As in `skills.demonstration.recording`.
     """
     said = reading or TableReading()
+    is_ended = ends_with_line(file)
     with open_text(file) as text:
         names, separator = header_of(text)
         uses = _uses(names, said)
@@ -199,13 +213,16 @@ def read_table(file: BinaryIO, reading: TableReading | None = None) -> Recording
             said.decimal,
             None if time is None else (time.index, time.unit),
         )
+    if not is_ended:
+        check_last_number(file, separator, said.decimal)
     stamps_ns = stamps_of(numbers.stamps_ns, len(numbers.values), said)
     if time is not None and time.unit != "s":
         check_steps(names[time.index], time.unit, stamps_ns)
     columns = {
         name: scaled(numbers.values[:, k], QUANTITIES[name][use.unit]) for k, (name, use) in enumerate(uses.items())
     }
-    return _recording(_Table(columns, stamps_ns), said, _listed(names, uses))
+    recording = _recording(_Table(columns, stamps_ns), said, _listed(names, uses))
+    return recording if is_ended else replace(recording, notes=(NOT_ENDED,))
 
 
 def _listed(names: Sequence[str], uses: Mapping[str, _Use]) -> tuple[Column, ...]:
@@ -626,6 +643,7 @@ def read_extract(file: BinaryIO) -> Recording:
         UnreadableRecording: A row of another length, a cell that is not a number, no rows.
         MixedFrames, NotFinite, NotMetres, BackwardStamps, RepeatedStamps, NotAQuaternion: See `skills.errors`.
     """
+    check_whole(file)
     with open_text(file, "Extract") as text:
         first, second = text.readline(LINE_CHARACTERS), text.readline(LINE_CHARACTERS)
         topic, kind = first.removeprefix(FIRST).strip(), second.removeprefix(_SECOND).strip()

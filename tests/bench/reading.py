@@ -1,12 +1,17 @@
 """Speed of reading recordings, compared with decompressing their chunks and with libraries that decode each message."""
 
 import struct
+import time
+import zipfile
+from collections.abc import Callable
 from io import BytesIO
+from typing import Any
 
 import numpy as np
 import zstandard
 from mcap.stream_reader import StreamReader
 from mcap_ros2.reader import read_ros2_messages
+from pyarrow import csv, parquet
 from rich.table import Table
 
 from skills.demonstration.demonstration import cut_demo
@@ -14,7 +19,7 @@ from skills.formats import read_recording
 from skills.formats.mcap.recording import read_mcap
 from skills.gridworld.grid import discretize, fit_grid
 from tests.bench.timing import best_s, in_turn
-from tests.formats import bags, large, records, written
+from tests.formats import bags, large, lerobots, others, records, written
 
 ROUNDS = 9
 LIBRARY_S = 3.0  # the libraries take a hundred times as long, so they read a shorter recording of the same kind
@@ -57,18 +62,36 @@ def _long(table: Table) -> None:
 
 
 def _tables(table: Table) -> None:
-    """Read an ee_csv of two arms, 1000 s at 30 Hz, and the same numbers with numpy alone."""
+    """Read tables and an episode, and the same files with pyarrow alone."""
     head, *rows = written.ee_csv().splitlines()
     stamps = (bags.START_NS + k * written.STEP_NS for k in range(30_000))
     lines = [f"{stamp},{rows[k % len(rows)].partition(',')[2]}" for k, stamp in enumerate(stamps)]
-    data = "\n".join([head, *lines, ""]).encode()
-    ours, bare = in_turn(
-        lambda: read_recording(BytesIO(data), frame="ECM"),
-        lambda: np.loadtxt(BytesIO(data), delimiter=",", skiprows=1),
-        rounds=3,
-    )
-    table.add_row("an ee_csv, 30,000 rows", f"{ours * 1e3:.0f} ms", f"{len(data) / ours / 1e6:.0f} MB/s")
-    table.add_row("  numpy.loadtxt alone", f"{bare * 1e3:.0f} ms", f"{ours / bare:.1f} x for ours")
+    _beside_arrow(table, "an ee_csv, 30,000 rows", "\n".join([head, *lines, ""]).encode(), _csv, frame="ECM")
+    motion = written.sample("heron").motion_of()
+    poses = [",".join(map(repr, row)) for row in np.column_stack([motion.tip_mm, motion.rotation_xyzw]).tolist()]
+    lines = [f"{k // 200}.{k % 200 * 5:03d},{poses[k % len(poses)]}" for k in range(100_000)]
+    narrow = "\n".join(["t_s,x_mm,y_mm,z_mm,qx,qy,qz,qw", *lines, ""]).encode()
+    _beside_arrow(table, "a table of one arm's poses, 100,000 rows", narrow, _csv)
+    files = lerobots.episode(lerobots.columns_of(300_000))
+    data = files["data/chunk-000/episode_000000.parquet"]
+    episode = others.zipped(files, zipfile.ZIP_STORED)
+    _beside_arrow(table, "an episode of LeRobot, 300,000 frames", episode, lambda _: _parquet(data), frame="ECM")
+
+
+def _beside_arrow(table: Table, name: str, data: bytes, bare: Callable[[bytes], object], **how: Any) -> None:
+    works = lambda: read_recording(BytesIO(data), **how), lambda: bare(data)
+    ours, theirs = in_turn(*works, rounds=5, clock=time.process_time)  # pyarrow works in threads of its own
+    speed = len(data) / ours / 1e6
+    table.add_row(name, f"{ours * 1e3:.0f} ms", f"{speed:.0f} MB/s, {1e3 / speed:.1f} s for 1 GB")
+    table.add_row("  pyarrow alone", f"{theirs * 1e3:.0f} ms", f"{ours / theirs:.1f} x for ours")
+
+
+def _csv(data: bytes) -> object:
+    return csv.read_csv(BytesIO(data), csv.ReadOptions(use_threads=False))
+
+
+def _parquet(data: bytes) -> object:
+    return parquet.ParquetFile(BytesIO(data)).read(use_threads=False)
 
 
 def _chunks(data: bytes) -> list[tuple[bytes, int]]:
