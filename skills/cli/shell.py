@@ -162,6 +162,11 @@ def tell(wrong: str, advice: Sequence[str]) -> None:
         err.print(line, markup=False, soft_wrap=True)
 
 
+def first_sentence(error: SkillsError) -> str:
+    """Return the fault without its remedies."""
+    return PARTS.split(error.message, maxsplit=1)[0]
+
+
 def _in_commands(error: SkillsError, command: Callable[..., None]) -> tuple[str, list[str]]:
     """Return the fault and the remedies in the words of the command line.
 

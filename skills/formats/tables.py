@@ -73,6 +73,7 @@ from skills.formats.cells import (
     csv_rows,
     ends_with_line,
     header_of,
+    is_number,
     open_text,
     read_numbers,
 )
@@ -272,6 +273,11 @@ def _uses(names: list[str], said: TableReading) -> dict[str, _Use]:
         BadColumns: A column is unknown or duplicate, or a mapping names one that does not exist.
         BadSettings: A mapping or a unit is impossible, or contradicts another.
     """
+    if all(map(is_number, names)):
+        raise BadColumns(
+            "The table has no header: its first row has numbers. Write the names of the columns above it, separated as "
+            f"the numbers are. Known columns: {KNOWN}."
+        )
     units, needed, aliases = _units(said), set[str](), _aliases(names)
     mapped = _mapped(names, said, units, needed)
     of_calibration = aliases is not _PAPER_NAMES

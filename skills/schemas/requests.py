@@ -221,6 +221,14 @@ class TableIn(Reading):
     )
 
 
+class StatedIn(TableIn):
+    """What a folder's owner states about recordings for `skills recording table` (docs/recordings.md)."""
+
+    source: Text = ""
+    episode: Name | None = None
+    tool: list[Name] | None = None
+
+
 READING = {"column", "unit", "decimal", "table_arm", "instrument"}
 
 

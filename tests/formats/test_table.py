@@ -166,6 +166,11 @@ def test_a_time_said_twice_is_refused():
         read("t_s,x_m,y_m,z_m\n0,0,0,0\n", rate_hz=100.0)
 
 
+def test_a_table_without_a_header_is_told_so():
+    with pytest.raises(BadColumns, match="no header: its first row has numbers"):
+        read_recording(io.BytesIO(b"-0.01,0.055,-0.135\n-0.01,0.05,-0.13\n"), rate_hz=30.0)
+
+
 def test_an_absurd_exponent_costs_neither_time_nor_memory():
     assert read("t_s,x_m,y_m,z_m\n1e-999999999,0,0,-0.1\n").motion_of().stamps_ns.tolist() == [0]
     with pytest.raises(NotFinite):
