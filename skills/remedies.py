@@ -175,6 +175,11 @@ class Action(Enum):
         command="Name it, such as --unit {one} or --unit {other}",
         python="Name it, such as unit=[{one}] or unit=[{other}]",
     )
+    DELETE_FIRST = Words(
+        http="To have them read in another way, erase its demonstrations and DELETE /recordings/{recording} first.",
+        command="Or erase its demonstrations with skills demo withdraw, and it: skills recording delete {recording}",
+        python="Or erase its demonstrations, and it: client.delete_recording({recording})",
+    )
     NAME_RATE = Words(
         http="Send it with rate_hz, or name the column of times: column=t_s=NAME, t_ms, t_us or t_ns.",
         command="Give --rate-hz, or name the column of times: --column t_s=NAME, t_ms, t_us or t_ns",

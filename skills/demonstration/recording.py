@@ -67,7 +67,7 @@ def check_tips(topic: str, stamps_ns: Ints, tip_mm: Floats) -> None:
         metres = float(np.abs(tip_mm[first]).max() / 1000.0)
         raise NotMetres(
             f"{topic}: a coordinate of {metres:g} m {_at(stamps_ns, first)}; the tip of a PSM stays within 1 m. "
-            "Give the positions in metres (or, in a table, name the columns x_mm, y_mm, z_mm).",
+            "Give the positions in metres (or, in a table, name the columns x_mm, y_mm, z_mm, or the unit mm).",
             topic=topic,
             sample=first,
             metres=metres,

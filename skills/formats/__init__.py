@@ -18,6 +18,7 @@ from skills.formats.cells import SEPARATORS, Decimals, header_of, open_text
 from skills.formats.mcap.recording import MAGIC
 from skills.formats.tables import BASE, TableReading, read_table
 from skills.formats.writer import write_bag, write_mcap
+from skills.remedies import Action, Remedy
 
 __all__ = ["BYTES", "MEDIA_TYPES", "SUFFIXES", "media_type_of", "read_recording", "write_bag", "write_mcap"]
 
@@ -36,6 +37,7 @@ SUFFIXES = {MCAP: ".mcap", ZIP: ".zip", TABLE: ".csv", TEXT: ".txt", ROSBAG1: ".
 
 _HEAD_BYTES = 65536
 _MAGIC = ((MAGIC, MCAP), (archive.MAGIC, ZIP), (rosbag.ROS1_MAGIC, ROSBAG1), (rosbag.DB3_MAGIC, SQLITE))
+_PARQUET = b"PAR1"
 _OTHERS = (
     (b"PK\x05\x06", "an empty zip archive"),
     (b"\x1f\x8b", "gzip; unpack it first"),
@@ -44,7 +46,7 @@ _OTHERS = (
         "zstd (a bag compressed as a file); unpack it with `zstd -d`, or send the bag folder as a zip",
     ),
     (b"\x89HDF", "HDF5; export a table"),
-    (b"PAR1", "Parquet; send it with the meta/info.json of its LeRobot dataset, as a zip"),
+    (_PARQUET, "Parquet, a part of a LeRobot dataset; send an episode with its meta/info.json, as a zip"),
 )
 _READ = (
     "MCAP, zipped bag folders, ROS 1 and .db3 bags, zipped LeRobot episodes, CSV and JIGSAWS kinematics can be read."
@@ -127,7 +129,8 @@ def media_type_of(file: BinaryIO) -> str:
             return kind
     for magic, name in _OTHERS:
         if head.startswith(magic):
-            raise UnknownFormat(f"This is {name}. {_READ}")
+            remedies = [Remedy(Action.CUT_EPISODE)] if magic == _PARQUET else []
+            raise UnknownFormat(f"This is {name}. {_READ}", *remedies)
     return _kind_of_text(head)
 
 

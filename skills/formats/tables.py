@@ -441,10 +441,7 @@ def check_time(column: str | None, said: TableReading) -> None:
     if column is not None and said.rate_hz is not None:
         raise BadColumns(f"The table has the column {column} and the request has rate_hz; use one of them.")
     if column is None and said.rate_hz is None and not said.untimed:
-        raise BadColumns(
-            "The table has no column t_s; add it, or give rate_hz for samples at a constant rate.",
-            Remedy(Action.NAME_RATE),
-        )
+        raise BadColumns("The table has no column t_s, and there is no rate.", Remedy(Action.NAME_RATE))
 
 
 def stamps_of(stamps_ns: Ints | None, count: int, said: TableReading) -> Ints:

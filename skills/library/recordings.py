@@ -177,7 +177,10 @@ def keep(session: Session, upload: Upload, told: Told, actor: str) -> tuple[Stor
                     "These bytes cannot be stored with these reading parameters; ask the operator of the service."
                 )
             before = " and ".join(f"no {name}" if to is None else f"{name} {to}" for name, to in stored.reading.items())
-            raise Conflict(f"These bytes are stored already, read with {before}; send the same parameters.")
+            raise Conflict(
+                f"These bytes are stored already, read with {before}; send the same parameters.",
+                Remedy(Action.DELETE_FIRST, recording=stored.sha256),
+            )
         return stored, _brought_by(session, stored, actor)
     stored = StoredRecording(
         sha256=upload.sha256,

@@ -355,7 +355,7 @@ def test_a_dataset_that_contradicts_itself_is_refused(files, words):
 
 
 def test_a_parquet_file_alone_is_refused_with_the_remedy():
-    with pytest.raises(UnknownFormat, match=r"send it with the meta/info\.json"):
+    with pytest.raises(UnknownFormat, match=r"send an episode with its meta/info\.json"):
         read_recording(io.BytesIO(lerobots.parquet(columns_of(4))))
 
 
