@@ -256,11 +256,13 @@ def _plain_blocks(file: BinaryIO, decimal: Decimals) -> Iterator[bytes]:
         is_last = len(read) < BLOCK_BYTES
         whole, newline, rest = (rest + read, b"\n", b"") if is_last else (rest + read).rpartition(b"\n")
         block = (whole + newline).replace(b"\r\n", b"\n")
+        if not newline or b"\r" in block:  # also in the header, below which a row would be lost
+            raise _NotPlain
         if is_header:
             block, is_header = block.partition(b"\n")[2], False
         if is_last:  # it may end with empty lines, or without a line end
             block = block.rstrip(b"\n") + b"\n"
-        if b'"' in block or b"\r" in block or not newline:
+        if b'"' in block:
             raise _NotPlain
         if not block.isascii():
             block.decode()

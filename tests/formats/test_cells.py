@@ -94,6 +94,13 @@ def test_other_tables_are_left_to_the_thorough_parser(rows):
     assert both("a,b\n" + rows, (0, 1))[0] is None
 
 
+@pytest.mark.parametrize("end", ["\r", "\r\r\n"])
+def test_a_row_below_a_header_with_another_line_end_is_not_lost(end):
+    quick, thorough = both(f"a,b{end}1,2\n3,4\n", (0, 1))
+    assert quick is None
+    assert isinstance(thorough, type) or thorough.values.tolist() == [[1, 2], [3, 4]]
+
+
 def test_the_quick_parser_starts_no_threads():
     """A reader's process may start none; Arrow's own reader of CSV files would."""
     code = (
