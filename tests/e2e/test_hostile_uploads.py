@@ -16,15 +16,26 @@ import numpy as np
 import pytest
 
 from skills.client import Client
+from skills.formats import BYTES
 from tests.api.service import KESTREL, MCAP, assert_problem
 from tests.e2e.conftest import FORK_SERVER, Service, running
 from tests.formats import hostile, lerobots
+from tests.formats.test_tables_hostile import FILES, mutations
 from tests.library import cases
 from tests.measured import peak_mib
 from tests.waiting import END_S, crowded
 
 BAG = cases.bag()
 EPISODE = lerobots.packed(lerobots.episode()).getvalue()
+TABLE_BOMBS = {
+    "a million rows of one value": b"x_mm,y_mm,z_mm\n" + 1_000_000 * b"0,50,-120\n",
+    "a million empty lines": b"x_mm,y_mm,z_mm\n0,50,-120\n" + 1_000_000 * b"\n",
+    "a line of 10 MB": b"x_mm,y_mm,z_mm\n" + 10_000_000 * b"1",
+    "a million columns": b",".join([b"x_mm"] * 1_000_000) + b"\n",
+    "a million brackets of numpy": b"x_mm,y_mm,z_mm\n" + 1_000_000 * b"np.float64(",
+    "numbers of 5000 digits": b"x_mm,y_mm,z_mm\n" + 500 * b",".join(3 * [b"0." + 5000 * b"1"]) + b"\n",
+    "exponents of 1000 digits": b"x_mm,y_mm,z_mm\n" + 1000 * (b",".join(3 * [b"1e-" + 1000 * b"9"]) + b"\n"),
+}
 BOMB_S = 5.0  # of processor time, so that other load does not matter
 OTHERS_S = 0.25
 GROWTH_MIB = 64
@@ -51,8 +62,12 @@ def http(service: Service) -> Iterator[httpx.Client]:
         yield http
 
 
-def send(http: httpx.Client, data: bytes, path: str = "/recordings") -> httpx.Response:
+def send(
+    http: httpx.Client, data: bytes, path: str = "/recordings", table: dict[str, Any] | None = None
+) -> httpx.Response:
     query: dict[str, Any] = dict(KESTREL) if path == "/demos" else {}
+    if table is not None:
+        return http.post(path, params=table, content=data, headers={"Content-Type": BYTES})
     if not data.startswith(b"PK"):
         return http.post(path, params=query, content=data, headers={"Content-Type": MCAP})
     query |= {"frame": "ECM"} | ({"arm": "PSM1", "segment": "whole"} if query else {})
@@ -102,11 +117,11 @@ def others_are_served(http: httpx.Client) -> Iterator[None]:
     assert float(np.quantile(took, 0.95)) < OTHERS_S * crowded()
 
 
-def sweep(service: Service, http: httpx.Client, files: Iterable[bytes]) -> int:
+def sweep(service: Service, http: httpx.Client, files: Iterable[bytes], table: dict[str, Any] | None = None) -> int:
     """Send files, and count the accepted ones: all others give 4xx and leave no row."""
     before, accepted = rows(service), set()
     for data in files:
-        answer = send(http, data)
+        answer = send(http, data, table=table)
         if answer.status_code in (200, 201):
             accepted.add(answer.json()["id"])
         else:
@@ -166,6 +181,24 @@ def test_damaged_and_hostile_lerobot_episodes_are_refused(service, http):
     several = lerobots.packed(lerobots.dataset("v2.1")).getvalue()
     assert "has 3 episodes" in assert_problem(send(http, several), range(400, 500))["detail"]
     assert rows(service) == before
+
+
+@pytest.mark.parametrize("count", [2, pytest.param(50, marks=pytest.mark.nightly)])
+def test_damaged_and_misassembled_tables_are_refused_or_stored(service, http, count):
+    """That an accepted one is read as its text says, is tested in `tests/formats/test_tables_hostile.py`."""
+    for name, (text, how) in FILES.items():
+        accepted = sweep(service, http, hostile.truncations(text.encode(), count, seed=count), how)
+        assert accepted <= 0.1 * count or not name.startswith("ee_csv")
+        sweep(service, http, hostile.flips(text.encode(), count, seed=count), how)
+        sweep(service, http, mutations(text, count, seed=count), how)
+
+
+@pytest.mark.parametrize("name", TABLE_BOMBS)
+def test_table_bombs_are_refused_or_read_within_the_limits(service, http, name):
+    began = reading_s(service)
+    answer = send(http, TABLE_BOMBS[name], table={"rate_hz": 100, "frame": "ECM"})
+    assert answer.status_code == 201 or assert_problem(answer, range(400, 500))
+    assert reading_s(service) - began < BOMB_S
 
 
 @pytest.mark.nightly

@@ -251,13 +251,14 @@ def _deep_footer(levels: int) -> bytes:
     """Return a file whose schema is a chain of groups, as Thrift's compact protocol encodes it."""
     group = b"\x35\x02\x18\x01a\x15\x02\x00"  # repetition: repeated, name: a, children: 1
     leaf = b"\x15\x0a\x25\x02\x18\x01a\x00"  # type: double
-    count = _varint(levels + 1)
+    count = varint(levels + 1)
     footer = b"\x15\x02\x19\xfc" + count + b"\x48\x01r\x15\x02\x00" + group * (levels - 1) + leaf
     footer += b"\x16\x00\x19\x0c\x00"  # no rows, no row groups
     return b"PAR1" + footer + len(footer).to_bytes(4, "little") + b"PAR1"
 
 
-def _varint(number: int) -> bytes:
+def varint(number: int) -> bytes:
+    """Return a number in the variable length of Thrift's compact protocol."""
     out = bytearray()
     while number > 127:
         out.append(number & 127 | 128)

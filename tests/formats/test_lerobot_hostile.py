@@ -7,18 +7,22 @@ import stat
 import tempfile
 import zipfile
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from skills.demonstration.recording import Recording
 from skills.errors import SkillsError, UnreadableRecording
 from skills.formats import read_recording
+from skills.formats.lerobot.cut import cut_episode, episodes_of, find_dataset
 from skills.formats.reader_process import ConfinedReader
 from skills.sandbox import ProcessLimits
 from skills.sandbox.forked import ForkServer
-from tests.formats import lerobots
+from tests.formats import hostile, lerobots
 from tests.formats.lerobots import columns_of, episode, packed, parquet, poses
 from tests.formats.others import damaged, zipped
 
@@ -153,6 +157,71 @@ def test_claims_of_statistics_change_nothing():
         data[at : at + 4] = np.float32(np.inf).tobytes()
         at = data.find(least, footer)
     assert same(read_recording(packed(episode(data=bytes(data))), frame="ECM"), plain)
+
+
+def lies(data: bytes, true: int, false: int) -> Iterator[bytes]:
+    """Yield the file with one integer of its footer replaced by another, for each place where it stands."""
+    said, lie = (lerobots.varint(2 * number) for number in (true, false))
+    start = len(data) - 8 - int.from_bytes(data[-8:-4], "little")
+    for at in range(start + 1, len(data) - 8):
+        if data[at : at + len(said)] == said and data[at - 1] & 0x0F == 6:  # the header of a field of 64 bits
+            footer = data[start:at] + lie + data[at + len(said) : -8]
+            yield data[:start] + footer + len(footer).to_bytes(4, "little") + b"PAR1"
+
+
+@pytest.mark.parametrize(
+    ("true", "false", "fewest"),
+    [(40, 39, 3), (40, 41, 3), (40, 0, 3), (40, 1_000_000_000, 3), (640, 639, 1), (640, 10_000_000_000, 1), (0, 5, 1)],
+    ids=["rows", "more rows", "no rows", "endless rows", "values", "endless values", "nulls"],
+)
+def test_wrong_counts_are_refused_or_change_nothing(reader, true, false, fewest):
+    """`true` is a number of rows, of values in a column of 16, or of nulls."""
+    columns = {"observation.state": poses(40), "frame_index": np.arange(40)}
+    data = parquet(columns, use_dictionary=False)
+    plain, wrong = confined(reader, packed(episode(columns, data=data)).getvalue()), list(lies(data, true, false))
+    for bad in wrong:
+        began = cpu_s(reader)
+        with suppress(SkillsError):
+            assert same(confined(reader, packed(episode(columns, data=bad)).getvalue()), plain)
+        assert cpu_s(reader) - began < MOST_CPU_S
+    assert len(wrong) >= fewest
+
+
+@pytest.mark.parametrize("count", [60, pytest.param(2000, marks=pytest.mark.nightly)])
+def test_no_flipped_bit_of_the_table_of_episodes_changes_one(count, tmp_path):
+    """The rows of an episode of v3.0 follow from it, and nothing else in the dataset vouches for them."""
+    files, table = lerobots.dataset("v3.0"), "meta/episodes/chunk-000/file-000.parquet"
+    sound, refused = cut_all(lerobots.write(files, tmp_path)), 0
+    for bad in hostile.flips(files[table], count, seed=count):
+        (tmp_path / table).write_bytes(bad)
+        try:
+            found = cut_all(tmp_path)
+        except SkillsError:
+            refused += 1
+            continue
+        assert all(same(found[number], sound[number]) for number in found)
+    assert refused > 0.15 * count
+
+
+def test_an_episode_whose_rows_contradict_its_length_is_refused(tmp_path):
+    files, table = lerobots.dataset("v3.0"), "meta/episodes/chunk-000/file-000.parquet"
+    rows = pq.read_table(io.BytesIO(files[table])).to_pylist()
+    rows[1]["length"] -= 1
+    lerobots.write(files | {table: parquet(pa.Table.from_pylist(rows))}, tmp_path)
+    with pytest.raises(UnreadableRecording, match="gives episode 1 49 frames, from 40 to 90"):
+        cut_all(tmp_path)
+
+
+def cut_all(folder: Path) -> dict[int, Recording]:
+    """Return the episodes of a dataset, cut and read."""
+    found = {}
+    with find_dataset(folder) as dataset:
+        assert dataset is not None
+        for number, one in episodes_of(dataset).items():
+            with io.BytesIO() as out:
+                cut_episode(dataset, one, out)
+                found[number] = read_recording(out, frame="ECM")
+    return found
 
 
 def test_paths_in_the_metadata_and_links_lead_nowhere(tmp_path, monkeypatch):

@@ -143,7 +143,9 @@ def mutations(text: str, count: int, seed: int) -> Iterator[bytes]:
         for _ in range(rng.randint(1, 3)):
             rng.choice(_CHANGES)(rows, rng)
         end = rng.choice(("\n", "\n", "\r\n", "\r"))
-        yield (end.join(separator.join(row) for row in rows) + end).encode("utf-8", "surrogatepass")
+        head, *others = (separator.join(row) for row in rows)
+        first = rng.choice((end, end, end, "\r"))  # of the header, now and then another line end
+        yield (head + first + end.join(others) + end).encode("utf-8", "surrogatepass")
 
 
 Rows = list[list[str]]

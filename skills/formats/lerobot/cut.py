@@ -179,13 +179,20 @@ def _files_of_episodes(dataset: Dataset) -> Iterator[Episode]:
 
 def _episodes_in_files(dataset: Dataset) -> Iterator[Episode]:
     """Yield the episodes of v3.0, from the table that says in which rows of which file each one is."""
-    names = ["episode_index", "length", "data/chunk_index", "data/file_index", "dataset_from_index"]
+    ends = ["dataset_from_index", "dataset_to_index"]
+    names = ["episode_index", "length", "data/chunk_index", "data/file_index", *ends]
     places = []
     for table in dataset.parquets("meta/episodes/"):
         with dataset.files.unpacked(table) as file:
             places += read_rows(file, names, most_rows=EPISODES)
     if not all(isinstance(place[name], int) for place in places for name in names):
         raise UnreadableRecording("A number in meta/episodes of the dataset is missing; copy the dataset again.")
+    wrong = next((one for one in places if one["dataset_to_index"] - one["dataset_from_index"] != one["length"]), None)
+    if wrong is not None:
+        raise UnreadableRecording(
+            f"meta/episodes of the dataset gives episode {wrong['episode_index']} {wrong['length']} frames, from "
+            f"{wrong['dataset_from_index']} to {wrong['dataset_to_index']}; copy the dataset again."
+        )
     files = {(int(found[1]), int(found[2])): name for name in dataset.data if (found := _DATA_FILE.search(name))}
     first: dict[tuple[int, int], int] = {}
     for place in sorted(places, key=lambda place: int(place["dataset_from_index"])):
