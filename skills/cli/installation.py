@@ -180,6 +180,9 @@ def verify(
     bag: Annotated[
         Path | None, typer.Argument(help="A bag for replay; by default the whole installation is verified.")
     ] = None,
+    decode_all: Annotated[
+        bool, typer.Option("--decode-all", help="Decode every recording again, and not only the newest.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Check every digest and reference of this installation, or one replay bag; exit code 1 if anything is wrong."""
@@ -189,13 +192,18 @@ def verify(
         lines = list(verify_bag(bag))
         _say("\n".join(lines), as_json, whole=True, checked=lines)
         return
+    from skills.api import app
     from skills.db.session import Database
     from skills.library.inspection import Checked, inspect_installation
     from skills.settings import settings
 
     found: dict[str, Checked] = {}
-    with closing(Database(settings().database_url)) as database, _telling("verifying") as told:
-        for part in inspect_installation(database):
+    with (
+        closing(Database(settings().database_url)) as database,
+        app.confined_reader(settings()) as reader,
+        _telling("verifying") as told,
+    ):
+        for part in inspect_installation(database, reader.tell, decode_all=decode_all):
             found[part.what] = part
             told(f"{part.what} {part.count or ''}")
     wrong = [one for part in found.values() for one in part.wrong]

@@ -38,6 +38,7 @@ from sqlalchemy import (
 from sqlalchemy.types import NullType, TypeEngine
 
 from skills.db import Base, Moment, now, rfc3339
+from skills.db.models import ParsedChunk, ParsedRecording
 from skills.db.packed import Packed
 from skills.db.service_tables import Executor, SignIn
 from skills.db.session import revision_of, revisions, upgrade
@@ -49,7 +50,10 @@ MANIFEST = "manifest.json"
 SEAL_BYTES = 64
 CUT_OFF = "its end is missing or damaged, as in a truncated file"
 PIECE_BYTES = 1 << 20
-LEFT_OUT = {Executor.__tablename__, SignIn.__tablename__}  # running workers and browser sessions: gone after a restore
+LEFT_OUT = {
+    *(Executor.__tablename__, SignIn.__tablename__),  # running workers and browser sessions: gone after a restore
+    *(ParsedRecording.__tablename__, ParsedChunk.__tablename__),  # a cache: decoded again from the recordings' bytes
+}
 ROWS_AT_ONCE = 500
 ROWS_WITH_BYTES_AT_ONCE = 8  # a recording's chunk has 1 MiB
 

@@ -141,6 +141,33 @@ class RecordingChunk(Base):
     data: Mapped[bytes] = mapped_column(LargeBinary)
 
 
+class ParsedRecording(Base):
+    """A cache of a recording's content as it was read from its bytes (`skills.library.parsed`).
+
+    A row may be deleted at any time; the bytes are then decoded again. `version` is the `READER_VERSION` that read it;
+    rows of another version are not used.
+    """
+
+    __tablename__ = "parsed_recordings"
+
+    recording_row: Mapped[int] = mapped_column(ForeignKey("recordings.row", ondelete="CASCADE"), primary_key=True)
+    version: Mapped[int]
+    reading: Mapped[str] = mapped_column(Sha256)  # digest of the reading parameters
+    sha256: Mapped[str] = mapped_column(Sha256)  # of the recording's digest, the two above and the chunks
+
+
+class ParsedChunk(Base):
+    """A chunk of 1 MiB of a recording's serialised content."""
+
+    __tablename__ = "parsed_chunks"
+
+    recording_row: Mapped[int] = mapped_column(
+        ForeignKey("parsed_recordings.recording_row", ondelete="CASCADE"), primary_key=True
+    )
+    number: Mapped[int] = mapped_column(primary_key=True)
+    data: Mapped[bytes] = mapped_column(LargeBinary)
+
+
 SUCCESS = "success"
 
 

@@ -26,6 +26,7 @@ import numpy as np
 
 from skills import errors, packing
 from skills.compiled import check_kept, kept_in, make_ready
+from skills.demonstration.identification import ArmIdentification, Identification
 from skills.demonstration.recording import (
     BaseFrame,
     Column,
@@ -48,6 +49,7 @@ from skills.sandbox import ProcessLimits
 from skills.sandbox.forked import ForkServer, Turns
 from skills.schemas import recordings as described
 
+READER_VERSION = 1  # raised when equal bytes give another `Told`, so that cached ones are decoded again
 MOST = 200  # entries of each list of unlimited length; `counts` has the full numbers of segments and labels
 
 
@@ -58,12 +60,21 @@ class Told:
     Attributes:
         recording: The recording.
         proposed: The proposed hand-offs, ordered by arm and time.
+        identifications: Those of the recording, each of which takes a tenth of a second to compute.
+        bases: Those of the recording, which are computed with them.
         about_json: The result of `about_recording` as JSON, so that it passes between processes unchanged.
     """
 
     recording: Recording
     proposed: tuple[Segment, ...]
+    identifications: tuple[ArmIdentification, ...]
+    bases: tuple[BaseFrame, ...]
     about_json: str
+
+    def __post_init__(self) -> None:
+        packing.canonical([as_json(one) for one in (*self.identifications, *self.bases)])  # raises for NaN
+        # The recording's own properties have them now, so that a cut in another process does not compute them again.
+        vars(self.recording).update(identifications=self.identifications, bases=self.bases)
 
     @property
     def about(self) -> dict[str, Any]:
@@ -80,7 +91,8 @@ def read_told(file: BinaryIO, **how: Any) -> Told:
 def tell(recording: Recording) -> Told:
     """Compute the description of a recording."""
     proposed = propose_by_arm(recording)
-    return Told(recording, proposed, json.dumps(about_recording(recording, proposed), allow_nan=False))
+    about_json = json.dumps(about_recording(recording, proposed), allow_nan=False)
+    return Told(recording, proposed, recording.identifications, recording.bases, about_json)
 
 
 def about_recording(recording: Recording, proposed: Sequence[Segment]) -> dict[str, Any]:
@@ -225,7 +237,10 @@ class Refusal:
         return error
 
 
-KNOWN = packing.known(Recording, Motion, Signal, Joints, BaseFrame, Column, Label, Topic, Segment, Told, Refusal)
+KNOWN = packing.known(
+    *(Recording, Motion, Signal, Joints, Column, Label, Topic),
+    *(Told, Segment, BaseFrame, ArmIdentification, Identification, Refusal),
+)
 
 
 class ConfinedReader:

@@ -4,7 +4,6 @@ recording, DemoIn --make_demo--> Made --upload_demo, add_demo--> Added
 """
 
 import json
-import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple
@@ -39,7 +38,7 @@ from skills.gridworld.reward import RewardMap, sparse_reward
 from skills.library import consent
 from skills.library.catalogue import find_surgeon, find_suture_type
 from skills.library.integrity import demo_identity, find_by_digest
-from skills.library.recordings import Teller, Upload, find_recording, keep, recording_bytes, tell_upload
+from skills.library.recordings import Teller, Upload, entry_of, find_recording, keep, stored_recording, tell_upload
 from skills.library.releases import withdraw_failed, withdraw_resting_on
 from skills.packing import canonical
 from skills.remedies import Action, Remedy
@@ -225,23 +224,18 @@ def upload_demo(database: Database, upload: Upload, cut: DemoIn, actor: str, rea
         find_surgeon(session, cut.surgeon)
         find_suture_type(session, cut.suture)
     told = tell_upload(upload, read)
-    made = make_demo(told, cut)
+    made, entry = make_demo(told, cut), entry_of(upload, told)
     with database.writing() as session:
-        stored, _ = keep(session, upload, told, actor)
+        stored, _ = keep(session, upload, told, entry, actor)
         return _store_demo(session, stored, made, cut, actor)
 
 
 def add_demo(database: Database, recording_sha256: str, cut: DemoIn, actor: str, read: Teller = read_told) -> Added:
     """Cut another demonstration out of a stored recording; it raises the errors of `make_demo` as well."""
-    with tempfile.TemporaryFile() as file:
-        with database.reading() as session:
-            find_surgeon(session, cut.surgeon)
-            find_suture_type(session, cut.suture)
-            stored = find_recording(session, recording_sha256)
-            file.writelines(recording_bytes(session, stored))
-        # Outside the transaction, because reading a recording takes long.
-        told = read(file, **stored.reading)
-    made = make_demo(told, cut)
+    with database.reading() as session:
+        find_surgeon(session, cut.surgeon)
+        find_suture_type(session, cut.suture)
+    made = make_demo(stored_recording(database, recording_sha256, read), cut)
     with database.writing() as session:
         return _store_demo(session, find_recording(session, recording_sha256), made, cut, actor)
 

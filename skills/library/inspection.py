@@ -3,10 +3,12 @@
     Database --inspect_installation--> Checked, part by part
 
 Tables and their packed values are taken from the models, so a new table is checked without being named here. The input
-of a row's digest differs from table to table: `AGREES` has a check for each. Rows are named by table and number, never
-by a pseudonym. Nothing is changed, and transactions are short, so that other users are not blocked.
+of a row's digest differs from table to table: `AGREES` has a check for each. Cached contents of recordings are compared
+with their bytes, decoded again. Rows are named by table and number, never by a pseudonym. Nothing is changed, and
+transactions are short, so that other users are not blocked.
 """
 
+import tempfile
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -18,6 +20,8 @@ from sqlalchemy.orm import Mapper, Session, defer, object_session
 from skills.db import Base
 from skills.db.models import (
     Demonstration,
+    ParsedChunk,
+    ParsedRecording,
     Plan,
     PolicyVersion,
     RecordingChunk,
@@ -30,17 +34,19 @@ from skills.db.models import (
 from skills.db.packed import Packed, digest
 from skills.db.service_tables import Job
 from skills.db.session import Database, revision_of, revisions
-from skills.errors import Busy, SkillsError
+from skills.errors import Busy, Corrupt, SkillsError
+from skills.formats.reader_process import READER_VERSION, read_told
 from skills.gridworld.reward import sparse_reward
+from skills.library import parsed
 from skills.library.calibrations import read_calibration
 from skills.library.integrity import covered, demo_identity, planned, policy_identity
 from skills.library.jobs import identity_of
 from skills.library.policies import path_of
-from skills.library.recordings import recording_bytes
+from skills.library.recordings import Teller, recording_bytes
 from skills.packing import canonical, sha256
 
 ROWS_AT_ONCE = 100
-WITH_OTHERS = {RecordingChunk}  # checked with the recording that they belong to
+WITH_OTHERS = {RecordingChunk, ParsedChunk}  # checked with the recording or the entry that they belong to
 NAMED = 20  # orphans that are named for one reference, of all that are counted
 
 Why = Iterator[str]
@@ -55,8 +61,15 @@ class Checked:
     wrong: list[tuple[str, str]] = field(default_factory=list)
 
 
-def inspect_installation(database: Database) -> Iterator[Checked]:
+def inspect_installation(
+    database: Database, tell: Teller = read_told, *, decode_all: bool = False
+) -> Iterator[Checked]:
     """Check everything that is stored, part by part.
+
+    Args:
+        database: The database, without restriction.
+        tell: The reader of recordings, possibly in another process.
+        decode_all: Decode every recording whose content is cached, and not only the newest.
 
     Yields:
         Each part at its start, during its progress, and at its end.
@@ -72,6 +85,7 @@ def inspect_installation(database: Database) -> Iterator[Checked]:
         # Every model that the registry knows, so that a new table cannot be forgotten.
         if mapper.class_ not in WITH_OTHERS:
             yield from _rows(database, mapper)
+    yield from _decoded_again(database, tell, decode_all)
 
 
 def _at_once(what: str, look: Callable[[Session, Checked], None], database: Database) -> Iterator[Checked]:
@@ -199,6 +213,54 @@ def _in_words(error: Exception) -> str:
     return error.words() if isinstance(error, SkillsError) else f"it cannot be read ({type(error).__name__})"
 
 
+# ---- the cache of recordings -------------------------------------------------------------------------------------
+
+
+def _decoded_again(database: Database, tell: Teller, every: bool) -> Iterator[Checked]:
+    """Compare cached contents with their recordings decoded again: of the newest recording, or of every one."""
+    checked = Checked("recordings decoded")
+    yield checked
+    query = select(ParsedRecording.recording_row).where(ParsedRecording.version == READER_VERSION)
+    query = query.order_by(ParsedRecording.recording_row.desc())
+    try:
+        with database.reading() as session:
+            rows = session.scalars(query if every else query.limit(1)).all()
+        for row in rows:
+            for why in _decoded_otherwise(database, row, tell):
+                checked.wrong.append((f"recordings {row}", why))
+            checked.count += 1
+            yield checked
+    except Busy:
+        raise
+    except Exception as error:  # such as a schema without the cache
+        checked.wrong.append((checked.what, _in_words(error)))
+    yield checked
+
+
+def _decoded_otherwise(database: Database, row: int, tell: Teller) -> Why:
+    """Yield the fault of a cached content: it differs from the recording's bytes. Damaged ones are found before."""
+    with tempfile.TemporaryFile() as file:
+        with database.reading() as session:
+            stored = session.get(StoredRecording, row)
+            kept = None if stored is None else parsed.find(session, stored)
+            if stored is None or kept is None:  # erased or replaced since, or damaged
+                return
+            try:
+                file.writelines(recording_bytes(session, stored))
+            except Corrupt:  # reported with the recording
+                return
+        try:
+            again = tell(file, **stored.reading)
+        except Busy:
+            raise
+        except SkillsError as error:
+            yield f"its content is cached, but it cannot be decoded again: {error.words()}"
+            return
+    parts = ("recording", "proposed", "identifications", "bases")
+    if not all(parsed.alike(getattr(kept, part), getattr(again, part)) for part in parts):
+        yield "its cached content differs from its bytes; delete its row of parsed_recordings, which is written again"
+
+
 # ---- the input of each digest, and values that must agree --------------------------------------------------------
 
 
@@ -208,6 +270,14 @@ def _recording(row: StoredRecording) -> Why:
     size = sum(len(piece) for piece in recording_bytes(session, row))  # raises `Corrupt` if the digest differs
     if size != row.size_bytes:
         yield f"it has {size} bytes, its row has {row.size_bytes}"
+
+
+def _parsed_recording(row: ParsedRecording) -> Why:
+    session = object_session(row)
+    assert session is not None
+    if row.version == READER_VERSION:  # others are not used
+        parsed.read_entry(session, session.get_one(StoredRecording, row.recording_row))  # raises `Corrupt`
+    yield from ()
 
 
 def _demonstration(row: Demonstration) -> Why:
@@ -281,6 +351,7 @@ def _job(row: Job) -> Why:
 
 AGREES: dict[type, Callable[[Any], Why]] = {
     StoredRecording: _recording,
+    ParsedRecording: _parsed_recording,
     Demonstration: _demonstration,
     StoredRewardMap: _reward_map,
     PolicyVersion: _policy,

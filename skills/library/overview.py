@@ -9,7 +9,6 @@ A *style* is a surgeon's way of sewing one suture type. It is `stored` if it has
 it has a policy version, `released` if a version is served.
 """
 
-import tempfile
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -47,7 +46,7 @@ from skills.library import playbacks
 from skills.library.catalogue import find_surgeon, find_suture_type
 from skills.library.integrity import covered, learnt
 from skills.library.policies import learnt_from
-from skills.library.recordings import Reader, find_recording, recording_bytes
+from skills.library.recordings import Teller, stored_recording
 from skills.library.releases import is_served, served
 
 RECENT = 500  # jobs in the quantiles of durations: enough for a meaningful 99th percentile
@@ -176,14 +175,9 @@ def moves_to_goal(policy: Policy, reaches: NDArray[np.bool_]) -> NDArray[np.int6
     return counted
 
 
-def traces_of(database: Database, recording_sha256: str, read: Reader) -> dict[str, Any]:
-    """Read a stored recording again, and return the signals of its arms, jaws and clutch over time."""
-    with tempfile.TemporaryFile() as file:
-        with database.reading() as session:
-            stored = find_recording(session, recording_sha256)
-            reading = dict(stored.reading)
-            file.writelines(recording_bytes(session, stored))
-        recording = read(file, **reading)
+def traces_of(database: Database, recording_sha256: str, tell: Teller) -> dict[str, Any]:
+    """Return the signals of a stored recording's arms, jaws and clutch over time."""
+    recording = stored_recording(database, recording_sha256, tell).recording
     return {"duration_s": recording.duration_s, "arms": [_arm(recording, arm) for arm in recording.arms]}
 
 

@@ -1,10 +1,12 @@
 """Recordings: raw files, read and checked before any transaction, and stored in chunks of 1 MiB.
 
-file --Upload--> read_upload, tell_upload --keep--> StoredRecording with its chunks
+file --Upload--> read_upload, tell_upload --keep--> StoredRecording with its chunks --stored_recording--> Told
 """
 
 import base64
 import hashlib
+import logging
+import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -24,19 +26,22 @@ from skills.db.row_visibility import EVERYBODYS
 from skills.db.service_tables import record_event
 from skills.db.session import Database
 from skills.demonstration.demonstration import Recording
-from skills.errors import BadInput, Conflict, Corrupt, UnknownFormat, UnreadableRecording
+from skills.errors import BadInput, Busy, Conflict, Corrupt, UnknownFormat, UnreadableRecording
 from skills.fields import as_json
 from skills.formats import MEDIA_TYPES, media_type_of, read_recording
 from skills.formats.reader_process import Told, read_told
+from skills.library import parsed
 from skills.library.catalogue import find_surgeon
 from skills.library.integrity import find_by_digest
+from skills.library.parsed import CHUNK_BYTES
 from skills.remedies import Action, Remedy
 from skills.schemas.requests import Reading
 
-CHUNK_BYTES = 1 << 20
 Reader = Callable[..., Recording]  # `read_recording`, or a callable that runs it in another process
 Teller = Callable[..., Told]  # `read_told`, or a callable that runs it in another process
 BAGS = ("mcap", "rosbag1", "rosbag2")  # formats with checksums; text files have none
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -120,8 +125,9 @@ def store_recording(
         with database.reading() as session:  # fails early, before the long reading; looked up again when writing
             find_surgeon(session, surgeon)
     told = tell_upload(upload, read)
+    entry = entry_of(upload, told)
     with database.writing() as session:
-        stored, new = keep(session, upload, told, actor)
+        stored, new = keep(session, upload, told, entry, actor)
         if surgeon is not None:
             session.merge(RecordingSurgeon(recording_row=stored.row, surgeon_row=find_surgeon(session, surgeon).row))
         return stored, new
@@ -160,10 +166,24 @@ def _untimed(about: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def keep(session: Session, upload: Upload, told: Told, actor: str) -> tuple[StoredRecording, bool]:
+def entry_of(upload: Upload, told: Told) -> parsed.Entry | None:
+    """Serialise what was read of an upload for `keep`, before its transaction; None if it is too large to be kept."""
+    return parsed.entry_of(upload.sha256, upload.size_bytes, upload.reading, told)
+
+
+def keep(
+    session: Session, upload: Upload, told: Told, entry: parsed.Entry | None, actor: str
+) -> tuple[StoredRecording, bool]:
     """Write a recording in the caller's transaction, once; return the row, and whether it is new to the actor.
 
     Bytes that only others have uploaded are reported as new, so that a digest does not reveal their uploads.
+
+    Args:
+        session: The caller's transaction.
+        upload: The recording's bytes.
+        told: What was read of them.
+        entry: The same, from `entry_of`.
+        actor: The owner of the caller's key.
 
     Raises:
         Conflict: The bytes are already stored with other reading parameters.
@@ -181,6 +201,8 @@ def keep(session: Session, upload: Upload, told: Told, actor: str) -> tuple[Stor
                 f"These bytes are stored already, read with {before}; send the same parameters.",
                 Remedy(Action.DELETE_FIRST, recording=stored.sha256),
             )
+        if entry is not None and not parsed.is_current(session, stored):
+            parsed.put(session, stored.row, entry)
         return stored, _brought_by(session, stored, actor)
     stored = StoredRecording(
         sha256=upload.sha256,
@@ -200,6 +222,8 @@ def keep(session: Session, upload: Upload, told: Told, actor: str) -> tuple[Stor
         session.add(RecordingChunk(recording=stored.row, number=number, data=data))
         session.flush()
         number += 1
+    if entry is not None:
+        parsed.put(session, stored.row, entry)
     return stored, _brought_by(session, stored, actor)
 
 
@@ -216,6 +240,46 @@ def _brought_by(session: Session, stored: StoredRecording, actor: str) -> bool:
 def find_recording(session: Session, recording_sha256: str) -> StoredRecording:
     """Return a recording by the SHA-256 of its bytes."""
     return find_by_digest(session, StoredRecording, recording_sha256, "recording", Remedy(Action.ADD_RECORDING))
+
+
+def stored_recording(database: Database, recording_sha256: str, tell: Teller = read_told) -> Told:
+    """Return what is read of a stored recording: from the cache, or else decoded again, and cached.
+
+    No transaction is open while it is decoded.
+
+    Args:
+        database: The database, restricted to the rows that the caller may see.
+        recording_sha256: The SHA-256 of its bytes.
+        tell: The reader, possibly in another process.
+
+    Raises:
+        NotFound: There is no such recording.
+        Corrupt: Its bytes do not match their digest.
+        BadRecording: This version does not read it, or not within the limits of the reader.
+    """
+    with tempfile.TemporaryFile() as file:
+        with database.reading() as session:
+            stored = find_recording(session, recording_sha256)
+            kept = parsed.find(session, stored)
+            if kept is not None:
+                return kept
+            file.writelines(recording_bytes(session, stored))
+        told = tell(file, **stored.reading)
+    _remember(database, stored, told)
+    return told
+
+
+def _remember(database: Database, stored: StoredRecording, told: Told) -> None:
+    """Cache what was read of a stored recording, unless the recording was erased meanwhile."""
+    entry = parsed.entry_of(stored.sha256, stored.size_bytes, stored.reading, told)
+    if entry is None:
+        return
+    try:
+        with database.writing() as session:
+            if session.get(StoredRecording, stored.row) is not None:
+                parsed.put(session, stored.row, entry)
+    except Busy as error:  # the caller has the recording; the next use decodes it again
+        log.info("recordings %d: it was read, but could not be cached (%s).", stored.row, type(error).__name__)
 
 
 def recording_bytes(session: Session, stored: StoredRecording) -> Iterator[bytes]:

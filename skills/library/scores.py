@@ -11,7 +11,6 @@ erasure. It is meant for self-directed learning; it is not an examination.
 """
 
 import math
-import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
@@ -31,7 +30,7 @@ from skills.library import calibrations, releases
 from skills.library.catalogue import find_surgeon, find_suture_type
 from skills.library.consent import may, require
 from skills.library.demos import find_demo, newest_demo
-from skills.library.recordings import Reader, find_recording, recording_bytes
+from skills.library.recordings import Teller, find_recording, stored_recording
 from skills.schemas.comparison import CurvePoint, Percentiles, Reference, Score, ScoredStyle
 from skills.schemas.requests import ScoreIn
 from skills.scoring.calibration import LEVELS, Level, Skill, level_refusals, rate, refusals, unrated
@@ -177,13 +176,13 @@ class _Scored:
     row: Demonstration | None = None
 
 
-def score(database: Database, asked: ScoreIn, read: Reader) -> Score:
+def score(database: Database, asked: ScoreIn, tell: Teller) -> Score:
     """Score a motion against a style.
 
     Args:
         database: The database, restricted to the rows that the caller may see.
         asked: The request.
-        read: The reader of recordings, possibly in another process.
+        tell: The reader of recordings, possibly in another process.
 
     Raises:
         NotFound: There is no such surgeon, suture type, demonstration or recording, or nothing of the style.
@@ -199,7 +198,7 @@ def score(database: Database, asked: ScoreIn, read: Reader) -> Score:
         scored = _stored(session, asked)
         taught = reference.demo
     if scored is None:
-        scored = _of_recording(database, asked, read)
+        scored = _of_recording(database, asked, tell)
     # No transaction is open during the computation.
     numbers, beside = measure(scored.demo), measure(taught)
     deviation = laid_on(scored.demo, taught)
@@ -274,15 +273,13 @@ def _stored(session: Session, asked: ScoreIn) -> _Scored | None:
     return _Scored(row.demo, row.recording, row)
 
 
-def _of_recording(database: Database, asked: ScoreIn, read: Reader) -> _Scored:
+def _of_recording(database: Database, asked: ScoreIn, tell: Teller) -> _Scored:
     """Cut the motion to be scored out of a stored recording, without storing it."""
     assert asked.recording is not None
-    with tempfile.TemporaryFile() as file:
-        with database.reading() as session:
-            stored = find_recording(session, asked.recording)
-            _agreed_by_all(session, stored)
-            file.writelines(recording_bytes(session, stored))
-        recording = read(file, **stored.reading)
+    with database.reading() as session:
+        stored = find_recording(session, asked.recording)
+        _agreed_by_all(session, stored)
+    recording = stored_recording(database, stored.sha256, tell).recording
     demo = cut_demo(recording, arm=asked.arm, topic=asked.topic, start_s=asked.start_s, end_s=asked.end_s)
     return _Scored(demo, stored)
 

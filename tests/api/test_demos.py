@@ -44,7 +44,7 @@ def test_the_same_demonstration_is_stored_once(here: Service):
     assert demo["frame"] == "PSM_base"
     assert here.counts() | {"suture_types": 0, "events": 0} == {
         **dict.fromkeys(here.counts(), 0), "surgeons": 1, "recordings": 1, "recording_chunks": 1,
-        "recording_uploads": 1, "demonstrations": 1, "reward_maps": 1,
+        "recording_uploads": 1, "demonstrations": 1, "reward_maps": 1, "parsed_recordings": 1, "parsed_chunks": 1,
     }  # fmt: skip
 
 

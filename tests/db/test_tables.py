@@ -40,7 +40,8 @@ FROZEN = (
     "events",
     "erasures",
 )
-GONE_WITH_ITS_RECORDING = {"recording_uploads", "recording_surgeons"}  # who uploaded it, and for which surgeon
+# Who uploaded it, for which surgeon, and the cache of its content.
+GONE_WITH_ITS_RECORDING = {"recording_uploads", "recording_surgeons", "parsed_recordings", "parsed_chunks"}
 WITHDRAWABLE = ("demonstrations", "releases")
 FREE = {
     "surgeons", "suture_types", "jobs", "retraining_styles", "executors", "keys", "key_surgeons", "sign_ins",

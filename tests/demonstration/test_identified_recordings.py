@@ -8,11 +8,12 @@ import pytest
 from rosbags.rosbag1 import Reader
 from rosbags.typesys import Stores, get_typestore
 
+from skills import packing
 from skills.demonstration.demonstration import cut_demo, propose_segments
 from skills.demonstration.recording import Joints, Motion, Recording, base_frames
 from skills.errors import JointsDisagree, NotMetres
 from skills.formats import write_mcap
-from skills.formats.reader_process import read_told
+from skills.formats.reader_process import KNOWN, read_told, tell
 from skills.kinematics import angle_between, forward, instrument_of, matrix_of, quaternion_of, solutions_of
 from tests.demonstration.arms import MISTAKES, REAL, Recorded, another_unit, cut, drawn, real
 from tests.demonstration.sessions import A, Kind, M, session
@@ -53,6 +54,19 @@ def test_poses_and_partner_in_a_cameras_frame_become_those_of_the_base(recorded)
     assert got.partner.instrument == "400006"
     np.testing.assert_allclose(got.partner.position_mm, wanted.partner.position_mm, atol=0.05)
     np.testing.assert_allclose(got.partner.base_mm, wanted.partner.base_mm, atol=0.05)
+
+
+def test_what_joints_show_travels_with_the_recording(recorded):
+    """So that a cut in another process, or from the cache, does not compute it again."""
+    told, file = tell(recorded), io.BytesIO()
+    packing.write(file, told, KNOWN)
+    file.seek(0)
+    again = packing.read(file, KNOWN)
+    assert vars(again.recording).keys() >= {"identifications", "bases"}
+    assert again.recording.identifications == recorded.identifications != ()
+    assert again.recording.bases == recorded.bases != ()
+    with pytest.raises(ValueError, match="Out of range float"):
+        replace(told, bases=(replace(told.bases[0], spread_mm=float("nan")),))
 
 
 def test_the_bases_of_a_recording_in_the_cameras_frame_are_found(recorded):

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from skills.demonstration import recording as values
+from skills.demonstration.identification import ArmIdentification, Identification
 from skills.demonstration.segments import Segment
 from skills.errors import BadColumns, BadInput, Busy, SkillsError, UnreadableRecording
 from skills.formats import read_recording, reader_process, write_mcap
@@ -69,7 +70,7 @@ def test_the_recording_is_the_same_to_the_last_bit(reader, data, how):
 def test_every_value_of_a_recording_may_come_back():
     assert {v for v in vars(values).values() if is_dataclass(v) and v.__module__ == values.__name__} == {
         *KNOWN.values()
-    } - {Refusal, Told, Segment}
+    } - {Refusal, Told, Segment, ArmIdentification, Identification}
 
 
 @pytest.mark.parametrize(("data", "how"), [(BAG, {}), (TABLE, {"frame": "ECM"})], ids=["bag", "csv"])

@@ -8,7 +8,15 @@ from tests import backends
 from tests.library import cases
 
 # Files whose SQL may behave differently on PostgreSQL. The other files run on it at night.
-ON_BOTH_BY_DAY = {"test_library", "test_erasing", "test_restoring", "test_consent", "test_batches", "test_outcomes"}
+ON_BOTH_BY_DAY = {
+    "test_library",
+    "test_erasing",
+    "test_restoring",
+    "test_consent",
+    "test_batches",
+    "test_outcomes",
+    "test_parsed",
+}
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -13,7 +13,7 @@ from skills.library import demos
 from skills.library.catalogue import put_surgeon, seed_catalogue
 from skills.library.demos import Made, make_demo
 from skills.library.jobs import PART
-from skills.library.recordings import find_recording, keep
+from skills.library.recordings import entry_of, find_recording, keep
 from skills.library.retraining import request_retraining
 from skills.schemas.requests import DemoIn, RetrainingIn
 from tests.library import cases
@@ -43,7 +43,7 @@ def made_once(database: Database) -> tuple[Made, str]:
     upload = cases.upload(cases.hand_off())
     told = read_told(upload.file)
     with database.writing() as session:
-        keep(session, upload, told, "test")
+        keep(session, upload, told, entry_of(upload, told), "test")
     return make_demo(told, DemoIn(surgeon="anybody", suture=cases.SUTURE)), upload.sha256
 
 

@@ -7,7 +7,7 @@ import pytest
 from sqlalchemy import select, text
 
 from skills.db import Base
-from skills.db.models import Demonstration, RecordingChunk
+from skills.db.models import Demonstration, ParsedChunk, RecordingChunk
 from skills.db.packed import Packed
 from skills.db.service_tables import Event
 from skills.db.session import Database
@@ -212,7 +212,7 @@ def test_every_table_with_a_digest_is_compared_with_it():
     }
     with_a_nonce = {Event}  # nobody can compute it again
     assert known_by_digest - with_a_nonce <= set(AGREES)
-    assert {RecordingChunk} == WITH_OTHERS
+    assert {RecordingChunk, ParsedChunk} == WITH_OTHERS
 
 
 def test_inspection_walks_all_pages_and_an_unreadable_row_hides_no_other(

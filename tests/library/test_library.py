@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 from pydantic import ValidationError
-from sqlalchemy import func, select, text
+from sqlalchemy import delete, func, select, text
 from sqlalchemy.orm import Session
 
 from skills import library
 from skills.db import Base
-from skills.db.models import PolicyVersion, StoredRecording
+from skills.db.models import ParsedRecording, PolicyVersion, StoredRecording
 from skills.db.service_tables import Event, Job
 from skills.db.session import Database
 from skills.demonstration import segments
@@ -81,6 +81,8 @@ def test_a_recording_is_looked_at_before_the_transaction_that_stores_it(
     monkeypatch.setattr(Database, "writing", watched)
     monkeypatch.setattr(segments, "_look", seen)
     demo = cases.add_demo(database, cases.hand_off((7.5, 0.0, 0.0)))
+    with writing(database) as session:
+        session.execute(delete(ParsedRecording))
     add_demo(database, demo.recording.sha256, DemoIn(surgeon="kestrel", suture=cases.SUTURE, segment="whole"), "test")
     store_recording(database, cases.upload(cases.hand_off((7.5, 2.5, 0.0))), "test")
     assert looked == [False] * 3

@@ -6,7 +6,7 @@ import pytest
 from skills.db.models import Demonstration, MeasuredShape, StoredCalibration, StoredRecording
 from skills.db.session import Database
 from skills.errors import BadInput, Conflict, NotFound
-from skills.formats import read_recording
+from skills.formats.reader_process import read_told
 from skills.library.calibrations import keep
 from skills.library.catalogue import put_surgeon
 from skills.library.demos import upload_demo, withdraw_demo
@@ -19,7 +19,7 @@ from tests.library import cases
 from tests.scoring.test_model import model
 
 NO_ATLAS = {"uses": ["training", "export"]}
-READ = read_recording
+READ = read_told
 
 
 def put(database: Database, slug: str, **about: object) -> None:

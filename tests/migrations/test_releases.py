@@ -10,19 +10,22 @@ import zlib
 from collections.abc import Iterator
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import psycopg
 import pytest
 from alembic import command
 from alembic.script import ScriptDirectory
-from sqlalchemy import make_url, text
+from sqlalchemy import make_url, select, text
 from typer.testing import CliRunner
 
 from skills.cli import app
 from skills.db import Base
+from skills.db.models import StoredRecording
 from skills.db.session import Database, alembic_config, revision_of
+from skills.formats.reader_process import Told, read_told
 from skills.library.inspection import inspect_installation
+from skills.library.recordings import stored_recording
 from skills.settings import settings
 from tests import backends
 from tests.api.service import assert_problem, serving
@@ -35,7 +38,7 @@ KEPT = sorted(folder.name for folder in RELEASES.iterdir() if folder.is_dir())
 ADDED_LATER = {
     "retraining_styles", "playback_pictures", "keys", "key_surgeons", "sign_ins", "recording_uploads",
     "measured_shapes", "calibrations", "policy_demonstrations", "recording_surgeons",
-    "demonstration_outcomes",
+    "demonstration_outcomes", "parsed_recordings", "parsed_chunks",
 }  # fmt: skip
 FILLED_AGAIN = {"recording_uploads"}
 KEYS = {"keys", "key_surgeons", "sign_ins"}  # empty: with a key, the installation would answer its tests with 401
@@ -87,6 +90,24 @@ def test_all_of_a_release_is_whole_after_its_migration(release: Released):
     database.migrate()
     assert kept_of(rows(database), before) == before
     assert {part.what: part.wrong for part in inspect_installation(database) if part.wrong} == {}
+
+
+def test_a_recording_of_a_release_is_decoded_once_and_then_cached(release: Released):
+    database, _ = release
+    database.migrate()
+    assert rows(database)["parsed_recordings"] == []
+    with database.reading() as session:
+        sha256s = session.scalars(select(StoredRecording.sha256)).all()
+    decoded: list[str] = []
+    for one in [*sha256s, *sha256s]:
+
+        def read(file: BinaryIO, of: str = one, **how: Any) -> Told:
+            decoded.append(of)
+            return read_told(file, **how)
+
+        stored_recording(database, one, read)
+    assert decoded == list(sha256s) != []
+    assert {part.what: part.wrong for part in inspect_installation(database, decode_all=True) if part.wrong} == {}
 
 
 def test_down_and_up_again_keeps_every_row_and_every_answer(release: Released):

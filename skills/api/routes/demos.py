@@ -11,7 +11,7 @@ from pydantic import Field
 from sqlalchemy import select
 
 from skills.api.authorisation import Asking, erasing_is_for_admins, needs
-from skills.api.dependencies import Actor, Db, Digest, Incoming, Jobs, Limit, Read, RowCursor, Slug, Strict, Tell
+from skills.api.dependencies import Actor, Db, Digest, Incoming, Jobs, Limit, RowCursor, Slug, Strict, Tell
 from skills.api.openapi import ends, gives, gives_file, gives_page, makes, router_of, says
 from skills.api.pages import HTML, drawings, render, standalone_headers, wants_page
 from skills.api.pages.drawings import report_page
@@ -309,9 +309,9 @@ score_router = router_of(route_class=Strict, tags=["scores"], max_body_size=MEBI
 
 
 @score_router.post("/scores", dependencies=[needs("reader")], **says(Score, 404, 409, 410))
-def score(body: ScoreIn, db: Db, read: Read) -> Response:
+def score(body: ScoreIn, db: Db, tell: Tell) -> Response:
     """Score a motion: its figures compared with the reference's, its deviation, percentiles, and a curve over time.
 
     Research use only; not a credential.
     """
-    return say(scores.score(db, body, read))
+    return say(scores.score(db, body, tell))

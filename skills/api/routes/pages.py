@@ -11,7 +11,7 @@ from sqlalchemy.orm import Session
 
 from skills import errors
 from skills.api.authorisation import Asking, needs, open_to_all
-from skills.api.dependencies import Configured, Db, Digest, Limit, Read, RowCursor, Slug, SlugCursor
+from skills.api.dependencies import Configured, Db, Digest, Limit, RowCursor, Slug, SlugCursor, Tell
 from skills.api.pages import assets, build, drawings, render
 from skills.api.responses import JSON
 from skills.api.routes.policies import JobId, Version
@@ -143,7 +143,7 @@ def show_score(
     request: Request,
     caller: Asking,
     db: Db,
-    read: Read,
+    tell: Tell,
     surgeon: Annotated[str, Query(max_length=64)] = "",
 ) -> Response:
     """Show the score of a demonstration against a surgeon's style; by default that of an expert, if there is one."""
@@ -152,7 +152,7 @@ def show_score(
         surgeons = scores.references(session, found.suture)
     others = [one.slug for one in surgeons if one.row != found.surgeon_row]
     against = surgeon or next(iter(others), found.surgeon.slug)
-    score = scores.score(db, ScoreIn(surgeon=against, suture=found.suture, demo=found.sha256), read)
+    score = scores.score(db, ScoreIn(surgeon=against, suture=found.suture, demo=found.sha256), tell)
     drawn: dict[str, Any] = {
         "views": drawings.deviation_views(score.deviation),
         "along": drawings.deviation_along(score.deviation),
@@ -208,9 +208,9 @@ def show_recording(
 
 
 @router.get("/pages/recordings/{recording}/traces", dependencies=[needs("reader")])
-def trace_recording(recording: Digest, caller: Asking, db: Db, read: Read) -> Response:
+def trace_recording(recording: Digest, caller: Asking, db: Db, tell: Tell) -> Response:
     """Return the data of a recording's timeline."""
-    return _json(overview.traces_of(db, recording, read))
+    return _json(overview.traces_of(db, recording, tell))
 
 
 @router.get("/pages/plans", dependencies=[needs("reader")])
