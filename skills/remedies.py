@@ -50,6 +50,11 @@ class Action(Enum):
         command="List them: skills demo list",
         python="List them: client.demos()",
     )
+    LIST_DATASETS = Words(
+        http="GET /jobs?kind=dataset lists the exports, and POST /datasets requests one.",
+        command="Export one: skills export-dataset OUT.zip",
+        python="List the exports: client.jobs(kind='dataset'), or request one: client.dataset(...)",
+    )
     ADD_DEMO = Words(
         http="POST /demos?surgeon={surgeon}&suture={suture} adds one.",
         command="Add one: skills demo add FILE --surgeon {surgeon} --suture {suture}",

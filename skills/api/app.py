@@ -18,13 +18,12 @@ from skills.api.openapi import complete
 from skills.api.policy_cache import AtHand, PolicyCache
 from skills.api.problems import TOO_LARGE, answer_refusals
 from skills.api.responses import DOWNLOADS_READ, Encoded, Watching
-from skills.api.routes import catalogue, demos, operating, pages, plans, policies
+from skills.api.routes import catalogue, datasets, demos, operating, pages, plans, policies
 from skills.db.session import Database
-from skills.formats.reader_process import ConfinedReader
 from skills.jobs import Engine
 from skills.library.catalogue import seed_catalogue
+from skills.library.recordings import confined_reader
 from skills.logs import request_id
-from skills.sandbox import ProcessLimits
 from skills.settings import Settings
 
 DESCRIPTION = (
@@ -83,6 +82,7 @@ def create_app(settings: Settings) -> FastAPI:
         plans.picture_router,
         policies.retraining_router,
         policies.card_router,
+        datasets.router,
         demos.atlas_router,
         demos.score_router,
         operating.router,
@@ -102,19 +102,6 @@ def prepare_database(database: Database) -> None:
     database.migrate()
     with database.writing() as session:
         seed_catalogue(session)
-
-
-def confined_reader(settings: Settings) -> ConfinedReader:
-    """Create the reader of uploaded recordings, with the resource limits of the settings."""
-    limits = ProcessLimits(
-        memory_bytes=settings.reading_memory_bytes,
-        wall_s=settings.reading_wall_s,
-        cpu_s=settings.reading_cpu_s,
-        file_bytes=settings.reading_file_bytes,
-        answer_bytes=settings.reading_answer_bytes,
-        children=False,
-    )
-    return ConfinedReader(limits, at_once=settings.readers)
 
 
 class Service(FastAPI):

@@ -5,7 +5,7 @@ encoded once and cached under the digest of the policy and the identity of its r
 
 A stream waits for its client between two chunks, perhaps for long, and is abandoned there when the client disconnects.
 Its generator therefore holds no session, file or lock across a `yield` (`tests/test_architecture.py` checks sessions).
-A recording is read in one transaction per chunk.
+A recording, or a dataset, is read in one transaction per chunk.
 
 Job events are server-sent events. One polling task queries the database for all watchers, however many there are. On
 SQLite it queries only when `PRAGMA data_version` shows a commit; on PostgreSQL, whose notifications cover other changes
@@ -21,7 +21,7 @@ from contextlib import aclosing, contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from time import monotonic
-from typing import Annotated, Any, Never
+from typing import Annotated, Any
 
 import orjson
 from anyio import CapacityLimiter, to_thread
@@ -38,7 +38,6 @@ from skills.db.session import Database
 from skills.errors import PreconditionFailed, SkillsError, TooMany, UnknownFormat
 from skills.formats import BYTES
 from skills.library import policies
-from skills.library.demos import exported_chunk, exported_recording
 from skills.library.integrity import learnt
 from skills.library.jobs import ACTIVE, find_job, find_jobs, job_json
 from skills.library.recordings import damaged
@@ -291,56 +290,53 @@ class Stream(StreamingResponse):
             await self._pieces.aclose()
 
 
-async def recording_pieces(
-    database: Database, demo: str, sha256: str, limiter: CapacityLimiter
+async def stored_pieces(
+    read: Callable[[int], bytes | None], refuse: Callable[[], object], sha256: str, limiter: CapacityLimiter
 ) -> AsyncGenerator[bytes, None]:
-    """Yield the bytes of a demonstration's recording, after all of them were compared with its digest.
+    """Yield the bytes of a stored file, after all of them were compared with its digest.
 
-    Every chunk is read in a transaction of its own, so the recording is read twice: to check it before the first byte
+    Every chunk is read in a transaction of its own, so the file is read twice: to check it before the first byte
     is sent, and to send it. The second pass is checked as well, and withholds its last chunk until the digest agrees.
 
     Args:
-        database: The database, restricted to the rows that the caller may see.
-        demo: The demonstration's digest.
-        sha256: The recording's digest.
+        read: Returns a chunk by its number, in a transaction of its own; None after the last one.
+        refuse: Called if the digest differs; raises if the file was erased, or may not be passed on any more.
+        sha256: The file's digest.
         limiter: Limit on reading threads, shared by the application; see `DOWNLOADS_READ`.
 
     Raises:
         Corrupt: The bytes do not match the digest.
-        NotFound: The demonstration was erased meanwhile.
-        Conflict: A chunk is missing, and the consent to export was withdrawn meanwhile.
+        SkillsError: As `read` and `refuse`.
     """
-    async for _ in _chunks(database, demo, sha256, limiter):
+    async for _ in _chunks(read, refuse, sha256, limiter):
         pass
-    async with aclosing(_chunks(database, demo, sha256, limiter)) as chunks:
+    async with aclosing(_chunks(read, refuse, sha256, limiter)) as chunks:
         async for chunk in chunks:
             for at in range(0, len(chunk), PIECE_BYTES):
                 yield chunk[at : at + PIECE_BYTES]
 
 
-async def _chunks(database: Database, demo: str, sha256: str, limiter: CapacityLimiter) -> AsyncGenerator[bytes, None]:
-    """Yield the chunks of a recording; the last one only if all of them together match the digest."""
+async def _chunks(
+    read: Callable[[int], bytes | None], refuse: Callable[[], object], sha256: str, limiter: CapacityLimiter
+) -> AsyncGenerator[bytes, None]:
+    """Yield the chunks of a file; the last one only if all of them together match the digest."""
     seen, held, number = hashlib.sha256(), b"", 0
 
-    def read() -> bytes | None:
-        chunk = exported_chunk(database, demo, number)
+    def read_next() -> bytes | None:
+        chunk = read(number)
         if isinstance(chunk, str):  # SQLite does not enforce the column's type
             raise damaged()
         if chunk is not None:
             seen.update(chunk)
         return chunk
 
-    def refuse() -> Never:
-        with database.reading() as session:
-            exported_recording(session, demo)  # raises if it was erased, or may no longer be exported
-        raise damaged()
-
-    while (chunk := await to_thread.run_sync(read, limiter=limiter)) is not None:
+    while (chunk := await to_thread.run_sync(read_next, limiter=limiter)) is not None:
         if held:
             yield held
         held, number = chunk, number + 1
     if seen.hexdigest() != sha256:
         await to_thread.run_sync(refuse)
+        raise damaged()
     yield held
 
 

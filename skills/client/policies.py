@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from skills.learning.policy import Policy as LearntPolicy
 
 State = Literal["queued", "running", "succeeded", "failed", "cancelled"]
-Kind = Literal["training", "retraining", "playback", "pictures"]
+Kind = Literal["training", "retraining", "playback", "pictures", "dataset"]
 Combining = Literal["medoid", "barycentre", "corridor"]
 Watcher = Callable[[Job], None]
 

@@ -33,7 +33,7 @@ from skills.db.models import (
     StoredRewardMap,
     Surgeon,
 )
-from skills.db.service_tables import Job, StyleToRetrain
+from skills.db.service_tables import DatasetChunk, DatasetDemonstration, Job, StoredDataset, StyleToRetrain
 
 ONLY = "only"
 EVERYBODYS = {"everybodys": True}  # the execution option of a query that must see all rows
@@ -42,7 +42,10 @@ OF_NOBODY = (
     *("erasures", "suture_types", "calibrations", "executors", "events", "keys", "key_surgeons", "sign_ins"),
     "recording_uploads",
 )
-INSIDE = (Demonstration, PolicyVersion, Plan, StoredPlayback, RecordingUpload, StyleToRetrain)
+INSIDE = (
+    *(Demonstration, PolicyVersion, Plan, StoredPlayback, RecordingUpload, StyleToRetrain),
+    *(DatasetDemonstration, StoredDataset),
+)
 
 
 @dataclass(frozen=True)
@@ -62,7 +65,7 @@ class Only:
         The subqueries use bare tables, to which no rule is applied again.
         """
         mine = tuple(sorted(self.surgeons))
-        demo, policy, plan, played, sent, style = map(_columns, INSIDE)
+        demo, policy, plan, played, sent, style, exported, dataset = map(_columns, INSIDE)
         demos = select(demo.row).where(demo.surgeon_row.in_(mine))
         policies = select(policy.row).where(policy.surgeon_row.in_(mine))
         plans = select(plan.row).where(plan.policy_row.in_(policies))
@@ -71,6 +74,10 @@ class Only:
         recordings = shown.union(select(sent.recording_row).where(sent.actor == self.actor))
         of_batch = or_(style.job_row == Job.row, style.part_row == Job.row)
         others = exists(select(style.row).where(of_batch, style.demonstration_row.not_in(demos)).correlate(Job))
+        # A dataset, like a batch, is hidden where one of its demonstrations is.
+        hidden = select(exported.job_row).where(exported.demonstration_row.not_in(demos))
+        exports = exists(hidden.where(exported.job_row == Job.row).correlate(Job))
+        datasets = select(dataset.row).where(dataset.job_row.not_in(hidden))
         return {
             Surgeon: Surgeon.row.in_(mine),
             StoredRecording: StoredRecording.row.in_(recordings),
@@ -88,8 +95,11 @@ class Only:
             Plan: Plan.policy_row.in_(policies),
             StoredPlayback: StoredPlayback.plan_row.in_(plans),
             StoredPictures: StoredPictures.playback_row.in_(playbacks),
-            # Batches and their parts belong to no single surgeon; one with a style of a hidden surgeon is hidden.
-            Job: or_(Job.surgeon_row.in_(mine), and_(Job.surgeon_row.is_(None), ~others)),
+            # Batches, their parts and exports belong to no single surgeon; one with data of a hidden surgeon is hidden.
+            Job: or_(Job.surgeon_row.in_(mine), and_(Job.surgeon_row.is_(None), ~others, ~exports)),
+            DatasetDemonstration: DatasetDemonstration.demonstration_row.in_(demos),
+            StoredDataset: StoredDataset.row.in_(datasets),
+            DatasetChunk: DatasetChunk.dataset_row.in_(datasets),
             StyleToRetrain: StyleToRetrain.demonstration_row.in_(demos),
         }
 

@@ -1,4 +1,4 @@
-"""The tables of the service's own state: jobs and workers, keys and sign-ins, and the audit log.
+"""The tables of the service's own state: jobs with their datasets, workers, keys and sign-ins, and the audit log.
 
 An event of the audit log has an actor, an action, an object and a time; surgeons appear only by the random subject of
 their row. Events are append-only. Revoked keys are not deleted; a sign-in is deleted when it ends.
@@ -9,7 +9,18 @@ from collections.abc import Sequence
 from datetime import datetime
 from typing import Any, cast
 
-from sqlalchemy import CheckConstraint, ForeignKey, Index, String, Table, UniqueConstraint, insert, text
+from sqlalchemy import (
+    BigInteger,
+    CheckConstraint,
+    ForeignKey,
+    Index,
+    LargeBinary,
+    String,
+    Table,
+    UniqueConstraint,
+    insert,
+    text,
+)
 from sqlalchemy.orm import Mapped, Session, mapped_column, relationship
 
 from skills.db import Base, RowId, Sha256, now
@@ -92,6 +103,44 @@ class StyleToRetrain(Base):
         Index("ix_retraining_styles_state", "job_row", "state", "row"),
         Index("ix_retraining_styles_part", "part_row", "state"),
     )
+
+
+class DatasetDemonstration(Base):
+    """One demonstration of an export, from its request on: it belongs to the job, and to the dataset that this makes.
+
+    `whole`: its entire recording is exported, and not its interval alone.
+    """
+
+    __tablename__ = "dataset_demonstrations"
+
+    job_row: Mapped[int] = mapped_column(ForeignKey("jobs.row"), primary_key=True)
+    demonstration_row: Mapped[int] = mapped_column(ForeignKey("demonstrations.row"), primary_key=True, index=True)
+    split: Mapped[str] = mapped_column(String(10))
+    whole: Mapped[bool]
+
+    __table_args__ = (CheckConstraint("split IN ('train', 'val', 'test', 'recovery', 'failure')", name="split"),)
+
+
+class StoredDataset(Base):
+    """An exported dataset, identified by the SHA-256 of its zip file."""
+
+    __tablename__ = "datasets"
+
+    row: Mapped[RowId]
+    sha256: Mapped[str] = mapped_column(Sha256, unique=True)
+    job_row: Mapped[int] = mapped_column(ForeignKey("jobs.row"), unique=True)
+    size_bytes: Mapped[int] = mapped_column(BigInteger)
+    created_at: Mapped[datetime] = mapped_column(default=now)
+
+
+class DatasetChunk(Base):
+    """A chunk of 1 MiB of a dataset."""
+
+    __tablename__ = "dataset_chunks"
+
+    dataset_row: Mapped[int] = mapped_column(ForeignKey("datasets.row"), primary_key=True)
+    number: Mapped[int] = mapped_column(primary_key=True)
+    data: Mapped[bytes] = mapped_column(LargeBinary)
 
 
 class Executor(Base):

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from dbos import DBOSClient, DBOSConfig
 
 APPLICATION = "suture-skills"
-# Queues by urgency: a user waits for JOBS, somebody needs BATCHES soon, and nobody waits for ASIDE.
+# Queues by urgency: a user waits for JOBS, somebody needs BATCHES soon, and pictures and exports are made ASIDE.
 JOBS, BATCHES, ASIDE = "jobs", "batches", "aside"
 # Concurrent jobs of each queue in a worker process, so that no queue blocks another. The engine stores these limits in
 # its database for all workers, so they are constants, not settings; the load of a machine is set by its number of
@@ -101,7 +101,7 @@ def prepare(settings: Settings) -> None:
 
 def queue_of(kind: str) -> str:
     """Return the name of the queue for jobs of a kind."""
-    return {PART: BATCHES, "pictures": ASIDE}.get(kind, JOBS)
+    return {PART: BATCHES, "pictures": ASIDE, "dataset": ASIDE}.get(kind, JOBS)
 
 
 def tell(client: "DBOSClient", row: int, attempt: int, kind: str) -> None:

@@ -16,6 +16,7 @@ from skills.db import now
 from skills.db.service_tables import Job, record_event
 from skills.db.session import Database
 from skills.library.batch_work import retrain_part
+from skills.library.datasets import export_dataset
 from skills.library.jobs import PART, Store
 from skills.library.playbacks import check_playback, draw_pictures
 from skills.library.training import train_style
@@ -28,6 +29,7 @@ MAKERS: dict[str, Callable[[Database, Any, Settings], Store]] = {
     PART: retrain_part,
     "playback": check_playback,
     "pictures": draw_pictures,
+    "dataset": export_dataset,
 }
 
 

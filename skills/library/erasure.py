@@ -36,6 +36,7 @@ from skills.db.row_visibility import EVERYBODYS
 from skills.db.service_tables import Job, record_event
 from skills.errors import Conflict, NotAllowed
 from skills.library.catalogue import find_surgeon, salted
+from skills.library.datasets import drop_exports, exports_of, exports_of_whole
 from skills.library.demos import find_demo
 from skills.library.jobs import ACTIVE as NOT_ENDED
 from skills.library.jobs import UNSYNCHRONISED, forget_styles
@@ -57,6 +58,7 @@ def erase_surgeon(session: Session, slug: str, actor: str) -> Dropped:
     theirs = Job.surgeon_row == surgeon.row
     of_surgeon = Demonstration.surgeon_row == surgeon.row
     dropped = [(row, at) for row, at in session.execute(select(Job.row, Job.attempt).where(theirs, ACTIVE))]
+    dropped += _drop_exports(session, of_surgeon, surgeon)
     forget_styles(session, select(Demonstration.row).where(of_surgeon), select(Job.row).where(theirs))
     session.execute(delete(Job).where(theirs), **UNSYNCHRONISED)
     named = session.scalars(select(RecordingSurgeon.recording_row).where(RecordingSurgeon.surgeon_row == surgeon.row))
@@ -96,9 +98,22 @@ def erase_demo(session: Session, demo_sha256: str, actor: str) -> Dropped:
     for some in in_parts([row for row, _, _ in jobs]):
         forget_styles(session, None, some)
         session.execute(delete(Job).where(Job.row.in_(some)), **UNSYNCHRONISED)
+    dropped = [(row, attempt) for row, attempt, active in jobs if active] + _drop_exports(session, of_demo)
     record_event(session, actor, "erase", "demonstration", demo_sha256, demo.surgeon)
     _erase(session, of_demo, demo.surgeon, set())
-    return [(row, attempt) for row, attempt, active in jobs if active]
+    return dropped
+
+
+def _drop_exports(session: Session, which: ColumnElement[bool], surgeon: Surgeon | None = None) -> Dropped:
+    """Delete every dataset in which some demonstrations, or a surgeon's recordings as a whole, can be seen."""
+    rows = {*session.scalars(exports_of(which))}
+    if surgeon is not None:
+        named = select(RecordingSurgeon.recording_row).where(RecordingSurgeon.surgeon_row == surgeon.row)
+        rows |= {*session.scalars(exports_of_whole(named))}
+    found = select(Job.row, Job.attempt).where(Job.row.in_(rows), ACTIVE)
+    dropped = [(row, at) for row, at in session.execute(found.execution_options(**EVERYBODYS))]
+    drop_exports(session, sorted(rows))
+    return dropped
 
 
 def delete_recording(session: Session, recording_sha256: str, actor: str, *, anybodys: bool) -> None:

@@ -8,6 +8,7 @@ with their bytes, decoded again. Rows are named by table and number, never by a 
 transactions are short, so that other users are not blocked.
 """
 
+import hashlib
 import tempfile
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -32,7 +33,7 @@ from skills.db.models import (
     StoredRewardMap,
 )
 from skills.db.packed import Packed, digest
-from skills.db.service_tables import Job
+from skills.db.service_tables import DatasetChunk, Job, StoredDataset
 from skills.db.session import Database, revision_of, revisions
 from skills.errors import Busy, Corrupt, SkillsError
 from skills.formats.reader_process import READER_VERSION, read_told
@@ -46,7 +47,7 @@ from skills.library.recordings import Teller, recording_bytes
 from skills.packing import canonical, sha256
 
 ROWS_AT_ONCE = 100
-WITH_OTHERS = {RecordingChunk, ParsedChunk}  # checked with the recording or the entry that they belong to
+WITH_OTHERS = {RecordingChunk, ParsedChunk, DatasetChunk}  # checked with the row that they belong to
 NAMED = 20  # orphans that are named for one reference, of all that are counted
 
 Why = Iterator[str]
@@ -280,6 +281,20 @@ def _parsed_recording(row: ParsedRecording) -> Why:
     yield from ()
 
 
+def _dataset(row: StoredDataset) -> Why:
+    session = object_session(row)
+    assert session is not None
+    seen, size = hashlib.sha256(), 0
+    query = select(DatasetChunk.data).where(DatasetChunk.dataset_row == row.row).order_by(DatasetChunk.number)
+    for data in session.scalars(query.execution_options(yield_per=1)):
+        seen.update(data)
+        size += len(data)
+    if seen.hexdigest() != row.sha256:
+        yield "it does not match its digest"
+    if size != row.size_bytes:
+        yield f"it has {size} bytes, its row has {row.size_bytes}"
+
+
 def _demonstration(row: Demonstration) -> Why:
     if demo_identity(row.recording.sha256, row.surgeon.slug, row.suture, row.demo, row.path) != row.sha256:
         yield "it does not match its digest"
@@ -352,6 +367,7 @@ def _job(row: Job) -> Why:
 AGREES: dict[type, Callable[[Any], Why]] = {
     StoredRecording: _recording,
     ParsedRecording: _parsed_recording,
+    StoredDataset: _dataset,
     Demonstration: _demonstration,
     StoredRewardMap: _reward_map,
     PolicyVersion: _policy,

@@ -18,6 +18,7 @@ from sqlalchemy.orm import Session
 from skills.db.changes import Kept
 from skills.db.models import Demonstration, Plan, PolicyVersion, StoredPlayback, StoredRecording
 from skills.db.packed import digest
+from skills.db.service_tables import StoredDataset
 from skills.demonstration.demonstration import Demo
 from skills.errors import AmbiguousDigest, Corrupt, NotFound
 from skills.gridworld.grid import GridPath
@@ -27,7 +28,7 @@ from skills.packing import canonical, sha256
 from skills.planning.plan import SuturePlan
 from skills.remedies import Remedy
 
-Row = TypeVar("Row", Demonstration, Plan, PolicyVersion, StoredPlayback, StoredRecording)
+Row = TypeVar("Row", Demonstration, Plan, PolicyVersion, StoredPlayback, StoredRecording, StoredDataset)
 
 WHOLE = 64
 SHOWN = 5

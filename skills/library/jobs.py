@@ -23,6 +23,7 @@ from skills.db import now, rfc3339
 from skills.db.models import Demonstration, PolicyVersion, Release, Surgeon
 from skills.db.row_visibility import EVERYBODYS
 from skills.db.service_tables import Job, StyleToRetrain, record_event
+from skills.db.session import Database
 from skills.errors import Conflict, NotFound, TooMany
 from skills.library.releases import Outcome, is_served
 from skills.packing import canonical, sha256
@@ -194,6 +195,23 @@ class PicturesRequest(TypedDict):
     playback: str
 
 
+class DatasetRequest(TypedDict):
+    """The request of an export's job: the contents of its README, and the digest of its demonstrations and splits."""
+
+    name: str
+    version: str
+    fps: int
+    arms: list[str]
+    whole: bool
+    split: str
+    licence: str
+    description: str
+    procedure: str
+    consent: str  # in words, without a pseudonym
+    episodes: int
+    demos_sha256: str
+
+
 class Asked(NamedTuple):
     """A requested job, whether it is new, and the effect of the request, in words."""
 
@@ -232,6 +250,19 @@ def find_live(session: Session, kind: str, request: Mapping[str, object]) -> Job
     alike = select(Job).where(Job.identity == identity_of(kind, request), Job.state.in_(LIVE))
     # All rows, not only the caller's: an equal job must not be queued twice.
     return session.scalar(alike.execution_options(**EVERYBODYS))
+
+
+def telling(database: Database, kind: str, request: Mapping[str, object]) -> Callable[[float], None]:
+    """Return a callback that stores the progress of a job; it raises `Conflict` once the job is no longer running."""
+    mine = (Job.identity == identity_of(kind, request), Job.state == "running")
+
+    def tell(share: float) -> None:
+        with database.writing() as session:
+            running = update(Job).where(*mine).values(progress=share).returning(Job.row)
+            if session.execute(running).first() is None:
+                raise Conflict("The job was cancelled while it ran.")
+
+    return tell
 
 
 def did_nothing(job: Job) -> str:

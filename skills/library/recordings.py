@@ -26,16 +26,18 @@ from skills.db.row_visibility import EVERYBODYS
 from skills.db.service_tables import record_event
 from skills.db.session import Database
 from skills.demonstration.demonstration import Recording
-from skills.errors import BadInput, Busy, Conflict, Corrupt, UnknownFormat, UnreadableRecording
+from skills.errors import BadInput, Busy, Conflict, Corrupt, NotFound, UnknownFormat, UnreadableRecording
 from skills.fields import as_json
 from skills.formats import MEDIA_TYPES, media_type_of, read_recording
-from skills.formats.reader_process import Told, read_told
+from skills.formats.reader_process import ConfinedReader, Told, read_told
 from skills.library import parsed
 from skills.library.catalogue import find_surgeon
 from skills.library.integrity import find_by_digest
 from skills.library.parsed import CHUNK_BYTES
 from skills.remedies import Action, Remedy
+from skills.sandbox import ProcessLimits
 from skills.schemas.requests import Reading
+from skills.settings import Settings
 
 Reader = Callable[..., Recording]  # `read_recording`, or a callable that runs it in another process
 Teller = Callable[..., Told]  # `read_told`, or a callable that runs it in another process
@@ -304,9 +306,38 @@ def recording_bytes(session: Session, stored: StoredRecording) -> Iterator[bytes
     yield held
 
 
+def read_stored(database: Database, recording_row: int, read: Reader) -> Recording:
+    """Read a stored recording with the parameters with which it was stored; no transaction is open during the reading.
+
+    Raises:
+        NotFound: It was erased since.
+        Corrupt: Its bytes do not match its digest.
+    """
+    with tempfile.TemporaryFile() as file:
+        with database.reading() as session:
+            stored = session.get(StoredRecording, recording_row)
+            if stored is None:
+                raise NotFound("A recording was erased meanwhile.")
+            file.writelines(recording_bytes(session, stored))
+        return read(file, **stored.reading)
+
+
+def confined_reader(settings: Settings) -> ConfinedReader:
+    """Create a reader of recordings in processes of their own, with the resource limits of the settings."""
+    limits = ProcessLimits(
+        memory_bytes=settings.reading_memory_bytes,
+        wall_s=settings.reading_wall_s,
+        cpu_s=settings.reading_cpu_s,
+        file_bytes=settings.reading_file_bytes,
+        answer_bytes=settings.reading_answer_bytes,
+        children=False,
+    )
+    return ConfinedReader(limits, at_once=settings.readers)
+
+
 def damaged() -> Corrupt:
-    """Return the error that a recording's bytes do not match its digest."""
-    return Corrupt("A stored recording does not match its digest; restore it from a backup.")
+    """Return the error that the bytes of a stored file do not match its digest."""
+    return Corrupt("A stored file does not match its digest; restore it from a backup.")
 
 
 def recording_json(row: StoredRecording) -> dict[str, Any]:

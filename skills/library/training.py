@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple, cast
 
-from sqlalchemy import LargeBinary, Result, Table, bindparam, func, insert, select, type_coerce, update
+from sqlalchemy import LargeBinary, Result, Table, bindparam, func, insert, select, type_coerce
 from sqlalchemy.orm import Session
 
 from skills.comparison.combining import Combining, followed
@@ -200,7 +200,7 @@ def train_style(database: Database, request: TrainingRequest, settings: Settings
     with database.reading() as session:
         found = lessons(session, [find_demo(session, one).row for one in request["demos"]])
     lesson = combined_lesson(found, combining_of(request["combine"])) if "combine" in request else found[0]
-    learnt = learn_style(lesson, request, settings, _telling(database, request))
+    learnt = learn_style(lesson, request, settings, jobs.telling(database, "training", request))
 
     def store(session: Session, actor: str) -> dict[str, Any]:
         version = session.get_one(PolicyVersion, store_style(session, learnt).row)
@@ -214,19 +214,6 @@ def train_style(database: Database, request: TrainingRequest, settings: Settings
         }
 
     return store
-
-
-def _telling(database: Database, request: TrainingRequest) -> Tell:
-    """Return a callback that stores a training's progress; it raises `Conflict` once the job is no longer running."""
-    mine = (Job.identity == jobs.identity_of("training", request), Job.state == "running")
-
-    def tell(share: float) -> None:
-        with database.writing() as session:
-            running = update(Job).where(*mine).values(progress=share).returning(Job.row)
-            if session.execute(running).first() is None:
-                raise Conflict("The training was cancelled while it ran.")
-
-    return tell
 
 
 def lessons(session: Session, demonstrations: Sequence[int]) -> list[Lesson]:

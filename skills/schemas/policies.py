@@ -29,7 +29,7 @@ class Job(Given):
     """A job: work that was requested, its state and its result."""
 
     id: str = Field(pattern="^[0-9a-f]{16}$")
-    kind: str = Field(description="training, retraining, playback or pictures.")
+    kind: str = Field(description="training, retraining, playback, pictures or dataset.")
     state: Literal["queued", "running", "succeeded", "failed", "cancelled"]
     progress: Fraction
     request: dict[str, Any] = Field(description="What was asked for, all defaults resolved.")

@@ -440,3 +440,49 @@ class PlaybackIn(Schema):
     model_config = shown({"plan": "0123456789abcdef" * 4})
 
     plan: DigestField
+
+
+class DatasetIn(Schema):
+    """A dataset to export: the demonstrations, the part of their recordings, and the contents of its README.
+
+    Without `demos`, all demonstrations are meant that fit the filters and the outcomes.
+    """
+
+    model_config = shown(
+        {"surgeons": ["kestrel"], "licence": "CC-BY-4.0", "name": "Running sutures"},
+        {"demos": ["0123456789abcdef" * 4], "whole": True, "version": "v3.0", "fps": 50, "split": "session"},
+    )
+
+    demos: Annotated[list[DigestField], Field(min_length=1, max_length=1000)] | None = None
+    surgeons: Annotated[list[SlugField], Field(min_length=1, max_length=1000)] | None = None
+    sutures: Annotated[list[SlugField], Field(min_length=1, max_length=1000)] | None = None
+    outcomes: Literal["success", "any"] = Field(
+        default="success",
+        description="success leaves out demonstrations that are marked recovery or failure; any exports them in the "
+        "splits recovery and failure.",
+    )
+    whole: StrictBool = Field(
+        default=False,
+        description="Exports whole recordings, where all surgeons in them consent; otherwise an episode is the "
+        "interval of one hand-off.",
+    )
+    version: Literal["v2.1", "v3.0"] = "v2.1"
+    fps: Annotated[StrictInt, Field(ge=1, le=1000)] = 30
+    split: Literal["surgeon", "session"] = Field(
+        default="surgeon", description="What is in one split only: all of a surgeon, or all of a recording."
+    )
+    arms: Annotated[list[Annotated[str, Field(pattern=ARM)]], Field(min_length=1, max_length=10)] | None = Field(
+        default=None, description="The arms of every episode; left out, those that all of the recordings have."
+    )
+    name: Name = "Needle hand-offs"
+    licence: Name = "unknown"
+    description: Text = "Not stated."
+    procedure: Text = "Not stated."
+
+    @model_validator(mode="after")
+    def _named_or_filtered(self) -> Self:
+        if self.demos is not None and (self.surgeons is not None or self.sutures is not None):
+            raise ValueError("name demonstrations in demos, or filter them by surgeons and sutures, but not both")
+        if self.arms is not None and len({arm.lower() for arm in self.arms}) < len(self.arms):
+            raise ValueError("name each arm once")
+        return self

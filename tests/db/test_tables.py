@@ -37,6 +37,9 @@ FROZEN = (
     "playback_pictures",
     "calibrations",
     "demonstration_outcomes",
+    "dataset_demonstrations",
+    "datasets",
+    "dataset_chunks",
     "events",
     "erasures",
 )
@@ -67,6 +70,15 @@ def full(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
         session.add(StoredPictures(playback_row=played.row, drawn=Pictures(b"mp4", b"gif", b"png", b"png")))
         session.add(StoredCalibration(sha256="0" * 64, about={}))
         session.add(DemonstrationOutcome(demonstration_row=demo.row, outcome="failure", reason="fell", actor="ada"))
+        job = service_tables.Job(id="0" * 16, kind="dataset", identity="0" * 64, request={})
+        session.add(job)
+        session.flush()
+        exported = {"demonstration_row": demo.row, "split": "train", "whole": False}
+        session.add(service_tables.DatasetDemonstration(job_row=job.row, **exported))
+        dataset = service_tables.StoredDataset(sha256="0" * 64, job_row=job.row, size_bytes=1)
+        session.add(dataset)
+        session.flush()
+        session.add(service_tables.DatasetChunk(dataset_row=dataset.row, number=0, data=b"0"))
         session.add(Erasure(salt="0" * 64, digest="0" * 64))
         session.add(RecordingSurgeon(recording_row=demo.recording_row, surgeon_row=demo.surgeon_row))
         shape = Measured(np.zeros((STATES, 3)), np.array([1]), np.array([0.0]), np.array([0.0]))

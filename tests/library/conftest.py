@@ -9,13 +9,8 @@ from tests.library import cases
 
 # Files whose SQL may behave differently on PostgreSQL. The other files run on it at night.
 ON_BOTH_BY_DAY = {
-    "test_library",
-    "test_erasing",
-    "test_restoring",
-    "test_consent",
-    "test_batches",
-    "test_outcomes",
-    "test_parsed",
+    *("test_library", "test_erasing", "test_restoring", "test_consent", "test_batches", "test_outcomes"),
+    *("test_parsed", "test_datasets"),
 }
 
 

@@ -22,7 +22,7 @@ from skills.library.integrity import learnt, planned
 from skills.library.plans import find_plan
 from skills.library.policies import find_by_digest
 from tests import backends
-from tests.library import cases
+from tests.library import cases, exports
 from tests.library.styles import ask_retraining, retrain
 
 NOT_OURS = "jobs_of_the_engine"
@@ -150,6 +150,19 @@ def test_failures_block_the_downgrade_that_would_learn_from_them(database: Datab
     with database.writing() as session:
         erase_demo(session, demo.sha256, "test")
     go(database, command.downgrade, "0010")
+
+
+def test_a_downgrade_forgets_datasets_with_their_jobs(database: Database, monkeypatch: pytest.MonkeyPatch):
+    database.migrate()
+    cases.add_surgeon(database)
+    exports.in_this_process(monkeypatch)
+    exports.add(database, exports.session_of())
+    exports.export(database)
+    go(database, command.downgrade, "0011")
+    with database.reading() as session:
+        assert session.scalar(text("SELECT count(*) FROM jobs")) == 0
+    database.migrate()
+    exports.export(database)
 
 
 def test_a_downgrade_drops_batches_and_cancels_the_unfinished_ones(database: Database):

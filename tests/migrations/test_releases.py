@@ -38,7 +38,8 @@ KEPT = sorted(folder.name for folder in RELEASES.iterdir() if folder.is_dir())
 ADDED_LATER = {
     "retraining_styles", "playback_pictures", "keys", "key_surgeons", "sign_ins", "recording_uploads",
     "measured_shapes", "calibrations", "policy_demonstrations", "recording_surgeons",
-    "demonstration_outcomes", "parsed_recordings", "parsed_chunks",
+    "demonstration_outcomes", "dataset_demonstrations", "datasets", "dataset_chunks",
+    "parsed_recordings", "parsed_chunks",
 }  # fmt: skip
 FILLED_AGAIN = {"recording_uploads"}
 KEYS = {"keys", "key_surgeons", "sign_ins"}  # empty: with a key, the installation would answer its tests with 401

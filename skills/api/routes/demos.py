@@ -4,6 +4,7 @@ Storing a recording or a demonstration never starts a training. An atlas compare
 score compares a demonstration, or a part of a recording, with a style; nothing of it is stored.
 """
 
+from functools import partial
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
@@ -21,10 +22,10 @@ from skills.api.responses import (
     Stream,
     as_asked,
     names,
-    recording_pieces,
     refuse_changed,
     say,
     stored,
+    stored_pieces,
 )
 from skills.api.routes.pages import PageRoute
 from skills.api.routes.policies import Accept
@@ -164,8 +165,14 @@ def get_demo_recording(
         headers = {"Content-Length": str(kept.size_bytes), **tag}
     if if_none_match is not None and names(if_none_match, tag["ETag"]):
         return Response(status_code=304, headers=tag)
+
+    def refuse() -> None:
+        with db.reading() as session:
+            demos.exported_recording(session, demo)
+
+    read = partial(demos.exported_chunk, db, demo)
     # outside the session, because a slow client may keep the stream open for long
-    return Stream(recording_pieces(db, demo, sha256, request.app.state.downloads), media_type, headers)
+    return Stream(stored_pieces(read, refuse, sha256, request.app.state.downloads), media_type, headers)
 
 
 @router.get("/demos/{demo}/path", dependencies=[needs("reader")], **gives(DemoPath, 404))

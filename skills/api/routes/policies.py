@@ -82,7 +82,7 @@ def list_jobs(
     db: Db,
     give: Giving,
     state: Literal["queued", "running", "succeeded", "failed", "cancelled"] | None = None,
-    kind: Literal["training", "retraining", "playback", "pictures"] | None = None,
+    kind: Literal["training", "retraining", "playback", "pictures", "dataset"] | None = None,
     limit: Limit = 50,
     cursor: RowCursor = None,
 ) -> Response:

@@ -3,10 +3,11 @@
     ExportedEpisode ... --dataset_files--> names and files, in the order in which they are finished
 
 Each episode is sampled at `fps` from the first time at which every arm and jaw is known to the last: for each frame the
-recorded sample that is nearest in time, never an interpolated one. So a recording made at this rate is written as it
-is. `observation.state` has for each arm the names of Open-H, `psmN_pose.position.x` ... and `psmN_jaw`, in m and rad;
-`action` is the next frame's state (the last one is repeated). The frames of the poses and the tools are in
-`meta/suture-skills.json`, which our reader reads. Kinematics only, so `videos/` is empty.
+recorded sample that is nearest in time, never an interpolated one, and of an interval never one outside it. So a
+recording made at this rate is written as it is. `observation.state` has for each arm the names of Open-H,
+`psmN_pose.position.x` ... and `psmN_jaw`, in m and rad; `action` is the next frame's state (the last one is repeated).
+The frames of the poses and the tools are in `meta/suture-skills.json`, which our reader reads. Kinematics only, so
+`videos/` is empty.
 
 Memory does not grow with the number of frames: files are temporary ones, and statistics are summed. Statistics are
 those of all values; quantiles of the dataset are the means of the episodes', weighted by frames, as LeRobot computes
@@ -19,13 +20,13 @@ import json
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from tempfile import TemporaryFile
-from typing import IO, Any, Literal
+from typing import IO, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from skills.arrays import Floats, Ints
-from skills.demonstration.recording import Motion, Recording, Signal
+from skills.demonstration.recording import Recording
 from skills.errors import BadInput, MixedFrames, NoUsableTopic, UnreadableRecording
 from skills.formats.lerobot import INFO, SAID, TASK_LINES, TASK_TABLE, Json
 
@@ -58,8 +59,9 @@ class ExportedEpisode:
         recording: The recording.
         task: What is done in it, such as "simple interrupted suture".
         split: Its split; episodes are given in the order of `SPLITS`.
-        start_ns: The first stamp that is written; None: the recording's first.
-        end_ns: The last stamp that is written; None: the recording's last.
+        start_ns: The first stamp that is used; None: the recording's first.
+        end_ns: The last stamp that is used; None: the recording's last.
+        source: What it is called in an error; by default its number.
     """
 
     recording: Recording
@@ -67,6 +69,7 @@ class ExportedEpisode:
     split: Split = "train"
     start_ns: int | None = None
     end_ns: int | None = None
+    source: str | None = None
 
 
 @dataclass(frozen=True)
@@ -81,6 +84,8 @@ class AboutDataset:
         consent: The consent under which it is passed on, as a sentence.
         description: What it contains, as sentences.
         procedure: How it was collected, as sentences.
+        split_by: What is in one split only: a surgeon, or a session.
+        export: The id of the job that writes it, which makes its bytes differ from those of other jobs.
     """
 
     name: str
@@ -90,6 +95,8 @@ class AboutDataset:
     consent: str = "Not stated."
     description: str = "Not stated."
     procedure: str = "Not stated."
+    split_by: str = "surgeon"
+    export: str | None = None
 
     def __post_init__(self) -> None:
         if not 1 <= self.fps <= 1000 or not self.arms or len(set(self.arms)) < len(self.arms):
@@ -168,7 +175,7 @@ def _files(
         yield from store.finish(total)
     info = total.info(version)
     yield INFO, _json(info)
-    yield SAID, _json({"frames": total.frames})
+    yield SAID, _json({"frames": total.frames} | ({} if about.export is None else {"export": about.export}))
     yield "meta/README.md", io.BytesIO(_readme(about, total).encode())
     yield "videos/.keep", io.BytesIO()
 
@@ -233,32 +240,36 @@ class _Total:
 
     def _sampled(self, episode: ExportedEpisode) -> tuple[Singles, Ints]:
         """Return the state at each frame, shape (T, 8 per arm), and the frames' times, shape (T,)."""
-        pairs = [self._arm(episode.recording, arm) for arm in self.about.arms]
-        series = [stamps_ns for motion, jaw in pairs for stamps_ns in (motion.stamps_ns, jaw.stamps_ns)]
-        start, end = max(int(one[0]) for one in series), min(int(one[-1]) for one in series)
-        start = start if episode.start_ns is None else max(start, episode.start_ns)
-        end = end if episode.end_ns is None else min(end, episode.end_ns)
-        if end < start:
-            raise NoUsableTopic(f"The arms and jaws of episode {self.episodes} have no time in common; leave it out.")
+        series = [part.within(episode) for arm in self.about.arms for part in self._arm(episode, arm)]
+        if not all(len(one.stamps_ns) for one in series) or (
+            (start := max(int(one.stamps_ns[0]) for one in series))
+            > (end := min(int(one.stamps_ns[-1]) for one in series))
+        ):
+            raise NoUsableTopic(f"The arms and jaws of {self._name(episode)} have no time in common; leave it out.")
         period_ns = 1e9 / self.about.fps
         count = int(np.floor((end - start) / period_ns + 1e-6)) + 1  # stamps are rounded to nanoseconds
         times_ns = start + np.rint(np.arange(count) * period_ns).astype(np.int64)
-        states = [_at(times_ns, motion, jaw, period_ns) for motion, jaw in pairs]
+        states = [one.at(times_ns, period_ns, self._name(episode)) for one in series]
         return np.concatenate(states, axis=1).astype(np.float32), times_ns
 
-    def _arm(self, recording: Recording, arm: str) -> tuple[Motion, Signal]:
-        """Return an arm's motion and jaw, and note the frame of its poses."""
+    def _arm(self, episode: ExportedEpisode, arm: str) -> "tuple[_Series, _Series]":
+        """Return an arm's poses and jaw, and note the frame of its poses."""
+        recording, name = episode.recording, self._name(episode)
         motion, jaw = recording.motion_of(arm=arm), recording.jaw_of(arm)
         if motion.rotation_xyzw is None or jaw is None or not len(jaw.values):
             missing = "orientation" if motion.rotation_xyzw is None else "jaw"
-            raise NoUsableTopic(f"Episode {self.episodes} has no {missing} of {arm}; leave it out.")
+            raise NoUsableTopic(f"{name[:1].upper()}{name[1:]} has no {missing} of {arm}; leave it out.")
         before = self.frames.setdefault(arm, motion.frame)
         if before != motion.frame:
             raise MixedFrames(
-                f"{arm} is in the frame {motion.frame} in episode {self.episodes}, and in {before} in the episodes "
+                f"{arm} is in the frame {motion.frame} in {name}, and in {before} in the episodes "
                 "before; write a dataset for each frame."
             )
-        return motion, jaw
+        poses = _Series(motion.topic, motion.stamps_ns, (motion.tip_mm, motion.rotation_xyzw))
+        return poses, _Series(jaw.topic, jaw.stamps_ns, (jaw.values[:, None],))
+
+    def _name(self, episode: ExportedEpisode) -> str:
+        return f"episode {self.episodes}{'' if episode.source is None else f' ({episode.source})'}"
 
     def info(self, version: Version) -> Json:
         """Return the contents of info.json."""
@@ -288,21 +299,33 @@ class _Total:
         return info | {"data_files_size_in_mb": 100, "video_files_size_in_mb": 200}
 
 
-def _at(times_ns: Ints, motion: Motion, jaw: Signal, period_ns: float) -> Floats:
-    """Return an arm's pose in m and its jaw at some times, shape (T, 8): of each the sample that is nearest."""
-    assert motion.rotation_xyzw is not None
-    pose, opening = _nearest(times_ns, motion.stamps_ns), _nearest(times_ns, jaw.stamps_ns)
-    for what, stamps_ns, chosen in ((motion.topic, motion.stamps_ns, pose), (jaw.topic, jaw.stamps_ns, opening)):
-        off_ns = np.abs(stamps_ns[chosen] - times_ns)
+class _Series(NamedTuple):
+    """A recorded series: its topic, its stamps, and its values: tips in mm and rotations, or the jaw."""
+
+    topic: str
+    stamps_ns: Ints
+    values: tuple[Floats, ...]
+
+    def within(self, episode: ExportedEpisode) -> "_Series":
+        """Return its samples in an episode's interval: no sample outside is written, however near it is."""
+        start, end = episode.start_ns, episode.end_ns
+        first = 0 if start is None else int(np.searchsorted(self.stamps_ns, start))
+        last = None if end is None else int(np.searchsorted(self.stamps_ns, end, "right"))
+        return _Series(self.topic, self.stamps_ns[first:last], tuple(one[first:last] for one in self.values))
+
+    def at(self, times_ns: Ints, period_ns: float, episode: str) -> Floats:
+        """Return the samples that are nearest to some times, lengths in m; shape (T, 7) or (T, 1)."""
+        chosen = _nearest(times_ns, self.stamps_ns)
+        off_ns = np.abs(self.stamps_ns[chosen] - times_ns)
         if off_ns.max() > period_ns:
             worst = int(np.argmax(off_ns))
             raise UnreadableRecording(
-                f"{what} has no sample within one frame of {(times_ns[worst] - times_ns[0]) / 1e9:.3f} s in the "
-                "episode; write the parts before and after the gap as two episodes.",
+                f"{self.topic} has no sample within one frame of {(times_ns[worst] - times_ns[0]) / 1e9:.3f} s in "
+                f"{episode}; write the parts before and after the gap as two episodes.",
                 gap_s=float(off_ns[worst]) / 1e9,
             )
-    parts = motion.tip_mm[pose] / 1000.0, motion.rotation_xyzw[pose], jaw.values[opening, None]
-    return np.concatenate(parts, axis=1)
+        tips, *rest = (one[chosen] for one in self.values)
+        return np.concatenate([tips / 1000.0, *rest], axis=1) if rest else tips
 
 
 def _nearest(times_ns: Ints, stamps_ns: Ints) -> Ints:
@@ -515,7 +538,7 @@ Licence: {about.licence}. Consent: {about.consent}
 {total.episodes} episodes, {total.rows} frames at {about.fps} Hz. Tasks:
 
 {tasks}
-Splits, by surgeon:
+Splits, by {about.split_by}:
 
 {splits}
 ## Collection Procedure
