@@ -53,7 +53,7 @@ class Action(Enum):
     LIST_DATASETS = Words(
         http="GET /jobs?kind=dataset lists the exports, and POST /datasets requests one.",
         command="Export one: skills export-dataset OUT.zip",
-        python="List the exports: client.jobs(kind='dataset'), or request one: client.dataset(...)",
+        python="List the exports: client.jobs(kind='dataset'), or request one: client.export_dataset(...)",
     )
     ADD_DEMO = Words(
         http="POST /demos?surgeon={surgeon}&suture={suture} adds one.",

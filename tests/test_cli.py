@@ -19,12 +19,13 @@ from skills.cli.policies import MANY
 from skills.cli.shell import complete_surgeons, complete_sutures, connect
 from skills.db.session import Database
 from skills.formats import read_recording, write_mcap
+from skills.formats.lerobot.cut import find_dataset
 from skills.formats.lerobot.writer import AboutDataset, ExportedEpisode, dataset_files
 from skills.library.catalogue import put_surgeon
 from skills.seeds.recordings import sample_recordings
 from skills.settings import Settings, settings
 from tests.formats import bags, lerobots, trials
-from tests.library import cases
+from tests.library import cases, exports
 
 STYLE = ("wren", "simple-running")
 
@@ -59,6 +60,25 @@ def test_a_command_that_waits_for_one_job_starts_one_worker(tmp_path: Path, monk
         with connect(given, workers=workers):
             pass
     assert crews == [1, 4, 0]
+
+
+def test_a_dataset_is_exported_verified_and_never_overwritten(skills, tmp_path: Path) -> None:
+    file = tmp_path / "hand-off.mcap"
+    file.write_bytes(write_mcap(exports.session_of()))
+    assert skills("migrate")[0] == 0
+    assert skills("surgeon", "put", "kestrel")[0] == 0
+    assert skills("suture", "list")[0] == 0
+    add = ("demo", "add", str(file), "--surgeon", "kestrel", "--suture", "simple-running", "--arm", "PSM1")
+    code, said = skills(*add, "--segment", "whole")
+    assert code == 0, said
+    out = str(tmp_path / "dataset")
+    code, said = skills("export-dataset", out, "--surgeon", "kestrel", "--licence", "CC-BY-4.0", "--fps", "25")
+    assert (code, "episodes: 1, frames: 30" in said) == (0, True), said
+    with find_dataset(tmp_path / "dataset") as unpacked:
+        assert unpacked.tasks == {0: "Simple running"}
+    for existing in (out, str(file)):
+        code, said = skills("export-dataset", existing)
+        assert (code, "exists already" in said) == (1, True), said
 
 
 def test_from_a_bag_folder_to_a_released_policy_and_a_plan(skills, tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from typing import Any
 import typer
 from typer.core import TyperGroup
 
-from skills.cli import comparison, folder_table, installation, policies, recordings
+from skills.cli import comparison, datasets, folder_table, installation, policies, recordings
 from skills.cli.shell import err, tell
 from skills.remedies import did_you_mean
 
@@ -76,6 +76,7 @@ for commands in (  # the order of the commands in `skills --help`
     installation.commands,
     installation.key_commands,
     recordings.commands,
+    datasets.commands,
     policies.learning_commands,
     policies.commands,
     policies.plan_commands,

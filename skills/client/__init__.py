@@ -32,6 +32,7 @@ from skills.client.connection import (
     call,
     given,
 )
+from skills.client.datasets import Datasets
 from skills.client.plans import Plans
 from skills.client.policies import Atlases, Jobs, Policies, Scores
 from skills.client.recordings import Catalogue, Recordings
@@ -100,7 +101,7 @@ TIMEOUT_S = 60.0  # ours: the service reads a large recording in at most 30 s, a
 AGAIN = Retrying()
 
 
-class Calls(Atlases, Catalogue, Recordings, Jobs, Policies, Plans, Keys, Scores):
+class Calls(Atlases, Catalogue, Recordings, Datasets, Jobs, Policies, Plans, Keys, Scores):
     """All calls, and the state that they share."""
 
     def _connect(

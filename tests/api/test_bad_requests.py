@@ -41,6 +41,10 @@ SOUND: dict[tuple[str, str], Any] = {
     },
     ("PUT", "/demos/{demo}/outcome"): {"outcome": "failure", "reason": "It fell."},
     ("POST", "/playbacks"): {"plan": "0" * 64},
+    ("POST", "/datasets"): {
+        "demos": ["0" * 64], "outcomes": "any", "whole": True, "version": "v3.0", "fps": 30, "split": "session",
+        "arms": ["PSM1"], "name": "Sutures", "licence": "CC-BY-4.0", "description": "Many.", "procedure": "By hand.",
+    },
     ("POST", "/scores"): {
         **KESTREL, "recording": "0" * 64, "arm": "PSM", "topic": "table", "start_s": 0.0, "end_s": 0.5,
         "reference": "0" * 64,
@@ -54,7 +58,18 @@ TOKENS = (
     '{"a": 1}', '[["b"]]', f'"{CANARY}"', '"' + "x" * 5000 + '"', "1.5e308", '"; DROP TABLE jobs; --"',
 )  # fmt: skip
 CACHED = {"measured_shapes": 0}  # a request for an atlas fills this cache and changes nothing else
-FREE_TEXT = {"owner", "reason", "name", "family", "description", "also_called", "protocol", "source"}
+FREE_TEXT = {
+    "owner",
+    "reason",
+    "name",
+    "family",
+    "description",
+    "also_called",
+    "protocol",
+    "source",
+    "licence",
+    "procedure",
+}
 NUMBERS_ONLY = ("true", '"1"')  # sent in place of a number
 WHOLE_ONLY = ("1.5", "true", '"1"', "1e400", "-1")
 BODIES = (

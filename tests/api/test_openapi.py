@@ -24,6 +24,7 @@ OPERATIONS = {
     "put_surgeon", "put_suture_type",
     "read_suture_points", "ready", "release", "retrain", "roll_out", "score", "train", "upload_demo", "watch_job",
     "withdraw", "withdraw_demo",
+    "delete_dataset", "export_dataset", "get_dataset",
 }  # fmt: skip
 EVERY_CALL = {"400", "500", "503"}
 PATH = {**KESTREL, "version": "1"}
@@ -113,7 +114,7 @@ def test_every_example_of_a_request_does_what_it_shows(trained: Service, method:
         example = {
             "plan": trained.client.plan(**KESTREL, suture_points=[{"position_mm": GOAL_MM}], handoff="none")["id"]
         }
-    digests = {"demo": there["id"], "recording": there["recording"]}
+    digests = {"demo": there["id"], "demos": [there["id"]], "recording": there["recording"]}
     example = {name: digests.get(name, value) for name, value in example.items()}
     path = path.format(**PATH, recording=there["recording"], demo=there["id"])
     answer = trained.http.request(method, path, json=example)

@@ -43,6 +43,8 @@ NEEDED = {
     "DELETE /jobs/{job}": TRAINER,
     "POST /plans": TRAINER,
     "POST /playbacks": TRAINER,
+    "POST /datasets": TRAINER,
+    "DELETE /datasets/{dataset}": TRAINER,
     "POST /playbacks/{playback}/pictures": TRAINER,
     "POST /policies/{surgeon}/{suture}/versions/{version}/release": RELEASER,
     "DELETE /policies/{surgeon}/{suture}/release": RELEASER,

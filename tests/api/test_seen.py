@@ -114,6 +114,8 @@ def test_no_body_or_query_reaches_anything_of_kestrels(service: Service, admin: 
         ("PUT", f"/demos/{kestrels['demo']}/outcome", {"json": {"outcome": "success"}}),
         ("POST", "/plans", {"json": KESTREL | {"suture_points": [{"position_mm": GOAL_MM}], "handoff": "none"}}),
         ("POST", "/playbacks", {"json": {"plan": kestrels["plan"]}}),
+        ("POST", "/datasets", {"json": {"surgeons": ["kestrel"]}}),
+        ("POST", "/datasets", {"json": {"demos": [kestrels["demo"]]}}),
         ("POST", f"/recordings/{own['recording']}/demos", {"json": KESTREL}),
         ("POST", f"/recordings/{kestrels['recording']}/demos", {"json": HERON}),
         ("POST", "/demos", {"params": KESTREL, "content": cases.hand_off(), "headers": {"Content-Type": CSV}}),
