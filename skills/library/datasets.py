@@ -22,7 +22,7 @@ from tempfile import TemporaryFile
 from typing import IO, Any, NamedTuple, cast
 from zipfile import ZipFile, ZipInfo
 
-from sqlalchemy import ColumnElement, Select, Table, and_, delete, false, insert, or_, select, true
+from sqlalchemy import ColumnElement, Select, Table, and_, delete, exists, insert, literal, or_, select
 from sqlalchemy.orm import Session
 
 from skills.db import in_parts
@@ -224,32 +224,43 @@ def _arms(session: Session, chosen: Sequence[_Chosen], wanted: list[str] | None)
 # ---- consent -------------------------------------------------------------------------------------------------------
 
 
-def _together(whole: ColumnElement[bool]) -> ColumnElement[bool]:
-    """Return the condition that a demonstration `_RECORDED` is seen in the episode of `_DEMOS`."""
-    overlaps = and_(_RECORDED.c.start_s <= _DEMOS.c.end_s, _RECORDED.c.end_s >= _DEMOS.c.start_s)
-    return and_(_RECORDED.c.recording_row == _DEMOS.c.recording_row, or_(whole, overlaps))
+def _overlap(of: Any) -> ColumnElement[bool]:
+    """Return the condition that a demonstration `_RECORDED` is seen in an episode with the columns `of`."""
+    at_once = and_(_RECORDED.c.start_s <= of.end_s, _RECORDED.c.end_s >= of.start_s)
+    return and_(_RECORDED.c.recording_row == of.recording_row, or_(of.whole, at_once))
+
+
+EPISODE = (_DEMOS.c.recording_row, _DEMOS.c.surgeon_row, _DEMOS.c.start_s, _DEMOS.c.end_s)
 
 
 def _recorded_with(rows: Sequence[int], *, whole: bool) -> Iterator[Select[Any]]:
-    """Yield queries of the surgeons who are recorded in the episodes of some demonstrations.
-
-    The tables are bare, because a surgeon whom the caller may not see has to consent too.
-    """
+    """Yield queries of the surgeons who are recorded in the episodes of some demonstrations."""
     for some in in_parts(rows):
-        mine = _DEMOS.c.row.in_(some)
-        yield select(_RECORDED.c.surgeon_row).join(_DEMOS, _together(true() if whole else false())).where(mine)
-        if whole:
-            of = _NAMED.c.recording_row == _DEMOS.c.recording_row
-            yield select(_NAMED.c.surgeon_row).join(_DEMOS, of).where(mine)
+        yield from _recorded(select(*EPISODE, literal(whole).label("whole")).where(_DEMOS.c.row.in_(some)))
 
 
 def _recorded_in(job_row: int) -> Iterator[Select[Any]]:
     """Yield queries of the surgeons who are recorded in the episodes of an export."""
-    mine, exported = _EXPORTED.c.job_row == job_row, _EXPORTED.c.demonstration_row == _DEMOS.c.row
-    seen = select(_RECORDED.c.surgeon_row).select_from(_EXPORTED).join(_DEMOS, exported)
-    yield seen.join(_RECORDED, _together(_EXPORTED.c.whole)).where(mine)
-    named = select(_NAMED.c.surgeon_row).select_from(_EXPORTED).join(_DEMOS, exported)
-    yield named.join(_NAMED, _NAMED.c.recording_row == _DEMOS.c.recording_row).where(mine, _EXPORTED.c.whole)
+    mine = _EXPORTED.c.demonstration_row == _DEMOS.c.row
+    yield from _recorded(
+        select(*EPISODE, _EXPORTED.c.whole).join(_EXPORTED, mine).where(_EXPORTED.c.job_row == job_row)
+    )
+
+
+def _recorded(episodes: Select[Any]) -> Iterator[Select[Any]]:
+    """Yield queries of the surgeons who are recorded in some episodes.
+
+    The tables are bare, because a surgeon whom the caller may not see has to consent too. Only demonstrations of other
+    surgeons are compared with the episodes, so the time does not grow with the square of those in one recording.
+    """
+    of = episodes.cte("episodes").c
+    yield select(of.surgeon_row)
+    others = (
+        _RECORDED.c.recording_row.in_(select(of.recording_row)),
+        _RECORDED.c.surgeon_row.not_in(select(of.surgeon_row)),
+    )
+    yield select(_RECORDED.c.surgeon_row).where(*others, exists().where(_overlap(of)))
+    yield select(_NAMED.c.surgeon_row).where(_NAMED.c.recording_row.in_(select(of.recording_row).where(of.whole)))
 
 
 def _surgeons(session: Session, queries: Iterable[Select[Any]]) -> list[Surgeon]:
@@ -508,9 +519,10 @@ def delete_dataset(session: Session, dataset_sha256: str, actor: str) -> None:
 def exports_of(which: ColumnElement[bool]) -> Select[int]:
     """Return the query of the jobs whose episodes have a demonstration, for a condition on `Demonstration`."""
     erased = select(Demonstration.row).where(which)
-    of_job = _EXPORTED.c.demonstration_row == _DEMOS.c.row
-    seen = select(_EXPORTED.c.job_row).select_from(_EXPORTED).join(_DEMOS, of_job)
-    return seen.join(_RECORDED, _together(_EXPORTED.c.whole)).where(_RECORDED.c.row.in_(erased)).distinct()
+    mine = _EXPORTED.c.demonstration_row == _DEMOS.c.row
+    of = select(_EXPORTED.c.job_row, _DEMOS.c.row, *EPISODE, _EXPORTED.c.whole).join(_EXPORTED, mine).subquery().c
+    seen = exists().where(_RECORDED.c.row.in_(erased), _overlap(of))
+    return select(of.job_row).where(or_(of.row.in_(erased), seen)).distinct()
 
 
 def exports_of_whole(recordings: Select[int]) -> Select[int]:

@@ -9,7 +9,7 @@ from sqlalchemy import select, text
 from skills.db import Base
 from skills.db.models import Demonstration, ParsedChunk, RecordingChunk
 from skills.db.packed import Packed
-from skills.db.service_tables import Event
+from skills.db.service_tables import DatasetChunk, Event
 from skills.db.session import Database
 from skills.library import inspection
 from skills.library.atlas import far_apart
@@ -212,7 +212,7 @@ def test_every_table_with_a_digest_is_compared_with_it():
     }
     with_a_nonce = {Event}  # nobody can compute it again
     assert known_by_digest - with_a_nonce <= set(AGREES)
-    assert {RecordingChunk, ParsedChunk} == WITH_OTHERS
+    assert {RecordingChunk, ParsedChunk, DatasetChunk} == WITH_OTHERS
 
 
 def test_inspection_walks_all_pages_and_an_unreadable_row_hides_no_other(
