@@ -54,7 +54,7 @@ from skills.library.catalogue import find_surgeon, find_suture_type
 from skills.library.demos import find_demo
 from skills.library.integrity import find_by_digest
 from skills.library.jobs import UNSYNCHRONISED, DatasetRequest, Store
-from skills.library.recordings import CHUNK_BYTES, Reader, confined_reader, read_stored
+from skills.library.recordings import CHUNK_BYTES, Teller, confined_reader, stored_recording
 from skills.packing import canonical, sha256
 from skills.remedies import Action, Remedy
 from skills.schemas.requests import DatasetIn
@@ -320,7 +320,7 @@ def consents_in_words(surgeons: Sequence[Surgeon]) -> str:
 class _Episode:
     """An episode to write: a recording or an interval of it, and the demonstrations in it that were chosen."""
 
-    recording_row: int
+    recording: str  # the SHA-256 of its bytes
     split: Split
     task: str
     demos: tuple[str, ...]
@@ -366,7 +366,7 @@ def export_dataset(database: Database, request: DatasetRequest, settings: Settin
     with ExitStack() as opened:
         file = opened.enter_context(TemporaryFile())
         with confined_reader(settings) as read:
-            exported = _exported(database, read, episodes, tell)
+            exported = _exported(database, read.tell, episodes, tell)
             made = write_dataset(file, exported, about, cast(Version, request["version"]), settings)
         until_stored = opened.pop_all()
 
@@ -399,10 +399,12 @@ def _episodes(session: Session, job_row: int) -> list[_Episode]:
     query = (
         select(
             *(exported.split, exported.whole, of.row, of.sha256, of.recording_row, of.start_s, of.end_s),
+            StoredRecording.sha256.label("recording"),
             SutureType.name.label("suture"),
         )
         .select_from(exported)
         .join(of, of.row == exported.demonstration_row)
+        .join(StoredRecording, StoredRecording.row == of.recording_row)
         .join(SutureType, SutureType.slug == of.suture)
         .where(exported.job_row == job_row)
     )
@@ -412,7 +414,7 @@ def _episodes(session: Session, job_row: int) -> list[_Episode]:
         found.setdefault(key, []).append(one)
     episodes = [
         _Episode(
-            some[0].recording_row,
+            some[0].recording,
             some[0].split,
             ", ".join(sorted({one.suture for one in some})),
             tuple(one.sha256 for one in some),
@@ -424,16 +426,16 @@ def _episodes(session: Session, job_row: int) -> list[_Episode]:
 
 
 def _exported(
-    database: Database, read: Reader, episodes: Sequence[_Episode], tell: Callable[[float], None]
+    database: Database, read: Teller, episodes: Sequence[_Episode], tell: Callable[[float], None]
 ) -> Iterator[ExportedEpisode]:
     """Read the recordings one after another, and yield their episodes."""
     at, recording = None, None
     for number, episode in enumerate(episodes):
         if number % max(1, len(episodes) // TOLD_STEPS) == 0:
             tell(number / (len(episodes) + 1))
-        if recording is None or at != episode.recording_row:
+        if recording is None or at != episode.recording:
             recording = None  # before the next one is read, so that only one is in memory
-            recording, at = read_stored(database, episode.recording_row, read), episode.recording_row
+            recording, at = stored_recording(database, episode.recording, read).recording, episode.recording
         yield _part(recording, episode)
 
 

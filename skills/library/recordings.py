@@ -26,7 +26,7 @@ from skills.db.row_visibility import EVERYBODYS
 from skills.db.service_tables import record_event
 from skills.db.session import Database
 from skills.demonstration.demonstration import Recording
-from skills.errors import BadInput, Busy, Conflict, Corrupt, NotFound, UnknownFormat, UnreadableRecording
+from skills.errors import BadInput, Busy, Conflict, Corrupt, UnknownFormat, UnreadableRecording
 from skills.fields import as_json
 from skills.formats import MEDIA_TYPES, media_type_of, read_recording
 from skills.formats.reader_process import ConfinedReader, Told, read_told
@@ -304,22 +304,6 @@ def recording_bytes(session: Session, stored: StoredRecording) -> Iterator[bytes
     if seen.hexdigest() != stored.sha256:
         raise damaged()
     yield held
-
-
-def read_stored(database: Database, recording_row: int, read: Reader) -> Recording:
-    """Read a stored recording with the parameters with which it was stored; no transaction is open during the reading.
-
-    Raises:
-        NotFound: It was erased since.
-        Corrupt: Its bytes do not match its digest.
-    """
-    with tempfile.TemporaryFile() as file:
-        with database.reading() as session:
-            stored = session.get(StoredRecording, recording_row)
-            if stored is None:
-                raise NotFound("A recording was erased meanwhile.")
-            file.writelines(recording_bytes(session, stored))
-        return read(file, **stored.reading)
 
 
 def confined_reader(settings: Settings) -> ConfinedReader:
