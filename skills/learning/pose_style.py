@@ -1,0 +1,285 @@
+"""Pose styles: the motion of a hand as position, orientation, jaw and tempo along one phase.
+
+    Demos --learn_pose_style--> PoseStyle --between--> PosePath   at a start and a goal pose that were not demonstrated
+
+The policies of the grid know positions only. A pose style keeps what a hand does: phase is the share of the time of a
+demonstration, and every demonstration is resampled at `PHASES` of them. The paper has no orientation; all of this is
+ours.
+
+A demonstration is *laid* between another start and goal by adding what its ends lack, blended over the phase by a
+smoothstep, which moves neither end's velocity: to the position a vector, to the orientation a rotation. The path at a
+start and a goal is the weighted mean of all laid demonstrations. Those that were shown in a situation more like this
+one count more (`_weights`), so that a style which is performed differently at different places is not averaged away.
+Before the mean is taken they are warped onto each other in time (DTW, as in `skills.learning.evaluation`), since a mean
+of motions that are not in step is smoother than each; afterwards the mean tempo is restored.
+
+Orientations are averaged as by Markley et al. (Averaging Quaternions, J. Guid. Control Dyn. 30, 2007): the mean is the
+eigenvector of the largest eigenvalue of the sum of the quaternions' outer products.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.ndimage import gaussian_filter1d
+from scipy.spatial.transform import Rotation, Slerp
+
+from skills.arrays import Floats, frozen
+from skills.demonstration.demonstration import Demo
+from skills.demonstration.movement import same_signs
+from skills.errors import BadInput, MixedFrames
+from skills.learning.evaluation import dtw
+
+PHASES = 101  # ours: a hundredth of a hand-off of 5 s is a twentieth of a second, in which a hand does not turn back
+WARP_SMOOTHING = 3.0  # ours: standard deviation in phases; the steps of a DTW path are no tempo
+LIKE_FLOOR = 1e-6  # of squared distances between situations; several demonstrations may share one
+
+
+@dataclass(frozen=True, eq=False)
+class PosePath:
+    """One motion of a hand.
+
+    Attributes:
+        tip_mm: Positions of the tip, shape (N, 3), in the frame of the style.
+        rotation_xyzw: Orientations in that frame, unit quaternions, shape (N, 4).
+        elapsed_s: Time from the start, shape (N,), increasing from 0.
+        jaw_rad: Angle of the jaw, shape (N,); None if not every demonstration has it.
+        spread_mm: Standard deviation of the demonstrations' positions about the path, shape (N,); 0 for a single one.
+        spread_rad: Standard deviation of their orientations about the path, shape (N,).
+    """
+
+    tip_mm: Floats
+    rotation_xyzw: Floats
+    elapsed_s: Floats
+    jaw_rad: Floats | None
+    spread_mm: Floats
+    spread_rad: Floats
+
+    def __post_init__(self) -> None:
+        count = len(self.tip_mm)
+        shapes: dict[str, tuple[int, ...]] = {
+            "tip_mm": (count, 3),
+            "rotation_xyzw": (count, 4),
+            "elapsed_s": (count,),
+            "jaw_rad": (count,),
+            "spread_mm": (count,),
+            "spread_rad": (count,),
+        }
+        for name, shape in shapes.items():
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, frozen(getattr(self, name), np.float64, shape, name))
+
+
+@dataclass(frozen=True, eq=False)
+class PoseStyle:
+    """The demonstrations of one style, resampled along their phase.
+
+    Attributes:
+        frame: The frame of all poses.
+        tip_mm: Positions, shape (K, PHASES, 3).
+        rotation_xyzw: Orientations, unit quaternions, shape (K, PHASES, 4).
+        duration_s: Duration of each demonstration, shape (K,).
+        jaw_rad: Angles of the jaw, shape (K, PHASES); None if not every demonstration has it.
+    """
+
+    frame: str
+    tip_mm: Floats
+    rotation_xyzw: Floats
+    duration_s: Floats
+    jaw_rad: Floats | None = None
+
+    def __post_init__(self) -> None:
+        count = len(self.tip_mm)
+        shapes: dict[str, tuple[int, ...]] = {
+            "tip_mm": (count, PHASES, 3),
+            "rotation_xyzw": (count, PHASES, 4),
+            "duration_s": (count,),
+            "jaw_rad": (count, PHASES),
+        }
+        for name, shape in shapes.items():
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, frozen(getattr(self, name), np.float64, shape, name))
+
+    def between(self, start_mm: ArrayLike, start_xyzw: ArrayLike, goal_mm: ArrayLike, goal_xyzw: ArrayLike) -> PosePath:
+        """Return the style's motion from a start pose to a goal pose; it begins and ends in them exactly.
+
+        Args:
+            start_mm: Position of the start in `frame`, shape (3,).
+            start_xyzw: Its orientation, a unit quaternion, shape (4,).
+            goal_mm: Position of the goal, shape (3,).
+            goal_xyzw: Its orientation, shape (4,).
+
+        Returns:
+            The motion at `PHASES` phases.
+
+        Raises:
+            BadInput: A number is not finite, or a quaternion is not a unit quaternion.
+        """
+        ends = np.stack([frozen(start_mm, np.float64, (3,), "start_mm"), frozen(goal_mm, np.float64, (3,), "goal_mm")])
+        turns = Rotation.from_quat([unit_quaternion(start_xyzw, "start_xyzw"), unit_quaternion(goal_xyzw, "goal_xyzw")])
+        tips = np.stack([laid_tip(tip, ends) for tip in self.tip_mm])
+        rotations = np.stack([laid_rotation(rotation, turns) for rotation in self.rotation_xyzw])
+        weights = self._weights(ends, turns)
+        jaws = np.zeros(tips.shape[:2]) if self.jaw_rad is None else self.jaw_rad
+        elapsed = np.linspace(0.0, 1.0, PHASES)
+        if len(tips) > 1:
+            mean = np.einsum("k,kpi->pi", weights, tips)
+            warps = np.stack([_warp(tip, mean) for tip in tips])
+            tips = np.stack([_at(tip, warp) for tip, warp in zip(tips, warps, strict=True)])
+            rotations = np.stack([_turn_at(one, warp) for one, warp in zip(rotations, warps, strict=True)])
+            jaws = np.stack([_at(jaw, warp) for jaw, warp in zip(jaws, warps, strict=True)])
+            elapsed = weights @ warps / (PHASES - 1)
+        tip_mm, rotation = np.einsum("k,kpi->pi", weights, tips), mean_rotation(rotations, weights)
+        off_mm = np.linalg.norm(tips - tip_mm, axis=2)
+        dots = np.abs(np.einsum("kpi,pi->kp", rotations, rotation)).clip(0.0, 1.0)
+        spread_mm, spread_rad = (np.sqrt(weights @ apart**2) for apart in (off_mm, 2 * np.arccos(dots)))
+        # The phase of the result is the share of its own time again: the mean tempo of the demonstrations.
+        again = np.interp(np.linspace(0.0, 1.0, PHASES), elapsed, np.arange(PHASES))
+        return PosePath(
+            _at(tip_mm, again),
+            same_signs(_turn_at(rotation, again)),
+            np.linspace(0.0, 1.0, PHASES) * float(weights @ self.duration_s),
+            None if self.jaw_rad is None else _at(weights @ jaws, again),
+            _at(spread_mm, again),
+            _at(spread_rad, again),
+        )
+
+    def _weights(self, ends: Floats, turns: Rotation) -> Floats:
+        """Return the weight of each demonstration between two poses, (K,), with sum 1.
+
+        Situations differ by the vector from start to goal and by the start's position, both in units of the mean
+        distance from start to goal, and by the orientations of start and goal in rad. The weight is 1 / (1 + d^2 / n),
+        where d is the distance to this situation, and n the median of each demonstration's d^2 to its nearest other.
+        """
+        if len(self.tip_mm) == 1:
+            return np.ones(1)
+        shown = [
+            _Situation(tip[[0, -1]], Rotation.from_quat(rotation[[0, -1]]))
+            for tip, rotation in zip(self.tip_mm, self.rotation_xyzw, strict=True)
+        ]
+        length = float(np.mean([np.linalg.norm(one.ends[1] - one.ends[0]) for one in shown]))
+        length = max(length, np.finfo(float).tiny)
+        among = np.array([[one.apart(other, length) for other in shown] for one in shown])
+        np.fill_diagonal(among, np.inf)
+        usual = max(float(np.median(among.min(axis=1))), LIKE_FLOOR)
+        here = _Situation(ends, turns)
+        weights = 1.0 / (1.0 + np.array([one.apart(here, length) for one in shown]) / usual)
+        return np.asarray(weights / weights.sum())
+
+
+@dataclass(frozen=True, eq=False)
+class _Situation:
+    """Start and goal of a motion: positions (2, 3) and orientations."""
+
+    ends: Floats
+    turns: Rotation
+
+    def apart(self, other: "_Situation", length_mm: float) -> float:
+        """Return the squared distance of two situations."""
+        line = (self.ends[1] - self.ends[0]) - (other.ends[1] - other.ends[0])
+        moved = np.concatenate([line, self.ends[0] - other.ends[0]]) / length_mm
+        turned = (self.turns.inv() * other.turns).magnitude()
+        return float(moved @ moved + turned @ turned)
+
+
+def learn_pose_style(demos: Sequence[Demo]) -> PoseStyle:
+    """Learn a pose style from demonstrations of one surgeon and suture type.
+
+    Args:
+        demos: At least one, all in one frame and with orientation.
+
+    Returns:
+        The style.
+
+    Raises:
+        BadInput: There is no demonstration, or one has no orientation.
+        MixedFrames: They are in different frames.
+    """
+    if not demos:
+        raise BadInput("A pose style needs at least one demonstration.")
+    frames = sorted({demo.frame for demo in demos})
+    if len(frames) > 1:
+        raise MixedFrames(f"The demonstrations are in the frames {', '.join(frames)}; choose those in one frame.")
+    phases = np.linspace(0.0, 1.0, PHASES)
+    rotations, jaws = [], []
+    for demo in demos:
+        if demo.rotation_xyzw is None:
+            raise BadInput(
+                f"The demonstration of {demo.arm} at {demo.start_s:g} s has no orientation, which a pose style needs; "
+                "leave it out."
+            )
+        seconds = phases * demo.stamps_s[-1]
+        rotations.append(_turn_at(demo.rotation_xyzw, np.interp(seconds, demo.stamps_s, np.arange(len(demo.stamps_s)))))
+        if demo.jaw_rad is not None:
+            jaws.append(np.interp(seconds, demo.stamps_s, demo.jaw_rad))
+    tips = [
+        np.stack([np.interp(phases * demo.stamps_s[-1], demo.stamps_s, axis) for axis in demo.tip_mm.T], axis=1)
+        for demo in demos
+    ]
+    return PoseStyle(
+        frames[0],
+        np.stack(tips),
+        np.stack(rotations),
+        np.array([demo.stamps_s[-1] for demo in demos]),
+        np.stack(jaws) if len(jaws) == len(demos) else None,
+    )
+
+
+def unit_quaternion(values: ArrayLike, name: str) -> Floats:
+    """Return a unit quaternion x, y, z, w, shape (4,).
+
+    Raises:
+        BadInput: It has another shape, or its length is not 1.
+    """
+    quaternion = frozen(values, np.float64, (4,), name)
+    if not abs(float(np.linalg.norm(quaternion)) - 1.0) <= 1e-3:
+        raise BadInput(f"{name} must be a unit quaternion x, y, z, w; it has length {np.linalg.norm(quaternion):g}.")
+    return quaternion
+
+
+def _blend() -> Floats:
+    """Return the share of the goal's correction at each phase, (PHASES,): a smoothstep."""
+    phase = np.linspace(0.0, 1.0, PHASES)
+    return np.asarray(phase * phase * (3.0 - 2.0 * phase))
+
+
+def laid_tip(tip_mm: Floats, ends_mm: Floats) -> Floats:
+    """Return positions laid between two ends."""
+    share = _blend()[:, None]
+    return np.asarray(tip_mm + (1.0 - share) * (ends_mm[0] - tip_mm[0]) + share * (ends_mm[1] - tip_mm[-1]))
+
+
+def laid_rotation(rotation_xyzw: Floats, ends: Rotation) -> Floats:
+    """Return orientations laid between two ends."""
+    rotations = Rotation.from_quat(rotation_xyzw)
+    first, last = ends[0] * rotations[0].inv(), ends[1] * rotations[-1].inv()
+    over = (last * first.inv()).as_rotvec()
+    return np.asarray((Rotation.from_rotvec(_blend()[:, None] * over) * first * rotations).as_quat())
+
+
+def _warp(tip_mm: Floats, mean_mm: Floats) -> Floats:
+    """Return the place in a motion, an index with fraction, that corresponds to each phase of the mean, (PHASES,)."""
+    pairs = dtw(mean_mm, tip_mm).pairs
+    places = np.bincount(pairs[:, 0], pairs[:, 1]) / np.bincount(pairs[:, 0])
+    smooth = np.maximum.accumulate(gaussian_filter1d(places, WARP_SMOOTHING, mode="nearest"))
+    smooth[0], smooth[-1] = 0.0, PHASES - 1.0
+    return np.asarray(smooth)
+
+
+def _at(values: Floats, places: Floats) -> Floats:
+    """Return values at places, indices with fractions."""
+    before = np.minimum(places.astype(np.int64), len(values) - 2)
+    share = (places - before).reshape(-1, *(1,) * (values.ndim - 1))
+    return np.asarray((1.0 - share) * values[before] + share * values[before + 1])
+
+
+def _turn_at(rotation_xyzw: Floats, places: Floats) -> Floats:
+    """Return orientations at places, along the shorter way between two neighbours."""
+    return np.asarray(Slerp(np.arange(len(rotation_xyzw)), Rotation.from_quat(rotation_xyzw))(places).as_quat())
+
+
+def mean_rotation(rotation_xyzw: Floats, weights: Floats) -> Floats:
+    """Return the weighted mean orientation at each phase, (PHASES, 4), from (K, PHASES, 4)."""
+    outer = np.einsum("k,kpi,kpj->pij", weights, rotation_xyzw, rotation_xyzw)
+    return np.asarray(np.linalg.eigh(outer)[1][:, :, -1])

@@ -1,0 +1,262 @@
+"""Pose styles on hands left out: ours beside a straight line, the medoid, and movement primitives of libraries.
+
+`SKILLS_TEST_BENCHMARKS` names the folder of the public pose data: CLFD, three tasks of nine demonstrations, and 50
+needle regrasps of SurgicAI in a simulator, in its scaled units. One demonstration after the other is left out; its start
+and goal pose are given to all alike. Position: mean Euclidean distance along the DTW alignment; orientation: mean angle
+at equal phase. DMP and ProMP are those of movement_primitives, the mixtures of GMR and TP-GMM those of scikit-learn.
+All but the straight line, the DMP and TP-GMM's positions learn from the demonstrations laid between start and goal.
+"""
+
+import os
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+
+import numpy as np
+from movement_primitives.dmp import CartesianDMP
+from movement_primitives.promp import ProMP
+from rich.table import Table
+from scipy.spatial.transform import Rotation, Slerp
+from sklearn.mixture import GaussianMixture
+
+from skills.arrays import Floats
+from skills.demonstration.demonstration import Demo
+from skills.learning.evaluation import dtw
+from skills.learning.pose_style import PHASES, PoseStyle, laid_rotation, laid_tip, learn_pose_style, mean_rotation
+from tests.bench.timing import best_s
+
+Poses = tuple[Floats, Floats]  # positions, (PHASES, 3), and unit quaternions, (PHASES, 4)
+Method = Callable[[list[Poses], Poses, Poses], Poses]  # demonstrations, their medoid, start and goal pose: a motion
+PHASE = np.linspace(0.0, 1.0, PHASES)
+
+
+def motions() -> dict[str, list[Poses]]:
+    """Return the demonstrations of each set, resampled in time: CLFD in cm, SurgicAI in its own units."""
+    folder = Path(os.environ["SKILLS_TEST_BENCHMARKS"])
+    found = {}
+    for name in ("bottle2shelf", "openbox", "platestandingtolying"):
+        poses = np.load(folder / f"clfd_{name}.npy").astype(np.float64)
+        found[name] = [_resampled(one[:, :3], Rotation.from_quat(one[:, [4, 5, 6, 3]])) for one in poses]
+    with np.load(folder / "surgicai_regrasp.npz") as archive:
+        episode, pose = archive["episode"], archive["observation"][:, :6].astype(np.float64)
+    found["regrasp"] = [
+        _resampled(pose[episode == one, :3], Rotation.from_euler("xyz", pose[episode == one, 3:]))
+        for one in np.unique(episode)
+    ]
+    return found
+
+
+def _resampled(tip: Floats, rotation: Rotation) -> Poses:
+    at, places = np.linspace(0.0, 1.0, len(tip)), PHASE
+    position = np.stack([np.interp(places, at, axis) for axis in tip.T], axis=1)
+    return position, Slerp(at, rotation)(places).as_quat()
+
+
+def demo_of(poses: Poses) -> Demo:
+    """Return poses as a demonstration of ten seconds."""
+    tip, rotation = poses
+    return Demo("PSM1", "table", "world", 0.0, 10.0, 10.0 * PHASE, tip, rotation)
+
+
+def errors(motion: Poses, shown: Poses) -> tuple[float, float]:
+    """Return the mean distance along the DTW alignment, and the mean angle at equal phase in degrees."""
+    pairs = dtw(motion[0], shown[0]).pairs
+    apart = np.linalg.norm(motion[0][pairs[:, 0]] - shown[0][pairs[:, 1]], axis=1)
+    turned = (Rotation.from_quat(motion[1]).inv() * Rotation.from_quat(shown[1])).magnitude()
+    return float(apart.mean()), float(np.degrees(turned.mean()))
+
+
+# ---- methods ---------------------------------------------------------------------------------------------------------
+
+
+def style_of(shown: list[Poses]) -> PoseStyle:
+    """Return the pose style of demonstrations."""
+    return learn_pose_style([demo_of(one) for one in shown])
+
+
+def ours(shown: list[Poses], middle: Poses, ends: Poses) -> Poses:
+    """Ours."""
+    path = style_of(shown).between(ends[0][0], ends[1][0], ends[0][-1], ends[1][-1])
+    return path.tip_mm, path.rotation_xyzw
+
+
+def alone(shown: list[Poses], middle: Poses, ends: Poses) -> Poses:
+    """Ours, from the first demonstration alone."""
+    return ours(shown[:1], middle, ends)
+
+
+def straight(ends: Poses) -> Poses:
+    """Return a straight line at constant speed, with slerp."""
+    tip = ends[0][0] + PHASE[:, None] * (ends[0][-1] - ends[0][0])
+    return tip, Slerp([0, 1], Rotation.from_quat(ends[1][[0, -1]]))(PHASE).as_quat()
+
+
+def line(shown: list[Poses], middle: Poses, ends: Poses) -> Poses:
+    """A straight line."""
+    return straight(ends)
+
+
+def medoid(shown: list[Poses], middle: Poses, ends: Poses) -> Poses:
+    """The demonstration that is nearest to all others, where it was shown."""
+    return middle
+
+
+def laid(one: Poses, ends: Poses) -> Poses:
+    """Return a demonstration laid between start and goal, as in `skills.learning.pose_style`."""
+    return laid_tip(one[0], ends[0][[0, -1]]), laid_rotation(one[1], Rotation.from_quat(ends[1][[0, -1]]))
+
+
+def laid_medoid(shown: list[Poses], middle: Poses, ends: Poses) -> Poses:
+    """The medoid, laid."""
+    return laid(middle, ends)
+
+
+def mean(shown: list[Poses], middle: Poses, ends: Poses) -> Poses:
+    """The mean at equal phase of all, laid."""
+    tips, rotations = (np.stack(part) for part in zip(*(laid(one, ends) for one in shown), strict=True))
+    return tips.mean(axis=0), mean_rotation(rotations, np.full(len(tips), 1 / len(tips)))
+
+
+def dmp(shown: list[Poses], middle: Poses, ends: Poses) -> Poses:
+    """A dynamic movement primitive of the medoid, with its start and goal replaced."""
+    primitive = CartesianDMP(execution_time=1.0, dt=1 / (PHASES - 1), n_weights_per_dim=30)
+    tip, rotation = middle
+    primitive.imitate(PHASE, np.hstack([tip, rotation[:, [3, 0, 1, 2]]]))
+    first, last = (np.concatenate([ends[0][k], ends[1][k][[3, 0, 1, 2]]]) for k in (0, -1))
+    primitive.configure(start_y=first, goal_y=last)
+    _, made = primitive.open_loop(run_t=1.0)
+    return _resampled(made[:, :3], Rotation.from_quat(made[:, [4, 5, 6, 3]]))
+
+
+def _residuals(shown: list[Poses], ends: Poses) -> tuple[Floats, Poses]:
+    """Return the laid demonstrations as offsets and rotation vectors about the straight line, (K, PHASES, 6)."""
+    base = straight(ends)
+    turn = Rotation.from_quat(base[1]).inv()
+    found = [laid(one, ends) for one in shown]
+    return np.stack([np.hstack([p - base[0], (turn * Rotation.from_quat(q)).as_rotvec()]) for p, q in found]), base
+
+
+def _added(base: Poses, residual: Floats) -> Poses:
+    turned = Rotation.from_quat(base[1]) * Rotation.from_rotvec(residual[:, 3:])
+    return base[0] + residual[:, :3], turned.as_quat()
+
+
+def promp(shown: list[Poses], middle: Poses, ends: Poses) -> Poses:
+    """A probabilistic movement primitive of all, laid, with ridge weights; its mean, since all begin and end alike."""
+    values, base = _residuals(shown, ends)
+    primitive = ProMP(n_dims=6, n_weights_per_dim=25)
+    weights = np.stack([primitive.weights(PHASE, one, lmbda=1e-6).ravel() for one in values])
+    primitive.from_weight_distribution(weights.mean(axis=0), np.cov(weights.T))
+    return _added(base, primitive.mean_trajectory(PHASE))
+
+
+def _given(mixture: GaussianMixture, known: Floats, outputs: slice) -> tuple[Floats, Floats]:
+    """Return mean (T, D) and covariance (T, D, D) of the outputs of a mixture, given its first variable."""
+    means, covariances = mixture.means_, mixture.covariances_
+    chance = mixture.weights_ * np.exp(-0.5 * (known[:, None] - means[:, 0]) ** 2 / covariances[:, 0, 0])
+    chance /= np.sqrt(covariances[:, 0, 0])
+    chance /= chance.sum(axis=1, keepdims=True)
+    slope = covariances[:, outputs, 0] / covariances[:, 0, 0][:, None]
+    centres = means[:, outputs] + (known[:, None, None] - means[:, 0, None]) * slope
+    rest = covariances[:, outputs, outputs] - slope[:, :, None] * covariances[:, 0, outputs][:, None, :]
+    middle = np.einsum("tk,tkd->td", chance, centres)
+    off = centres - middle[:, None]
+    return middle, np.einsum("tk,kde->tde", chance, rest) + np.einsum("tk,tkd,tke->tde", chance, off, off)
+
+
+def _mixture(data: Floats) -> GaussianMixture:
+    found = GaussianMixture(8, random_state=0, reg_covar=1e-4, n_init=2)
+    # Begun at equal parts of the phase, as is usual for trajectories: k-means mixes beginning and end.
+    part = np.minimum((data[:, 0] * 8).astype(int), 7)
+    found.means_init = np.stack([data[part == k].mean(axis=0) for k in range(8)])
+    return found.fit(data)
+
+
+def gmr(shown: list[Poses], middle: Poses, ends: Poses) -> Poses:
+    """Gaussian mixture regression on the phase, of all, laid."""
+    values, base = _residuals(shown, ends)
+    scale = values.reshape(-1, 6).std(axis=0) + 1e-9
+    data = np.hstack([np.tile(PHASE, len(values))[:, None], (values / scale).reshape(-1, 6)])
+    return _added(base, _given(_mixture(data), PHASE, slice(1, 7))[0] * scale)
+
+
+def tp_gmm(shown: list[Poses], middle: Poses, ends: Poses) -> Poses:
+    """A mixture in the frames of start and goal, whose product at new frames is the motion; orientations as `gmr`."""
+
+    def frames(one: Poses) -> tuple[Rotation, Floats]:
+        return Rotation.from_quat(one[1][[0, -1]]), one[0][[0, -1]]
+
+    scale = float(np.mean([one[0].std() for one in shown]))
+    columns = []
+    for one in shown:
+        turns, places = frames(one)
+        columns.append(np.hstack([turns[k].inv().apply(one[0] - places[k]) / scale for k in (0, 1)]))
+    data = np.hstack([np.tile(PHASE, len(shown))[:, None], np.concatenate(columns)])
+    middle, spread = _given(_mixture(data), PHASE, slice(1, 7))
+    turns, places = frames(ends)
+    total, weighted = np.zeros((PHASES, 3, 3)), np.zeros((PHASES, 3))
+    for k in (0, 1):
+        part, turn = slice(3 * k, 3 * k + 3), turns[k].as_matrix()
+        precision = np.linalg.inv(turn @ spread[:, part, part] @ turn.T + 1e-6 * np.eye(3))
+        total += precision
+        weighted += np.einsum("tij,tj->ti", precision, turns[k].apply(middle[:, part]) * scale + places[k])
+    return np.linalg.solve(total, weighted[:, :, None])[:, :, 0], gmr(shown, middle, ends)[1]
+
+
+METHODS: dict[str, Method] = {
+    "ours": ours,
+    "ours from one": alone,
+    "straight line": line,
+    "medoid": medoid,
+    "laid medoid": laid_medoid,
+    "mean by phase, laid": mean,
+    "DMP": dmp,
+    "ProMP": promp,
+    "GMR": gmr,
+    "TP-GMM": tp_gmm,
+}
+
+
+def left_out(shown: list[Poses], methods: Iterable[Method]) -> Iterator[Floats]:
+    """Yield the errors of each method with one demonstration after the other left out, (demonstrations, 2)."""
+    apart = np.array([[0.0 if one is other else errors(one, other)[0] for other in shown] for one in shown])
+    for made in methods:
+        found = []
+        for k, (tip, rotation) in enumerate(shown):
+            rest = [one for i, one in enumerate(shown) if i != k]
+            middle = rest[int(np.argmin(np.delete(np.delete(apart, k, 0), k, 1).sum(axis=1)))]
+            found.append(errors(made(rest, middle, (tip[[0, -1]], rotation[[0, -1]])), shown[k]))
+        yield np.array(found)
+
+
+def interval(differences: Floats, seed: int = 0) -> tuple[float, float]:
+    """Return the 95 % interval of a mean of paired differences, by bootstrap."""
+    rng = np.random.default_rng(seed)
+    means = rng.choice(differences, (10_000, len(differences))).mean(axis=1)
+    return float(np.quantile(means, 0.025)), float(np.quantile(means, 0.975))
+
+
+def pose_styles(table: Table) -> None:
+    """Add the errors of all methods on the demonstrations left out, and the time of learning."""
+    sets = motions()
+    found = {name: dict(zip(METHODS, left_out(shown, METHODS.values()), strict=True)) for name, shown in sets.items()}
+    for name, errs in found.items():
+        for method, one in errs.items():
+            mm = 1.0 if name == "regrasp" else 10.0
+            position, turn = one.mean(axis=0) * (mm, 1.0)
+            table.add_row(
+                f"{name}, left out: {method}", f"{position:.3g} {'units' if mm == 1 else 'mm'}", f"{turn:.2f} degrees"
+            )
+    together = {method: np.concatenate([found[name][method] for name in list(sets)[:3]]) for method in METHODS}
+    for method, one in together.items():
+        less = (together["ours"] - one) / one.mean(axis=0)
+        shares = [
+            f"{100 * d.mean():+.1f} % ({100 * low:+.1f} to {100 * high:+.1f})"
+            for d in less.T
+            for low, high in [interval(d)]
+        ]
+        table.add_row(f"CLFD together: ours against {method}", f"position {shares[0]}", f"orientation {shares[1]}")
+    shown = [demo_of(one) for one in sets["openbox"]]
+    ends = (shown[0].tip_mm[0], sets["openbox"][0][1][0], shown[0].tip_mm[-1], sets["openbox"][0][1][-1])
+    style = learn_pose_style(shown)
+    table.add_row("nine demonstrations: learn", f"{1000 * best_s(lambda: learn_pose_style(shown)):.1f} ms", "")
+    table.add_row("nine demonstrations: a motion", f"{1000 * best_s(lambda: style.between(*ends)):.1f} ms", "")

@@ -1,0 +1,137 @@
+"""Pose styles: hand-worked cases, a second method for rotations, and hands left out of public data."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from skills.demonstration.demonstration import Demo
+from skills.errors import BadInput, MixedFrames
+from skills.learning.pose_style import PHASES, learn_pose_style, mean_rotation
+from tests.bench.pose_styles import laid_medoid, left_out, line, motions, ours
+
+
+def a_demo(seed: int = 0, *, at_mm: tuple[float, float, float] = (0.0, 0.0, -120.0), samples: int = 240) -> Demo:
+    """Return an arc of 40 mm with a turn of 60 degrees about an axis of its own, in 4 s."""
+    rng = np.random.default_rng(seed)
+    share = np.linspace(0.0, 1.0, samples)
+    tip = np.stack([40 * share, 8 * np.sin(np.pi * share), 5 * np.sin(2 * np.pi * share)], axis=1) + at_mm
+    axis = rng.normal(size=3)
+    turned = Rotation.from_rotvec(np.radians(60) * share[:, None] * axis / np.linalg.norm(axis))
+    return Demo(
+        "PSM2",
+        "/PSM2/local/measured_cp",
+        "PSM2_base",
+        0.0,
+        4.0,
+        4 * share,
+        tip + rng.normal(size=(1, 3)),
+        (turned * Rotation.from_euler("xyz", rng.normal(size=3))).as_quat(),
+        0.5 + 0.3 * share,
+    )
+
+
+def poses(seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return a random pose: a position in mm and a quaternion."""
+    rng = np.random.default_rng(seed)
+    return rng.normal(scale=30.0, size=3), Rotation.random(rng=rng).as_quat()
+
+
+def angle(one: np.ndarray, other: np.ndarray) -> float:
+    """Return the largest angle between orientations, in rad."""
+    return float(np.max((Rotation.from_quat(one).inv() * Rotation.from_quat(other)).magnitude()))
+
+
+def test_one_demonstration_between_its_own_ends_is_itself() -> None:
+    demo = a_demo(samples=PHASES)
+    assert demo.rotation_xyzw is not None and demo.jaw_rad is not None
+    ends = (demo.tip_mm[0], demo.rotation_xyzw[0], demo.tip_mm[-1], demo.rotation_xyzw[-1])
+    path = learn_pose_style([demo]).between(*ends)
+    assert np.abs(path.tip_mm - demo.tip_mm).max() < 1e-9
+    assert angle(path.rotation_xyzw, demo.rotation_xyzw) < 1e-7
+    assert path.jaw_rad is not None and np.abs(path.jaw_rad - demo.jaw_rad).max() < 1e-9
+    assert np.abs(path.elapsed_s - demo.stamps_s).max() < 1e-9
+    assert path.spread_mm.max() == 0.0 and path.spread_rad.max() < 1e-7
+
+
+@given(st.integers(0, 10_000), st.integers(1, 4))
+def test_a_motion_begins_and_ends_in_the_poses_asked_for(seed: int, count: int) -> None:
+    style = learn_pose_style([a_demo(one) for one in range(count)])
+    start, goal = poses(seed), poses(seed + 1)
+    path = style.between(*start, *goal)
+    assert np.abs(path.tip_mm[[0, -1]] - [start[0], goal[0]]).max() < 1e-9
+    assert angle(path.rotation_xyzw[[0, -1]], np.stack([start[1], goal[1]])) < 1e-6
+    assert np.abs(np.linalg.norm(path.rotation_xyzw, axis=1) - 1).max() < 1e-12
+    assert (np.diff(path.elapsed_s) > 0).all()
+
+
+def test_a_style_moved_as_a_whole_keeps_its_motion() -> None:
+    demo = a_demo()
+    assert demo.rotation_xyzw is not None
+    away = np.array([7.0, -3.0, 11.0])
+    style = learn_pose_style([demo])
+    here = style.between(demo.tip_mm[0], demo.rotation_xyzw[0], demo.tip_mm[-1], demo.rotation_xyzw[-1])
+    there = style.between(demo.tip_mm[0] + away, demo.rotation_xyzw[0], demo.tip_mm[-1] + away, demo.rotation_xyzw[-1])
+    assert np.abs(there.tip_mm - here.tip_mm - away).max() < 1e-9
+    assert angle(there.rotation_xyzw, here.rotation_xyzw) < 1e-7
+
+
+def test_a_turn_of_60_degrees_is_kept() -> None:
+    demo = a_demo()
+    assert demo.rotation_xyzw is not None
+    path = learn_pose_style([demo]).between(
+        demo.tip_mm[0], demo.rotation_xyzw[0], demo.tip_mm[-1], demo.rotation_xyzw[-1]
+    )
+    assert angle(path.rotation_xyzw[:1], path.rotation_xyzw[-1:]) == pytest.approx(np.radians(60), abs=1e-6)
+
+
+def test_the_demonstration_of_this_situation_counts_most() -> None:
+    shown = [a_demo(0), replace(a_demo(0), tip_mm=a_demo(0).tip_mm * (1, 4, 1)), a_demo(3, at_mm=(60.0, 40.0, -90.0))]
+    for demo in (shown[0], shown[2]):
+        assert demo.rotation_xyzw is not None
+        path = learn_pose_style(shown).between(
+            demo.tip_mm[0], demo.rotation_xyzw[0], demo.tip_mm[-1], demo.rotation_xyzw[-1]
+        )
+        assert path.spread_mm.max() > 0.0
+        nearest = [np.abs(path.tip_mm - one.tip_mm[:: len(one.tip_mm) // PHASES][:PHASES]).mean() for one in shown]
+        assert nearest[2] == min(nearest) if demo is shown[2] else nearest[2] == max(nearest)
+
+
+def test_the_mean_orientation_is_that_of_a_library() -> None:
+    rng = np.random.default_rng(0)
+    rotations = np.stack([Rotation.random(5, rng=rng).as_quat() for _ in range(PHASES)], axis=1)
+    weights = rng.random(5)
+    theirs = np.stack([Rotation.from_quat(rotations[:, k]).mean(weights).as_quat() for k in range(PHASES)])
+    assert angle(mean_rotation(rotations, weights / weights.sum()), theirs) < 1e-6
+
+
+def test_demonstrations_that_make_no_style_are_refused() -> None:
+    with pytest.raises(BadInput, match="at least one"):
+        learn_pose_style([])
+    with pytest.raises(BadInput, match="no orientation"):
+        learn_pose_style([a_demo(), replace(a_demo(), rotation_xyzw=None)])
+    with pytest.raises(MixedFrames):
+        learn_pose_style([a_demo(), replace(a_demo(), frame="ECM")])
+    with pytest.raises(BadInput):
+        learn_pose_style([a_demo()]).between((0, 0, np.nan), (0, 0, 0, 1), (0, 0, 0), (0, 0, 0, 1))
+    with pytest.raises(BadInput, match="unit quaternion"):
+        learn_pose_style([a_demo()]).between((0, 0, 0), (0, 0, 0, 1.1), (0, 0, 0), (0, 0, 0, 1))
+
+
+def test_the_jaw_is_left_out_unless_all_have_it() -> None:
+    demo = a_demo()
+    assert demo.rotation_xyzw is not None
+    style = learn_pose_style([demo, replace(demo, jaw_rad=None)])
+    assert style.jaw_rad is None
+    assert style.between(*poses(1), *poses(2)).jaw_rad is None
+
+
+@pytest.mark.needs("benchmarks")
+@pytest.mark.parametrize("name", ["bottle2shelf", "openbox", "platestandingtolying", "regrasp"])
+def test_hands_left_out_are_nearer_to_ours_than_to_the_trivial_rivals(name: str) -> None:
+    shown = motions()[name][:12]
+    mine, laid, straight = (one.mean(axis=0) for one in left_out(shown, (ours, laid_medoid, line)))
+    assert (mine < laid).all() and (mine < straight).all()

@@ -1,0 +1,184 @@
+"""The tube around a pose path: runs that try to leave it, defects of the update, and a replay by the clock."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation, Slerp
+
+from skills.errors import BadInput, BadSettings
+from skills.learning.pose_style import PHASES, PosePath
+from skills.learning.tube import Hands, TubeLimits, advance, certify_tube, next_pose
+
+LIMITS = TubeLimits(step_mm=6.0, step_rad=0.2, disturbance_mm=1.0, disturbance_rad=0.02, start_mm=20.0, start_rad=0.5)
+
+
+def a_path(turn_deg: float = 60.0) -> PosePath:
+    """Return a hand-off of 60 mm with a turn, fast in the middle."""
+    phase = np.linspace(0.0, 1.0, PHASES)
+    share = phase * phase * (3 - 2 * phase)
+    tip = np.stack([60 * share, 12 * np.sin(np.pi * share), -120 - 8 * np.sin(2 * np.pi * share)], axis=1)
+    turned = Slerp([0, 1], Rotation.from_euler("xyz", [(10, 20, 30), (10 + turn_deg, 20, 30)], degrees=True))(share)
+    nothing = np.zeros(PHASES)
+    return PosePath(tip, turned.as_quat(), 4 * phase, nothing, nothing, nothing)
+
+
+def unit(rng: np.random.Generator, count: int) -> np.ndarray:
+    """Return directions, (count, 3)."""
+    directions = rng.normal(size=(count, 3))
+    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+def excursions(path: PosePath, limits: TubeLimits, runs: int, seed: int) -> tuple[float, float, int]:
+    """Follow a path from starts on the edge, disturbed each tick; a third of the runs always away from the path.
+
+    Returns:
+        The largest distance from the pose of the phase, in mm and in rad, and the ticks until all have arrived.
+    """
+    rng = np.random.default_rng(seed)
+    poses = Rotation.from_quat(path.rotation_xyzw)
+    phases = rng.integers(0, PHASES, runs)
+    tip = path.tip_mm[phases] + limits.start_mm * unit(rng, runs)
+    rotation = poses[phases] * Rotation.from_rotvec(limits.start_rad * unit(rng, runs))
+    hands, furthest = Hands(tip, rotation.as_quat(), phases), np.array([limits.start_mm, limits.start_rad])
+    hostile, tick = np.arange(runs) % 3 == 0, 0
+    while (hands.phases < PHASES - 1).any():
+        tick += 1
+        assert tick < 1000, "the runs do not arrive"
+        sent = advance(path, hands, limits)
+        away = sent.tip_mm - path.tip_mm[sent.phases]
+        far = np.linalg.norm(away, axis=1, keepdims=True)
+        push = np.where(hostile[:, None] & (far > 1e-9), away / np.maximum(far, 1e-12), unit(rng, runs))
+        size = np.where(hostile, 1.0, rng.random(runs))[:, None]
+        twist = (poses[sent.phases].inv() * sent.rotations).as_rotvec()
+        angle = np.linalg.norm(twist, axis=1, keepdims=True)
+        spin = np.where(hostile[:, None] & (angle > 1e-9), twist / np.maximum(angle, 1e-12), unit(rng, runs))
+        reached = sent.rotations * Rotation.from_rotvec(limits.disturbance_rad * size * spin)
+        hands = Hands(sent.tip_mm + limits.disturbance_mm * size * push, reached.as_quat(), sent.phases)
+        off_rad = (hands.rotations.inv() * poses[hands.phases]).magnitude().max()
+        off_mm = np.linalg.norm(hands.tip_mm - path.tip_mm[hands.phases], axis=1).max()
+        furthest = np.maximum(furthest, [off_mm, off_rad])
+    return float(furthest[0]), float(furthest[1]), tick
+
+
+def held_in_the_tube(runs: int, seed: int) -> None:
+    """Compare runs with the certificate."""
+    for limits in (LIMITS, replace(LIMITS, ahead=3), replace(LIMITS, start_mm=0.0, start_rad=0.0)):
+        path = a_path()
+        proven = certify_tube(path, limits)
+        assert proven.holds, proven.faults
+        off_mm, off_rad, ticks = excursions(path, limits, runs, seed)
+        assert off_mm <= proven.radius_mm + 1e-9 and off_rad <= proven.radius_rad + 1e-9
+        assert ticks <= proven.ticks
+        assert proven.radius_mm <= 2 * off_mm and proven.radius_rad <= 2 * off_rad
+
+
+def test_no_run_leaves_the_tube_and_all_arrive_in_time() -> None:
+    held_in_the_tube(3000, seed=1)
+
+
+@pytest.mark.nightly
+def test_a_million_runs_stay_in_the_tube() -> None:
+    for seed in range(100):
+        held_in_the_tube(10_000, seed)
+
+
+def too_long(path: PosePath, hands: Hands, limits: TubeLimits) -> Hands:
+    """Take steps a tenth too long."""
+    return advance(path, hands, replace(limits, step_mm=1.1 * limits.step_mm))
+
+
+def unnormalised(path: PosePath, hands: Hands, limits: TubeLimits) -> Hands:
+    """Return quaternions a thousandth too long."""
+    after = advance(path, hands, limits)
+    return replace(after, rotation_xyzw=1.001 * after.rotation_xyzw)
+
+
+def by_the_clock(path: PosePath, hands: Hands, limits: TubeLimits) -> Hands:
+    """Advance the phase in each tick, wherever the hand is, and make a step towards its pose."""
+    later = np.minimum(hands.phases + 1, len(path.tip_mm) - 1)
+    return replace(advance(path, replace(hands, phases=later), replace(limits, ahead=1)), phases=later)
+
+
+def jumping(path: PosePath, hands: Hands, limits: TubeLimits) -> Hands:
+    """Skip a phase at one place."""
+    after = advance(path, hands, limits)
+    return replace(after, phases=np.where(after.phases == 50, 52, after.phases))
+
+
+def backwards(path: PosePath, hands: Hands, limits: TubeLimits) -> Hands:
+    """Fall back at one place."""
+    after = advance(path, hands, limits)
+    return replace(after, phases=np.where(after.phases == 70, 60, after.phases))
+
+
+def lazy(path: PosePath, hands: Hands, limits: TubeLimits) -> Hands:
+    """Make only half of each step."""
+    return advance(path, hands, replace(limits, step_mm=limits.step_mm / 2))
+
+
+@pytest.mark.parametrize(
+    ("update", "fault"),
+    [
+        (too_long, "A step is longer"),
+        (unnormalised, "not a unit quaternion"),
+        (by_the_clock, "advances to a position that is not reached"),
+        (jumping, "The phase advances by more"),
+        (backwards, "goes back"),
+        (lazy, "does not come nearer to the position"),
+    ],
+)
+def test_a_defect_of_the_update_fails_the_certificate(update, fault: str) -> None:  # type: ignore[no-untyped-def]
+    found = certify_tube(a_path(), LIMITS, update)
+    assert not found.holds and any(fault in one for one in found.faults), found.faults
+
+
+def test_a_step_shorter_than_move_and_disturbance_is_named() -> None:
+    path = a_path()
+    quick = float(np.linalg.norm(np.diff(path.tip_mm, axis=0), axis=1).max())
+    assert certify_tube(path, replace(LIMITS, step_mm=1.0 + 1.001 * quick)).holds
+    short = certify_tube(path, replace(LIMITS, step_mm=1.0 + 0.999 * quick))
+    assert not short.holds and "is not as long as the disturbance of 1 mm" in short.faults[0]
+
+
+def test_a_replay_by_the_clock_leaves_the_tube() -> None:
+    path, limits = a_path(), LIMITS
+    tip, phase, worst = path.tip_mm[0] + (0.0, 0.0, 15.0), 0, 0.0
+    held = Hands(tip[None], path.rotation_xyzw[:1], np.array([phase]))
+    for tick in range(PHASES - 1):
+        if 30 <= tick < 60:  # something holds the hand
+            held = replace(held, phases=np.minimum(held.phases + 1, PHASES - 1))
+        else:
+            held = by_the_clock(path, held, limits)
+        worst = max(worst, float(np.linalg.norm(held.tip_mm - path.tip_mm[held.phases], axis=1)[0]))
+    assert worst > certify_tube(path, limits).radius_mm
+
+
+def test_a_hand_that_is_held_is_waited_for() -> None:
+    path = a_path()
+    held = path.tip_mm[20] + (0.0, 0.0, 12.0)
+    phase: int | None = 20
+    for _ in range(30):
+        tip, _, phase = next_pose(path, held, path.rotation_xyzw[20], phase, LIMITS)
+    assert phase == 20 and np.linalg.norm(tip - held) == pytest.approx(LIMITS.step_mm)
+
+
+def test_a_start_joins_at_the_nearest_pose_and_not_the_nearest_position() -> None:
+    path = a_path()
+    assert next_pose(path, path.tip_mm[30], path.rotation_xyzw[30], None, LIMITS)[2] == 31
+    turned = next_pose(path, path.tip_mm[30], path.rotation_xyzw[60], None, LIMITS)[2]
+    assert 30 < turned < 60
+
+
+def test_what_is_not_a_pose_or_a_phase_is_refused() -> None:
+    path = a_path()
+    with pytest.raises(BadInput):
+        next_pose(path, (0, 0, np.nan), (0, 0, 0, 1), None, LIMITS)
+    with pytest.raises(BadInput):
+        next_pose(path, (0, 0, 0), (0, 0, 0, 2), None, LIMITS)
+    with pytest.raises(BadSettings):
+        next_pose(path, (0, 0, 0), (0, 0, 0, 1), PHASES, LIMITS)
+    with pytest.raises(BadSettings):
+        TubeLimits(step_mm=1.0, disturbance_mm=1.0)
+    with pytest.raises(BadSettings):
+        TubeLimits(step_mm=float("nan"))
