@@ -43,8 +43,8 @@ from typing import BinaryIO, TextIO
 import numpy as np
 
 from skills.arrays import Floats, Ints
+from skills.demonstration.motion import COORDINATE_LIMIT_MM
 from skills.demonstration.recording import (
-    COORDINATE_LIMIT_MM,
     Column,
     Motion,
     Recording,

@@ -5,14 +5,8 @@ import io
 import numpy as np
 import pytest
 
-from skills.demonstration.recording import (
-    DROPPED_GAP_NS,
-    DROPPED_SHARE_LIMIT,
-    equal_samples,
-    recorded_joints,
-    recorded_motion,
-    recorded_signal,
-)
+from skills.demonstration.motion import DROPPED_GAP_NS, DROPPED_SHARE_LIMIT
+from skills.demonstration.recording import equal_samples, recorded_joints, recorded_motion, recorded_signal
 from skills.errors import BackwardStamps, NotFinite, NotMetres, RepeatedStamps
 from skills.formats import read_recording
 from skills.formats.reader_process import tell

@@ -11,6 +11,7 @@ from typing import IO, Any, BinaryIO
 import numpy as np
 import pytest
 
+from skills.demonstration import bases, motion
 from skills.demonstration import recording as values
 from skills.demonstration.identification import ArmIdentification, Identification
 from skills.demonstration.segments import Segment
@@ -68,7 +69,8 @@ def test_the_recording_is_the_same_to_the_last_bit(reader, data, how):
 
 
 def test_every_value_of_a_recording_may_come_back():
-    assert {v for v in vars(values).values() if is_dataclass(v) and v.__module__ == values.__name__} == {
+    rooms = {one.__name__: vars(one) for one in (values, motion, bases)}
+    assert {v for name, here in rooms.items() for v in here.values() if is_dataclass(v) and v.__module__ == name} == {
         *KNOWN.values()
     } - {Refusal, Told, Segment, ArmIdentification, Identification}
 
