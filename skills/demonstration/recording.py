@@ -13,7 +13,8 @@
 Motions, joints and signals are checked in their constructors (`skills.demonstration.motion`).
 """
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
 
@@ -117,6 +118,8 @@ class Recording:
         notes: Metadata of the file, name and value, such as the digest of the file that it was made from.
         left_out: Topics that were not usable, and the fault of each; no demonstration depends on any of them.
         columns: The columns of a table.
+        setpoints: Commanded poses of the tips of PSMs; nothing is learnt from them, and none is a motion.
+        jaw_setpoints: Arm and the commanded angle of its jaw in rad.
     """
 
     format: Format
@@ -136,6 +139,8 @@ class Recording:
     notes: tuple[tuple[str, str], ...] = ()
     left_out: tuple[tuple[str, str], ...] = ()
     columns: tuple[Column, ...] = ()
+    setpoints: tuple[Motion, ...] = ()
+    jaw_setpoints: tuple[tuple[str, Signal], ...] = ()
 
     def __post_init__(self) -> None:
         if not self.motions:
@@ -208,6 +213,28 @@ class Recording:
     def jaw_of(self, arm: str) -> Signal | None:
         """Return the jaw signal of an arm, or None if it was not recorded."""
         return dict(self.jaws).get(arm)
+
+    def setpoint_of(self, motion: Motion) -> Motion | None:
+        """Return the setpoints of a motion: of the same arm in the same frame; None if there are none.
+
+        Poses of one arm in its base and in another frame may name the same frame, so what their topics say of it must
+        be the same too.
+        """
+        place = motion.arm, motion.frame, motion.states_base
+        return next((one for one in self.setpoints if (one.arm, one.frame, one.states_base) == place), None)
+
+    def without_setpoints(self, faults: Mapping[str, str]) -> "Recording":
+        """Return it without the setpoints on some topics, and with the fault of each in `left_out`."""
+        return replace(
+            self,
+            setpoints=tuple(one for one in self.setpoints if one.topic not in faults),
+            jaw_setpoints=tuple((arm, one) for arm, one in self.jaw_setpoints if one.topic not in faults),
+            left_out=tuple((dict(self.left_out) | dict(faults)).items()),
+        )
+
+    def jaw_setpoint_of(self, arm: str) -> Signal | None:
+        """Return the setpoints of an arm's jaw, or None if they were not recorded."""
+        return dict(self.jaw_setpoints).get(arm)
 
     def motion_of(self, *, arm: str | None = None, topic: str | None = None) -> Motion:
         """Choose a motion by its topic, or else the arm's `local/measured_cp`, then `measured_cp`, then any other.

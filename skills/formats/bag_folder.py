@@ -37,7 +37,7 @@ from skills.demonstration.recording import (
     Topic,
     recorded_motion,
 )
-from skills.errors import MixedFrames, NoUsableTopic, UnknownFormat, UnreadableRecording
+from skills.errors import MixedFrames, NoUsableTopic, SkillsError, UnknownFormat, UnreadableRecording
 from skills.formats import jigsaws
 from skills.formats.annotations import read_labels
 from skills.formats.archive import Archive, refusing, shown
@@ -62,6 +62,19 @@ def join(parts: Sequence[Recording]) -> Recording:
     """
     if len(parts) == 1:
         return parts[0]
+    faults = {topic: why for part in parts for topic, why in part.left_out}  # also if only one part has it
+    tips: list[Motion] = []
+    jaws: list[tuple[str, Signal]] = []
+    for topic in sorted({one.topic for part in parts for one in part.setpoints} - faults.keys()):
+        try:
+            tips += _motions([one for one in part.setpoints if one.topic == topic] for part in parts)
+        except SkillsError as error:
+            faults[topic] = str(error)
+    for topic in sorted({one.topic for part in parts for _, one in part.jaw_setpoints} - faults.keys()):
+        try:
+            jaws += _signals([pair for pair in part.jaw_setpoints if pair[1].topic == topic] for part in parts)
+        except SkillsError as error:
+            faults[topic] = str(error)
     first = parts[0]
     pedals, clutches = _signals(part.pedals for part in parts), [part.clutch for part in parts if part.clutch]
     return Recording(
@@ -80,7 +93,9 @@ def join(parts: Sequence[Recording]) -> Recording:
         tools=tuple({arm: tool for part in parts for arm, tool in part.tools}.items()),
         labels=in_time(label for part in parts for label in part.labels),
         notes=tuple(dict.fromkeys(note for part in parts for note in part.notes)),
-        left_out=tuple(dict(pair for part in parts for pair in part.left_out).items()),
+        left_out=tuple(faults.items()),
+        setpoints=tuple(tips),
+        jaw_setpoints=tuple(jaws),
     )
 
 

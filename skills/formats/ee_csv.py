@@ -8,10 +8,12 @@ Its columns are named by arm, each row being one picture:
     psm1_jaw                                   the jaw's angle in rad
     psm1_js[0] ... psm1_js[5]                  the measured joints, rad and m (or psm1_measured_js[0] ...)
     psm1_rcm_pose.position.x ... orientation.w the tip in the arm's base, as of /PSM1/local/measured_cp (see below)
+    psm1_sp.position.x ... orientation.w       the setpoint of the tip, as of /PSM1/setpoint_cp
+    psm1_jaw_sp                                the setpoint of the jaw in rad
 
 and the same for the other arms. Motions, joints and jaws have the names of the topics that the recorders subscribe to.
-Setpoints (psm1_sp, psm1_jaw_sp, psm1_set_js), the endoscope's and the set-up joints' columns are not used, nor is any
-other; no value of the used columns depends on them.
+Setpoints of the joints (psm1_set_js), the endoscope's and the set-up joints' columns are not used, nor is any other; no
+value of the used columns depends on them. Setpoints that are not usable are left out, whatever their fault.
 
 The file does not say in which frame the poses are, and laboratories differ: the caller must name it, as "base" for each
 arm's own base. `rcm_pose` is the tip in the arm's base in most recorders and the pose of the base itself in one. It is
@@ -20,7 +22,7 @@ whose pose is 0 in every row, quaternion included, was not recorded, and is left
 """
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import BinaryIO
 
@@ -42,6 +44,7 @@ from skills.demonstration.recording import (
 )
 from skills.errors import BadColumns, BadSettings, MixedFrames, NoUsableTopic, SkillsError
 from skills.formats.cells import check_whole, header_of, open_text, read_numbers
+from skills.formats.setpoints import ColumnSetpoints
 from skills.formats.tables import (
     BASE,
     TableReading,
@@ -61,11 +64,14 @@ TIME = "timestamp"
 STEADY_MM, STEADY_RAD = 3.0, 0.05  # as of `skills.demonstration.partner`: a base that moves more has no single pose
 _FIRST = re.compile(r"psm\d+_(pose\.position\.x|(measured_)?js\[0\])")
 _USED = re.compile(
-    r"(?P<arm>psm\d+)_((?P<pose>pose|rcm_pose)\.(position\.(?P<axis>[xyz])|orientation\.(?P<part>[xyzw]))|(?P<jaw>jaw)"
+    r"(?P<arm>psm\d+)_((?P<pose>pose|rcm_pose|sp)\.(position\.(?P<axis>[xyz])|orientation\.(?P<part>[xyzw]))"
+    r"|(?P<jaw>jaw|jaw_sp)"
     r"|(measured_)?js\[(?P<joint>\d)\])"
 )
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 _JOINTS = tuple(f"q{k}" for k in range(1, len(JOINTS) + 1))
+_PARTS = {"js": _JOINTS, "jaw": ("jaw",), "jaw_sp": ("jaw",)}  # of any other kind `_POSE`
+_SETPOINTS = {"sp": "/{}/setpoint_cp", "jaw_sp": "/{}/jaw/setpoint_js"}
 _KIND = "ee_csv"
 
 
@@ -76,6 +82,11 @@ class _Group:
     arm: str
     kind: str
     columns: tuple[int, ...]
+
+    @property
+    def topic(self) -> str:
+        """The topic of a setpoint."""
+        return _SETPOINTS[self.kind].format(self.arm)
 
 
 def is_header(names: Iterable[str]) -> bool:
@@ -106,10 +117,29 @@ def read_ee_csv(file: BinaryIO, said: TableReading) -> Recording:
         raise BadSettings("The columns of an ee_csv are in m, rad and ns; omit unit, or map the columns of one arm.")
     check_whole(file)
     with open_text(file) as text:
+        names, _ = header_of(text)
+    groups, faults = _groups(names)
+    time = _time(names)
+    check_time(TIME if time is not None else None, said)
+    try:
+        stamps_ns, parts = _read(file, groups, time, said)
+    except SkillsError as error:
+        measured = [one for one in groups if one.kind not in _SETPOINTS]
+        if len(measured) == len(groups):
+            raise
+        stamps_ns, parts = _read(file, measured, time, said)
+        faults |= {one.topic: str(error) for one in groups if one.kind in _SETPOINTS}
+        groups = measured
+    return _recording(parts, stamps_ns, said, _columns(names, groups, time), faults)
+
+
+def _read(
+    file: BinaryIO, groups: Sequence[_Group], time: int | None, said: TableReading
+) -> tuple[Ints, dict[tuple[str, str], Floats]]:
+    """Return the stamps, shape (T,), and the numbers of each arm and kind, shape (T, K)."""
+    file.seek(0)
+    with open_text(file) as text:
         names, separator = header_of(text)
-        groups = _groups(names)
-        time = _time(names)
-        check_time(TIME if time is not None else None, said)
         used = sorted({k for group in groups for k in group.columns} | ({time} if time is not None else set()))
         numbers = read_numbers(text, names, used, separator, said.decimal, None if time is None else (time, "ns"))
     place = {column: k for k, column in enumerate(used)}
@@ -118,30 +148,44 @@ def read_ee_csv(file: BinaryIO, said: TableReading) -> Recording:
         assert numbers.stamps_ns is not None
         check_steps(TIME, "ns", numbers.stamps_ns)
     stamps_ns = stamps_of(numbers.stamps_ns, len(numbers.values), said)
-    parts = {(one.arm, one.kind): numbers.values[:, [place[k] for k in one.columns]] for one in groups}
-    return _recording(parts, stamps_ns, said, _columns(names, groups, time))
+    return stamps_ns, {(one.arm, one.kind): numbers.values[:, [place[k] for k in one.columns]] for one in groups}
 
 
-def _groups(names: Sequence[str]) -> list[_Group]:
-    found: dict[tuple[str, str], dict[str, int]] = {}
+def _groups(names: Sequence[str]) -> tuple[list[_Group], dict[str, str]]:
+    """Return the groups of columns, and the topics of setpoints whose columns are not usable, with the fault of each.
+
+    Raises:
+        BadColumns: Another column is missing or there twice.
+    """
+    found: dict[tuple[str, str], dict[str, list[int]]] = {}
     for index, name in enumerate(names):
         said = _USED.fullmatch(name)
         if said is None:
             continue
         kind = said["pose"] or said["jaw"] or "js"
         part = said["axis"] or (said["part"] and f"q{said['part']}") or (said["joint"] and f"q{int(said['joint']) + 1}")
-        group = found.setdefault((said["arm"].upper(), kind), {})
-        if group.setdefault(part or kind, index) != index:
-            raise BadColumns(f"The table has the column {name!r} twice; export the table again.", doubled=[name])
-    groups = []
+        found.setdefault((said["arm"].upper(), kind), {}).setdefault(part or "jaw", []).append(index)
+    groups, faults = [], {}
     for (arm, kind), group in sorted(found.items()):
-        wanted = {"js": _JOINTS, "jaw": ("jaw",)}.get(kind, _POSE)
-        missing = [part for part in wanted if part not in group]
-        if missing or len(group) > len(wanted):
-            which = f"{missing[0]} of {arm}'s {kind} is missing" if missing else f"{arm} has more joints than a PSM"
-            raise BadColumns(f"The table is incomplete: {which}; export the table again.", missing=missing)
-        groups.append(_Group(arm, kind, tuple(group[part] for part in wanted)))
-    return groups
+        try:
+            groups.append(_group(names, arm, kind, group))
+        except BadColumns as error:
+            if kind not in _SETPOINTS:
+                raise
+            faults[_SETPOINTS[kind].format(arm)] = str(error)
+    return groups, faults
+
+
+def _group(names: Sequence[str], arm: str, kind: str, found: Mapping[str, Sequence[int]]) -> _Group:
+    wanted = _PARTS.get(kind, _POSE)
+    doubled = [names[indices[0]] for indices in found.values() if len(indices) > 1]
+    if doubled:
+        raise BadColumns(f"The table has the column {doubled[0]!r} twice; export the table again.", doubled=doubled)
+    missing = [part for part in wanted if part not in found]
+    if missing or len(found) > len(wanted):
+        which = f"{missing[0]} of {arm}'s {kind} is missing" if missing else f"{arm} has more joints than a PSM"
+        raise BadColumns(f"The table is incomplete: {which}; export the table again.", missing=missing)
+    return _Group(arm, kind, tuple(found[part][0] for part in wanted))
 
 
 def _time(names: Sequence[str]) -> int | None:
@@ -154,15 +198,15 @@ def _time(names: Sequence[str]) -> int | None:
 def _columns(names: Sequence[str], groups: Sequence[_Group], time: int | None) -> tuple[Column, ...]:
     meant = {} if time is None else {time: ("t", "ns")}
     for group in groups:
-        parts = {"js": _JOINTS, "jaw": ("jaw",)}.get(group.kind, _POSE)
-        place = "local " if group.kind == "rcm_pose" else ""
+        parts = _PARTS.get(group.kind, _POSE)
+        place = {"rcm_pose": "local ", "sp": "setpoint ", "jaw_sp": "setpoint "}.get(group.kind, "")
         for index, part in zip(group.columns, parts, strict=True):
             meant[index] = (f"{group.arm} {place}{part}", _unit(group.kind, part))
     return tuple(Column(name, *meant.get(index, ("", ""))) for index, name in enumerate(names))
 
 
 def _unit(kind: str, part: str) -> str:
-    if kind in ("js", "jaw"):
+    if kind in _PARTS:
         return "m" if part == _JOINTS[INSERTION] else "rad"
     return "m" if part in ("x", "y", "z") else ""
 
@@ -177,12 +221,16 @@ def _check_whole(times: Floats) -> None:
 
 
 def _recording(
-    parts: dict[tuple[str, str], Floats], stamps_ns: Ints, said: TableReading, columns: tuple[Column, ...]
+    parts: dict[tuple[str, str], Floats],
+    stamps_ns: Ints,
+    said: TableReading,
+    columns: tuple[Column, ...],
+    faults: Mapping[str, str],
 ) -> Recording:
     motions: list[Motion] = []
     joints: list[Joints] = []
     jaws: list[tuple[str, Signal]] = []
-    left_out: list[tuple[str, str]] = []
+    left_out: list[tuple[str, str]] = list(faults.items())
     posing = [arm for arm, kind in parts if kind == "pose" and parts[arm, kind].any()]
     for (arm, kind), values in parts.items():
         if kind == "js":
@@ -213,7 +261,9 @@ def _recording(
         raise NoUsableTopic("The table has the pose of no arm: all its poses are 0.")
     for motion in motions:
         check_outside(motion)
-    here = {motion.topic for motion in motions} | {one.topic for one in joints} | {signal.topic for _, signal in jaws}
+    setpoints = _setpoints(parts, stamps_ns, motions)
+    here = {motion.topic for motion in (*motions, *setpoints.tips)} | {one.topic for one in joints}
+    here |= {signal.topic for _, signal in (*jaws, *setpoints.jaws)}
     return Recording(
         format="csv",
         integrity="none",
@@ -224,9 +274,25 @@ def _recording(
         tools=()
         if said.instrument is None
         else tuple((arm, said.instrument) for arm in sorted({m.arm for m in motions})),
-        left_out=tuple(left_out),
+        left_out=(*left_out, *setpoints.left_out),
         columns=columns,
+        setpoints=tuple(setpoints.tips),
+        jaw_setpoints=tuple(setpoints.jaws),
     )
+
+
+def _setpoints(parts: Mapping[tuple[str, str], Floats], stamps_ns: Ints, motions: Sequence[Motion]) -> ColumnSetpoints:
+    setpoints = ColumnSetpoints()
+    for (arm, kind), values in parts.items():
+        measured = next((one for one in motions if one.topic == f"/{arm}/measured_cp"), None)
+        topic = _SETPOINTS.get(kind, "").format(arm)
+        if kind == "jaw_sp":
+            setpoints.add_jaw(arm, topic, stamps_ns, values[:, 0])
+        elif kind == "sp" and measured is None:
+            setpoints.left_out.append((topic, "The arm has no measured pose beside it."))
+        elif kind == "sp" and measured is not None:
+            setpoints.add_tip(topic, stamps_ns, scaled(values[:, :3], 1000.0), values[:, 3:], measured)
+    return setpoints
 
 
 def _motion(arm: str, topic: str, frame: str, stamps_ns: Ints, tip_mm: Floats, rotation_xyzw: Floats) -> Motion:

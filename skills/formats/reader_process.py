@@ -99,8 +99,8 @@ def about_recording(recording: Recording, proposed: Sequence[Segment]) -> dict[s
     """Return the description of a recording for clients: its contents, its quality and the proposed hand-offs.
 
     Each list that the recording could make arbitrarily long is limited to `MOST` entries. Counts of dropped and of
-    equal samples, and identifications, are only present if there are any, so that all other descriptions are those of
-    version 0.1.0.
+    equal samples, setpoints and identifications are only present if there are any, so that all other descriptions are
+    those of version 0.1.0.
     """
     dropped = [asdict(one) for one in _dropped(recording)[:MOST]]
     about: dict[str, Any] = {
@@ -132,13 +132,21 @@ def about_recording(recording: Recording, proposed: Sequence[Segment]) -> dict[s
     }
     if recording.identifications:
         about["identifications"] = [as_json(one) for one in recording.identifications]
+    if setpoints := _setpoints(recording)[:MOST]:
+        about["setpoints"] = [asdict(one) for one in setpoints]
     return about | ({"dropped": dropped} if dropped else {})
 
 
+def _setpoints(recording: Recording) -> list[described.Setpoints]:
+    tips = [described.Setpoints(one.arm, one.topic, one.frame, len(one.stamps_ns)) for one in recording.setpoints]
+    jaws = recording.jaw_setpoints
+    return tips + [described.Setpoints(arm, one.topic, None, len(one.stamps_ns)) for arm, one in jaws]
+
+
 def _dropped(recording: Recording) -> list[described.Dropped]:
-    signals = [signal for _, signal in (*recording.jaws, *recording.grippers)]
+    signals = [signal for _, signal in (*recording.jaws, *recording.grippers, *recording.jaw_setpoints)]
     streams: list[Motion | Joints | Signal]
-    streams = [*recording.motions, *recording.joints, *recording.masters, *signals]
+    streams = [*recording.motions, *recording.joints, *recording.masters, *recording.setpoints, *signals]
     return [described.Dropped(one.topic, one.backward_stamps) for one in streams if one.backward_stamps]
 
 

@@ -166,10 +166,12 @@ def read_rosbag(files: Sequence[BinaryIO], suffix: Suffix, integrity: Integrity 
             paths = [_copied(file, Path(folder) / f"part{number}{suffix}") for number, file in enumerate(files)]
             reader = open_files.enter_context(_reading(paths))  # open files stay readable without their folder
         out = open_files.enter_context(tempfile.TemporaryFile())  # unnamed: deleted when closed
+        faults: dict[str, str] = {}
         with _refusing(paths[0]):
-            here = _convert(reader, out)
+            here = _convert(reader, out, faults=faults)
         out.seek(0)
-        return replace(read_mcap(out), format=_FORMATS[suffix], integrity=integrity, topics=here)
+        recording = replace(read_mcap(out), format=_FORMATS[suffix], integrity=integrity, topics=here)
+        return recording.without_setpoints(faults) if faults else recording
 
 
 def convert(paths: Sequence[Path], out: IO[bytes], notes: dict[str, str] | None = None) -> tuple[Topic, ...]:
@@ -214,12 +216,14 @@ def _refusing(path: Path) -> AbstractContextManager[None]:
     return refusing(f"The {_NAMES.get(path.suffix, 'bag')}", advice)
 
 
-def _convert(reader: AnyReader, out: IO[bytes], notes: dict[str, str] | None = None) -> tuple[Topic, ...]:
+def _convert(
+    reader: AnyReader, out: IO[bytes], notes: dict[str, str] | None = None, faults: dict[str, str] | None = None
+) -> tuple[Topic, ...]:
     here = _topics(reader)
     if not any(topics.arm_of_pose(topic.name, topic.type) for topic in here):
         said = ", ".join(f"{topic.name} ({topic.type})" for topic in here[:20])
         raise NoUsableTopic(f"No topic has the pose of a PSM. It has {said or 'no topics'}.")
-    write_messages(_messages(reader), out, notes)
+    write_messages(_messages(reader, faults), out, notes)
     return here
 
 
@@ -230,11 +234,19 @@ def _topics(reader: AnyReader) -> tuple[Topic, ...]:
     return tuple(Topic(name, kind, count) for (name, kind), count in sorted(counts.items()))
 
 
-def _messages(reader: AnyReader) -> Iterator[Message]:
+def _messages(reader: AnyReader, faults: dict[str, str] | None) -> Iterator[Message]:
+    """Yield the used messages; with `faults`, topics of setpoints end at their first fault, which is put there."""
     wanted = [one for one in reader.connections if topics.meaning(one.topic, one.msgtype) is not None]
+    setpoints = {one.topic for one in wanted if topics.is_setpoint(one.topic, one.msgtype)}
     for connection, log_ns, data in reader.messages(connections=wanted):
-        write = _WRITERS[connection.msgtype]
-        yield write(connection.topic, log_ns, reader.deserialize(data, connection.msgtype))
+        topic, write = connection.topic, _WRITERS[connection.msgtype]
+        if faults is None or topic not in setpoints:
+            yield write(topic, log_ns, reader.deserialize(data, connection.msgtype))
+        elif topic not in faults:
+            try:
+                yield write(topic, log_ns, reader.deserialize(data, connection.msgtype))
+            except Exception:  # on a damaged message rosbags may raise anything
+                faults[topic] = "A message of the topic is damaged."
 
 
 def _pose(topic: str, log_ns: int, said: Any) -> Message:

@@ -4,8 +4,9 @@ dVRK 2.2 and later publish the tip as PoseStamped, earlier versions as Transform
 of measurement in the header. The topics follow the CRTK conventions (dVRK documentation, "Arms" and "Console"); they
 may be below any namespace, as in `/CRTK/psm2/measured_cp`.
 
-Only measured motions are used. Commands (`setpoint_cp`, `servo_cp`, `move_cp` and the like) are not, nor are poses of
-other things (`T_b_w`, the base of an arm in a simulator's world).
+Only measured motions are learnt from. Setpoints of a PSM's tip and jaw are read beside them, because a dataset may have
+them as its actions; they are never motions. Other commands (`servo_cp`, `move_cp` and the like) are not used, nor are
+poses of other things (`T_b_w`, the base of an arm in a simulator's world).
 """
 
 import re
@@ -27,6 +28,7 @@ _PSM = re.compile(r"PSM\d*", re.IGNORECASE)
 _MTM = re.compile(r"MTM[LR]?\d*", re.IGNORECASE)
 _PAIR = re.compile(r"MTM[LR]?\d*_PSM\d*", re.IGNORECASE)
 _COMMANDS = re.compile(r"setpoint|desired|goal|servo|move|T_b_w")
+_SETPOINTS = ("setpoint_cp", "position_cartesian_desired", "position_cartesian_local_desired")  # dVRK 2, and before
 _CONSOLE = ("clutch", "camera", "operator_present")
 
 
@@ -42,6 +44,8 @@ class Kind(Enum):
     FOLLOWING = auto()  # true while an MTM drives its PSM
     SCALE = auto()
     TOOL = auto()
+    SETPOINT = auto()  # commanded pose of a PSM's tip
+    JAW_SETPOINT = auto()
 
 
 @dataclass(frozen=True)
@@ -61,6 +65,8 @@ def meaning(topic: str, message_type: str) -> Meaning | None:
         return _of_pose(topic)
     if message_type == JOINT_STATE and topic.endswith("/measured_js"):
         return _of_joints(topic)
+    if message_type == JOINT_STATE and topic.endswith("/jaw/setpoint_js"):
+        return _about(Kind.JAW_SETPOINT, _named(_PSM, topic))
     if message_type in (JOY, BOOL) and _is_pedal(topic):
         return Meaning(Kind.PEDAL, topic)
     if message_type == BOOL and topic.endswith("/following"):
@@ -82,8 +88,17 @@ def arm_of_pose(topic: str, message_type: str) -> str | None:
     return said.whose if said is not None and said.kind is Kind.MOTION else None
 
 
+def is_setpoint(topic: str, message_type: str) -> bool:
+    """Return whether a topic carries setpoints of a PSM's tip or jaw; no recording is refused for them."""
+    said = meaning(topic, message_type)
+    return said is not None and said.kind in (Kind.SETPOINT, Kind.JAW_SETPOINT)
+
+
 def _of_pose(topic: str) -> Meaning | None:
-    if _COMMANDS.search(topic.rsplit("/", 1)[-1]):
+    name = topic.rsplit("/", 1)[-1]
+    if name in _SETPOINTS:
+        return _about(Kind.SETPOINT, _named(_PSM, topic))
+    if _COMMANDS.search(name):
         return None
     return _about(Kind.MOTION, _named(_PSM, topic)) or _about(Kind.MASTER, _named(_MTM, topic))
 

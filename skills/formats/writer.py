@@ -308,10 +308,16 @@ def _messages(recording: Recording) -> Iterator[Message]:
         topic = _named(joints.topic, f"/{joints.arm}/measured_js")
         for stamp_ns, row in zip(joints.stamps_ns.tolist(), _metric(joints).tolist(), strict=True):
             yield joint_state(topic, stamp_ns, row)
-    for kind, signals in (("jaw", recording.jaws), ("gripper", recording.grippers)):
-        for arm, signal in signals:
-            for stamp_ns, value in _samples(signal):
-                yield joint_state(f"/{arm}/{kind}/measured_js", stamp_ns, [value], [kind])
+    for motion in recording.setpoints:
+        yield from _poses(motion, "setpoint_cp")
+    angles = (
+        *(("jaw/measured_js", arm, signal) for arm, signal in recording.jaws),
+        *(("gripper/measured_js", arm, signal) for arm, signal in recording.grippers),
+        *(("jaw/setpoint_js", arm, signal) for arm, signal in recording.jaw_setpoints),
+    )
+    for topic, arm, signal in angles:
+        for stamp_ns, value in _samples(signal):
+            yield joint_state(f"/{arm}/{topic}", stamp_ns, [value], [topic.split("/")[0]])
     for topic, pedal in _pedals(recording):
         for stamp_ns, value in _samples(pedal):
             yield joy(topic, stamp_ns, [int(value)])

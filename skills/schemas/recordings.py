@@ -89,6 +89,21 @@ class JointStates:
 
 @schema
 @dataclass(frozen=True)
+class Setpoints:
+    """The setpoints of an arm's tip or jaw on a topic.
+
+    Attributes:
+        frame: The frame of the poses; null for a jaw.
+    """
+
+    arm: str
+    topic: str
+    frame: str | None
+    samples: Count
+
+
+@schema
+@dataclass(frozen=True)
 class Master:
     """A master's motion."""
 
@@ -157,6 +172,9 @@ class Described(Given):
     left_out: list[LeftOut]
     dropped: list[Dropped] = Field(
         default=[], description="Topics with samples whose stamps went back; older versions refused these recordings."
+    )
+    setpoints: list[Setpoints] = Field(
+        default=[], description="Commanded poses and jaws; nothing is learnt from them, and older versions read none."
     )
     base_frames: list[BaseFrame]
     identifications: list[ArmIdentification] = Field(

@@ -1,7 +1,7 @@
 """Pose styles on hands left out: ours beside a straight line, the medoid, and movement primitives of libraries.
 
 `SKILLS_TEST_BENCHMARKS` names the folder of the public pose data: CLFD, three tasks of nine demonstrations, and 50
-needle regrasps of SurgicAI in a simulator, in its scaled units. One demonstration after the other is left out; its start
+needle regrasps of SurgicAI in a simulator, in its units. One demonstration after the other is left out, and its start
 and goal pose are given to all alike. Position: mean Euclidean distance along the DTW alignment; orientation: mean angle
 at equal phase. DMP and ProMP are those of movement_primitives, the mixtures of GMR and TP-GMM those of scikit-learn.
 All but the straight line, the DMP and TP-GMM's positions learn from the demonstrations laid between start and goal.

@@ -36,6 +36,14 @@ def poses(count: int, seed: int = 0) -> np.ndarray:
     return np.concatenate(arms, axis=1).astype(np.float32)
 
 
+def commands(count: int = 40, seed: int = 0) -> np.ndarray:
+    """Return setpoints near the poses, and of the jaws, single precision, shape (count, 16)."""
+    numbers = poses(count, seed)
+    numbers[:, [0, 1, 2, 8, 9, 10]] += np.float32(0.002)
+    numbers[:, [7, 15]] -= np.float32(0.05)
+    return numbers
+
+
 def joints(count: int) -> np.ndarray:
     """Return the joints of a PSM along a straight line, rad and m, shape (count, 6)."""
     tip_mm = np.linspace([-10.0, 40.0, -120.0], [20.0, 60.0, -110.0], count)

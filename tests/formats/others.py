@@ -44,6 +44,8 @@ def whole(count=10):
         "PSM2", "/PSM2/measured_js", stamps_ns, np.linspace([0.1, 0.2, 90, 0, 0, 0], [1, 1, 120, 1, 1, 1], count)
     )
     master_joints = Joints("MTMR", "/MTMR/measured_js", stamps_ns, np.ones((count, 7)))
+    setpoint = Motion("PSM2", "/PSM2/setpoint_cp", "ECM", stamps_ns + 7, tip_mm + 0.5, turns)
+    local = replace(setpoint, topic="/PSM2/local/setpoint_cp", frame="PSM2_base")
     pedal = Signal(stamps_ns[:2], np.array([1.0, 0.0]), "/footpedals/coag")
     clutch = Signal(stamps_ns[:2], np.array([1.0, 0.0]), "/console/clutch")
     return replace(
@@ -57,18 +59,25 @@ def whole(count=10):
         scales=(("MTMR_PSM2", Signal(stamps_ns[:1], np.array([0.2]), "/MTMR_PSM2/scale")),),
         tools=(("PSM2", "LARGE_NEEDLE_DRIVER:400006"),),
         notes=(("original sha256", "00ff"),),
+        setpoints=(local, setpoint),
+        jaw_setpoints=(("PSM2", Signal(stamps_ns, np.linspace(0.8, 0.2, count), "/PSM2/jaw/setpoint_js")),),
     )
 
 
 def assert_all_the_same(got, want):
     """Assert that two recordings are equal in all their content."""
     assert_same(got, want, tolerance_mm=1e-12)
-    np.testing.assert_allclose(got.masters[0].tip_mm, want.masters[0].tip_mm, rtol=0, atol=1e-12)
+    moving = zip((*got.masters, *got.setpoints), (*want.masters, *want.setpoints), strict=True)
+    for one, other in moving:
+        assert (one.arm, one.topic, one.frame) == (other.arm, other.topic, other.frame)
+        np.testing.assert_array_equal(one.stamps_ns, other.stamps_ns)
+        np.testing.assert_allclose(one.tip_mm, other.tip_mm, rtol=0, atol=1e-12)
+        np.testing.assert_array_equal(one.rotation_xyzw, other.rotation_xyzw)
     for one, other in zip(got.joints, want.joints, strict=True):
         assert (one.arm, one.topic) == (other.arm, other.topic)
         np.testing.assert_array_equal(one.stamps_ns, other.stamps_ns)
         np.testing.assert_allclose(one.positions, other.positions, rtol=0, atol=1e-12)
-    for name in ("grippers", "pedals", "following", "scales"):
+    for name in ("grippers", "pedals", "following", "scales", "jaw_setpoints"):
         for (who, one), (whom, other) in zip(getattr(got, name), getattr(want, name), strict=True):
             assert (who, one.topic) == (whom, other.topic)
             np.testing.assert_array_equal(one.stamps_ns, other.stamps_ns)

@@ -142,7 +142,8 @@ def test_joints_beside_poses_are_used_where_no_frame_is_stated():
     more = {f"observation.state.psm1.joint_{k + 1}": q[:, k] for k in range(6)}
     recording = read(episode(columns_of(40, **more)), None)
     assert [motion.frame for motion in recording.motions] == ["PSM1_base"]
-    assert [topic for topic, _ in recording.left_out] == ["/PSM1/measured_cp", "/PSM2/measured_cp"]
+    unframed = [f"/{arm}/{name}" for name in ("measured_cp", "setpoint_cp") for arm in ("PSM1", "PSM2")]
+    assert [topic for topic, _ in recording.left_out] == unframed
 
 
 # ---- names

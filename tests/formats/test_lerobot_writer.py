@@ -18,7 +18,14 @@ from skills.demonstration.recording import Label, Motion, Recording, Signal
 from skills.errors import BadInput, MixedFrames, NoUsableTopic, UnreadableRecording
 from skills.formats import read_recording, write_mcap
 from skills.formats.lerobot.cut import cut_episode, episodes_of, find_dataset
-from skills.formats.lerobot.writer import MANIFEST, AboutDataset, ExportedEpisode, dataset_files, splits_by_surgeon
+from skills.formats.lerobot.writer import (
+    MANIFEST,
+    AboutDataset,
+    ExportedEpisode,
+    action_rule,
+    dataset_files,
+    splits_by_surgeon,
+)
 from tests.formats import lerobots
 
 ABOUT = AboutDataset("Sutures", ("PSM1", "PSM2"), licence="CC-BY-4.0", consent="Export, until 2030.")
@@ -38,6 +45,23 @@ def recording(count: int = 40, seed: int = 0, rate_hz: float = 30.0) -> Recordin
     labels = (Label("A1", "stage", int(stamps_ns[5]), int(stamps_ns[9])),)
     tools = (("PSM1", lerobots.NEEDLE_DRIVER),)
     return Recording("mcap", "full", tuple(motions), tuple(jaws), labels=labels, tools=tools)
+
+
+def commanded(given: Recording, seed: int) -> Recording:
+    """Return a recording with setpoints as single precision holds them, at other times than its poses."""
+    count = len(given.motions[0].stamps_ns)
+    action = lerobots.commands(count, seed).astype(np.float64)
+    tips, jaws = [], []
+    for k, motion in enumerate(given.motions):
+        at, stamps_ns = 8 * k, motion.stamps_ns + 3_000_000
+        tip_mm, turns = 1000.0 * action[:, at : at + 3], action[:, at + 3 : at + 7]
+        tips.append(Motion(motion.arm, f"/{motion.arm}/setpoint_cp", motion.frame, stamps_ns, tip_mm, turns))
+        jaws.append((motion.arm, Signal(stamps_ns, action[:, at + 7])))
+    return replace(given, setpoints=tuple(tips), jaw_setpoints=tuple(jaws))
+
+
+def commanded_episodes() -> list[ExportedEpisode]:
+    return [replace(one, recording=commanded(one.recording, k)) for k, one in enumerate(episodes())]
 
 
 def episodes(counts: Iterable[int] = (40, 50, 60)) -> list[ExportedEpisode]:
@@ -124,6 +148,80 @@ def test_actions_are_the_next_states_and_stages_are_named(tmp_path):
     stages = table["observation.meta.stage"].to_pylist()
     assert [k for k, name in enumerate(stages) if name == "A1"] == [5, 6, 7, 8, 9]
     assert set(stages) == {"A1", ""}
+
+
+COMMANDED = replace(ABOUT, action="setpoint")
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_setpoints_are_written_as_actions_and_read_as_the_same_bits(tmp_path, version):
+    given = commanded_episodes()
+    folder = written(tmp_path, given, version, COMMANDED)
+    for number, episode in enumerate(given):
+        again, recording = read(folder, number), episode.recording
+        assert again.left_out == ()
+        for one, other in zip(again.setpoints, recording.setpoints, strict=True):
+            assert (one.arm, one.frame, one.topic) == (other.arm, "ECM", other.topic)
+            np.testing.assert_array_equal(one.tip_mm.astype(np.float32), other.tip_mm.astype(np.float32))
+            np.testing.assert_array_equal(one.rotation_xyzw, other.rotation_xyzw)
+            np.testing.assert_array_equal(
+                again.jaw_setpoint_of(one.arm).values, recording.jaw_setpoint_of(one.arm).values
+            )
+    more = [replace(one, recording=read(folder, k)) for k, one in enumerate(given)]
+    assert action_rule(more, ABOUT) == "setpoint"
+    folders = folder, written(tmp_path / "again", more, version, COMMANDED)
+    whole, rewritten = (pq.ParquetDataset(sorted((one / "data").rglob("*.parquet"))).read() for one in folders)
+    for name in ("observation.state", "action", "timestamp"):
+        assert whole[name].to_pylist() == rewritten[name].to_pylist()
+
+
+def test_the_rule_of_the_actions_is_stated_and_names_tell_it(tmp_path):
+    for about, rule, first in (
+        (ABOUT, "next state", "psm1_pose.position.x"),
+        (COMMANDED, "setpoint", lerobots.ACTION[0]),
+    ):
+        folder = written(tmp_path / rule, commanded_episodes(), "v2.1", about)
+        assert json.loads((folder / "meta/suture-skills.json").read_text())["action"] == rule
+        assert ("setpoints" in (folder / "meta/README.md").read_text()) is (rule == "setpoint")
+        (names,) = json.loads((folder / "meta/info.json").read_text())["features"]["action"]["names"]
+        assert names[0] == first
+        assert bool(read(folder, 0).setpoints) is (rule == "setpoint")
+
+
+def sparse(one: Recording) -> Recording:
+    """Return a recording whose setpoints have a gap of 0.2 s."""
+    kept = np.r_[0:10, 16 : len(one.setpoints[0].stamps_ns)]
+    first = one.setpoints[0]
+    gap = replace(
+        first, stamps_ns=first.stamps_ns[kept], tip_mm=first.tip_mm[kept], rotation_xyzw=first.rotation_xyzw[kept]
+    )
+    return replace(one, setpoints=(gap, *one.setpoints[1:]))
+
+
+@pytest.mark.parametrize(
+    ("change", "error"),
+    [
+        (lambda one: replace(one, setpoints=one.setpoints[:1]), NoUsableTopic),
+        (lambda one: replace(one, jaw_setpoints=one.jaw_setpoints[:1]), NoUsableTopic),
+        (
+            lambda one: replace(one, setpoints=(one.setpoints[0], replace(one.setpoints[1], frame="PSM2_base"))),
+            NoUsableTopic,
+        ),
+        (
+            lambda one: replace(one, setpoints=(one.setpoints[0], replace(one.setpoints[1], rotation_xyzw=None))),
+            NoUsableTopic,
+        ),
+        (sparse, UnreadableRecording),
+    ],
+    ids=["an arm", "a jaw", "another frame", "no orientation", "a gap"],
+)
+def test_setpoints_that_one_episode_lacks_are_no_actions_of_the_dataset(tmp_path, change, error):
+    first, second, third = commanded_episodes()
+    assert action_rule([first, second, third], ABOUT) == "setpoint"
+    given = [first, replace(second, recording=change(second.recording)), third]
+    assert action_rule(given, ABOUT) == "next state"
+    with pytest.raises(error):
+        written(tmp_path, given, "v2.1", COMMANDED)
 
 
 def test_a_faster_recording_is_sampled_and_never_interpolated(tmp_path):

@@ -147,6 +147,10 @@ def test_a_definition_without_what_is_wanted_is_left_out():
         ("/dvrk/footpedals/bicoag", topics.JOY, Kind.PEDAL, "/dvrk/footpedals/bicoag"),
         ("/MTML_PSM1/following", topics.BOOL, Kind.FOLLOWING, "MTML_PSM1"),
         ("/PSM1/tool_type", topics.STRING, Kind.TOOL, "PSM1"),
+        ("/PSM2/setpoint_cp", topics.POSE, Kind.SETPOINT, "PSM2"),
+        ("/CRTK/psm2/local/setpoint_cp", topics.TRANSFORM, Kind.SETPOINT, "psm2"),
+        ("/dvrk/PSM2/position_cartesian_desired", topics.POSE, Kind.SETPOINT, "PSM2"),
+        ("/PSM2/jaw/setpoint_js", topics.JOINT_STATE, Kind.JAW_SETPOINT, "PSM2"),
     ],
 )
 def test_a_topic_and_its_type_say_what_it_tells(topic, message_type, kind, whose):
@@ -158,15 +162,15 @@ def test_a_topic_and_its_type_say_what_it_tells(topic, message_type, kind, whose
 @pytest.mark.parametrize(
     ("topic", "message_type"),
     [
-        ("/PSM2/setpoint_cp", topics.POSE),
-        ("/PSM2/local/setpoint_cp", topics.POSE),
+        ("/MTMR/setpoint_cp", topics.POSE),
         ("/PSM2/servo_cp", topics.POSE),
-        ("/PSM2/position_cartesian_desired", topics.POSE),
+        ("/PSM2/goal_cp", topics.POSE),
         ("/CRTK/psm2/T_b_w", topics.POSE),
         ("/SUJ/PSM2/measured_cp", topics.POSE),
         ("/ECM/measured_cp", topics.POSE),
         ("/CRTK/Needle/measured_cp", topics.POSE),
         ("/PSM2/setpoint_js", topics.JOINT_STATE),
+        ("/MTMR/jaw/setpoint_js", topics.JOINT_STATE),
         ("/SUJ/PSM2/measured_js", topics.JOINT_STATE),
         ("/SUJ/joint_states", topics.JOINT_STATE),
         ("/MTMR/jaw/measured_js", topics.JOINT_STATE),

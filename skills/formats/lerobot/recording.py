@@ -8,11 +8,18 @@ arm's number):
     psmN_local_pose.position.x ...                     the same relative to the arm's own remote centre
     psmN_joint_1 ... psmN_joint_6                      the measured joints, rad, the third in m
     psmN_jaw                                           the jaw's angle, rad
+    psmN_sp.position.x ... psmN_sp.orientation.w       setpoint of the tip, in the frame of psmN_pose
+    psmN_local_sp.position.x ...                       the same in the frame of psmN_local_pose
+    psmN_joint_sp_1 ... psmN_joint_sp_6                setpoints of the joints, rad, the third in m
+    psmN_jaw_sp                                        setpoint of the jaw, rad
 
 Separators may be dots, as in `observation.cartesian_state.psm1.pose.position.x`, and joints may be named, as in
 `observation.state.psm1.joint_position` with `yaw`. Where an arm has joints and no local pose, forward kinematics makes
 one, with the instrument whose number is in the dataset's tool name (`observation.meta.tool.psm1`), or in `tools` of our
-own file. Actions are not used. Motions are called by the topics of a dVRK from which recorders take such columns.
+own file. Motions are called by the topics of a dVRK from which recorders take such columns.
+
+Of actions only those are used whose names say that they are setpoints, with `_sp` or `_setpoint`: under the names of
+the state an action may as well be the next state, or a difference. Setpoints that are not usable are left out.
 """
 
 import re
@@ -26,6 +33,7 @@ from skills.demonstration.recording import Joints, Motion, Recording, Signal, To
 from skills.errors import BackwardStamps, BadColumns, MixedFrames, NotFinite, NoUsableTopic, UnreadableRecording
 from skills.formats.lerobot import INFO, NUMBERS, SAID, VERSIONS, Dataset, Feature, Files, read_dataset
 from skills.formats.lerobot.parquet import ParquetTable, printable, read_columns
+from skills.formats.setpoints import ColumnSetpoints
 from skills.formats.tables import BASE, check_outside
 from skills.kinematics import INSERTION, INSTRUMENTS, forward, quaternion_of
 from skills.remedies import Action, Remedy, did_you_mean
@@ -35,14 +43,16 @@ COARSE_S = 1e-3  # timestamps that are coarser, a float32 after 2.3 hours or in 
 SAME_S = 1e-4  # LeRobot's own tolerance between timestamps and its rate
 
 _POSE = re.compile(
-    r"(?:observation\.cartesian_state\.)?(psm\d{1,2})[._](local_)?pose\.(position\.[xyz]|orientation\.[xyzw])", re.I
+    r"(?:observation\.cartesian_state\.)?(psm\d{1,2})[._](local_)?(pose|sp|setpoint)"
+    r"\.(position\.[xyz]|orientation\.[xyzw])",
+    re.I,
 )
 _JOINT = re.compile(
-    r"(?:observation\.state\.)?(psm\d{1,2})[._]joint(?:_position)?[._]"
+    r"(?:observation\.state\.)?(psm\d{1,2})[._]joint(?:_position)?(_sp|_setpoint)?[._]"
     r"([1-6]|yaw|pitch|insertion|roll|wrist_pitch|wrist_yaw)",
     re.I,
 )
-_JAW = re.compile(r"(?:observation\.state\.)?(psm\d{1,2})[._](?:jaw|gripper)", re.I)
+_JAW = re.compile(r"(?:observation\.state\.)?(psm\d{1,2})[._](?:jaw|gripper)(_sp|_setpoint)?", re.I)
 _TOOL = re.compile(r"(?:observation\.meta\.tool\.)?(psm\d{1,2})(?:_tool_type)?", re.I)
 _NUMBER = re.compile(r"(?:^|:)(\d+)(?:\[|$)")  # of "LARGE_NEEDLE_DRIVER:400006[..11]", or alone
 _FRAME = re.compile(r"[A-Za-z0-9_./-]{1,64}")
@@ -55,7 +65,12 @@ _TOPICS = {
     "pose": "/{}/measured_cp",
     "joints": "/{}/measured_js",
     "jaw": "/{}/jaw/measured_js",
+    "setpoint": "/{}/setpoint_cp",
+    "local_setpoint": "/{}/local/setpoint_cp",
+    "joint_setpoints": "/{}/setpoint_js",
+    "jaw_setpoint": "/{}/jaw/setpoint_js",
 }
+_SETPOINTS = ("setpoint", "local_setpoint", "joint_setpoints", "jaw_setpoint")
 
 Place = tuple[str, int]  # a feature, and the index of one of its numbers
 Quantity = tuple[str, str]  # an arm such as "PSM1", and a key of `_TOPICS`
@@ -86,17 +101,16 @@ def read_episode(files: Files, root: str, frame: str | None = None) -> Recording
         if count and isinstance(claimed, int) and count < claimed < 10**9:
             count = claimed
         raise several_episodes(count)
-    meanings, unknown = _meanings(dataset)
-    used = {feature for places in meanings.values() for feature, _ in places.values()} | {*_SCALARS, _SEC, _NANOSEC}
-    features = [one for one in dataset.features if (one.name in used and not one.is_text) or _arms_of_tools(one)]
-    with files.unpacked(dataset.data[0]) as file:
-        table = read_columns(file, [one.column for one in features])
+    meanings, commanded, unknown = _meanings(dataset)
+    try:
+        table = _read(dataset, meanings | commanded)
+    except UnreadableRecording as error:
+        table = _read(dataset, meanings)  # which raises if the fault is not one of setpoints
+        unknown += [(_topic(*quantity), str(error)) for quantity in commanded]
+        commanded = {}
     _check_one_episode(dataset, table)
     stamps_ns, clock = _stamps_ns(dataset, table)
-    values = {
-        quantity: np.stack([table.numbers[feature][:, k] for _, (feature, k) in sorted(places.items())], axis=1)
-        for quantity, places in sorted(meanings.items())
-    }
+    values = _values(table, meanings)
     tools = _tools(dataset, table)
     joints = {
         arm: Joints(arm, _topic(arm, kind), stamps_ns, _in_mm(one))
@@ -104,6 +118,7 @@ def read_episode(files: Files, root: str, frame: str | None = None) -> Recording
         if kind == "joints"
     }
     motions, left_out = _motions(values, joints, tools, stamps_ns, _frames(dataset, frame, {arm for arm, _ in values}))
+    setpoints = _setpoints(_values(table, commanded), motions, tools, stamps_ns)
     return Recording(
         format="lerobot",
         integrity="full",  # a zip archive has a checksum (CRC-32) of every file in it
@@ -117,8 +132,26 @@ def read_episode(files: Files, root: str, frame: str | None = None) -> Recording
         joints=tuple(joints.values()),
         tools=tuple(sorted(tools.items())),
         notes=(*_notes(dataset, table), ("stamps", clock)),
-        left_out=(*left_out, *unknown),
+        left_out=(*left_out, *unknown, *setpoints.left_out),
+        setpoints=tuple(setpoints.tips),
+        jaw_setpoints=tuple(setpoints.jaws),
     )
+
+
+def _read(dataset: Dataset, meanings: Mapping[Quantity, Mapping[int, Place]]) -> ParquetTable:
+    """Read the columns of some quantities, the scalars and the tools."""
+    used = {feature for places in meanings.values() for feature, _ in places.values()} | {*_SCALARS, _SEC, _NANOSEC}
+    features = [one for one in dataset.features if (one.name in used and not one.is_text) or _arms_of_tools(one)]
+    with dataset.files.unpacked(dataset.data[0]) as file:
+        return read_columns(file, [one.column for one in features])
+
+
+def _values(table: ParquetTable, meanings: Mapping[Quantity, Mapping[int, Place]]) -> dict[Quantity, Floats]:
+    """Return the numbers of each quantity, shape (T, K)."""
+    return {
+        quantity: np.stack([table.numbers[feature][:, k] for _, (feature, k) in sorted(places.items())], axis=1)
+        for quantity, places in sorted(meanings.items())
+    }
 
 
 def several_episodes(episodes: int) -> UnreadableRecording:
@@ -150,11 +183,13 @@ def _check_one_episode(dataset: Dataset, table: ParquetTable) -> None:
 # ---- columns and their meanings ------------------------------------------------------------------------------------
 
 
-def _meanings(dataset: Dataset) -> tuple[dict[Quantity, dict[int, Place]], list[LeftOut]]:
-    """Return the columns of each quantity by component, and the observed columns without a meaning.
+def _meanings(
+    dataset: Dataset,
+) -> tuple[dict[Quantity, dict[int, Place]], dict[Quantity, dict[int, Place]], list[LeftOut]]:
+    """Return the columns of each measured quantity by component, those of setpoints, and the columns left out.
 
     Raises:
-        BadColumns: A column is ambiguous, a quantity incomplete, or a stated column is not there.
+        BadColumns: A column is ambiguous, a measured quantity incomplete, or a stated column is not there.
         NoUsableTopic: No quantity is a pose or the joints of a PSM.
     """
     numeric = [one for one in dataset.features if not one.is_text and not one.is_picture]
@@ -163,32 +198,41 @@ def _meanings(dataset: Dataset) -> tuple[dict[Quantity, dict[int, Place]], list[
     found: dict[Quantity, dict[int, Place]] = {}
     for (arm, kind, component), place in stated.items():
         found.setdefault((arm, kind), {})[component] = place
-    unknown = []
+    unknown, faults = [], {}
     for feature in numeric:
-        if not feature.name.startswith("observation.") or feature.name in (_SEC, _NANOSEC):
+        action = feature.name == "action" or feature.name.startswith("action.")
+        if not (action or feature.name.startswith("observation.")) or feature.name in (_SEC, _NANOSEC):
             continue
         nameless = []
         for index in range(feature.width):
             place, names = (feature.name, index), feature.called(index)
-            meaning = next((said for name in names if (said := meaning_of(name)) is not None), None)
-            if meaning is None:
+            said = (meaning_of(name.removeprefix("action.") if action else name) for name in names)
+            meaning = next((one for one in said if one is not None), None)
+            if meaning is None or (action and meaning[1] not in _SETPOINTS):
                 nameless += [] if place in taken else [names[0]]
             elif meaning not in stated and place not in taken:
                 arm, kind, component = meaning
                 if found.setdefault((arm, kind), {}).setdefault(component, place) != place:
-                    raise BadColumns(
-                        f"Two columns of the dataset are called {printable(names[0])}.", Remedy(Action.NAME_FEATURES)
-                    )
-        if nameless:
+                    double = f"Two columns of the dataset are called {printable(names[0])}."
+                    if kind not in _SETPOINTS:
+                        raise BadColumns(double, Remedy(Action.NAME_FEATURES))
+                    faults[arm, kind] = double
+        if nameless and not action:
             unknown.append((feature.name[:NOTE_CHARACTERS], f"not used: {', '.join(nameless)}"[:NOTE_CHARACTERS]))
-    _check_complete(found)
-    if not any(kind != "jaw" for _, kind in found):
+    measured = {quantity: places for quantity, places in found.items() if quantity[1] not in _SETPOINTS}
+    for quantity, places in sorted(measured.items()):
+        if why := _incomplete(quantity, places):
+            raise BadColumns(why)
+    commanded = {quantity: places for quantity, places in found.items() if quantity[1] in _SETPOINTS}
+    faults |= {quantity: why for quantity, places in commanded.items() if (why := _incomplete(quantity, places))}
+    unknown += [(_topic(*quantity), why) for quantity, why in faults.items()]
+    if not any(kind != "jaw" for _, kind in measured):
         listed = ", ".join(name for one in numeric for name in one.names or [one.name])[:1000]
         raise NoUsableTopic(
             f"No column of the dataset is known as a pose or the joints of a PSM. It has {printable_list(listed)}.",
             Remedy(Action.NAME_FEATURES),
         )
-    return found, unknown
+    return measured, {one: places for one, places in commanded.items() if one not in faults}, unknown
 
 
 def printable_list(text: str) -> str:
@@ -199,12 +243,13 @@ def printable_list(text: str) -> str:
 def meaning_of(name: str) -> tuple[str, str, int] | None:
     """Return the arm, the quantity and the component that a column's name stands for; None for any other name."""
     if pose := _POSE.fullmatch(name):
-        return pose[1].upper(), "local_pose" if pose[2] else "pose", _POSE_PARTS.index(pose[3].lower())
+        kind = ("local_" if pose[2] else "") + ("pose" if pose[3].lower() == "pose" else "setpoint")
+        return pose[1].upper(), kind, _POSE_PARTS.index(pose[4].lower())
     if joint := _JOINT.fullmatch(name):
-        which = joint[2].lower()
-        return joint[1].upper(), "joints", int(which) - 1 if which.isdecimal() else _JOINT_NAMES.index(which)
+        which, kind = joint[3].lower(), "joint_setpoints" if joint[2] else "joints"
+        return joint[1].upper(), kind, int(which) - 1 if which.isdecimal() else _JOINT_NAMES.index(which)
     if jaw := _JAW.fullmatch(name):
-        return jaw[1].upper(), "jaw", 0
+        return jaw[1].upper(), "jaw_setpoint" if jaw[2] else "jaw", 0
     return None
 
 
@@ -228,20 +273,15 @@ def _stated(dataset: Dataset, numeric: Sequence[Feature]) -> dict[tuple[str, str
     return stated
 
 
-def _check_complete(found: Mapping[Quantity, Mapping[int, Place]]) -> None:
-    """Refuse a pose without its position or with a part of an orientation, and joints of which one is missing.
-
-    Raises:
-        BadColumns: A column is missing.
-    """
-    for (arm, kind), places in sorted(found.items()):
-        if kind == "jaw":
-            continue
-        names = _JOINT_NAMES if kind == "joints" else _POSE_PARTS
-        count = 3 if kind != "joints" and max(places) < 3 else len(names)
-        missing = [names[k] for k in range(count) if k not in places]
-        if missing:
-            raise BadColumns(f"The {kind} of {arm} has no column {missing[0]}; all parts are needed.", missing=missing)
+def _incomplete(quantity: Quantity, places: Mapping[int, Place]) -> str | None:
+    """Return the fault of a quantity with a missing column; a pose may have no orientation, a setpoint may not."""
+    arm, kind = quantity
+    if kind.startswith("jaw"):
+        return None
+    names = _JOINT_NAMES if kind.startswith("joint") else _POSE_PARTS
+    count = 3 if kind in ("pose", "local_pose") and max(places) < 3 else len(names)
+    missing = next((names[k] for k in range(count) if k not in places), None)
+    return missing and f"The {kind} of {arm} has no column {missing}; all parts are needed."
 
 
 def _topic(arm: str, kind: str) -> str:
@@ -272,7 +312,7 @@ def _motions(
             if number is None:
                 left_out.append((joints[arm].topic, f"no pose from joints: the instrument of {arm} is not known"))
             else:
-                local = _forward(joints[arm], number)
+                local = _forward(joints[arm].positions, number)
         if local is not None:
             motions.append(replace(_motion(arm, "local_pose", base, stamps_ns, local), from_joints=computed))
         if pose is not None and arm in frames:
@@ -291,6 +331,32 @@ def _motions(
         f"{', '.join(INSTRUMENTS)}.",
         Remedy(Action.NAME_TOOL),
     )
+
+
+def _setpoints(
+    values: Mapping[Quantity, Floats], motions: Sequence[Motion], tools: Mapping[str, str], stamps_ns: Ints
+) -> ColumnSetpoints:
+    """Return the setpoints beside measured poses in the same frame; those of joints in the base of their arm."""
+    setpoints = ColumnSetpoints()
+    for (arm, kind), found in values.items():
+        topic, pose = _topic(arm, kind), found
+        beside = _topic(arm, "pose" if kind == "setpoint" else "local_pose")
+        measured = next((one for one in motions if one.topic == beside), None)
+        if kind == "jaw_setpoint":
+            setpoints.add_jaw(arm, topic, stamps_ns, found[:, 0])
+            continue
+        if kind == "joint_setpoints":
+            number = _number(tools.get(arm, ""))
+            if (arm, "local_setpoint") in values or number is None or not np.isfinite(found).all():
+                why = "not used: the instrument is not known, a number is NaN or infinite, or poses are there too"
+                setpoints.left_out.append((topic, why))
+                continue
+            topic, pose = _topic(arm, "local_setpoint"), _forward(_in_mm(found), number)
+        if measured is None:
+            setpoints.left_out.append((topic, f"{arm} has no measured pose beside it in a known frame"))
+        else:
+            setpoints.add_tip(topic, stamps_ns, 1000.0 * pose[:, :3], pose[:, 3:], measured)
+    return setpoints
 
 
 def _frames(dataset: Dataset, frame: str | None, arms: Collection[str]) -> dict[str, str]:
@@ -334,9 +400,9 @@ def _in_mm(joints: Floats) -> Floats:
     return scaled
 
 
-def _forward(joints: Joints, instrument: str) -> Floats:
-    """Return the poses of the tip in m, shape (T, 7)."""
-    tip_mm, turned = forward(joints.positions, instrument)
+def _forward(positions: Floats, instrument: str) -> Floats:
+    """Return the poses of the tip in m, shape (T, 7), from joints in rad and mm, shape (T, 6)."""
+    tip_mm, turned = forward(positions, instrument)
     return np.concatenate([tip_mm / 1000.0, quaternion_of(turned)], axis=1)
 
 

@@ -5,9 +5,13 @@
 Each episode is sampled at `fps` from the first time at which every arm and jaw is known to the last: for each frame the
 recorded sample that is nearest in time, never an interpolated one, and of an interval never one outside it. So a
 recording made at this rate is written as it is. `observation.state` has for each arm the names of Open-H,
-`psmN_pose.position.x` ... and `psmN_jaw`, in m and rad; `action` is the next frame's state (the last one is repeated).
-The frames of the poses and the tools are in `meta/suture-skills.json`, which our reader reads. Kinematics only, so
-`videos/` is empty.
+`psmN_pose.position.x` ... and `psmN_jaw`, in m and rad; `action` has, as `AboutDataset.action` says, either
+
+    next state   the next frame's state (the last one is repeated), under the state's names
+    setpoint     the setpoints nearest in time, in the frames of the state: `psmN_sp.position.x` ... and `psmN_jaw_sp`
+
+The frames of the poses and the rule of the action are in `meta/suture-skills.json`, which our reader reads. Kinematics
+only, so `videos/` is empty.
 
 Memory does not grow with the number of frames: files are temporary ones, and statistics are summed. Statistics are
 those of all values; quantiles of the dataset are the means of the episodes', weighted by frames, as LeRobot computes
@@ -18,7 +22,7 @@ import hashlib
 import io
 import json
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from tempfile import TemporaryFile
 from typing import IO, Any, Literal, NamedTuple
 
@@ -26,11 +30,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skills.arrays import Floats, Ints
-from skills.demonstration.recording import Recording
+from skills.demonstration.recording import Motion, Recording, Signal
 from skills.errors import BadInput, MixedFrames, NoUsableTopic, UnreadableRecording
 from skills.formats.lerobot import INFO, SAID, TASK_LINES, TASK_TABLE, Json
 
 Version = Literal["v2.1", "v3.0"]
+ActionRule = Literal["next state", "setpoint"]
 Split = Literal["train", "val", "test", "recovery", "failure"]
 SPLITS: tuple[Split, ...] = ("train", "val", "test", "recovery", "failure")
 SHARES = {"train": 0.8, "val": 0.1, "test": 0.1}  # of the episodes; a surgeon is in one of them
@@ -44,6 +49,10 @@ MANIFEST = "SHA256SUMS"
 _V21_DATA = "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
 _V30_DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 _STAGE, _TASK, _TOOL = "observation.meta.stage", "instruction.text", "observation.meta.tool.{}"
+_ACTIONS: dict[ActionRule, str] = {
+    "next state": "`action` is the state of the next frame.",
+    "setpoint": "`action` has the setpoints of these poses and jaws that are nearest in time, in the same frames.",
+}
 _PIECE = 1 << 20
 
 Singles = NDArray[np.float32]
@@ -80,6 +89,7 @@ class AboutDataset:
         name: Its title.
         arms: The arms of every episode, in the order of the state, such as ("PSM1", "PSM2").
         fps: Frames per second.
+        action: The rule of the action; `action_rule` returns the one that the episodes allow.
         licence: The licence, such as "CC-BY-4.0".
         consent: The consent under which it is passed on, as a sentence.
         description: What it contains, as sentences.
@@ -91,6 +101,7 @@ class AboutDataset:
     name: str
     arms: tuple[str, ...]
     fps: int = 30
+    action: ActionRule = "next state"
     licence: str = "unknown"
     consent: str = "Not stated."
     description: str = "Not stated."
@@ -108,6 +119,33 @@ class AboutDataset:
         return [
             name for arm in map(str.lower, self.arms) for name in (*(f"{arm}_pose.{p}" for p in PARTS), f"{arm}_jaw")
         ]
+
+    @property
+    def action_names(self) -> list[str]:
+        """The names of the action's numbers."""
+        if self.action == "next state":
+            return self.names
+        return [name.replace("_pose.", "_sp.").replace("_jaw", "_jaw_sp") for name in self.names]
+
+
+def action_rule(episodes: Iterable[ExportedEpisode], about: AboutDataset) -> ActionRule:
+    """Return "setpoint" if every episode has setpoints of every arm at every frame, and otherwise "next state".
+
+    Args:
+        episodes: Those of the dataset; each is used once, and not kept, and none after the first without setpoints.
+        about: Its description, of which the arms and the rate are used.
+
+    Raises:
+        NoUsableTopic, UnreadableRecording: An episode cannot be written, whatever its actions are.
+    """
+    total = _Total(replace(about, action="next state"))
+    for episode in episodes:
+        _, times_ns = total.sampled(episode)
+        try:
+            total.commanded(episode, times_ns)
+        except (NoUsableTopic, UnreadableRecording):
+            return "next state"
+    return "setpoint"
 
 
 def splits_by_surgeon(episodes: Mapping[str, int]) -> dict[str, Split]:
@@ -145,7 +183,8 @@ def dataset_files(
 
     Raises:
         BadInput: There are no episodes, or not in the order of their splits.
-        NoUsableTopic: An episode lacks an arm, its orientation or its jaw, or these have no time in common.
+        NoUsableTopic: An episode lacks an arm, its orientation or its jaw, or these have no time in common; or
+            setpoints, if these are the actions.
         MixedFrames: An arm's poses are in another frame than in the episodes before.
         UnreadableRecording: An arm has no sample within one frame of a frame's time.
     """
@@ -175,7 +214,13 @@ def _files(
         yield from store.finish(total)
     info = total.info(version)
     yield INFO, _json(info)
-    yield SAID, _json({"frames": total.frames} | ({} if about.export is None else {"export": about.export}))
+    yield (
+        SAID,
+        _json(
+            {"action": about.action, "frames": total.frames}
+            | ({} if about.export is None else {"export": about.export})
+        ),
+    )
     yield "meta/README.md", io.BytesIO(_readme(about, total).encode())
     yield "videos/.keep", io.BytesIO()
 
@@ -211,13 +256,14 @@ class _Total:
     def take(self, episode: ExportedEpisode) -> _Taken:
         """Return an episode as columns, and add it."""
         self._add_to_split(episode.split)
-        state, stamps_ns = self._sampled(episode)
+        state, stamps_ns = self.sampled(episode)
+        following = np.concatenate([state[1:], state[-1:]])
         rows, number = len(state), self.episodes
         task = self.tasks.setdefault(episode.task, len(self.tasks))
         tools = dict(episode.recording.tools)
         columns: dict[str, Numbers | list[str]] = {
             "observation.state": state,
-            "action": np.concatenate([state[1:], state[-1:]]),
+            "action": following if self.about.action == "next state" else self.commanded(episode, stamps_ns),
             **{_TOOL.format(arm.lower()): [tools.get(arm, "")] * rows for arm in self.about.arms},
             _STAGE: _stages(episode.recording, stamps_ns),
             _TASK: [episode.task] * rows,
@@ -238,7 +284,7 @@ class _Total:
             raise BadInput(f"Give the episodes in the order of their splits: {', '.join(SPLITS)}.", split=split)
         self.splits.setdefault(split, [self.episodes, self.episodes])[1] += 1
 
-    def _sampled(self, episode: ExportedEpisode) -> tuple[Singles, Ints]:
+    def sampled(self, episode: ExportedEpisode) -> tuple[Singles, Ints]:
         """Return the state at each frame, shape (T, 8 per arm), and the frames' times, shape (T,)."""
         series = [part.within(episode) for arm in self.about.arms for part in self._arm(episode, arm)]
         if not all(len(one.stamps_ns) for one in series) or (
@@ -249,10 +295,33 @@ class _Total:
         period_ns = 1e9 / self.about.fps
         count = int(np.floor((end - start) / period_ns + 1e-6)) + 1  # stamps are rounded to nanoseconds
         times_ns = start + np.rint(np.arange(count) * period_ns).astype(np.int64)
-        states = [one.at(times_ns, period_ns, self._name(episode)) for one in series]
-        return np.concatenate(states, axis=1).astype(np.float32), times_ns
+        return self._numbers(series, episode, times_ns), times_ns
 
-    def _arm(self, episode: ExportedEpisode, arm: str) -> "tuple[_Series, _Series]":
+    def commanded(self, episode: ExportedEpisode, times_ns: Ints) -> Singles:
+        """Return the setpoints at some times, shape (T, 8 per arm), in the frames of the state.
+
+        Raises:
+            NoUsableTopic: An arm or its jaw has none in the episode's interval.
+            UnreadableRecording: None is within one frame of a time.
+        """
+        recording, series = episode.recording, list[_Series]()
+        for arm in self.about.arms:
+            tip, jaw = recording.setpoint_of(recording.motion_of(arm=arm)), recording.jaw_setpoint_of(arm)
+            found = () if tip is None or jaw is None else _series_of(tip, jaw)
+            parts = [one.within(episode) for one in found]
+            if not parts or not all(len(one.stamps_ns) for one in parts):
+                raise NoUsableTopic(
+                    f"{self._name(episode).capitalize()} has no setpoints of {arm} and its jaw in the frame of its "
+                    "poses; leave it out, or write the next states as actions."
+                )
+            series += parts
+        return self._numbers(series, episode, times_ns)
+
+    def _numbers(self, series: "list[_Series]", episode: ExportedEpisode, times_ns: Ints) -> Singles:
+        numbers = [one.at(times_ns, 1e9 / self.about.fps, self._name(episode)) for one in series]
+        return np.concatenate(numbers, axis=1).astype(np.float32)
+
+    def _arm(self, episode: ExportedEpisode, arm: str) -> "tuple[_Series, ...]":
         """Return an arm's poses and jaw, and note the frame of its poses."""
         recording, name = episode.recording, self._name(episode)
         motion, jaw = recording.motion_of(arm=arm), recording.jaw_of(arm)
@@ -265,8 +334,7 @@ class _Total:
                 f"{arm} is in the frame {motion.frame} in {name}, and in {before} in the episodes "
                 "before; write a dataset for each frame."
             )
-        poses = _Series(motion.topic, motion.stamps_ns, (motion.tip_mm, motion.rotation_xyzw))
-        return poses, _Series(jaw.topic, jaw.stamps_ns, (jaw.values[:, None],))
+        return _series_of(motion, jaw)
 
     def _name(self, episode: ExportedEpisode) -> str:
         return f"episode {self.episodes}{'' if episode.source is None else f' ({episode.source})'}"
@@ -275,7 +343,10 @@ class _Total:
         """Return the contents of info.json."""
         state = {"dtype": "float32", "shape": [len(self.about.names)], "names": [self.about.names]}
         texts = [*(_TOOL.format(arm.lower()) for arm in self.about.arms), _STAGE, _TASK]
-        features: dict[str, Json] = {"observation.state": state, "action": state}
+        features: dict[str, Json] = {
+            "observation.state": state,
+            "action": state | {"names": [self.about.action_names]},
+        }
         features |= {name: {"dtype": "string", "shape": [1], "names": ["value"]} for name in texts}
         features["timestamp"] = {"dtype": "float32", "shape": [1], "names": None}
         for name in ("frame_index", "episode_index", "index", "task_index"):
@@ -326,6 +397,14 @@ class _Series(NamedTuple):
             )
         tips, *rest = (one[chosen] for one in self.values)
         return np.concatenate([tips / 1000.0, *rest], axis=1) if rest else tips
+
+
+def _series_of(motion: Motion, jaw: Signal) -> tuple[_Series, ...]:
+    """Return the poses and the jaw of an arm; nothing if the orientation is missing."""
+    if motion.rotation_xyzw is None:
+        return ()
+    poses = _Series(motion.topic, motion.stamps_ns, (motion.tip_mm, motion.rotation_xyzw))
+    return poses, _Series(jaw.topic, jaw.stamps_ns, (jaw.values[:, None],))
 
 
 def _nearest(times_ns: Ints, stamps_ns: Ints) -> Ints:
@@ -548,7 +627,7 @@ Splits, by {about.split_by}:
 ## Robot
 
 da Vinci Research Kit. `observation.state` has the measured pose and jaw of {", ".join(about.arms)}, in metres, unit
-quaternions x, y, z, w, and radians; `action` is the state of the next frame. The frames of the poses:
+quaternions x, y, z, w, and radians. {_ACTIONS[about.action]} The frames of the poses:
 
 {frames}
 ## Sensors

@@ -11,8 +11,8 @@ Messages are taken in order of their log time, as every MCAP reader does; sample
 poses, joints and jaw angles with stamps that decrease in that order are dropped and counted; events such as pedals are
 not, because each one counts. Messages without a header have their log time as stamp.
 
-A demonstration needs the motions, the jaws and the clutch: an error in one of them refuses the file. All other topics
-are optional: one that cannot be used is omitted, and `left_out` has the reason.
+A demonstration needs the motions, the jaws and the clutch: an error in one of them refuses the file. All other topics,
+setpoints among them, are optional: one that cannot be used is omitted, and `left_out` has the reason.
 """
 
 from collections import Counter
@@ -58,6 +58,7 @@ TOOL_LIMIT = 200  # characters of an instrument's name
 _INSERTION = 2  # the PSM's only prismatic joint
 
 _POSITION = Wanted(("position",), first=True)
+_ANGLES = (Kind.JAW, Kind.GRIPPER, Kind.JAW_SETPOINT)  # continuous values, the first of a joint state
 _WANTED = {
     topics.POSE: WANTED_POSE,
     topics.TRANSFORM: Wanted(
@@ -172,10 +173,10 @@ class _Log:
             return None
         schema = self.walker.schemas[channel.schema]
         topic = self.topics.setdefault(channel.topic, _Topic(channel.topic, meaning))
-        if schema.encoding == "ros2idl":
+        if schema.encoding == "ros2idl" and not topics.is_setpoint(channel.topic, message_type):
             self.foreign.append(channel)
             return None
-        wanted = _POSITION if meaning.kind in (Kind.JAW, Kind.GRIPPER) else _WANTED[message_type]
+        wanted = _POSITION if meaning.kind in _ANGLES else _WANTED[message_type]
         try:
             _check_encoding(channel, schema)
             if channel.schema not in self.fields:
@@ -228,7 +229,7 @@ def _ros2_name(name: str) -> str:
 
 
 def _recording(log: _Log) -> Recording:
-    motions, masters, joints, tools = [], [], [], []
+    motions, masters, joints, tools, setpoints = [], [], [], [], []
     signals: dict[Kind, dict[str, Signal]] = {kind: {} for kind in Kind}
     for topic in sorted(log.topics.values(), key=lambda topic: topic.name):
         if not topic.parts:
@@ -239,6 +240,8 @@ def _recording(log: _Log) -> Recording:
                 motions.append(_motion(topic))
             elif kind is Kind.MASTER:
                 masters.append(_motion(topic))
+            elif kind is Kind.SETPOINT:
+                setpoints.append(_motion(topic))
             elif kind is Kind.JOINTS:
                 joints.append(_joints(topic))
             elif kind is Kind.TOOL:
@@ -264,6 +267,8 @@ def _recording(log: _Log) -> Recording:
         tools=tuple(tools),
         notes=tuple(sorted(log.walker.notes.items())),
         left_out=tuple(sorted(log.left_out.items())),
+        setpoints=tuple(setpoints),
+        jaw_setpoints=tuple(signals[Kind.JAW_SETPOINT].items()),
     )
 
 
@@ -319,7 +324,7 @@ def _signal(topic: _Topic) -> Signal:
         raise NoUsableTopic(
             f"{topic.name} has messages without a value; remove the topic from the recording.", topic=topic.name
         )
-    make = recorded_signal if topic.meaning.kind in (Kind.JAW, Kind.GRIPPER) else Signal
+    make = recorded_signal if topic.meaning.kind in _ANGLES else Signal
     return make(stamps_ns, values[:, 0], topic.name)
 
 
