@@ -154,7 +154,7 @@ COMMANDED = replace(ABOUT, action="setpoint")
 
 
 @pytest.mark.parametrize("version", VERSIONS)
-def test_setpoints_are_written_as_actions_and_read_as_the_same_bits(tmp_path, version):
+def test_setpoints_written_as_actions_are_read_as_the_same_bits(tmp_path, version):
     given = commanded_episodes()
     folder = written(tmp_path, given, version, COMMANDED)
     for number, episode in enumerate(given):
@@ -215,7 +215,7 @@ def sparse(one: Recording) -> Recording:
     ],
     ids=["an arm", "a jaw", "another frame", "no orientation", "a gap"],
 )
-def test_setpoints_that_one_episode_lacks_are_no_actions_of_the_dataset(tmp_path, change, error):
+def test_setpoints_that_an_episode_lacks_are_no_actions(tmp_path, change, error):
     first, second, third = commanded_episodes()
     assert action_rule([first, second, third], ABOUT) == "setpoint"
     given = [first, replace(second, recording=change(second.recording)), third]

@@ -131,7 +131,7 @@ def test_no_fault_of_setpoints_refuses_a_ros_1_bag(fault, tmp_path):
     assert why in dict(found.left_out)[said[0].topic]
 
 
-def test_a_damaged_message_of_setpoints_refuses_no_ros_1_bag(tmp_path, monkeypatch):
+def test_a_damaged_message_of_setpoints_refuses_no_bag(tmp_path, monkeypatch):
     real, seen = NOETIC.serialize_ros1, []
 
     def cut(value, message_type):
@@ -241,7 +241,7 @@ def test_actions_that_are_called_setpoints_are_read_as_such():
     assert found.left_out == ()
 
 
-def test_actions_under_the_names_of_the_state_may_be_anything_and_are_not_read():
+def test_actions_under_the_names_of_the_state_are_not_read():
     found = read_episode(lerobots.commands(), names=lerobots.STATE)
     assert (found.setpoints, found.jaw_setpoints, found.left_out) == ((), (), ())
 
