@@ -32,11 +32,22 @@ WRONG = ROOT / "docs" / "mistakes.md"  # its commands are misspelt on purpose
 LINK = re.compile(r"\]\((?!https?:)([^)#]*)(?:#([^)]*))?\)")
 OF_OTHERS = {  # files of other projects, a pattern, and one that was rejected
     *("dvrk_bag_replay.py", "launch_crtk_interface.py", "simulator.launch.py", "docs/scene_coordinate_frames.md"),
+    *("data-collection/scripts/validation/validate_formatting.py", "validate_formatting.py"),
     *("scripts/validation/validate_formatting.py", "0001_what_it_does.py", "bytes.py"),
 }
 ELSEWHERE = {  # other libraries, columns and JSON, by the first part of the name
     *("DBOS", "Rotation", "csv", "httpx", "np", "sys", "yaml"),
-    *("a", "lineage", "nearest_limit", "observation", "psmN_local_pose", "psmN_pose", "result"),
+    *(
+        "a",
+        "lineage",
+        "nearest_limit",
+        "observation",
+        "psmN_local_pose",
+        "psmN_local_sp",
+        "psmN_pose",
+        "psmN_sp",
+        "result",
+    ),
 }
 ALSO_ELSEWHERE = {"policy.model_dump", "report.path_states"}  # pydantic's and JSON's, beginning as names of ours do
 SUFFIXES = {"csv", "json", "jsonl", "lock", "md", "parquet", "py", "sqlite", "toml", "txt", "urdf", "yaml", "zip"}

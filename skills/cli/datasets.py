@@ -59,7 +59,7 @@ def export_dataset(
     from skills.formats.lerobot.manifest import refuse_existing
 
     refuse_existing(to)
-    with service(works=True) as client:
+    with service(workers=1) as client:
         job = client.export_dataset(
             demos=demo,
             surgeons=surgeon,

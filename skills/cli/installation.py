@@ -192,15 +192,15 @@ def verify(
         lines = list(verify_bag(bag))
         _say("\n".join(lines), as_json, whole=True, checked=lines)
         return
-    from skills.api import app
     from skills.db.session import Database
     from skills.library.inspection import Checked, inspect_installation
+    from skills.library.recordings import confined_reader
     from skills.settings import settings
 
     found: dict[str, Checked] = {}
     with (
         closing(Database(settings().database_url)) as database,
-        app.confined_reader(settings()) as reader,
+        confined_reader(settings()) as reader,
         _telling("verifying") as told,
     ):
         for part in inspect_installation(database, reader.tell, decode_all=decode_all):

@@ -45,16 +45,25 @@ from skills.db.service_tables import (
 )
 from skills.db.session import Database
 from skills.demonstration.recording import Recording
-from skills.errors import BadInput, Conflict, TooLarge
+from skills.errors import BadInput, Conflict, NotFound, TooLarge
 from skills.formats.lerobot import INFO
-from skills.formats.lerobot.writer import SPLITS, AboutDataset, ExportedEpisode, Split, Version, dataset_files
+from skills.formats.lerobot.writer import (
+    SPLITS,
+    AboutDataset,
+    ExportedEpisode,
+    Split,
+    Version,
+    action_rule,
+    dataset_files,
+)
 from skills.formats.lerobot.writer import splits_by_surgeon as splits_by_group
 from skills.library import consent, jobs
 from skills.library.catalogue import find_surgeon, find_suture_type
 from skills.library.demos import find_demo
 from skills.library.integrity import find_by_digest
 from skills.library.jobs import UNSYNCHRONISED, DatasetRequest, Store
-from skills.library.recordings import CHUNK_BYTES, Teller, confined_reader, stored_recording
+from skills.library.parsed import CHUNK_BYTES
+from skills.library.recordings import Teller, confined_reader, stored_recording
 from skills.packing import canonical, sha256
 from skills.remedies import Action, Remedy
 from skills.schemas.requests import DatasetIn
@@ -366,7 +375,10 @@ def export_dataset(database: Database, request: DatasetRequest, settings: Settin
     with ExitStack() as opened:
         file = opened.enter_context(TemporaryFile())
         with confined_reader(settings) as read:
+            # Read once more than written: whether all episodes have setpoints is known after the last one.
+            rule = action_rule(_exported(database, read.tell, episodes, lambda _: tell(0.0)), about)
             exported = _exported(database, read.tell, episodes, tell)
+            about = replace(about, action=rule)
             made = write_dataset(file, exported, about, cast(Version, request["version"]), settings)
         until_stored = opened.pop_all()
 
@@ -435,7 +447,10 @@ def _exported(
             tell(number / (len(episodes) + 1))
         if recording is None or at != episode.recording:
             recording = None  # before the next one is read, so that only one is in memory
-            recording, at = stored_recording(database, episode.recording, read).recording, episode.recording
+            try:
+                recording, at = stored_recording(database, episode.recording, read).recording, episode.recording
+            except NotFound:
+                raise NotFound("A recording of the export was erased meanwhile; request it again.") from None
         yield _part(recording, episode)
 
 

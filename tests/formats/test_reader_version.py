@@ -12,7 +12,7 @@ from skills.seeds.recordings import sample_recordings
 from tests.formats import bags, lerobots, trials
 from tests.library import cases
 
-DIGESTS = {1: "c120cc5e48dfc395337b2f84d4b2c9d81405d6b10827b0cf2e32d9d1770e7936"}
+DIGESTS = {1: "f3e12fe5a106fc4ba531a9b17296658d5a2755c9c03d4fb2686dbec595e059f2"}
 FILES: list[tuple[bytes, dict[str, Any]]] = [
     (sample_recordings()[0].data, {}),
     (bags.pose_bag(bags.straight(40)), {}),

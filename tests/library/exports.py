@@ -4,6 +4,7 @@ import io
 import zipfile
 from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from skills.db.session import Database
 from skills.demonstration.recording import Motion, Recording, Signal
 from skills.formats import read_recording, write_mcap
 from skills.formats.lerobot.cut import cut_episode, episodes_of, find_dataset
+from skills.formats.reader_process import read_told
 from skills.library.datasets import dataset_chunk, request_dataset
 from skills.schemas.requests import DatasetIn
 from tests.library import cases
@@ -84,7 +86,9 @@ def read_episode(data: bytes, folder: Path, number: int) -> Recording:
 
 def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """Read recordings without starting a reader's process."""
-    monkeypatch.setattr("skills.library.datasets.confined_reader", lambda _settings: nullcontext(read_recording))
+    monkeypatch.setattr(
+        "skills.library.datasets.confined_reader", lambda _settings: nullcontext(SimpleNamespace(tell=read_told))
+    )
 
 
 def kept(database: Database) -> tuple[int, int, int]:
