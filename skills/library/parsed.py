@@ -32,7 +32,7 @@ CHUNK_BYTES = 1 << 20
 # Ours: a larger entry is not kept, so that uploads which compress well cannot fill the disk. Entries of bags, tables
 # and JIGSAWS take 0.1 to 1.1 times the bytes of their files, those of parquet files in single precision 1.6 times.
 MOST_SHARE = 4
-LEAST_BYTES = 64 << 10  # ours: the limit for the smallest files, whose names weigh more than their numbers
+LEAST_BYTES = 256 << 10  # ours: the limit for the smallest files, whose names weigh more than their numbers
 TOLERANCE = 1e-6  # ours, in mm, rad and s: another build of numpy may round differently
 
 log = logging.getLogger(__name__)
