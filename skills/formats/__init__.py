@@ -20,7 +20,7 @@ from skills.formats.tables import BASE, TableReading, read_table
 from skills.formats.writer import write_bag, write_mcap
 from skills.remedies import Action, Remedy
 
-__all__ = ["BYTES", "MEDIA_TYPES", "SUFFIXES", "media_type_of", "read_recording", "write_bag", "write_mcap"]
+__all__ = ["BYTES", "MEDIA_TYPES", "READABLE", "SUFFIXES", "media_type_of", "read_recording", "write_bag", "write_mcap"]
 
 MCAP, ZIP, TABLE, TEXT = "application/vnd.mcap", "application/zip", "text/csv", "text/plain"
 ROSBAG1, SQLITE = "application/x-rosbag", "application/vnd.sqlite3"
@@ -33,6 +33,7 @@ MEDIA_TYPES = {
     ROSBAG1: "a ROS 1 bag",
     SQLITE: "a .db3 bag",
 }
+READABLE = "; ".join(MEDIA_TYPES.values())  # for messages and pages
 SUFFIXES = {MCAP: ".mcap", ZIP: ".zip", TABLE: ".csv", TEXT: ".txt", ROSBAG1: ".bag", SQLITE: ".db3"}  # for dialogs
 
 _HEAD_BYTES = 65536
@@ -48,9 +49,7 @@ _OTHERS = (
     (b"\x89HDF", "HDF5; export a table"),
     (_PARQUET, "Parquet, a part of a LeRobot dataset; send an episode with its meta/info.json, as a zip"),
 )
-_READ = (
-    "MCAP, zipped bag folders, ROS 1 and .db3 bags, zipped LeRobot episodes, CSV and JIGSAWS kinematics can be read."
-)
+_READ = f"Send one of these: {READABLE}."
 
 
 def read_recording(

@@ -11,7 +11,7 @@ import pytest
 from skills.client import Client
 from skills.client.transport import PIECE_BYTES
 from skills.errors import UnknownFormat, UnreadableRecording
-from skills.formats import write_mcap
+from skills.formats import MEDIA_TYPES, write_mcap
 from tests.formats import bags, others, trials
 
 
@@ -80,6 +80,10 @@ def test_the_content_says_what_it_is(client, heard, tmp_path: Path, kind: str, s
         client.add_demo(recording, surgeon="kestrel", suture="simple-running")
         assert heard.headers["content-type"] == kind
         assert heard.body == KINDS[kind]
+
+
+def test_every_format_is_among_them():
+    assert KINDS.keys() == MEDIA_TYPES.keys()
 
 
 def test_what_is_no_recording_is_not_sent(client, heard):

@@ -25,6 +25,7 @@ from markupsafe import Markup
 
 from skills.api.authorisation import Caller, Role
 from skills.errors import UnknownFormat
+from skills.formats import READABLE
 from skills.library.overview import Style
 
 HTML = "text/html"
@@ -247,6 +248,7 @@ def render(request: Request, template: str, caller: Caller | None, *, status: in
         "path": request.url.path.removeprefix(root),
         "url": lambda path: root + path,
         "static": lambda name: f"{root}/static/{build()}/{name}",
+        "readable": READABLE,
         "may": lambda role: reached >= ladder.index(role),
     }
     html = templates().get_template(template).render(**about, **context)
