@@ -6,7 +6,7 @@ import sqlite3
 import time
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from threading import Event
 from typing import Any
@@ -226,6 +226,9 @@ def test_an_upload_after_the_fork_server_was_killed_succeeds(service, http):
 
 def test_a_stored_recording_is_read_apart_too(service, http):
     recording = send(http, BAG).json()["id"]
+    with closing(sqlite3.connect(service.database)) as database, database:
+        database.execute("DELETE FROM parsed_chunks")
+        database.execute("DELETE FROM parsed_recordings")
     os.kill(service.child(FORK_SERVER), signal.SIGKILL)
     answer = http.post(f"/recordings/{recording}/demos", json=KESTREL | {"grid": "fit", "cell_mm": 2.5})
     assert answer.status_code == 201

@@ -403,7 +403,7 @@ def test_a_table_is_previewed_with_what_is_said_of_it_and_then_stored(
 ) -> None:
     table = tmp_path / "hand-off.csv"
     table.write_text(written.positions("wren" if phone else "heron"))
-    surgeon = "linnet" if phone else "siskin"
+    surgeon = "pipit" if phone else "dunlin"
     client.put_surgeon(surgeon)
     with visiting(browser, url, phone=phone) as tab:
         page, asked = tab.page, tab.asked

@@ -2,11 +2,11 @@
 
 from functools import partial
 
-from fastapi import APIRouter, Request, Response
+from fastapi import Request, Response
 
 from skills.api.authorisation import needs
 from skills.api.dependencies import Actor, Db, Digest, Jobs, Strict, room_for_a_job
-from skills.api.openapi import ends, gives_file, starts_job
+from skills.api.openapi import ends, gives_file, router_of, starts_job
 from skills.api.responses import Condition, Stream, accepted, as_asked, names, stored_pieces
 from skills.api.routes.policies import Accept
 from skills.formats import BYTES
@@ -15,7 +15,7 @@ from skills.library.jobs import QUEUED, did_nothing
 from skills.schemas.requests import DatasetIn
 from skills.settings import MEBIBYTE
 
-router = APIRouter(route_class=Strict, tags=["datasets"], max_body_size=MEBIBYTE)
+router = router_of(route_class=Strict, tags=["datasets"], max_body_size=MEBIBYTE)
 
 ZIP = "application/zip"
 
