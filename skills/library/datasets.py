@@ -13,7 +13,7 @@ every surgeon who is recorded in it, also of one whose demonstration was added t
 import weakref
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
 from hashlib import file_digest
 from json import load
@@ -374,7 +374,8 @@ def export_dataset(database: Database, request: DatasetRequest, settings: Settin
     tell = jobs.telling(database, KIND, request)
     with ExitStack() as opened:
         file = opened.enter_context(TemporaryFile())
-        with confined_reader(settings) as read:
+        read = confined_reader(settings)
+        with closing(read.server):  # it starts at the first recording that is not cached
             # Read once more than written: whether all episodes have setpoints is known after the last one.
             rule = action_rule(_exported(database, read.tell, episodes, lambda _: tell(0.0)), about)
             exported = _exported(database, read.tell, episodes, tell)

@@ -2,7 +2,6 @@
 
 import io
 import zipfile
-from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -86,9 +85,8 @@ def read_episode(data: bytes, folder: Path, number: int) -> Recording:
 
 def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """Read recordings without starting a reader's process."""
-    monkeypatch.setattr(
-        "skills.library.datasets.confined_reader", lambda _settings: nullcontext(SimpleNamespace(tell=read_told))
-    )
+    reader = SimpleNamespace(tell=read_told, server=SimpleNamespace(close=lambda: None))
+    monkeypatch.setattr("skills.library.datasets.confined_reader", lambda _settings: reader)
 
 
 def kept(database: Database) -> tuple[int, int, int]:

@@ -11,13 +11,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from sqlalchemy import select, text
+from sqlalchemy import delete, select, text
 
-from skills.db.models import StoredRecording
+from skills.db.models import ParsedRecording, StoredRecording
 from skills.db.row_visibility import Only
 from skills.db.service_tables import DatasetDemonstration, Event, Job
 from skills.db.session import Database
 from skills.errors import BadInput, Conflict, NotFound, TooLarge
+from skills.formats.reader_process import ConfinedReader, Told
 from skills.library import consent, perform_job
 from skills.library.catalogue import find_surgeon, put_surgeon
 from skills.library.datasets import delete_dataset, export_dataset, find_dataset
@@ -202,11 +203,21 @@ def test_a_dataset_over_the_limit_is_not_stored(database: Database):
     assert kept(database) == (0, 0, 1)
 
 
-def test_a_confined_reader_reads_the_recordings(database: Database):
+def test_a_confined_reader_reads_what_is_not_cached(database: Database, monkeypatch: pytest.MonkeyPatch):
     add(database, session_of())
-    assert kept(database) == NONE_LEFT
-    export(database)
-    assert kept(database) == (1, 1, 1)
+    tell, told = ConfinedReader.tell, []
+
+    def counted(reader: ConfinedReader, *given: Any, **how: Any) -> Told:
+        told.append(reader)
+        return tell(reader, *given, **how)
+
+    monkeypatch.setattr(ConfinedReader, "tell", counted)
+    assert zip_of(database, export(database))
+    assert told == []
+    with database.writing() as session:
+        session.execute(delete(ParsedRecording))
+    assert zip_of(database, export(database, fps=25))
+    assert len(told) == 1  # and cached then
 
 
 # ---- the job -------------------------------------------------------------------------------------------------------
