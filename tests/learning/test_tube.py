@@ -79,7 +79,7 @@ def test_no_run_leaves_the_tube_and_all_arrive_in_time() -> None:
 
 @pytest.mark.nightly
 def test_a_million_runs_stay_in_the_tube() -> None:
-    for seed in range(100):
+    for seed in range(34):  # 10 000 runs under each of three limits
         held_in_the_tube(10_000, seed)
 
 
