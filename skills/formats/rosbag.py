@@ -244,9 +244,11 @@ def _messages(reader: AnyReader, faults: dict[str, str] | None) -> Iterator[Mess
             yield write(topic, log_ns, reader.deserialize(data, connection.msgtype))
         elif topic not in faults:
             try:
-                yield write(topic, log_ns, reader.deserialize(data, connection.msgtype))
+                message = write(topic, log_ns, reader.deserialize(data, connection.msgtype))
             except Exception:  # on a damaged message rosbags may raise anything
                 faults[topic] = "A message of the topic is damaged."
+            else:
+                yield message
 
 
 def _pose(topic: str, log_ns: int, said: Any) -> Message:

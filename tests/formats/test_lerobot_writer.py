@@ -155,6 +155,17 @@ COMMANDED = replace(ABOUT, action="setpoint")
 
 
 @pytest.mark.parametrize("version", VERSIONS)
+def test_no_setpoint_from_outside_an_interval_is_an_action(tmp_path, version):
+    given = commanded(recording(40), 0)
+    stamps_ns = given.motions[0].stamps_ns
+    part = ExportedEpisode(given, "x", start_ns=int(stamps_ns[5]), end_ns=int(stamps_ns[9]))
+    again = read(written(tmp_path, [part], version, COMMANDED), 0)
+    # The setpoint nearest to the last frame is 3 ms after the interval.
+    for one, other in zip(again.setpoints, given.setpoints, strict=True):
+        assert np.abs(one.tip_mm - other.tip_mm[[5, 6, 7, 8, 8]]).max() < 1e-9
+
+
+@pytest.mark.parametrize("version", VERSIONS)
 def test_setpoints_written_as_actions_are_read_as_the_same_bits(tmp_path, version):
     given = commanded_episodes()
     folder = written(tmp_path, given, version, COMMANDED)

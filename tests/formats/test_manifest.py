@@ -48,7 +48,7 @@ def with_line(name: str) -> dict[str, bytes]:
     return content | {MANIFEST: content[MANIFEST] + f"{empty}  {name}\n".encode()}
 
 
-@pytest.mark.parametrize("name", ["../out", "/tmp/out", "data/../../out", "a\\b", "C:/x", "..", "data/.", "a//b", "é"])
+@pytest.mark.parametrize("name", ["../out", "/out", "data/../../out", "a\\b", "C:/x", "..", "data/.", "a//b", "é"])
 def test_a_name_that_leaves_the_folder_is_refused(tmp_path: Path, name: str):
     with pytest.raises((Corrupt, UnreadableRecording)):
         unpack_dataset(zip_of(with_line(name)), tmp_path / "dataset")

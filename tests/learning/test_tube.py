@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from skills.errors import BadInput, BadSettings
 from skills.learning.pose_style import PHASES, PosePath
-from skills.learning.tube import Hands, TubeLimits, advance, certify_tube, next_pose
+from skills.learning.tube import Hands, TubeLimits, Update, advance, certify_tube, next_pose
 
 LIMITS = TubeLimits(step_mm=6.0, step_rad=0.2, disturbance_mm=1.0, disturbance_rad=0.02, start_mm=20.0, start_rad=0.5)
 
@@ -128,7 +128,7 @@ def lazy(path: PosePath, hands: Hands, limits: TubeLimits) -> Hands:
         (lazy, "does not come nearer to the position"),
     ],
 )
-def test_a_defect_of_the_update_fails_the_certificate(update, fault: str) -> None:  # type: ignore[no-untyped-def]
+def test_a_defect_of_the_update_fails_the_certificate(update: Update, fault: str) -> None:
     found = certify_tube(a_path(), LIMITS, update)
     assert not found.holds and any(fault in one for one in found.faults), found.faults
 
