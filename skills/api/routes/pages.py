@@ -171,18 +171,20 @@ def show_recordings(request: Request, caller: Asking, db: Db, cursor: RowCursor 
 
 
 @router.get("/pages/recordings/new", dependencies=[needs("reader")])
-def show_upload(request: Request, caller: Asking, surgeon: Picked = None, suture: Picked = None) -> Response:
+def show_upload(request: Request, caller: Asking, db: Db, surgeon: Picked = None, suture: Picked = None) -> Response:
     """Show the form that uploads a recording."""
-    return render(
-        request,
-        "upload.html",
-        caller,
-        kinds=MEDIA_TYPES,
-        suffixes=SUFFIXES,
-        instruments=list(INSTRUMENTS),
-        surgeon=surgeon,
-        suture=suture,
-    )
+    with db.reading() as session:
+        return render(
+            request,
+            "upload.html",
+            caller,
+            kinds=MEDIA_TYPES,
+            suffixes=SUFFIXES,
+            instruments=list(INSTRUMENTS),
+            surgeons=overview.all_surgeons(session),
+            surgeon=surgeon,
+            suture=suture,
+        )
 
 
 @router.get("/pages/recordings/{recording}", dependencies=[needs("reader")])

@@ -85,10 +85,11 @@ function send(path, file, headers, query) {
 }
 
 // Send the file with everything locked, so that what is stored is what was previewed.
-async function sent(path, where, then) {
+async function sent(path, where, then, more = {}) {
   const [file] = get("file").files;
   const kind = get("kind").value;
   const query = answers();
+  for (const [name, value] of Object.entries(more)) if (value) query.append(name, value);
   const fields = [...form.elements, get("store"), get("change")].filter((one) => !one.disabled && one !== get("stop"));
   for (const one of fields) one.disabled = true;
   get("progress").value = 0;
@@ -120,10 +121,13 @@ form.addEventListener("submit", (event) => {
   });
 });
 
-get("store").addEventListener("click", () => sent("/recordings", "store-said", (stored) => {
-  const more = new URLSearchParams(Object.entries({ surgeon: form.dataset.surgeon, suture: form.dataset.suture }).filter(([, value]) => value));
-  location.assign(`${root}/pages/recordings/${stored.id}${more.size ? `?${more}` : ""}`);
-}));
+get("store").addEventListener("click", () => {
+  const surgeon = get("surgeon").value;
+  sent("/recordings", "store-said", (stored) => {
+    const more = new URLSearchParams(Object.entries({ surgeon, suture: form.dataset.suture }).filter(([, value]) => value));
+    location.assign(`${root}/pages/recordings/${stored.id}${more.size ? `?${more}` : ""}`);
+  }, { surgeon });
+});
 
 get("change").addEventListener("click", () => {
   if (!said.hidden) said.open = true;
