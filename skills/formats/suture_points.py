@@ -46,7 +46,8 @@ def suture_points(scene: Recording, *, arm: str | None = None, frame: str | None
     Args:
         scene: The recording from `read_scene`.
         arm: The arm; optional if the scene has the base of exactly one.
-        frame: The name of that arm's base frame. If the scene has no base of the arm, the marks are taken to be in it.
+        frame: The name of that arm's base frame. If the scene has no base at all, or only other arms' and the marks
+            state this very frame, the marks are taken to be in it.
 
     Raises:
         NoUsableTopic: There are no marks; or no base, several, or not this arm's, and no frame is given.
@@ -181,11 +182,17 @@ def _base_of(scene: Recording, arm: str | None, frame: str | None, seen_in: str)
     if fitting:
         named = ", ".join(one.arm for one in fitting)
         raise NoUsableTopic(f"The file has the bases of {named}; name the arm.", arms=[one.arm for one in fitting])
+    if bases and frame != seen_in:
+        raise NoUsableTopic(
+            f"The marks are in the frame {seen_in!r}, and the file has the bases of "
+            f"{', '.join(one.arm for one in bases)}, not of {arm}; name one of these arms, or record "
+            f"/CRTK/<psm>/{_BASE} of {arm} too.",
+            *did_you_mean(arm or "", [one.arm for one in bases]),
+        )
     if frame is None:
         raise NoUsableTopic(
             f"The marks are in the frame {seen_in!r}, and the file has no pose of the arm's base in it; record "
             f"/CRTK/<psm>/{_BASE} too, or, if the marks are in the arm's base frame, name that as the frame.",
-            *did_you_mean(arm or "", [one.arm for one in bases]),
         )
     return None
 

@@ -91,6 +91,11 @@ def test_of_several_arms_one_is_named():
     assert found(both, arm="PSM2", frame="PSM2_base").points == found(world()).points
 
 
+def test_an_arm_that_is_not_in_the_scene_is_refused_also_with_a_frame():
+    with pytest.raises(NoUsableTopic, match="bases of psm2, not of psm9"):
+        found(world(), arm="psm9", frame="psm9_base")
+
+
 def test_without_a_base_the_marks_frame_must_be_said_to_be_the_arms():
     with pytest.raises(NoUsableTopic, match=r"frame 'world'.*T_b_w"):
         found(world(base=None))
