@@ -48,6 +48,12 @@ def test_the_scan_sees_the_whole_package():
         assert part in [named(file) for file in FILES]
 
 
+def test_every_folder_is_a_package():
+    """The import contract does not see a folder without `__init__.py`, nor the imports of its files."""
+    folders = {file.parent for file in FILES}
+    assert [named(folder) for folder in folders if not (folder / "__init__.py").is_file()] == []
+
+
 @pytest.fixture
 def loggers() -> Iterator[None]:
     """Restore every logger: import-linter disables them all, also for later tests."""

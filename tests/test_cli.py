@@ -169,7 +169,7 @@ def test_of_several_hand_offs_one_is_named_or_asked_for(
     assert (code, "Taken: the whole recording" in said) == (0, True), said
     code, said = skills(*add, "--segment", "both")
     assert (code, "'both' is neither" in said) == (1, True), said
-    monkeypatch.setattr("skills.cli.recordings.on_terminal", lambda: True)
+    monkeypatch.setattr("skills.cli.demos.on_terminal", lambda: True)
     result = CliRunner().invoke(app, list(add), input="3\n")
     assert (result.exit_code, "Taken: proposal 3 of 5" in result.output) == (0, True), result.output
 

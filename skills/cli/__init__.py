@@ -13,7 +13,7 @@ from typing import Any
 import typer
 from typer.core import TyperGroup
 
-from skills.cli import comparison, datasets, folder_table, installation, policies, recordings
+from skills.cli import comparison, datasets, demos, installation, policies, recordings
 from skills.cli.shell import err, tell
 from skills.remedies import did_you_mean
 
@@ -71,11 +71,11 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Suture styles: learn, certify, serve and check. Research use only.",
 )
-recordings.recordings.add_typer(folder_table.commands)
 for commands in (  # the order of the commands in `skills --help`
     installation.commands,
     installation.key_commands,
     recordings.commands,
+    demos.commands,
     datasets.commands,
     policies.learning_commands,
     policies.commands,

@@ -142,7 +142,7 @@ class RecordingChunk(Base):
 
 
 class ParsedRecording(Base):
-    """A cache of a recording's content as it was read from its bytes (`skills.library.parsed`).
+    """A cache of a recording's content as it was read from its bytes (`skills.library.recordings`).
 
     A row may be deleted at any time; the bytes are then decoded again. `version` is the `READER_VERSION` that read it;
     rows of another version are not used.

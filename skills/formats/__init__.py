@@ -15,8 +15,9 @@ from skills.errors import BadSettings, MixedFrames, UnknownFormat, UnreadableRec
 from skills.formats import archive, ee_csv, jigsaws, rosbag, tables
 from skills.formats.bag_folder import read_one, read_zip
 from skills.formats.cells import SEPARATORS, Decimals, header_of, open_text
-from skills.formats.mcap.recording import MAGIC
-from skills.formats.tables import BASE, TableReading, read_table
+from skills.formats.columns import BASE
+from skills.formats.mcap import MAGIC
+from skills.formats.tables import TableReading, read_table
 from skills.formats.writer import write_bag, write_mcap
 from skills.remedies import Action, Remedy
 

@@ -44,19 +44,8 @@ from skills.demonstration.recording import (
 )
 from skills.errors import BadColumns, BadSettings, MixedFrames, NoUsableTopic, SkillsError
 from skills.formats.cells import check_whole, header_of, open_text, read_numbers
-from skills.formats.setpoints import ColumnSetpoints
-from skills.formats.tables import (
-    BASE,
-    TableReading,
-    base_of,
-    check_joints,
-    check_outside,
-    check_steps,
-    check_time,
-    posed,
-    scaled,
-    stamps_of,
-)
+from skills.formats.columns import BASE, ColumnSetpoints, base_of, check_joints, check_outside, posed, scaled
+from skills.formats.tables import TableReading, check_steps, check_time, stamps_of
 from skills.kinematics import INSERTION, JOINTS
 from skills.remedies import Action, Remedy
 

@@ -31,7 +31,7 @@ from skills.demonstration.recording import Format, Integrity, Recording, Topic
 from skills.errors import NoUsableTopic, UnreadableRecording
 from skills.formats import topics, writer
 from skills.formats.archive import refusing
-from skills.formats.mcap.recording import read_mcap
+from skills.formats.mcap import read_mcap
 from skills.formats.writer import Message, write_messages
 
 TABLES = frozenset({"schema", "metadata", "topics", "message_definitions", "messages"})

@@ -43,10 +43,8 @@ from typing import BinaryIO, TextIO
 import numpy as np
 
 from skills.arrays import Floats, Ints
-from skills.demonstration.motion import COORDINATE_LIMIT_MM
 from skills.demonstration.recording import (
     Column,
-    Motion,
     Recording,
     Signal,
     Topic,
@@ -58,8 +56,6 @@ from skills.errors import (
     BadColumns,
     BadSettings,
     MixedFrames,
-    NotAQuaternion,
-    NotMetres,
     NoUsableTopic,
     UnreadableRecording,
 )
@@ -77,20 +73,23 @@ from skills.formats.cells import (
     open_text,
     read_numbers,
 )
-from skills.kinematics import INSTRUMENTS, JOINTS, UNITS, forward, instrument_of, quaternion_of
+from skills.formats.columns import (
+    BASE,
+    base_of,
+    check_joints,
+    check_outside,
+    posed,
+    quaternion_of_rpy,
+    quaternion_of_vector,
+    scaled,
+)
+from skills.kinematics import JOINTS, UNITS, instrument_of
 from skills.remedies import Action, Remedy, did_you_mean
 
 TOPIC = "table"
 DEFAULT_ARM = "PSM"
-BASE = "base"  # as a frame: the base of each arm
-# The tip is further from the remote centre than the wrist, because the wrist bends by less than a right angle. A reach
-# of 290 mm is 11.4 inches, so a path in inches never exceeds this limit.
-OUTSIDE_MM = min(instrument.cannula_mm - instrument.wrist_offset_mm for instrument in INSTRUMENTS.values())
-BEYOND_LIMIT = {"rad": 0.1, "mm": 10.0}  # ours: encoders overshoot a joint's limit by less; degrees and metres do not
 NOT_ENDED = ("last row", "It has no line end: if the file was cut, its last number lacks digits.")
 _FASTEST_HZ = 100_000.0
-_TURN_RAD = 2 * np.pi
-_JOINT_RAD = 7.0  # ours: more than any joint turns, less than 8 degrees
 
 LENGTHS: Mapping[str, float] = {"m": 1000.0, "mm": 1.0}  # in mm
 ANGLES: Mapping[str, float] = {"rad": 1.0, "deg": np.pi / 180}  # in rad
@@ -468,148 +467,12 @@ def check_steps(column: str, unit: str, stamps_ns: Ints) -> None:
         )
 
 
-def scaled(values: Floats, factor: float) -> Floats:
-    """Return values in mm or rad; infinite ones, where they overflow, are refused by the recording's values."""
-    with np.errstate(over="ignore"):
-        return values if factor == 1 else factor * values
-
-
-def base_of(arm: str, frame: str | None) -> str:
-    """Return the frame of poses that follow from the joints: the base of the arm.
-
-    Raises:
-        MixedFrames: The caller names another frame.
-    """
-    base = f"{arm}_base"
-    if frame not in (None, BASE, base):
-        raise MixedFrames(
-            f"The poses that follow from the joints are in {base}, not in {frame!r}; omit the frame.", frames=[base]
-        )
-    return base
-
-
-def check_joints(topic: str, joints: Floats) -> None:
-    """Refuse numbers that no joint of a PSM has in rad, and its insertion in mm.
-
-    Raises:
-        NotMetres: An insertion beyond 1 m, or an angle beyond `_JOINT_RAD`.
-    """
-    limits = np.where(np.array(UNITS) == "mm", COORDINATE_LIMIT_MM, _JOINT_RAD)
-    wrong = np.abs(joints) > limits
-    if wrong.any():
-        row, joint = np.argwhere(wrong)[0].tolist()
-        raise NotMetres(
-            f"{topic}: {JOINTS[joint]} is {joints[row, joint]:g} {UNITS[joint]} in sample {row}; no joint of a PSM is. "
-            "Give angles in rad and the insertion in m, or name the units of the columns.",
-            sample=row,
-            joint=JOINTS[joint],
-        )
-
-
-def posed(topic: str, joints: Floats, instrument: str | None) -> tuple[Floats, Floats]:
-    """Compute poses from joints by forward kinematics with a stated instrument.
-
-    Args:
-        topic: The source, for messages.
-        joints: Shape (T, 6), rad and mm.
-        instrument: Its number; None if none is stated.
-
-    Returns:
-        Positions in the arm's base frame in mm, shape (T, 3), and unit quaternions, shape (T, 4).
-
-    Raises:
-        NoUsableTopic: No instrument is stated.
-        NotMetres: A joint is beyond its limits, so the instrument, the unit or the order is another.
-    """
-    if instrument is None:
-        one, other, *_ = INSTRUMENTS
-        raise NoUsableTopic(
-            f"{topic} has joints and no poses; they become poses with the instrument that was on the arm.",
-            Remedy(Action.NAME_INSTRUMENT, one=one, other=other),
-            instruments=list(INSTRUMENTS),
-        )
-    tool = instrument_of(instrument)
-    beyond = np.maximum(tool.lower - joints, joints - tool.upper) - [BEYOND_LIMIT[unit] for unit in UNITS]
-    if (beyond > 0).any():
-        row, joint = np.argwhere(beyond > 0)[0].tolist()
-        raise NotMetres(
-            f"{topic}: {JOINTS[joint]} is {joints[row, joint]:.5g} {UNITS[joint]} in sample {row}, beyond the limits "
-            f"{tool.lower[joint]:.4g} to {tool.upper[joint]:.4g} of the {tool.arm.name} with {tool.name}; check the "
-            "units, the order of the joints and the instrument.",
-            sample=row,
-            joint=JOINTS[joint],
-        )
-    tip_mm, rotation = forward(joints, instrument)
-    return tip_mm, quaternion_of(rotation)
-
-
-def check_outside(motion: Motion) -> None:
-    """Refuse a path that never leaves the cannula: its numbers are in another unit, or from another origin.
-
-    Raises:
-        NotMetres: The tip is never outside.
-    """
-    if not motion.frame.endswith("_base"):  # only there the origin is the remote centre
-        return
-    away_mm = np.sqrt(np.einsum("ij,ij->i", motion.tip_mm, motion.tip_mm))
-    furthest = int(np.argmax(away_mm))
-    if away_mm[furthest] < OUTSIDE_MM:
-        at_s = (int(motion.stamps_ns[furthest]) - int(motion.stamps_ns[0])) / 1e9
-        raise NotMetres(
-            f"The tip is at most {away_mm[furthest]:.3g} mm from the remote centre (at {at_s:.3f} s); below "
-            f"{OUTSIDE_MM:.3g} mm its wrist is inside the cannula. Give the positions in the unit of the column "
-            "names, not in inches; or name the frame, if they are not relative to the remote centre.",
-            sample=furthest,
-            furthest_mm=float(away_mm[furthest]),
-        )
-
-
-def quaternion_of_rpy(rpy_rad: Floats) -> Floats:
-    """Return the unit quaternions x, y, z, w of R = Rz(yaw) Ry(pitch) Rx(roll).
-
-    Args:
-        rpy_rad: Roll, pitch, yaw about the fixed axes x, y, z, shape (T, 3).
-
-    Returns:
-        Shape (T, 4).
-    """
-    (cr, cp, cy), (sr, sp, sy) = np.cos(rpy_rad.T / 2), np.sin(rpy_rad.T / 2)
-    x, y = sr * cp * cy - cr * sp * sy, cr * sp * cy + sr * cp * sy
-    z, w = cr * cp * sy - sr * sp * cy, cr * cp * cy + sr * sp * sy
-    return np.stack([x, y, z, w], axis=1)
-
-
-def quaternion_of_vector(vector_rad: Floats) -> Floats:
-    """Return the unit quaternions x, y, z, w of rotation vectors: the axis times the angle.
-
-    Args:
-        vector_rad: Shape (T, 3).
-
-    Returns:
-        Shape (T, 4).
-
-    Raises:
-        NotAQuaternion: A vector is longer than a whole turn, so its unit is another.
-    """
-    with np.errstate(over="ignore"):
-        angle = np.linalg.norm(vector_rad, axis=1)
-    if not (angle <= _TURN_RAD).all():
-        row = int(np.argmin(angle <= _TURN_RAD))
-        raise NotAQuaternion(
-            f"{TOPIC}: the rotation vector of sample {row} has the length {angle[row]:g} rad, more than a turn; name "
-            "its columns with their unit, rx_rad or rx_deg.",
-            sample=row,
-        )
-    half = 0.5 * np.sinc(angle / _TURN_RAD)  # sin(angle / 2) / angle, which is 1/2 at 0
-    return np.column_stack([vector_rad * half[:, None], np.cos(angle / 2)])
-
-
 def _rotation_xyzw(table: _Table) -> Floats | None:
     if QUATERNION[0] in table.columns:
         return table.stacked(QUATERNION)
     if RPY[0] in table.columns:
         return quaternion_of_rpy(table.stacked(RPY))
-    return quaternion_of_vector(table.stacked(ROTATION_VECTOR)) if ROTATION_VECTOR[0] in table.columns else None
+    return quaternion_of_vector(TOPIC, table.stacked(ROTATION_VECTOR)) if ROTATION_VECTOR[0] in table.columns else None
 
 
 def _signal(table: _Table, quantity: str, name: str) -> Signal | None:

@@ -30,13 +30,21 @@ from mcap.writer import Writer
 from skills.demonstration.recording import Label, Topic
 from skills.errors import BadInput, UnreadableRecording
 from skills.formats import rosbag
-from skills.formats.annotations import read_labels
 from skills.formats.archive import pack
-from skills.formats.bag_folder import METADATA, TAGS_BYTES, check_counts, in_order, read_metadata, suffix_of, unzstd
+from skills.formats.bag_folder import (
+    METADATA,
+    TAGS_BYTES,
+    check_counts,
+    in_order,
+    read_labels,
+    read_metadata,
+    suffix_of,
+    unzstd,
+)
 from skills.formats.jigsaws import trials
 from skills.formats.lerobot import INFO
+from skills.formats.mcap import MAGIC
 from skills.formats.mcap.reader import NOTES
-from skills.formats.mcap.recording import MAGIC
 from skills.formats.mcap.records import RECOVER
 from skills.remedies import Action, Remedy, did_you_mean
 

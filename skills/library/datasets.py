@@ -62,8 +62,7 @@ from skills.library.catalogue import find_surgeon, find_suture_type
 from skills.library.demos import find_demo
 from skills.library.integrity import find_by_digest
 from skills.library.jobs import UNSYNCHRONISED, DatasetRequest, Store
-from skills.library.parsed import CHUNK_BYTES
-from skills.library.recordings import Teller, confined_reader, stored_recording
+from skills.library.recordings import CHUNK_BYTES, Teller, confined_reader, stored_recording
 from skills.packing import canonical, sha256
 from skills.remedies import Action, Remedy
 from skills.schemas.requests import DatasetIn

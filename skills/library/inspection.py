@@ -38,12 +38,11 @@ from skills.db.session import Database, revision_of, revisions
 from skills.errors import Busy, Corrupt, SkillsError
 from skills.formats.reader_process import READER_VERSION, read_told
 from skills.gridworld.reward import sparse_reward
-from skills.library import parsed
 from skills.library.calibrations import read_calibration
 from skills.library.integrity import covered, demo_identity, planned, policy_identity
 from skills.library.jobs import identity_of
 from skills.library.policies import path_of
-from skills.library.recordings import Teller, recording_bytes
+from skills.library.recordings import Teller, alike, cached_content, read_entry, recording_bytes
 from skills.packing import canonical, sha256
 
 ROWS_AT_ONCE = 100
@@ -243,7 +242,7 @@ def _decoded_otherwise(database: Database, row: int, tell: Teller) -> Why:
     with tempfile.TemporaryFile() as file:
         with database.reading() as session:
             stored = session.get(StoredRecording, row)
-            kept = None if stored is None else parsed.find(session, stored)
+            kept = None if stored is None else cached_content(session, stored)
             if stored is None or kept is None:  # erased or replaced since, or damaged
                 return
             try:
@@ -258,7 +257,7 @@ def _decoded_otherwise(database: Database, row: int, tell: Teller) -> Why:
             yield f"its content is cached, but it cannot be decoded again: {error.words()}"
             return
     parts = ("recording", "proposed", "identifications", "bases")
-    if not all(parsed.alike(getattr(kept, part), getattr(again, part)) for part in parts):
+    if not all(alike(getattr(kept, part), getattr(again, part)) for part in parts):
         yield "its cached content differs from its bytes; delete its row of parsed_recordings, which is written again"
 
 
@@ -277,7 +276,7 @@ def _parsed_recording(row: ParsedRecording) -> Why:
     session = object_session(row)
     assert session is not None
     if row.version == READER_VERSION:  # others are not used
-        parsed.read_entry(session, session.get_one(StoredRecording, row.recording_row))  # raises `Corrupt`
+        read_entry(session, session.get_one(StoredRecording, row.recording_row))  # raises `Corrupt`
     yield from ()
 
 

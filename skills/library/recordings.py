@@ -1,27 +1,41 @@
-"""Recordings: raw files, read and checked before any transaction, and stored in chunks of 1 MiB.
+"""Recordings: raw files, read and checked before any transaction, stored in chunks of 1 MiB; and their content, cached.
 
-file --Upload--> read_upload, tell_upload --keep--> StoredRecording with its chunks --stored_recording--> Told
+    file --Upload--> read_upload, tell_upload --keep--> StoredRecording with its chunks --stored_recording--> Told
+    Told --entry_of--> Entry --put_entry--> rows --cached_content--> Told
+
+Decoding a bag takes up to a second of processor time per MiB, reading the entry of its content takes a millisecond. The
+bytes remain the truth: an entry is used only if `READER_VERSION`, the reading parameters and its SHA-256 agree, and its
+values pass the checks of their constructors again. Any other is decoded again and replaced, so a row may be missing,
+outdated or deleted at any time. `skills verify` compares entries with their recordings decoded again.
+
+The entry of a recording is visible and erased with it. Backups leave entries out: they are computed from the bytes.
 """
 
 import base64
 import hashlib
+import io
 import logging
 import tempfile
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import partial
 from typing import Any, BinaryIO
 
-from sqlalchemy import select
+import numpy as np
+from sqlalchemy import delete, select
 from sqlalchemy.orm import Session
 
+from skills import packing
 from skills.db import rfc3339
 from skills.db.models import (
+    ParsedChunk,
+    ParsedRecording,
     RecordingChunk,
     RecordingSurgeon,
     RecordingUpload,
     StoredRecording,
 )
+from skills.db.packed import load_arrays
 from skills.db.row_visibility import EVERYBODYS
 from skills.db.service_tables import record_event
 from skills.db.session import Database
@@ -29,11 +43,10 @@ from skills.demonstration.demonstration import Recording
 from skills.errors import BadInput, Busy, Conflict, Corrupt, UnknownFormat, UnreadableRecording
 from skills.fields import as_json
 from skills.formats import MEDIA_TYPES, media_type_of, read_recording
-from skills.formats.reader_process import ConfinedReader, Told, read_told
-from skills.library import parsed
+from skills.formats.reader_process import KNOWN, READER_VERSION, ConfinedReader, Told, read_told
 from skills.library.catalogue import find_surgeon
 from skills.library.integrity import find_by_digest
-from skills.library.parsed import CHUNK_BYTES
+from skills.packing import canonical
 from skills.remedies import Action, Remedy
 from skills.sandbox import ProcessLimits
 from skills.schemas.requests import Reading
@@ -42,6 +55,15 @@ from skills.settings import Settings
 Reader = Callable[..., Recording]  # `read_recording`, or a callable that runs it in another process
 Teller = Callable[..., Told]  # `read_told`, or a callable that runs it in another process
 BAGS = ("mcap", "rosbag1", "rosbag2")  # formats with checksums; text files have none
+
+CHUNK_BYTES = 1 << 20
+# Ours: a larger entry is not kept, so that uploads which compress well cannot fill the disk. Entries of bags, tables
+# and JIGSAWS take 0.1 to 1.1 times the bytes of their files, those of parquet files in single precision 1.6 times.
+MOST_SHARE = 4
+LEAST_BYTES = 256 << 10  # ours: the limit for the smallest files, whose names weigh more than their numbers
+TOLERANCE = 1e-6  # ours, in mm, rad and s: another build of numpy may round differently
+
+log = logging.getLogger(__name__)
 
 log = logging.getLogger(__name__)
 
@@ -60,6 +82,15 @@ class Upload:
     def read_as(self, reading: dict[str, Any]) -> "Upload":
         """Return the upload with the reader's arguments."""
         return replace(self, reading=reading)
+
+
+@dataclass(frozen=True, eq=False)
+class Entry:
+    """The content of a recording, serialised: columns of `ParsedRecording`, and the data of its chunks."""
+
+    reading: str
+    sha256: str
+    data: memoryview
 
 
 def check_digest(header: str | None, of_bytes: str) -> bool:
@@ -168,14 +199,12 @@ def _untimed(about: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def entry_of(upload: Upload, told: Told) -> parsed.Entry | None:
+def entry_of(upload: Upload, told: Told) -> Entry | None:
     """Serialise what was read of an upload for `keep`, before its transaction; None if it is too large to be kept."""
-    return parsed.entry_of(upload.sha256, upload.size_bytes, upload.reading, told)
+    return packed_content(upload.sha256, upload.size_bytes, upload.reading, told)
 
 
-def keep(
-    session: Session, upload: Upload, told: Told, entry: parsed.Entry | None, actor: str
-) -> tuple[StoredRecording, bool]:
+def keep(session: Session, upload: Upload, told: Told, entry: Entry | None, actor: str) -> tuple[StoredRecording, bool]:
     """Write a recording in the caller's transaction, once; return the row, and whether it is new to the actor.
 
     Bytes that only others have uploaded are reported as new, so that a digest does not reveal their uploads.
@@ -203,8 +232,8 @@ def keep(
                 f"These bytes are stored already, read with {before}; send the same parameters.",
                 Remedy(Action.DELETE_FIRST, recording=stored.sha256),
             )
-        if entry is not None and not parsed.is_current(session, stored):
-            parsed.put(session, stored.row, entry)
+        if entry is not None and not is_cached(session, stored):
+            put_entry(session, stored.row, entry)
         return stored, _brought_by(session, stored, actor)
     stored = StoredRecording(
         sha256=upload.sha256,
@@ -225,7 +254,7 @@ def keep(
         session.flush()
         number += 1
     if entry is not None:
-        parsed.put(session, stored.row, entry)
+        put_entry(session, stored.row, entry)
     return stored, _brought_by(session, stored, actor)
 
 
@@ -262,7 +291,7 @@ def stored_recording(database: Database, recording_sha256: str, tell: Teller = r
     with tempfile.TemporaryFile() as file:
         with database.reading() as session:
             stored = find_recording(session, recording_sha256)
-            kept = parsed.find(session, stored)
+            kept = cached_content(session, stored)
             if kept is not None:
                 return kept
             file.writelines(recording_bytes(session, stored))
@@ -273,13 +302,13 @@ def stored_recording(database: Database, recording_sha256: str, tell: Teller = r
 
 def _remember(database: Database, stored: StoredRecording, told: Told) -> None:
     """Cache what was read of a stored recording, unless the recording was erased meanwhile."""
-    entry = parsed.entry_of(stored.sha256, stored.size_bytes, stored.reading, told)
+    entry = packed_content(stored.sha256, stored.size_bytes, stored.reading, told)
     if entry is None:
         return
     try:
         with database.writing() as session:
             if session.get(StoredRecording, stored.row) is not None:
-                parsed.put(session, stored.row, entry)
+                put_entry(session, stored.row, entry)
     except Busy as error:  # the caller has the recording; the next use decodes it again
         log.info("recordings %d: it was read, but could not be cached (%s).", stored.row, type(error).__name__)
 
@@ -336,3 +365,97 @@ def recording_json(row: StoredRecording) -> dict[str, Any]:
         **row.about,
         "created_at": rfc3339(row.created_at),
     }
+
+
+def packed_content(recording_sha256: str, size_bytes: int, reading: dict[str, Any], told: Told) -> Entry | None:
+    """Serialise the content of a recording; None if it takes more bytes than are kept of one.
+
+    It is called before the transaction, for which others wait.
+
+    Args:
+        recording_sha256: The SHA-256 of the recording's bytes.
+        size_bytes: Their number.
+        reading: The reading parameters.
+        told: What was read.
+    """
+    out = io.BytesIO()
+    packing.write(out, told, KNOWN)
+    data = out.getbuffer()
+    if len(data) > max(LEAST_BYTES, MOST_SHARE * size_bytes):
+        return None
+    parameters = _digest_of(reading)
+    return Entry(parameters, _seal(recording_sha256, parameters, data), data)
+
+
+def put_entry(session: Session, recording_row: int, entry: Entry) -> None:
+    """Store the entry of a recording, in place of any other."""
+    session.execute(delete(ParsedRecording).where(ParsedRecording.recording_row == recording_row))
+    kept = {"version": READER_VERSION, "reading": entry.reading, "sha256": entry.sha256}
+    session.add(ParsedRecording(recording_row=recording_row, **kept))
+    session.flush()
+    for number, start in enumerate(range(0, len(entry.data), CHUNK_BYTES)):
+        piece = bytes(entry.data[start : start + CHUNK_BYTES])
+        session.add(ParsedChunk(recording_row=recording_row, number=number, data=piece))
+        session.flush()
+
+
+def is_cached(session: Session, stored: StoredRecording) -> bool:
+    """Return whether a recording has an entry of this version and of its reading parameters."""
+    row = session.get(ParsedRecording, stored.row, execution_options=EVERYBODYS)
+    return row is not None and (row.version, row.reading) == (READER_VERSION, _digest_of(stored.reading))
+
+
+def cached_content(session: Session, stored: StoredRecording) -> Told | None:
+    """Return the content of a recording from its entry; None if there is none that may be used."""
+    if not is_cached(session, stored):
+        return None
+    try:
+        return read_entry(session, stored)
+    except Corrupt as error:
+        log.warning("parsed_recordings %d: %s", stored.row, error.message)
+        return None
+
+
+def read_entry(session: Session, stored: StoredRecording) -> Told:
+    """Return the content of a recording from its entry, of this version.
+
+    Raises:
+        Corrupt: The entry does not match its digest, or is not one that this version wrote.
+    """
+    row = session.get_one(ParsedRecording, stored.row)
+    query = select(ParsedChunk.data).where(ParsedChunk.recording_row == stored.row).order_by(ParsedChunk.number)
+    data = b"".join(session.scalars(query.execution_options(yield_per=1)))
+    if _seal(stored.sha256, row.reading, data) != row.sha256:
+        raise Corrupt("The entry does not match its digest and is not used; the recording's bytes are decoded instead.")
+    try:
+        told = packing.assemble(load_arrays(data), KNOWN)
+        if not isinstance(told, Told):
+            raise TypeError(type(told).__name__)
+    except Exception as error:  # of any class: its values are refused, or their form is unknown
+        raise Corrupt("The entry cannot be read and is not used; the recording's bytes are decoded instead.") from error
+    return told
+
+
+def alike(one: Any, other: Any) -> bool:
+    """Return whether two values are equal, their floating-point numbers within `TOLERANCE`."""
+    if type(one) is not type(other):
+        return False
+    if is_dataclass(one):
+        return all(alike(getattr(one, field.name), getattr(other, field.name)) for field in fields(one))
+    if isinstance(one, tuple):
+        return len(one) == len(other) and all(map(alike, one, other))
+    if isinstance(one, np.ndarray):
+        same_kind = (one.shape, one.dtype) == (other.shape, other.dtype)
+        return same_kind and bool((np.abs(one - other) <= TOLERANCE).all())
+    return bool(abs(one - other) <= TOLERANCE) if isinstance(one, float) else bool(one == other)
+
+
+def _digest_of(reading: dict[str, Any]) -> str:
+    return packing.sha256(canonical(reading))
+
+
+def _seal(recording_sha256: str, parameters: str, data: bytes | memoryview) -> str:
+    """Return the digest of an entry with the recording to which it belongs: moved to another one, it does not match."""
+    seen = hashlib.sha256(canonical([recording_sha256, parameters, READER_VERSION]))
+    seen.update(data)
+    return seen.hexdigest()

@@ -16,7 +16,7 @@ from rich.table import Table
 
 from skills.demonstration.demonstration import cut_demo
 from skills.formats import read_recording
-from skills.formats.mcap.recording import read_mcap
+from skills.formats.mcap import read_mcap
 from skills.gridworld.grid import discretize, fit_grid
 from tests.bench.timing import best_s, in_turn
 from tests.formats import bags, large, lerobots, others, records, written

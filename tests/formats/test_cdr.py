@@ -13,9 +13,8 @@ from rosbags.typesys import Stores, get_typestore
 
 from skills.errors import UnreadableRecording
 from skills.formats import topics
-from skills.formats.mcap import cdr
+from skills.formats.mcap import _WANTED, cdr
 from skills.formats.mcap.cdr import SHAPES_LIMIT, SLACK_BYTES, Decoder, Wanted, fields_of
-from skills.formats.mcap.recording import _WANTED
 from tests.formats import records
 from tests.formats.definitions import DEFINITIONS
 

@@ -9,8 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skills.formats import write_mcap
-from skills.formats.mcap import _kernels
-from skills.formats.mcap.recording import read_mcap
+from skills.formats.mcap import _kernels, read_mcap
 from tests.formats import bags, hostile, large
 from tests.formats.records import message
 

@@ -23,7 +23,7 @@ from skills.errors import (
     UnreadableRecording,
 )
 from skills.formats import read_recording, topics, write_mcap
-from skills.formats.mcap.recording import NeedsRosbags, read_mcap
+from skills.formats.mcap import NeedsRosbags, read_mcap
 from tests.formats.bags import (
     LOCAL,
     START_NS,

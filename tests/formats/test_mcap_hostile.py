@@ -15,7 +15,7 @@ import pytest
 from skills.demonstration.recording import Recording
 from skills.errors import SkillsError
 from skills.formats import write_mcap
-from skills.formats.mcap.recording import read_mcap
+from skills.formats.mcap import read_mcap
 from tests.formats import bags, hostile, large
 from tests.formats.weigh import weigh
 

@@ -7,7 +7,7 @@ import pytest
 
 from skills.errors import BackwardStamps, NotFinite, NoUsableTopic, SkillsError
 from skills.formats import topics
-from skills.formats.mcap.recording import read_mcap
+from skills.formats.mcap import read_mcap
 from skills.formats.topics import Kind
 from tests.formats import large
 from tests.formats.bags import LOCAL, START_NS, STEP_NS, bag, header, pose, straight

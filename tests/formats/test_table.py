@@ -18,7 +18,8 @@ from skills.errors import (
     UnreadableRecording,
 )
 from skills.formats import read_recording
-from skills.formats.tables import OUTSIDE_MM, quaternion_of_rpy, read_table
+from skills.formats.columns import OUTSIDE_MM, quaternion_of_rpy
+from skills.formats.tables import read_table
 from skills.kinematics import INSERTION, INSTRUMENTS, forward
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from skills.demonstration.demonstration import cut_demo
 from skills.errors import SkillsError
-from skills.formats.mcap.recording import read_mcap
+from skills.formats.mcap import read_mcap
 from skills.gridworld.grid import discretize, fit_grid
 from tests.measured import peak_mib
 from tests.waiting import END_S

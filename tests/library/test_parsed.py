@@ -19,14 +19,13 @@ from skills.errors import Busy, NotFound
 from skills.formats import media_type_of
 from skills.formats.lerobot.cut import cut_episode, episodes_of, find_dataset
 from skills.formats.reader_process import Told, read_told, tell
-from skills.library import overview, parsed, recordings, scores
+from skills.library import overview, recordings, scores
 from skills.library.backup import back_up, restore
 from skills.library.catalogue import put_surgeon
 from skills.library.demos import add_demo
 from skills.library.erasure import erase_surgeon
 from skills.library.inspection import inspect_installation
-from skills.library.parsed import alike, put
-from skills.library.recordings import entry_of, store_recording, stored_recording
+from skills.library.recordings import alike, entry_of, put_entry, store_recording, stored_recording
 from skills.schemas.requests import DemoIn, Reading, ScoreIn
 from skills.seeds.recordings import sample_recordings
 from tests.formats import bags, lerobots, trials
@@ -130,14 +129,14 @@ def test_a_recording_of_an_older_version_is_cached_at_its_first_use(database: Da
 
 
 def test_a_large_content_is_stored_in_chunks(database: Database, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(parsed, "CHUNK_BYTES", 1000)
+    monkeypatch.setattr(recordings, "CHUNK_BYTES", 1000)
     data = sample_recordings()[0].data
     sha256 = add(database, data)
     assert counted(database)[1] > 50
     assert same(read_told(io.BytesIO(data)), stored_recording(database, sha256, never))
     with database.writing() as session:  # replaced whole
         stored = recordings.find_recording(session, sha256)
-        put(session, stored.row, entry_of(cases.upload(data), read_told(io.BytesIO(data))))
+        put_entry(session, stored.row, entry_of(cases.upload(data), read_told(io.BytesIO(data))))
     assert same(read_told(io.BytesIO(data)), stored_recording(database, sha256, never))
 
 
@@ -179,9 +178,9 @@ def test_a_damaged_entry_is_logged_and_found_by_verify(database: Database, caplo
     ((where, why),) = faults(database)
     assert where == "parsed_recordings 1" and why.startswith("The entry does not match its digest")
     caplog.clear()
-    parsed.log.disabled = False  # import-linter, in another test, disables all loggers
+    recordings.log.disabled = False  # import-linter, in another test, disables all loggers
     stored_recording(database, sha256)
-    assert [record.getMessage().split(":")[0] for record in caplog.records if record.name == parsed.log.name] == [
+    assert [record.getMessage().split(":")[0] for record in caplog.records if record.name == recordings.log.name] == [
         "parsed_recordings 1"
     ]
     assert sha256 not in caplog.text
@@ -215,7 +214,7 @@ def replace_entry(database: Database, sha256: str, told: Told) -> None:
     """Store a content with its correct digest, as somebody with write access who knows the format would."""
     with database.writing() as session:
         stored = recordings.find_recording(session, sha256)
-        put(session, stored.row, parsed.entry_of(stored.sha256, 1 << 20, stored.reading, told))
+        put_entry(session, stored.row, recordings.packed_content(stored.sha256, 1 << 20, stored.reading, told))
 
 
 def test_verify_compares_the_newest_content_or_all_with_the_bytes(database: Database):
@@ -247,8 +246,8 @@ def test_contents_are_alike_within_rounding_and_in_nothing_else():
 
 
 def test_a_content_much_larger_than_its_file_is_not_kept(database: Database, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(parsed, "LEAST_BYTES", 0)
-    monkeypatch.setattr(parsed, "MOST_SHARE", 0.1)
+    monkeypatch.setattr(recordings, "LEAST_BYTES", 0)
+    monkeypatch.setattr(recordings, "MOST_SHARE", 0.1)
     sha256, decoded = add(database), []
     for _ in range(2):
         stored_recording(database, sha256, counting(decoded))

@@ -31,10 +31,9 @@ import numpy as np
 from skills.arrays import Floats, Ints
 from skills.demonstration.recording import Joints, Motion, Recording, Signal, Topic, recorded_motion
 from skills.errors import BackwardStamps, BadColumns, MixedFrames, NotFinite, NoUsableTopic, UnreadableRecording
+from skills.formats.columns import BASE, ColumnSetpoints, check_outside
 from skills.formats.lerobot import INFO, NUMBERS, SAID, VERSIONS, Dataset, Feature, Files, read_dataset
 from skills.formats.lerobot.parquet import ParquetTable, printable, read_columns
-from skills.formats.setpoints import ColumnSetpoints
-from skills.formats.tables import BASE, check_outside
 from skills.kinematics import INSERTION, INSTRUMENTS, forward, quaternion_of
 from skills.remedies import Action, Remedy, did_you_mean
 

@@ -1,0 +1,326 @@
+"""Commands of demonstrations: cut from recordings or from the trials of JIGSAWS, and marked."""
+
+import sys
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from skills.cli.recordings import (
+    Columns,
+    Decimal,
+    Frame,
+    Instrument,
+    OneEpisode,
+    RateHz,
+    RecordingPath,
+    TableArm,
+    Tool,
+    Units,
+    ready_one,
+)
+from skills.cli.shell import (
+    AsJson,
+    OfSurgeon,
+    OfSuture,
+    bar,
+    complete_surgeons,
+    complete_sutures,
+    err,
+    out,
+    print_json,
+    refusing,
+    service,
+    show,
+)
+from skills.errors import BadInput, SkillsError
+from skills.remedies import Door, did_you_mean
+
+if TYPE_CHECKING:
+    from skills.schemas.given import Demonstration
+
+    Part = Literal["whole"] | int | None
+
+commands = typer.Typer()
+demos = typer.Typer(no_args_is_help=True, help="Demonstrations: one hand-off each.")
+jigsaws = typer.Typer(no_args_is_help=True, help="The JIGSAWS data set, which its authors provide on request.")
+commands.add_typer(demos, name="demo")
+commands.add_typer(jigsaws, name="jigsaws")
+
+Demo = Annotated[str, typer.Argument(help="The demonstration's digest.")]
+Outcome = Literal["success", "recovery", "failure"]
+
+ABOUT = ("id", "surgeon", "suture", "arm", "state", "outcome", "created_at")
+
+
+@demos.command("add")
+@refusing
+def demo_add(
+    path: RecordingPath,
+    surgeon: Annotated[str, typer.Option(autocompletion=complete_surgeons)],
+    suture: Annotated[str, typer.Option(autocompletion=complete_sutures)],
+    arm: Annotated[str | None, typer.Option(help="Needed if a recording has several arms.")] = None,
+    topic: Annotated[str | None, typer.Option()] = None,
+    start_s: Annotated[float | None, typer.Option(help="Start of the hand-off in the recording.")] = None,
+    end_s: Annotated[float | None, typer.Option(help="End of the hand-off in the recording.")] = None,
+    segment: Annotated[
+        str | None,
+        typer.Option(
+            help="A proposed hand-off, counted from 1, or whole; without it and without times, the only proposal is "
+            "taken."
+        ),
+    ] = None,
+    proposal: Annotated[int | None, typer.Option(help="The same as --segment with a number.")] = None,
+    grid: Annotated[Literal["auto", "paper", "fit"], typer.Option(help="auto, paper or fit.")] = "auto",
+    cell_mm: Annotated[float | None, typer.Option()] = None,
+    hysteresis: Annotated[
+        float,
+        typer.Option(
+            help="Hysteresis in cells: a sample this far beyond its cell still counts to it; 0 to 0.5, 0.25 against "
+            "tremor."
+        ),
+    ] = 0.0,
+    session: Annotated[str | None, typer.Option()] = None,
+    outcome: Annotated[Outcome | None, typer.Option(help="What became of the hand-off, if it is known.")] = None,
+    reason: Annotated[str | None, typer.Option(help="Why; needed for a recovery or a failure.")] = None,
+    rate_hz: RateHz = None,
+    frame: Frame = None,
+    column: Columns = None,
+    unit: Units = None,
+    decimal: Decimal = None,
+    table_arm: TableArm = None,
+    instrument: Instrument = None,
+    episode: OneEpisode = None,
+    tool: Tool = None,
+    as_json: AsJson = False,
+) -> None:
+    """Store a recording and one demonstration of it; if several hand-offs are proposed, name one with --segment."""
+    if segment is not None and proposal is not None:
+        raise BadInput("Use --segment or --proposal, not both.")
+    from skills.client import Problem
+
+    part = proposal if segment is None else _part_of(segment)
+    with service() as client, ready_one(path, episode, column, tool) as (file, progress, sent_columns):
+
+        def add(part: "Part") -> "Demonstration":
+            return client.add_demo(
+                file,
+                surgeon=surgeon,
+                suture=suture,
+                arm=arm,
+                topic=topic,
+                start_s=start_s,
+                end_s=end_s,
+                segment=part,
+                grid=grid,
+                cell_mm=cell_mm,
+                hysteresis=hysteresis,
+                session=session,
+                outcome=outcome,
+                outcome_reason=reason,
+                rate_hz=rate_hz,
+                frame=frame,
+                column=sent_columns,
+                unit=unit,
+                decimal=decimal,
+                table_arm=table_arm,
+                instrument=instrument,
+                progress=progress,
+            )
+
+        try:
+            added = add(part)
+        except Problem as problem:
+            # a program has to name the segment; only a user at a terminal is prompted
+            if problem.kind != "segment-not-named" or as_json:
+                raise
+            _list_proposals(problem.body["numbers"]["segments"])
+            if not on_terminal():
+                raise
+            added = add(_part_of(typer.prompt("Which one? A number, or whole", err=True).strip()))
+    _measured(added, as_json)
+    if added.segment is not None and not as_json:
+        which = f"{added.segment.taken}, {added.segment.start_s:.2f} to {added.segment.end_s:.2f} s"
+        out.print(f"Taken: {which}; {added.segment.because}", markup=False, soft_wrap=True)
+
+
+def _part_of(segment: str) -> "Part":
+    """Return the value of --segment: a number, or "whole"."""
+    if segment == "whole":
+        return "whole"
+    if not segment.isdecimal():
+        raise BadInput(
+            f"--segment {segment!r} is neither the number of a proposed hand-off nor whole.",
+            *did_you_mean(segment, ["whole"]),
+            "List the proposed hand-offs: skills recording add FILE",
+        )
+    return int(segment)
+
+
+def on_terminal() -> bool:
+    """Return whether a user can be prompted."""
+    return sys.stdin.isatty()
+
+
+def _list_proposals(proposed: "list[dict[str, Any]]") -> None:
+    shown = [one | {name: f"{one[name]:.2f}" for name in ("start_s", "end_s")} for one in proposed]
+    show(shown, False, ("segment", "arm", "start_s", "end_s", "reason"))
+
+
+def _measured(demo: "Demonstration", as_json: bool) -> None:
+    show(demo, as_json, ("id", "surgeon", "suture", "arm", "frame", "report.path_states"))
+    if not as_json:
+        x, y, z = demo.report.discretisation_rmse_mm
+        loss = f"{x:.2f}, {y:.2f}, {z:.2f} mm off their cells along x, y, z (RMSE)"
+        out.print(f"{demo.report.revisits} crossings; samples are {loss}")
+
+
+@demos.command("list")
+@refusing
+def demo_list(
+    surgeon: OfSurgeon = None,
+    suture: OfSuture = None,
+    outcome: Annotated[
+        Literal["success", "recovery", "failure", "unknown"] | None, typer.Option(help="Only those marked so.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """List demonstrations, the newest first."""
+    with service() as client:
+        show(client.demos(surgeon, suture, outcome=outcome), as_json, ABOUT)
+
+
+@demos.command("show")
+@refusing
+def demo_show(demo: Demo, as_json: AsJson = False) -> None:
+    """Show a demonstration, with the figures measured when it was stored."""
+    with service() as client:
+        shown = client.demo(demo)
+    _measured(shown, as_json)
+    if not as_json:
+        out.print(f"{shown.state}, {shown.start_s:.2f} to {shown.end_s:.2f} s of {shown.recording}", soft_wrap=True)
+        _tell_outcome(shown)
+
+
+@demos.command("report")
+@refusing
+def demo_report(
+    demo: Demo,
+    html: Annotated[Path | None, typer.Option(help="Write the report to this file as HTML.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Report the quality of a demonstration, and how to improve it."""
+    with service() as client:
+        if html is not None:
+            html.write_bytes(client.demo_report_page(demo))
+            _written(html, as_json)
+            return
+        measured = client.demo_report(demo)
+    _measured(measured, as_json)
+    if not as_json:
+        for sentence in measured.report.advice:
+            out.print(f"- {sentence}", markup=False, soft_wrap=True)
+
+
+@demos.command("save")
+@refusing
+def demo_save(demo: Demo, to: Annotated[Path, typer.Argument(dir_okay=False)], as_json: AsJson = False) -> None:
+    """Write the recording of a demonstration to a file, exactly as it was uploaded."""
+    with service() as client, bar("fetching") as progress:
+        client.save_recording(demo, to, progress)
+    _written(to, as_json)
+
+
+def _written(to: Path, as_json: bool) -> None:
+    if as_json:
+        print_json({"file": to, "size_bytes": to.stat().st_size})
+    else:
+        out.print(f"{to}: {to.stat().st_size / 1e6:.1f} MB.", soft_wrap=True)
+
+
+@demos.command("mark")
+@refusing
+def demo_mark(
+    demo: Demo,
+    outcome: Annotated[Outcome, typer.Argument(help="What became of the hand-off.")],
+    reason: Annotated[str | None, typer.Option(help="Why; needed for a recovery or a failure.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Mark a demonstration; a recovery or a failure is not learnt from, and releases that rest on it are withdrawn."""
+    with service() as client:
+        marked = client.mark_demo(demo, outcome, reason=reason)
+    if as_json:
+        print_json(marked)
+    else:
+        _tell_outcome(marked)
+
+
+def _tell_outcome(demo: "Demonstration") -> None:
+    if demo.outcome is not None:
+        why = "" if demo.outcome_reason is None else f": {demo.outcome_reason}"
+        out.print(f"marked {demo.outcome}{why}", markup=False, soft_wrap=True)
+
+
+@demos.command("withdraw")
+@refusing
+def demo_withdraw(
+    demo: Demo,
+    erase: Annotated[bool, typer.Option("--erase", help="Delete it and everything derived from it.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Withdraw a demonstration and the releases that rest on it."""
+    with service() as client:
+        client.withdraw_demo(demo, erase=erase)
+    done = "erased" if erase else "withdrawn"
+    if as_json:
+        print_json({"demo": demo, "state": done})
+    else:
+        out.print(f"The demonstration is {done}, and no release depends on it.")
+
+
+@jigsaws.command("add")
+@refusing
+def jigsaws_add(
+    folder: Annotated[
+        Path,
+        typer.Argument(help="A folder with TASK/kinematics/AllGestures/*.txt, their transcriptions and meta files."),
+    ],
+    task: Annotated[list[str] | None, typer.Option(help="Only this task, such as Suturing; repeatable.")] = None,
+    suture: Annotated[
+        str | None,
+        typer.Option(
+            help="Make a demonstration of this suture type from each proposed hand-off.",
+            autocompletion=complete_sutures,
+        ),
+    ] = None,
+    arm: Annotated[Literal["PSM_left", "PSM_right"] | None, typer.Option(help="Only this arm.")] = None,
+    prefix: Annotated[str, typer.Option(help="Prefix of the pseudonyms, before the surgeon's letter.")] = "jigsaws",
+    as_json: AsJson = False,
+) -> None:
+    """Store every trial of a folder; exit code 1 if one was refused, while the others are stored."""
+    from rich.progress import track
+
+    from skills.samples import find_trials, send_trials
+
+    found = find_trials(folder, task or ())
+    with service() as client:
+        worded = partial(SkillsError.words, door=Door.COMMAND)
+        sending = send_trials(client, found, suture=suture, arm=arm, prefix=prefix, worded=worded)
+        done = [
+            asdict(sent)
+            for sent in track(
+                sending, "sending", total=len(found), console=err, transient=True, disable=not err.is_terminal
+            )
+        ]
+    if as_json:
+        print_json(done)
+    else:
+        rows = [one | {"recording": (one["recording"] or "")[:12], "demos": len(one["demos"])} for one in done]
+        show(rows, False, ("trial", "surgeon", "skill_level", "score", "recording", "proposed", "demos"))
+        for one in done:
+            for problem in one["problems"]:
+                err.print(f"{one['trial']}: {problem}", style="red", markup=False, soft_wrap=True)
+    if any(one["problems"] for one in done):
+        raise typer.Exit(1)

@@ -1,0 +1,219 @@
+"""Numbers in columns of tables and datasets, as poses: frames, units, joints, orientations and setpoints.
+
+Poses are mm in the base of the arm, whose origin is the remote centre, where the caller names no other frame; joints
+alone become poses by forward kinematics with the stated instrument. Numbers in another unit are refused.
+
+Setpoints in columns do not name their frame. Recorders take them from `setpoint_cp` beside `measured_cp`, so they are
+read in the frame of the measured pose, if they are near it: setpoints in another frame or unit are further away than an
+arm lags behind. No fault of a setpoint refuses a recording, because nothing is learnt from it.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from skills.arrays import Floats, Ints
+from skills.demonstration.motion import COORDINATE_LIMIT_MM
+from skills.demonstration.recording import Motion, Signal, recorded_motion, recorded_signal
+from skills.errors import MixedFrames, NotAQuaternion, NotMetres, NoUsableTopic, SkillsError
+from skills.kinematics import INSTRUMENTS, JOINTS, UNITS, forward, instrument_of, quaternion_of
+from skills.remedies import Action, Remedy
+
+BASE = "base"  # as a frame: the base of each arm
+# The tip is further from the remote centre than the wrist, because the wrist bends by less than a right angle. A reach
+# of 290 mm is 11.4 inches, so a path in inches never exceeds this limit.
+OUTSIDE_MM = min(instrument.cannula_mm - instrument.wrist_offset_mm for instrument in INSTRUMENTS.values())
+BEYOND_LIMIT = {"rad": 0.1, "mm": 10.0}  # ours: encoders overshoot a joint's limit by less; degrees and metres do not
+_TURN_RAD = 2 * np.pi
+_JOINT_RAD = 7.0  # ours: more than any joint turns, less than 8 degrees
+APART_MM = 30.0  # ours: an arm lags by some mm, and by a cell of the paper's grid, 5 mm, at 100 mm/s and 50 ms
+
+
+def scaled(values: Floats, factor: float) -> Floats:
+    """Return values in mm or rad; infinite ones, where they overflow, are refused by the recording's values."""
+    with np.errstate(over="ignore"):
+        return values if factor == 1 else factor * values
+
+
+def base_of(arm: str, frame: str | None) -> str:
+    """Return the frame of poses that follow from the joints: the base of the arm.
+
+    Raises:
+        MixedFrames: The caller names another frame.
+    """
+    base = f"{arm}_base"
+    if frame not in (None, BASE, base):
+        raise MixedFrames(
+            f"The poses that follow from the joints are in {base}, not in {frame!r}; omit the frame.", frames=[base]
+        )
+    return base
+
+
+def check_joints(topic: str, joints: Floats) -> None:
+    """Refuse numbers that no joint of a PSM has in rad, and its insertion in mm.
+
+    Raises:
+        NotMetres: An insertion beyond 1 m, or an angle beyond `_JOINT_RAD`.
+    """
+    limits = np.where(np.array(UNITS) == "mm", COORDINATE_LIMIT_MM, _JOINT_RAD)
+    wrong = np.abs(joints) > limits
+    if wrong.any():
+        row, joint = np.argwhere(wrong)[0].tolist()
+        raise NotMetres(
+            f"{topic}: {JOINTS[joint]} is {joints[row, joint]:g} {UNITS[joint]} in sample {row}; no joint of a PSM is. "
+            "Give angles in rad and the insertion in m, or name the units of the columns.",
+            sample=row,
+            joint=JOINTS[joint],
+        )
+
+
+def posed(topic: str, joints: Floats, instrument: str | None) -> tuple[Floats, Floats]:
+    """Compute poses from joints by forward kinematics with a stated instrument.
+
+    Args:
+        topic: The source, for messages.
+        joints: Shape (T, 6), rad and mm.
+        instrument: Its number; None if none is stated.
+
+    Returns:
+        Positions in the arm's base frame in mm, shape (T, 3), and unit quaternions, shape (T, 4).
+
+    Raises:
+        NoUsableTopic: No instrument is stated.
+        NotMetres: A joint is beyond its limits, so the instrument, the unit or the order is another.
+    """
+    if instrument is None:
+        one, other, *_ = INSTRUMENTS
+        raise NoUsableTopic(
+            f"{topic} has joints and no poses; they become poses with the instrument that was on the arm.",
+            Remedy(Action.NAME_INSTRUMENT, one=one, other=other),
+            instruments=list(INSTRUMENTS),
+        )
+    tool = instrument_of(instrument)
+    beyond = np.maximum(tool.lower - joints, joints - tool.upper) - [BEYOND_LIMIT[unit] for unit in UNITS]
+    if (beyond > 0).any():
+        row, joint = np.argwhere(beyond > 0)[0].tolist()
+        raise NotMetres(
+            f"{topic}: {JOINTS[joint]} is {joints[row, joint]:.5g} {UNITS[joint]} in sample {row}, beyond the limits "
+            f"{tool.lower[joint]:.4g} to {tool.upper[joint]:.4g} of the {tool.arm.name} with {tool.name}; check the "
+            "units, the order of the joints and the instrument.",
+            sample=row,
+            joint=JOINTS[joint],
+        )
+    tip_mm, rotation = forward(joints, instrument)
+    return tip_mm, quaternion_of(rotation)
+
+
+def check_outside(motion: Motion) -> None:
+    """Refuse a path that never leaves the cannula: its numbers are in another unit, or from another origin.
+
+    Raises:
+        NotMetres: The tip is never outside.
+    """
+    if not motion.frame.endswith("_base"):  # only there the origin is the remote centre
+        return
+    away_mm = np.sqrt(np.einsum("ij,ij->i", motion.tip_mm, motion.tip_mm))
+    furthest = int(np.argmax(away_mm))
+    if away_mm[furthest] < OUTSIDE_MM:
+        at_s = (int(motion.stamps_ns[furthest]) - int(motion.stamps_ns[0])) / 1e9
+        raise NotMetres(
+            f"The tip is at most {away_mm[furthest]:.3g} mm from the remote centre (at {at_s:.3f} s); below "
+            f"{OUTSIDE_MM:.3g} mm its wrist is inside the cannula. Give the positions in the unit of the column "
+            "names, not in inches; or name the frame, if they are not relative to the remote centre.",
+            sample=furthest,
+            furthest_mm=float(away_mm[furthest]),
+        )
+
+
+def quaternion_of_rpy(rpy_rad: Floats) -> Floats:
+    """Return the unit quaternions x, y, z, w of R = Rz(yaw) Ry(pitch) Rx(roll).
+
+    Args:
+        rpy_rad: Roll, pitch, yaw about the fixed axes x, y, z, shape (T, 3).
+
+    Returns:
+        Shape (T, 4).
+    """
+    (cr, cp, cy), (sr, sp, sy) = np.cos(rpy_rad.T / 2), np.sin(rpy_rad.T / 2)
+    x, y = sr * cp * cy - cr * sp * sy, cr * sp * cy + sr * cp * sy
+    z, w = cr * cp * sy - sr * sp * cy, cr * cp * cy + sr * sp * sy
+    return np.stack([x, y, z, w], axis=1)
+
+
+def quaternion_of_vector(topic: str, vector_rad: Floats) -> Floats:
+    """Return the unit quaternions x, y, z, w of rotation vectors: the axis times the angle.
+
+    Args:
+        topic: The source, for the message.
+        vector_rad: Shape (T, 3).
+
+    Returns:
+        Shape (T, 4).
+
+    Raises:
+        NotAQuaternion: A vector is longer than a whole turn, so its unit is another.
+    """
+    with np.errstate(over="ignore"):
+        angle = np.linalg.norm(vector_rad, axis=1)
+    if not (angle <= _TURN_RAD).all():
+        row = int(np.argmin(angle <= _TURN_RAD))
+        raise NotAQuaternion(
+            f"{topic}: the rotation vector of sample {row} has the length {angle[row]:g} rad, more than a turn; name "
+            "its columns with their unit, rx_rad or rx_deg.",
+            sample=row,
+        )
+    half = 0.5 * np.sinc(angle / _TURN_RAD)  # sin(angle / 2) / angle, which is 1/2 at 0
+    return np.column_stack([vector_rad * half[:, None], np.cos(angle / 2)])
+
+
+@dataclass(frozen=True)
+class ColumnSetpoints:
+    """The setpoints in the columns of one file.
+
+    Attributes:
+        tips: Commanded poses of tips.
+        jaws: Arm and the commanded angle of its jaw.
+        left_out: Topics that were not usable, and the fault of each.
+    """
+
+    tips: list[Motion] = field(default_factory=list)
+    jaws: list[tuple[str, Signal]] = field(default_factory=list)
+    left_out: list[tuple[str, str]] = field(default_factory=list)
+
+    def add_tip(self, topic: str, stamps_ns: Ints, tip_mm: Floats, rotation_xyzw: Floats, measured: Motion) -> None:
+        """Add the commanded poses of a tip.
+
+        Args:
+            topic: The topic from which a recorder takes such columns.
+            stamps_ns: Integer nanoseconds, shape (T,).
+            tip_mm: Positions, shape (T, 3).
+            rotation_xyzw: Orientations, shape (T, 4).
+            measured: The measured motion of the arm, in the frame of the setpoints.
+        """
+        try:
+            tip = recorded_motion(
+                arm=measured.arm,
+                topic=topic,
+                frame=measured.frame,
+                stamps_ns=stamps_ns,
+                tip_mm=tip_mm,
+                rotation_xyzw=rotation_xyzw,
+            )
+        except SkillsError as error:
+            self.left_out.append((topic, str(error)))
+            return
+        _, here, there = np.intersect1d(tip.stamps_ns, measured.stamps_ns, assume_unique=True, return_indices=True)
+        away_mm = np.linalg.norm(tip.tip_mm[here] - measured.tip_mm[there], axis=1)
+        if not (len(away_mm) and np.median(away_mm) <= APART_MM):
+            far_mm = float(np.median(away_mm)) if len(away_mm) else float("nan")
+            why = f"Its median distance from the measured tip is {far_mm:.3g} mm, above {APART_MM:g} mm: another frame."
+            self.left_out.append((topic, why))
+        else:
+            self.tips.append(tip)
+
+    def add_jaw(self, arm: str, topic: str, stamps_ns: Ints, angles_rad: Floats) -> None:
+        """Add the commanded angles of a jaw, shape (T,)."""
+        try:
+            self.jaws.append((arm, recorded_signal(stamps_ns, angles_rad, topic)))
+        except SkillsError as error:
+            self.left_out.append((topic, str(error)))
