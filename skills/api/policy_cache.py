@@ -25,8 +25,9 @@ from skills.errors import SkillsError, UnknownFormat
 from skills.library import consent, integrity, policies
 from skills.library.releases import STANDS
 
-Style = tuple[str, str, str]  # surgeon, suture type, and media type of the response
+Style = tuple[str, str, str]  # surgeon, suture type, and media type of the response, or `POSES`
 
+POSES = "pose-style"  # the response is the pose style, as JSON
 USUAL = frozenset({b"accept", b"if-none-match"})
 READ = USUAL | {b"if-match"}
 LONGEST = 500  # a longer header is left to the route
@@ -116,7 +117,10 @@ class PolicyCache:
                 return Known(known.body, known.release, known.last_day, None)
             served = policies.policy_of(session, surgeon, suture)
             assert release is not None, "both look at the same state"
-            body = self._encoded.policy(served.policy, served.release, media_type)
+            if media_type == POSES:
+                body = self._encoded.pose_style(served.policy)
+            else:
+                body = self._encoded.policy(served.policy, served.release, media_type)
             return Known(body, tuple(release), consent.last_day(served.policy.surgeon.consent), None)
 
     async def _sweep(self) -> None:

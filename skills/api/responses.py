@@ -40,6 +40,7 @@ from skills.formats import BYTES
 from skills.library import policies
 from skills.library.integrity import learnt
 from skills.library.jobs import ACTIVE, find_job, find_jobs, job_json
+from skills.library.pose_styles import pose_style_json, poses_of
 from skills.library.recordings import damaged
 from skills.library.releases import outcomes_of
 from skills.settings import MEBIBYTE, Settings
@@ -103,16 +104,18 @@ RawHeaders = list[tuple[bytes, bytes]]
 
 @dataclass(frozen=True)
 class Body:
-    """A response body with its media type and ETag."""
+    """A response body with its media type and ETag, and a link to what belongs to it (RFC 8288)."""
 
     content: bytes
     media_type: str
     etag: str
+    link: str | None = None
 
     @cached_property
     def validators(self) -> RawHeaders:
         """Return the headers that a 304 has as well."""
-        return [(b"etag", self.etag.encode()), (b"vary", b"Accept"), (b"cache-control", b"no-cache")]
+        link = [] if self.link is None else [(b"link", self.link.encode())]
+        return [(b"etag", self.etag.encode()), (b"vary", b"Accept"), (b"cache-control", b"no-cache"), *link]
 
     @cached_property
     def headers(self) -> RawHeaders:
@@ -174,10 +177,21 @@ class Encoded:
         media_type = negotiate(accept)
         # With their times, because row and version numbers are used again after an erasure.
         released = (release.row, release.released_at) if release else None
-        key = (policy.sha256, policy.version, policy.created_at, released, media_type)
+        poses = policy.poses.sha256 if policy.poses else None
+        key = (policy.sha256, policy.version, policy.created_at, released, poses, media_type)
         body = self._kept.get(key)
         if body is None:
             body = _encode(policy, release, media_type)
+            self._kept.put(key, body)
+        return body
+
+    def pose_style(self, policy: PolicyVersion) -> Body:
+        """Return the encoded pose style of a policy version, from the cache if it is there."""
+        key = (policy.sha256, policy.version, policy.created_at, policy.poses.sha256 if policy.poses else None)
+        body = self._kept.get(key)
+        if body is None:
+            content = orjson.dumps(pose_style_json(policy, poses_of(policy)))
+            body = Body(content, JSON, tag_of(content))
             self._kept.put(key, body)
         return body
 
@@ -198,7 +212,10 @@ def _encode(policy: PolicyVersion, release: Release | None, media_type: str) -> 
         about["actions"] = policies.actions_of(learnt(policy))
         about["arrays"] = f"/policy-versions/{policy.sha256} with Accept: {NPZ}"
         content = orjson.dumps(about)
-    return Body(content, media_type, tag_of(content))
+    # A header and no field: the bytes, and so the ETag and what older clients verify, stay those of the policy.
+    linked = release is not None and policy.poses is not None
+    link = f'<{policy.suture}/pose-style>; rel="related"; title="pose style"' if linked else None
+    return Body(content, media_type, tag_of(content), link)
 
 
 class Give:

@@ -2,6 +2,7 @@
 
 import json
 import time
+from math import degrees
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -248,6 +249,24 @@ def policy_show(surgeon: Surgeon, suture: Suture, version: int | None = None, as
     out.print(f"path    {metrics.exact_states} of {metrics.path_states} states, DTW {metrics.dtw_total_mm:g} mm")
     out.print(f"starts  {coverage.starts_reaching_goal} of {coverage.n_states} reach the goal")
     out.print(f"release {cell(policy.released_at) or 'not released'}")
+
+
+@policies.command("pose-style")
+@refusing
+def policy_pose_style(surgeon: Surgeon, suture: Suture, as_json: AsJson = False) -> None:
+    """Show the pose style of the released policy, and the tube that is proven around it."""
+    with service() as client:
+        style = client.pose_style(surgeon, suture)
+    if as_json:
+        print_json(style)
+        return
+    tube, limits = style.tube, style.tube.limits
+    turn = degrees(limits.step_rad)
+    out.print(f"{surgeon} {suture} version {style.version}  {style.sha256}", soft_wrap=True)
+    out.print(f"motion  {len(style.position_mm)} poses of {style.arm} in {style.frame}, {style.elapsed_s[-1]:.2f} s")
+    out.print(f"tube    {tube.radius_mm:.1f} mm and {tube.radius_deg:.1f} degrees, at the end after {tube.ticks} ticks")
+    out.print(f"step    {limits.step_mm:g} mm and {turn:.1f} degrees a tick of {1000 * style.tick_s:.0f} ms")
+    out.print(f"assumes {limits.disturbance_mm:g} mm and {degrees(limits.disturbance_rad):.1f} degrees of disturbance")
 
 
 @policies.command("release")

@@ -30,10 +30,12 @@ from skills.errors import BadInput, Corrupt
 from skills.schemas.given import (
     Atlas,
     Job,
+    NextPose,
     NextStep,
     Policy,
     PolicyCard,
     PolicySummary,
+    PoseStyle,
     RetrainedStyle,
     Retraining,
     Rollout,
@@ -369,6 +371,27 @@ class Policies(Connection):
         """Return the next action of the released policy at a position; nothing moves."""
         body = {"position_mm": list(position_mm), "phase": phase}
         return await self._ask(NextStep, "POST", at("policies", surgeon, suture, "next"), body)
+
+    @call
+    async def pose_style(self, surgeon: str, suture: str) -> PoseStyle:
+        """Return the pose style of the released policy: the poses of the hand along one phase, and the tube's proof."""
+        return await self._get(PoseStyle, at("policies", surgeon, suture, "pose-style"))
+
+    @call
+    async def next_pose(
+        self, surgeon: str, suture: str, position_mm: Position, rotation_xyzw: Sequence[float], phase: int | None = None
+    ) -> NextPose:
+        """Return the next pose of the released pose style at a pose; nothing moves.
+
+        Args:
+            surgeon: The surgeon's pseudonym.
+            suture: The suture type.
+            position_mm: Position of the tip in the frame of the pose style.
+            rotation_xyzw: Its orientation, a unit quaternion.
+            phase: The phase of the last answer; default: that of the nearest pose.
+        """
+        body = {"position_mm": list(position_mm), "rotation_xyzw": list(rotation_xyzw), "phase": phase}
+        return await self._ask(NextPose, "POST", at("policies", surgeon, suture, "next"), body)
 
     async def _verified(self, surgeon: str, suture: str, version: int | None) -> tuple[bytes, bytes, "LearntPolicy"]:
         """Return a policy's JSON, its arrays, and the policy rebuilt from them and verified."""

@@ -3,9 +3,9 @@
 A row labels a value: it has the value's owner, time and origin, and the value itself serialised in one column.
 
 Append-only (triggers of the migrations refuse changes): recordings and their chunks, demonstrations and their
-outcomes, reward maps, policy versions and their further demonstrations, releases, plans, playbacks and their pictures,
-calibrations; a demonstration and a release can be withdrawn, once. Only erasure deletes. The tables of the service's
-own state are in `skills.db.service_tables`.
+outcomes, reward maps, policy versions with their further demonstrations and pose styles, releases, plans, playbacks and
+their pictures, calibrations; a demonstration and a release can be withdrawn, once. Only erasure deletes. The tables of
+the service's own state are in `skills.db.service_tables`.
 """
 
 from datetime import datetime
@@ -38,7 +38,9 @@ from skills.learning.certificate import Coverage
 from skills.learning.dynamic_programming import ValueIteration
 from skills.learning.networks import Network
 from skills.learning.policy import LEARNERS, Policy
+from skills.learning.pose_style import PosePath
 from skills.learning.q_learning import PhaseQLearning, Training
+from skills.learning.tube import CertifiedPoses, TubeCertificate, TubeLimits
 from skills.packing import added_later, few_numbers
 from skills.planning.handoff import PsmM
 from skills.planning.plan import Pass, SuturePlan, SuturePoint
@@ -46,6 +48,7 @@ from skills.verification.playback import Pictures, Playback
 
 stored(GridWorld, GridPath, RewardLevels, *LEARNERS.values(), Training, Network)
 stored(SuturePoint, Pass, Pause, Partner, PsmM)
+stored(PosePath, TubeLimits, TubeCertificate)
 # Left out of the serialised value while they hold their default, so that the digests of older values stay the same.
 added_later(GridPath, "hysteresis")
 added_later(Policy, "network")
@@ -296,6 +299,7 @@ class PolicyVersion(Base):
     surgeon: Mapped[Surgeon] = relationship(lazy="joined", innerjoin=True)
     demonstration: Mapped[Demonstration] = relationship(lazy="select")
     others: Mapped[list[Demonstration]] = relationship(secondary="policy_demonstrations", lazy="select", viewonly=True)
+    poses: Mapped["StoredPoses | None"] = relationship(lazy="select", back_populates="policy", viewonly=True)
     __table_args__ = (UniqueConstraint("surgeon_row", "suture", "version", name="uq_policy_versions_version"),)
 
     @property
@@ -320,6 +324,24 @@ class PolicyVersion(Base):
         withdrawn = ["was withdrawn"] if any(one.withdrawn_at is not None for one in demos) else []
         marked = set() if self.of_any_outcome else {f"was marked {one.outcome}" for one in demos if one.failed}
         return [*withdrawn, *sorted(marked)]
+
+
+class StoredPoses(Base):
+    """The pose style of a policy version: the poses of its demonstrations' hands, and the certificate of their tube.
+
+    A version of before has none until an equal training is requested again, and one whose demonstrations have no
+    orientation has none at all.
+    """
+
+    __tablename__ = "pose_styles"
+
+    row: Mapped[RowId]
+    sha256: Mapped[str] = mapped_column(Sha256)
+    policy_row: Mapped[int] = mapped_column(ForeignKey("policy_versions.row"), unique=True)
+    poses: Mapped[CertifiedPoses] = mapped_column(Packed(CertifiedPoses), deferred=True)
+    created_at: Mapped[datetime] = mapped_column(default=now)
+
+    policy: Mapped[PolicyVersion] = relationship(lazy="joined", innerjoin=True, back_populates="poses")
 
 
 class PolicyDemonstration(Base):

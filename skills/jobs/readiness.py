@@ -31,7 +31,9 @@ from skills.learning._kernels import warp_compiled
 from skills.learning.certificate import certify
 from skills.learning.evaluation import dtw, measure
 from skills.learning.policy import learn_tabular, rollout_from
+from skills.learning.pose_style import PosePath
 from skills.learning.q_learning import PhaseQLearning
+from skills.learning.tube import TubeLimits, certify_tube, next_pose
 from skills.packing import palette_of
 from skills.remedies import Action, Remedy
 from skills.settings import Settings
@@ -40,6 +42,8 @@ PATIENCE_MS = 2000  # of each connection; a health check must answer soon
 LOOK_S = 0.1  # between two looks at the heartbeats
 UNUSABLE = "The database cannot be read and written; check it, its disk and its server."
 TWO_CELLS = GridPath(GridWorld((0.0, 0.0, 0.0), 1.0, (1, 1, 2)), np.array([0, 1]))
+STILL = np.zeros(2)
+TWO_POSES = PosePath(np.eye(2, 3), np.tile([0.0, 0.0, 0.0, 1.0], (2, 1)), np.array([0.0, 1.0]), None, STILL, STILL)
 
 
 def refuse_unready(settings: Settings) -> int:
@@ -173,13 +177,15 @@ def learn_once() -> None:
     certify(policy)
     measure(rollout_from(policy, TWO_CELLS.start))
     palette_of(policy.q)
+    certify_tube(TWO_POSES, TubeLimits())
     align_once()
 
 
 def align_once() -> None:
-    """Align the shortest possible path with its reverse, and compute a palette.
+    """Align the shortest possible path with its reverse, compute a palette, and follow two poses.
 
     A request calls the same functions.
     """
     dtw(TWO_CELLS.tip_mm, TWO_CELLS.tip_mm[::-1])
     palette_of(TWO_CELLS.tip_mm)
+    next_pose(TWO_POSES, TWO_POSES.tip_mm[0], TWO_POSES.rotation_xyzw[0], None, TubeLimits())

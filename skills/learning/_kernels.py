@@ -7,6 +7,7 @@ Random bits come from xorshift64 (Marsaglia 2003), whose state, `rng`, is one no
 drawn from the low half of 64 bits, the decision to explore or to slip from the high half.
 """
 
+from math import atan2, sin, sqrt
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from skills.compiled import compiled, inner
 UNKNOWN, OFF_GRID = -2, -1  # in a model: never tried; would have left the grid, so the arm stays
 # Unsigned integers, because numba makes a float of a uint64 and a Python integer.
 NONE, ONE, THREE, SEVEN, NINE, THIRTEEN, SEVENTEEN = (np.uint64(n) for n in (0, 1, 3, 7, 9, 13, 17))
+SMALLEST_SINE = 1e-6  # of half an angle: below it, a share of the chord equals a share of the arc to rounding
 SCATTER = np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio (Knuth 6.4): spreads similar bits over the table
 ACTIONS, HALF, LOW_HALF = np.uint64(27), np.uint64(32), np.uint64(0xFFFFFFFF)
 
@@ -340,6 +342,96 @@ def tell_apart(
     return count
 
 
+@inner
+def angle_between(a: Any, i: Any, b: Any, j: Any) -> Any:
+    """Return the angle between the orientations of row i of `a` and row j of `b`, unit quaternions, in rad."""
+    w = a[i, 0] * b[j, 0] + a[i, 1] * b[j, 1] + a[i, 2] * b[j, 2] + a[i, 3] * b[j, 3]
+    x = a[i, 3] * b[j, 0] - a[i, 0] * b[j, 3] - a[i, 1] * b[j, 2] + a[i, 2] * b[j, 1]
+    y = a[i, 3] * b[j, 1] + a[i, 0] * b[j, 2] - a[i, 1] * b[j, 3] - a[i, 2] * b[j, 0]
+    z = a[i, 3] * b[j, 2] - a[i, 0] * b[j, 1] + a[i, 1] * b[j, 0] - a[i, 2] * b[j, 3]
+    return 2.0 * atan2(sqrt(x * x + y * y + z * z), abs(w))
+
+
+@inner
+def distance_between(a: Any, i: Any, b: Any, j: Any) -> Any:
+    """Return the distance between the positions of row i of `a` and row j of `b`, in mm."""
+    x, y, z = b[j, 0] - a[i, 0], b[j, 1] - a[i, 1], b[j, 2] - a[i, 2]
+    return sqrt(x * x + y * y + z * z)
+
+
+def step_along(
+    path_mm: Any,  # (N, 3)
+    path_xyzw: Any,  # (N, 4) unit quaternions
+    tip_mm: Any,  # (R, 3): the positions reached, replaced by the commanded ones
+    rotation_xyzw: Any,  # (R, 4): the orientations reached, unit quaternions, replaced likewise
+    phases: Any,  # (R,) int64: replaced by the phases after the tick
+    off: Any,  # (R, 2): distance in mm and angle in rad from the pose of the phase before the tick, filled
+    step_mm: float,
+    step_rad: float,
+    ahead: int,
+) -> None:
+    """Make one tick of runs along a path, as `skills.learning.tube` describes it."""
+    last = len(path_mm) - 1
+    for run in range(len(phases)):
+        phase = phases[run]
+        off_mm = distance_between(tip_mm, run, path_mm, phase)
+        off_rad = angle_between(rotation_xyzw, run, path_xyzw, phase)
+        off[run, 0], off[run, 1] = off_mm, off_rad
+        there = min(phase + ahead, last)
+        while there > phase and not (
+            distance_between(tip_mm, run, path_mm, there) <= step_mm
+            and angle_between(rotation_xyzw, run, path_xyzw, there) <= step_rad
+        ):
+            there -= 1
+        if there > phase or (off_mm <= step_mm and off_rad <= step_rad):
+            # A pose that is reached is commanded exactly, without the rounding of a step towards it.
+            for axis in range(3):
+                tip_mm[run, axis] = path_mm[there, axis]
+            for axis in range(4):
+                rotation_xyzw[run, axis] = path_xyzw[there, axis]
+            phases[run] = there
+            continue
+        share = step_mm / max(off_mm, step_mm)
+        for axis in range(3):
+            tip_mm[run, axis] += share * (path_mm[phase, axis] - tip_mm[run, axis])
+        # The quaternion on the shorter way, at a share of its angle (Shoemake, Animating Rotation, 1985).
+        share, half = step_rad / max(off_rad, step_rad), off_rad / 2.0
+        dot = 0.0
+        for axis in range(4):
+            dot += rotation_xyzw[run, axis] * path_xyzw[phase, axis]
+        whole = sin(half)
+        stay, go = 1.0 - share, share
+        if whole > SMALLEST_SINE:
+            stay, go = sin((1.0 - share) * half) / whole, sin(share * half) / whole
+        if dot < 0.0:
+            go = -go
+        length = 0.0
+        for axis in range(4):
+            rotation_xyzw[run, axis] = stay * rotation_xyzw[run, axis] + go * path_xyzw[phase, axis]
+            length += rotation_xyzw[run, axis] * rotation_xyzw[run, axis]
+        length = sqrt(length)
+        for axis in range(4):
+            rotation_xyzw[run, axis] /= length
+
+
+def nearest_pose(
+    path_mm: Any,  # (N, 3)
+    path_xyzw: Any,  # (N, 4) unit quaternions
+    tip_mm: Any,  # (1, 3)
+    rotation_xyzw: Any,  # (1, 4), a unit quaternion
+    start_mm: float,
+    start_rad: float,
+) -> Any:
+    """Return the index of the nearest pose, by the larger of distance over `start_mm` and angle over `start_rad`."""
+    nearest, best = 0, -1.0
+    for phase in range(len(path_mm)):
+        off_mm = distance_between(tip_mm, 0, path_mm, phase) / start_mm
+        off = max(off_mm, angle_between(rotation_xyzw, 0, path_xyzw, phase) / start_rad)
+        if best < 0.0 or off < best:
+            nearest, best = phase, off
+    return nearest
+
+
 run_episodes_compiled = compiled(run_episodes)
 explore_compiled = compiled(explore)
 sweep_compiled = compiled(sweep)
@@ -347,3 +439,5 @@ settle_compiled = compiled(settle)
 spread_distances_compiled = compiled(spread_distances)
 warp_compiled = compiled(warp)
 tell_apart_compiled = compiled(tell_apart)
+step_along_compiled = compiled(step_along)
+nearest_pose_compiled = compiled(nearest_pose)

@@ -24,66 +24,38 @@ The premises are checked, not assumed: `certify_tube` measures m and the bulge o
 at every phase, at the distances at which its branches meet. It does not prove anything of the arm that executes it.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from math import ceil
+from math import ceil, sqrt
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from skills.arrays import Flags, Floats, Ints, frozen
+from skills.arrays import Flags, Floats, Ints, frozen, xyz
+from skills.demonstration.demonstration import Demo
+from skills.demonstration.partner import Partner
 from skills.errors import BadSettings
-from skills.fields import schema
-from skills.learning.pose_style import PosePath, unit_quaternion
+from skills.fields import Point, Quaternion
+from skills.learning._kernels import nearest_pose_compiled, step_along_compiled
+from skills.learning.pose_style import PosePath, learn_pose_style, unit_quaternion
+from skills.learning.tube_certificate import TubeCertificate, TubeLimits
+
+__all__ = [
+    "CertifiedPoses",
+    "Hands",
+    "PoseStep",
+    "TubeCertificate",
+    "TubeLimits",
+    "Update",
+    "advance",
+    "certified_poses",
+    "certify_tube",
+    "next_pose",
+]
 
 ROUNDING = 1e-9  # mm and rad: a step computed in double precision is off by about 1e-14
 DIRECTIONS = 26  # towards which the update is tried: along the axes, and the diagonals between them
-
-
-@schema
-@dataclass(frozen=True)
-class TubeLimits:
-    """The assumptions of a tube.
-
-    Attributes:
-        step_mm: Longest step of the position in a tick.
-        step_rad: Largest turn in a tick.
-        disturbance_mm: Largest distance between the commanded position and the one that is reached in a tick.
-        disturbance_rad: Largest angle between the commanded orientation and the one that is reached.
-        start_mm: Largest distance of a start from the path.
-        start_rad: Largest angle of a start from the path's orientation there.
-        ahead: Phases that one tick may advance.
-    """
-
-    step_mm: float = 6.0  # with 101 phases of a hand-off of 60 mm a phase is 0.6 mm on average, 2 mm where it is fast
-    step_rad: float = 0.2
-    disturbance_mm: float = 1.0  # a calibrated dVRK arm is within 1 mm of its command
-    disturbance_rad: float = 0.02
-    start_mm: float = 20.0
-    start_rad: float = 0.5
-    ahead: int = 1
-
-    def __post_init__(self) -> None:
-        numbers = [
-            self.step_mm,
-            self.step_rad,
-            self.disturbance_mm,
-            self.disturbance_rad,
-            self.start_mm,
-            self.start_rad,
-        ]
-        if not (np.isfinite(numbers).all() and min(numbers) >= 0 and 1 <= self.ahead <= 100):
-            raise BadSettings("The limits of a tube are finite and not negative, and it looks 1 to 100 phases ahead.")
-        if not (self.disturbance_mm < self.step_mm and self.disturbance_rad < self.step_rad):
-            raise BadSettings(
-                "The disturbance of a tick must be smaller than its step, or the hand need never arrive; "
-                "make the step longer.",
-                step_mm=self.step_mm,
-                disturbance_mm=self.disturbance_mm,
-                step_rad=self.step_rad,
-                disturbance_rad=self.disturbance_rad,
-            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,40 +81,75 @@ class Hands:
 Update = Callable[[PosePath, Hands, TubeLimits], Hands]
 
 
+@dataclass(frozen=True)
+class PoseStep:
+    """The next pose of a hand on a path.
+
+    Attributes:
+        position_mm: Where to send the tip within one tick, in the frame of the path.
+        rotation_xyzw: Its orientation there, a unit quaternion.
+        jaw_rad: Angle of the jaw there; None if the path has none.
+        phase: The phase after the tick.
+        elapsed_s: Time of that phase from the start of the motion.
+        off_mm: Distance of the pose that the hand has reached from that of the phase before the tick.
+        off_rad: The angle between their orientations.
+        finished: The phase is the last one, and its pose was reached before this tick.
+    """
+
+    position_mm: Point
+    rotation_xyzw: Quaternion
+    jaw_rad: float | None
+    phase: int
+    elapsed_s: float
+    off_mm: float
+    off_rad: float
+    finished: bool
+
+
 def next_pose(
     path: PosePath, tip_mm: ArrayLike, rotation_xyzw: ArrayLike, phase: int | None, limits: TubeLimits
-) -> tuple[Floats, Floats, int]:
+) -> PoseStep:
     """Return the next pose and phase for a pose that the hand has reached.
 
     Args:
         path: The motion to follow.
         tip_mm: Position in the frame of the path, shape (3,).
         rotation_xyzw: Orientation, a unit quaternion, shape (4,).
-        phase: The phase that the last call returned; None at the start: the nearest of the path (`nearest_phase`).
-        limits: Steps and window; disturbance and start are not used.
+        phase: The phase that the last call returned; None at the start: that of the nearest pose of the path, by the
+            larger of distance over `start_mm` and angle over `start_rad`.
+        limits: Steps and window; the disturbance is not used.
 
     Returns:
-        The next position, shape (3,), orientation, shape (4,), and phase. The motion is finished when the phase is the
-        last one and its pose is reached.
+        The next pose.
 
     Raises:
         BadInput: A number is not finite, or the quaternion is not a unit quaternion.
         BadSettings: There is no such phase.
     """
-    tip = frozen(tip_mm, np.float64, (3,), "tip_mm")
-    rotation = unit_quaternion(rotation_xyzw, "rotation_xyzw")
-    if phase is not None and not 0 <= phase < len(path.tip_mm):
-        raise BadSettings(f"The path has the phases 0 to {len(path.tip_mm) - 1}.", phase=phase)
-    now = nearest_phase(path, tip, Rotation.from_quat(rotation), limits) if phase is None else phase
-    after = advance(path, Hands(tip[None], rotation[None], np.array([now])), limits)
-    return after.tip_mm[0], after.rotation_xyzw[0], int(after.phases[0])
-
-
-def nearest_phase(path: PosePath, tip_mm: Floats, rotation: Rotation, limits: TubeLimits) -> int:
-    """Return the phase whose pose is nearest, the larger of distance over `start_mm` and angle over `start_rad`."""
-    off_mm = np.linalg.norm(path.tip_mm - tip_mm, axis=1) / max(limits.start_mm, ROUNDING)
-    off_rad = (rotation.inv() * Rotation.from_quat(path.rotation_xyzw)).magnitude() / max(limits.start_rad, ROUNDING)
-    return int(np.argmin(np.maximum(off_mm, off_rad)))
+    tip = np.array([frozen(tip_mm, np.float64, (3,), "tip_mm")])
+    rotation = np.array([unit_quaternion(rotation_xyzw, "rotation_xyzw")])
+    rotation /= sqrt(sum(part * part for part in rotation[0].tolist()))
+    last, along = len(path.tip_mm) - 1, (path.tip_mm, path.rotation_xyzw)
+    if phase is None:
+        starts = max(float(limits.start_mm), ROUNDING), max(float(limits.start_rad), ROUNDING)
+        phase = nearest_pose_compiled(*along, tip, rotation, *starts)
+    elif not 0 <= phase <= last:
+        raise BadSettings(f"The path has the phases 0 to {last}.", phase=phase)
+    phases, off = np.array([phase], np.int64), np.empty((1, 2))
+    steps = float(limits.step_mm), float(limits.step_rad), int(limits.ahead)
+    step_along_compiled(*along, tip, rotation, phases, off, *steps)
+    after, (off_mm, off_rad) = int(phases[0]), off[0].tolist()
+    x, y, z, w = rotation[0].tolist()
+    return PoseStep(
+        xyz(tip[0]),
+        (x, y, z, w),
+        None if path.jaw_rad is None else float(path.jaw_rad[after]),
+        after,
+        float(path.elapsed_s[after]),
+        off_mm,
+        off_rad,
+        bool(phase == last and off_mm <= limits.step_mm and off_rad <= limits.step_rad),
+    )
 
 
 def advance(path: PosePath, hands: Hands, limits: TubeLimits) -> Hands:
@@ -156,56 +163,59 @@ def advance(path: PosePath, hands: Hands, limits: TubeLimits) -> Hands:
     Returns:
         The commanded poses and the phases after the tick.
     """
-    poses, last = Rotation.from_quat(path.rotation_xyzw), len(path.tip_mm) - 1
-    back = hands.rotations.inv()
-    phases, reached = hands.phases.copy(), np.zeros(len(hands.phases), bool)
-    for ahead in range(limits.ahead, -1, -1):
-        there = np.minimum(hands.phases + ahead, last)
-        off_mm = np.linalg.norm(path.tip_mm[there] - hands.tip_mm, axis=1)
-        off_rad = (back * poses[there]).magnitude()
-        now = ~reached & (off_mm <= limits.step_mm) & (off_rad <= limits.step_rad)
-        phases[now], reached = there[now], reached | now
-    to_mm = path.tip_mm[phases] - hands.tip_mm
-    turn = (back * poses[phases]).as_rotvec()
-    far_mm, far_rad = np.linalg.norm(to_mm, axis=1), np.linalg.norm(turn, axis=1)
-    # A pose that is reached is commanded exactly, without the rounding of a step towards it.
-    tip_mm = hands.tip_mm + to_mm * (limits.step_mm / np.maximum(far_mm, limits.step_mm))[:, None]
-    turned = hands.rotations * Rotation.from_rotvec(
-        turn * (limits.step_rad / np.maximum(far_rad, limits.step_rad))[:, None]
-    )
-    exact = np.where(reached[:, None], path.rotation_xyzw[phases], turned.as_quat())
-    return Hands(np.where(reached[:, None], path.tip_mm[phases], tip_mm), exact, phases)
+    tip, rotation = (np.array(of, np.float64, order="C") for of in (hands.tip_mm, hands.rotation_xyzw))
+    phases = np.array(hands.phases, np.int64)
+    rotation /= np.linalg.norm(rotation, axis=1, keepdims=True)
+    steps = float(limits.step_mm), float(limits.step_rad), int(limits.ahead)
+    step_along_compiled(path.tip_mm, path.rotation_xyzw, tip, rotation, phases, np.empty((len(tip), 2)), *steps)
+    return Hands(tip, rotation, phases)
 
 
-@schema
-@dataclass(frozen=True)
-class TubeCertificate:
-    """The proof that a motion stays in a tube around a path and reaches its end, under the limits that it states.
+@dataclass(frozen=True, eq=False)
+class CertifiedPoses:
+    """The motion that a style's demonstrations give at their own place, with the certificate of its tube.
 
     Attributes:
-        limits: The assumptions.
-        move_mm: The path's largest move within the window.
-        move_rad: Its largest turn within the window.
-        radius_mm: No position is further from the path.
-        radius_rad: No orientation is further from the path's at the phase.
-        ticks: After so many ticks every run has reached the end.
-        checked: Updates that were checked.
-        faults: Premises that do not hold; the certificate holds if there are none.
+        arm: The arm that was demonstrated.
+        frame: The frame of all poses.
+        path: The motion from the start pose to the goal pose of the demonstration whose place it has.
+        tube: The certificate; a motion whose certificate does not hold is not served.
+        partner: The other arm as it took the needle in that demonstration; None if it was not recorded.
     """
 
-    limits: TubeLimits
-    move_mm: float
-    move_rad: float
-    radius_mm: float
-    radius_rad: float
-    ticks: int
-    checked: int
-    faults: tuple[str, ...]
+    arm: str
+    frame: str
+    path: PosePath
+    tube: TubeCertificate
+    partner: Partner | None = None
 
     @property
-    def holds(self) -> bool:
-        """Whether every premise holds, and something was checked."""
-        return not self.faults and self.checked > 0
+    def tick_s(self) -> float:
+        """The time of a phase: a tick that advances by one takes as long as in the demonstrations."""
+        return float(self.path.elapsed_s[-1]) / (len(self.path.elapsed_s) - 1)
+
+
+def certified_poses(demos: Sequence[Demo], at: int = 0) -> CertifiedPoses | None:
+    """Learn the poses of a style, and certify the tube around them with the default limits.
+
+    Args:
+        demos: Demonstrations of one arm in one frame.
+        at: The index of the one at whose start and goal pose the motion lies.
+
+    Returns:
+        The motion, whether its certificate holds or not; None if a demonstration has no orientation.
+
+    Raises:
+        BadInput: There is no demonstration.
+        MixedFrames: They are in different frames.
+    """
+    place = demos[at] if demos else None
+    if place is not None and (place.rotation_xyzw is None or any(one.rotation_xyzw is None for one in demos)):
+        return None
+    style = learn_pose_style(demos)
+    assert place is not None and place.rotation_xyzw is not None, "checked above, and by `learn_pose_style`"
+    path = style.between(place.tip_mm[0], place.rotation_xyzw[0], place.tip_mm[-1], place.rotation_xyzw[-1])
+    return CertifiedPoses(place.arm, style.frame, path, certify_tube(path, TubeLimits()), place.partner)
 
 
 def certify_tube(path: PosePath, limits: TubeLimits, update: Update = advance) -> TubeCertificate:
@@ -278,7 +288,10 @@ def _bulge(path: PosePath, ahead: int) -> tuple[float, float]:
 
 
 def _try_update(path: PosePath, limits: TubeLimits, update: Update) -> tuple[int, list[str]]:
-    """Check what the bound assumes of the update, at every phase, to all sides, at the distances that decide.
+    """Check what the bound assumes of the update, at every phase, at all pairs of the distances that decide.
+
+    The directions alternate: every phase and every pair of distances is tried towards all of them, but not each pair at
+    each phase, so that a batch does not spend more time on certificates than on learning.
 
     Returns:
         The number of updates checked, and the assumptions that do not hold.
@@ -292,25 +305,24 @@ def _try_update(path: PosePath, limits: TubeLimits, update: Update) -> tuple[int
             (limits.step_rad, limits.disturbance_rad, limits.start_rad),
         )
     )
-    grid = np.stack(
-        np.meshgrid(np.arange(len(path.tip_mm)), np.arange(DIRECTIONS), far_mm, far_rad, indexing="ij"), axis=-1
-    ).reshape(-1, 4)
-    phases, side = grid[:, 0].astype(np.int64), grid[:, 1].astype(np.int64)
-    poses = Rotation.from_quat(path.rotation_xyzw)
+    apart = np.stack(np.meshgrid(far_mm, far_rad, indexing="ij"), axis=-1).reshape(-1, 2)
+    phases = np.repeat(np.arange(len(path.tip_mm)), len(apart))
+    off = np.tile(apart, (len(path.tip_mm), 1))
+    side = (phases + 7 * np.tile(np.arange(len(apart)), len(path.tip_mm))) % DIRECTIONS  # 7 has no divisor with 26
     before = Hands(
-        path.tip_mm[phases] + sides[side] * grid[:, 2:3],
-        (poses[phases] * Rotation.from_rotvec(sides[side[::-1]] * grid[:, 3:])).as_quat(),
+        path.tip_mm[phases] + sides[side] * off[:, :1],
+        _turned(path.rotation_xyzw[phases], sides[side[::-1]], off[:, 1]),
         phases,
     )
     after = update(path, before, limits)
     stepped = np.linalg.norm(after.tip_mm - before.tip_mm, axis=1)
-    turned = (before.rotations.inv() * after.rotations).magnitude()
+    turned = _angles(before.rotation_xyzw, after.rotation_xyzw)
     off_mm = np.linalg.norm(after.tip_mm - path.tip_mm[after.phases], axis=1)
-    off_rad = (after.rotations.inv() * poses[after.phases]).magnitude()
+    off_rad = _angles(after.rotation_xyzw, path.rotation_xyzw[after.phases])
     waits = after.phases == before.phases
-    wanted_mm = np.where(waits, np.maximum(grid[:, 2] - limits.step_mm, 0.0), 0.0)
-    wanted_rad = np.where(waits, np.maximum(grid[:, 3] - limits.step_rad, 0.0), 0.0)
-    inside = (grid[:, 2] <= limits.disturbance_mm) & (grid[:, 3] <= limits.disturbance_rad)
+    wanted_mm = np.where(waits, np.maximum(off[:, 0] - limits.step_mm, 0.0), 0.0)
+    wanted_rad = np.where(waits, np.maximum(off[:, 1] - limits.step_rad, 0.0), 0.0)
+    inside = (off[:, 0] <= limits.disturbance_mm) & (off[:, 1] <= limits.disturbance_rad)
     due = np.minimum(before.phases + limits.ahead, len(path.tip_mm) - 1)
     checks: dict[str, Flags] = {
         "An orientation is not a unit quaternion": (
@@ -327,9 +339,20 @@ def _try_update(path: PosePath, limits: TubeLimits, update: Update) -> tuple[int
         "A turn does not come nearer to the orientation by its whole size": off_rad <= wanted_rad + ROUNDING,
         "The phase does not advance by the window within the disturbance": ~inside | (after.phases == due),
     }
-    return len(grid), [
-        f"{name} at {int((~held).sum())} of {len(grid)} poses" for name, held in checks.items() if not held.all()
+    return len(off), [
+        f"{name} at {int((~held).sum())} of {len(off)} poses" for name, held in checks.items() if not held.all()
     ]
+
+
+def _angles(one_xyzw: Floats, other_xyzw: Floats) -> Floats:
+    """Return the angles between orientations, unit quaternions (R, 4), by the chord between them, exact also near 0."""
+    nearer = np.minimum(np.linalg.norm(one_xyzw - other_xyzw, axis=1), np.linalg.norm(one_xyzw + other_xyzw, axis=1))
+    return np.asarray(4.0 * np.arcsin(np.minimum(nearer / 2.0, 1.0)))
+
+
+def _turned(rotation_xyzw: Floats, axes: Floats, angles: Floats) -> Floats:
+    """Return orientations, (R, 4), turned about their own axes, (R, 3) of length 1, by angles, (R,)."""
+    return np.asarray((Rotation.from_quat(rotation_xyzw) * Rotation.from_rotvec(axes * angles[:, None])).as_quat())
 
 
 def _deciding(step: float, disturbance: float, start: float) -> Floats:

@@ -146,6 +146,8 @@ class _Batch:
         }
         if "gate" in shared:
             request["gate"] = shared["gate"]
+        if "poses" in shared:
+            request["poses"] = shared["poses"]
         if how is not None:
             request["combine"] = {"kind": how.kind}
         return request

@@ -28,6 +28,7 @@ from skills.db.models import (
     Release,
     StoredPictures,
     StoredPlayback,
+    StoredPoses,
     StoredRecording,
     StoredRewardMap,
     Surgeon,
@@ -177,6 +178,7 @@ def _erase(session: Session, which: ColumnElement[bool], surgeon: Surgeon, recor
             delete(Plan).where(Plan.policy_row.in_(some)),
             delete(Release).where(Release.policy_row.in_(some)),
             delete(PolicyDemonstration).where(PolicyDemonstration.policy_row.in_(some)),
+            delete(StoredPoses).where(StoredPoses.policy_row.in_(some)),
             delete(PolicyVersion).where(PolicyVersion.row.in_(some)),
         ):
             session.execute(statement, **UNSYNCHRONISED)

@@ -29,6 +29,7 @@ from skills.db.models import (
     Release,
     StoredCalibration,
     StoredPlayback,
+    StoredPoses,
     StoredRecording,
     StoredRewardMap,
 )
@@ -39,9 +40,10 @@ from skills.errors import Busy, Corrupt, SkillsError
 from skills.formats.reader_process import READER_VERSION, read_told
 from skills.gridworld.reward import sparse_reward
 from skills.library.calibrations import read_calibration
-from skills.library.integrity import covered, demo_identity, planned, policy_identity
+from skills.library.integrity import covered, demo_identity, planned, policy_identity, posed
 from skills.library.jobs import identity_of
 from skills.library.policies import path_of
+from skills.library.pose_styles import poses_of_demonstrations
 from skills.library.recordings import Teller, alike, cached_content, read_entry, recording_bytes
 from skills.packing import canonical, sha256
 
@@ -331,6 +333,12 @@ def _policy(row: PolicyVersion) -> Why:
         yield "its path differs from that of its demonstration"
 
 
+def _poses(row: StoredPoses) -> Why:
+    poses, again = posed(row), poses_of_demonstrations(row.policy)
+    if again is None or not alike(poses.path, again.path) or poses.frame != again.frame:
+        yield "it differs from the poses of its version's demonstrations"
+
+
 def _release(row: Release) -> Why:
     policy = row.policy
     if (policy.surgeon_row, policy.suture) != (row.surgeon_row, row.suture):
@@ -370,6 +378,7 @@ AGREES: dict[type, Callable[[Any], Why]] = {
     Demonstration: _demonstration,
     StoredRewardMap: _reward_map,
     PolicyVersion: _policy,
+    StoredPoses: _poses,
     Release: _release,
     Plan: _plan,
     StoredPlayback: _playback,

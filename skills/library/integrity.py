@@ -1,7 +1,7 @@
 """Integrity of stored values: rows found by digest, and values verified against the digest of their row.
 
     digest, in full or a prefix --find_by_digest--> row
-    row --learnt, covered, planned--> verified value, or `Corrupt`
+    row --learnt, posed, covered, planned--> verified value, or `Corrupt`
 
 A column is protected by its own checksum (`skills.db.packed`); this module verifies values that belong together: a
 policy with its manifest, a plan with the policy that it follows. A value that does not match its digest is refused;
@@ -16,7 +16,7 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from skills.db.changes import Kept
-from skills.db.models import Demonstration, Plan, PolicyVersion, StoredPlayback, StoredRecording
+from skills.db.models import Demonstration, Plan, PolicyVersion, StoredPlayback, StoredPoses, StoredRecording
 from skills.db.packed import digest
 from skills.db.service_tables import StoredDataset
 from skills.demonstration.demonstration import Demo
@@ -24,6 +24,7 @@ from skills.errors import AmbiguousDigest, Corrupt, NotFound
 from skills.gridworld.grid import GridPath
 from skills.learning.certificate import Coverage
 from skills.learning.policy import Policy
+from skills.learning.tube import CertifiedPoses
 from skills.packing import canonical, sha256
 from skills.planning.plan import SuturePlan
 from skills.remedies import Remedy
@@ -85,14 +86,35 @@ def learnt(version: PolicyVersion) -> Policy:
     return policy
 
 
+_poses: Kept[str, tuple[str, CertifiedPoses]] = Kept(256)  # by the policy's digest; some 10 kB each
+
+
+def posed(stored: StoredPoses) -> CertifiedPoses:
+    """Return the pose style of a policy version, after verifying it against its digest.
+
+    Raises:
+        Corrupt: It does not match; no arm should follow it.
+    """
+    policy = stored.policy.sha256
+    sha256, poses = _poses.get(policy) or (None, None)
+    if poses is None or sha256 != stored.sha256:
+        poses = stored.poses
+        if poses_identity_of(policy, digest(poses)) != stored.sha256:
+            raise Corrupt("A stored pose style does not match its digest; restore it from a backup or train again.")
+        _poses.put(policy, (stored.sha256, poses))
+    return poses
+
+
 def remembered() -> list[str]:
-    """List the digests of the policies in this process's cache."""
-    return [policy for policy, _ in _policies.items()]
+    """List the digests of the policies in this process's caches."""
+    return [policy for kept in (_policies, _poses) for policy, _ in kept.items()]
 
 
 def forget(policies: Iterable[str]) -> None:
-    """Remove policies, by digest, from the cache: they were erased."""
-    _policies.forget(policies)
+    """Remove policies, by digest, from the caches: they were erased."""
+    gone = list(policies)
+    _policies.forget(gone)
+    _poses.forget(gone)
 
 
 def covered(version: PolicyVersion) -> Coverage:
@@ -149,6 +171,11 @@ def policy_identity(manifest: dict[str, Any], policy: Policy) -> str:
 def policy_identity_of(manifest: dict[str, Any], numbers: str) -> str:
     """Return a policy version's digest from its manifest and the digest of its numbers, see `policy_identity`."""
     return sha256(canonical([manifest, numbers]))
+
+
+def poses_identity_of(policy_sha256: str, poses: str) -> str:
+    """Return a pose style's digest from that of the policy version to which it belongs, and that of its value."""
+    return sha256(canonical([policy_sha256, poses]))
 
 
 def plan_identity(policy_sha256: str, plan: SuturePlan) -> str:

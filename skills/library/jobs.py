@@ -151,6 +151,7 @@ class TrainingRequest(TypedDict):
     learner: dict[str, Any]
     learner_version: int
     gate: NotRequired[int]  # requests of older versions have none
+    poses: NotRequired[int]  # likewise
     seed: int
     release: bool
     combine: NotRequired[dict[str, str]]  # of several demonstrations
@@ -166,6 +167,7 @@ class RetrainingRequest(TypedDict):
     learner: dict[str, Any]
     learner_version: int
     gate: NotRequired[int]
+    poses: NotRequired[int]
     seed: int
     release: bool
     styles: NotRequired[int]

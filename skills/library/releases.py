@@ -31,7 +31,7 @@ from sqlalchemy.orm import Session, aliased
 from skills.arrays import Floats
 from skills.db import now, rfc3339
 from skills.db.changes import announce
-from skills.db.models import Demonstration, PolicyVersion, Release, Surgeon
+from skills.db.models import Demonstration, PolicyVersion, Release, StoredPoses, Surgeon
 from skills.db.service_tables import Job, StyleToRetrain, record_event
 from skills.errors import Conflict, NotFound
 from skills.gridworld.grid import GridPath, GridWorld
@@ -126,16 +126,19 @@ def fit_of_versions(session: Session, released: PolicyVersion, trained: PolicyVe
 
 
 # The newest release of a style that is not withdrawn, with columns that identify it for ever: row numbers are reused
-# after an erasure. It is served if the surgeon's consent, returned as text, covers training.
+# after an erasure. It is served if the surgeon's consent, returned as text, covers training. A pose style may be added
+# to its version later.
 STANDS = (
     select(
         Release.row,
         type_coerce(Release.released_at, String).label("released_at"),
         consent.AS_TEXT.label("consent"),
+        StoredPoses.sha256.label("poses"),
         PolicyVersion.sha256,
     )
     .join(Surgeon, Surgeon.row == Release.surgeon_row)
     .join(PolicyVersion, PolicyVersion.row == Release.policy_row)
+    .outerjoin(StoredPoses, StoredPoses.policy_row == Release.policy_row)
     .where(Surgeon.slug == bindparam("surgeon"), Release.suture == bindparam("suture"))
     .where(Release.withdrawn_at.is_(None))
     .order_by(Release.row.desc())

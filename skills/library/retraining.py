@@ -24,7 +24,7 @@ from skills.library.demos import newest_demos
 from skills.library.jobs import BATCH, PART, Asked, PartRequest, RetrainingRequest, did_nothing
 from skills.library.policies import Recipe, recipes_of
 from skills.library.releases import Outcome
-from skills.library.training import GATE_VERSION
+from skills.library.training import GATE_VERSION, POSES_VERSION
 from skills.packing import canonical, sha256
 from skills.remedies import Action, Remedy
 from skills.schemas.requests import RetrainingIn
@@ -74,6 +74,7 @@ def request_retraining(session: Session, batch: RetrainingIn, actor: str) -> Ask
         "learner": describe_learner(learner),
         "learner_version": LEARNER_VERSION,
         "gate": GATE_VERSION,
+        "poses": POSES_VERSION,
         "seed": 0,
         "release": batch.release,
     }

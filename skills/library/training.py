@@ -1,7 +1,7 @@
 """Training of a style: from its demonstration to a certified policy version, and to its release if requested.
 
     request_training --> Job
-    Job's request --train_style--> Learnt --store_style--> PolicyVersion
+    Job's request --train_style--> Learnt --store_style--> PolicyVersion and its pose style
 
 Learning and certifying run outside any transaction; the result is packed before the transaction that stores it.
 """
@@ -14,16 +14,18 @@ from sqlalchemy import LargeBinary, Result, Table, bindparam, func, insert, sele
 from sqlalchemy.orm import Session
 
 from skills.comparison.combining import Combining, followed
+from skills.db.changes import announce
 from skills.db.models import (
     SUCCESS,
     Demonstration,
     PolicyDemonstration,
     PolicyVersion,
+    StoredPoses,
     StoredRewardMap,
     Surgeon,
     newest_mark,
 )
-from skills.db.packed import seal, unpack_as
+from skills.db.packed import Sealed, seal, unpack_as
 from skills.db.service_tables import Job, record_events
 from skills.db.session import Database
 from skills.deep import Tell, learn_policy, require_installed
@@ -37,11 +39,12 @@ from skills.learning.certificate import Certificate, certify
 from skills.learning.evaluation import check_in_space, measure
 from skills.learning.policy import LEARNER_VERSION, Learner, Policy, describe_learner, learner_of, refuse_too_large
 from skills.learning.q_learning import PhaseQLearning
+from skills.learning.tube import certified_poses
 from skills.library import jobs, releases
 from skills.library.catalogue import find_surgeon, find_suture_type
 from skills.library.consent import refusal, require
 from skills.library.demos import find_demo
-from skills.library.integrity import policy_identity_of
+from skills.library.integrity import policy_identity_of, poses_identity_of
 from skills.library.jobs import QUEUED, Asked, Store, TrainingRequest, did_nothing
 from skills.library.policies import BEST, choose_demos, combining_of, describe_combined, find_by_digest
 from skills.packing import canonical, sha256
@@ -72,8 +75,10 @@ STANDING = (
 KNOWN = select(_VERSIONS.c.sha256, _VERSIONS.c.row, _VERSIONS.c.version).where(
     _VERSIONS.c.sha256.in_(bindparam("digests", expanding=True))
 )
+HAVE_POSES = select(StoredPoses.policy_row).where(StoredPoses.policy_row.in_(bindparam("policies", expanding=True)))
 ADD = insert(_VERSIONS).returning(_VERSIONS.c.sha256, _VERSIONS.c.row, _VERSIONS.c.version)
 ANY = "any"  # `outcomes` of a training from demonstrations of any outcome
+POSES_VERSION = 1  # part of a training's identity: raise it when equal demonstrations give another pose style
 GATE_VERSION = 2  # part of a training's identity: raise it when the gate's result for an equal policy changes
 CERTIFICATE_NOTE = (
     "Checked on the grid: every greedy action against exact dynamic programming, and every start by following it; "
@@ -118,6 +123,7 @@ def request_training(session: Session, training: TrainingIn, actor: str) -> Aske
         "learner": describe_learner(learner),
         "learner_version": LEARNER_VERSION,
         "gate": GATE_VERSION,
+        "poses": POSES_VERSION,
         "seed": training.seed,
         "release": training.release,
     }
@@ -162,7 +168,8 @@ class Lesson:
 
     For several combined demonstrations it is the one at whose place their path lies; `others` are the rows of the rest,
     and `combined` is the description of the combination in the manifest. `outcomes` are those of all its
-    demonstrations, the oldest first; None is not known.
+    demonstrations, the oldest first; None is not known. `shown` are these demonstrations, still packed, and `at` is the
+    index of the one at whose place they lie; empty for a single one.
     """
 
     row: int
@@ -174,6 +181,8 @@ class Lesson:
     outcomes: tuple[str | None, ...]
     others: tuple[int, ...] = ()
     combined: dict[str, Any] | None = None
+    shown: tuple[bytes, ...] = ()
+    at: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,6 +195,7 @@ class Learnt:
     manifest: dict[str, Any]
     policy: bytes
     coverage: bytes
+    poses: Sealed | None
 
 
 class Stored(NamedTuple):
@@ -248,6 +258,8 @@ def combined_lesson(lessons: Sequence[Lesson], how: Combining) -> Lesson:
         demo=seal(found.demo).packed,
         reward=seal(sparse_reward(found.path, rewards[at].levels)).packed,
         outcomes=tuple(outcome for lesson in lessons for outcome in lesson.outcomes),
+        shown=tuple(lesson.demo for lesson in lessons),
+        at=at,
         others=tuple(lesson.row for lesson in lessons if lesson is not lessons[at]),
         combined=describe_combined(found, how, [lesson.sha256 for lesson in lessons]),
     )
@@ -284,6 +296,7 @@ def learn_style(lesson: Lesson, request: TrainingRequest, settings: Settings, te
 def certified(lesson: Lesson, request: TrainingRequest, demo: Demo, policy: Policy) -> Learnt:
     """Certify and measure a policy that was learnt from a demonstration, and pack all of it."""
     certificate, covered = certify(policy)
+    poses = certified_poses([unpack_as(Demo, one) for one in lesson.shown] or [demo], lesson.at)
     numbers, coverage = seal(policy), seal(covered)
     driven, undriven = _driven(policy, demo)
     refused_because = [*refusals(policy, certificate), *undriven]
@@ -299,6 +312,7 @@ def certified(lesson: Lesson, request: TrainingRequest, demo: Demo, policy: Poli
         manifest=manifest,
         policy=numbers.packed,
         coverage=coverage.packed,
+        poses=None if poses is None else seal(poses),
     )
 
 
@@ -331,12 +345,27 @@ def store_styles(session: Session, learnt: Sequence[Learnt]) -> list[Stored | Sk
         values = [_version(one, (standing[one.lesson.row].last or 0) + 1) for one in new]
         known |= _stored(session.execute(ADD, values))
         record_events(session, "worker", "train", "policy-version", [(one.sha256, one.lesson.surgeon) for one in new])
+    _store_poses(session, [one for one in learnt if refused[one.sha256] is None], known)
     rests_on = [
         {"policy_row": known[one.sha256].row, "demonstration_row": other} for one in new for other in one.lesson.others
     ]
     if rests_on:
         session.execute(insert(PolicyDemonstration), rests_on)
     return [refused[one.sha256] or known[one.sha256] for one in learnt]
+
+
+def _store_poses(session: Session, learnt: Sequence[Learnt], known: dict[str, Stored]) -> None:
+    """Store the pose styles of versions that have none yet, also of a version that an older code stored."""
+    made = {known[one.sha256].row: (one.sha256, one.poses) for one in learnt if one.poses is not None}
+    there = session.scalars(HAVE_POSES, {"policies": [*made]}).all()
+    values = [
+        {"policy_row": row, "sha256": poses_identity_of(policy, poses.digest), "poses": poses.packed}
+        for row, (policy, poses) in made.items()
+        if row not in there
+    ]
+    if values:
+        session.execute(insert(StoredPoses), values)
+        announce(session)  # the version may be served already
 
 
 def _stored(found: Result[Any]) -> dict[str, Stored]:

@@ -20,10 +20,12 @@ from skills.schemas import Given, Handedness, Page, PolicyName, SkillLevel
 from skills.schemas.comparison import Atlas, Score
 from skills.schemas.policies import (
     Job,
+    NextPose,
     NextStep,
     Policy,
     PolicyCard,
     PolicySummary,
+    PoseStyle,
     RetrainedStyle,
     Retraining,
     Rollout,
@@ -43,6 +45,7 @@ __all__ = [
     "Job",
     "Key",
     "NewKey",
+    "NextPose",
     "NextStep",
     "Page",
     "Plan",
@@ -50,6 +53,7 @@ __all__ = [
     "Policy",
     "PolicyCard",
     "PolicySummary",
+    "PoseStyle",
     "Problem",
     "Ready",
     "Recording",

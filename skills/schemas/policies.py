@@ -10,10 +10,12 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from skills.fields import Count, Fraction, Point, Sha256, Slug, schema, stored_schema
+from skills.demonstration.partner import Partner
+from skills.fields import Count, Fraction, Point, Quaternion, Sha256, Slug, schema, stored_schema
 from skills.gridworld.reward import RewardLevels
 from skills.learning.evaluation import Metrics, SpaceRollouts
 from skills.learning.q_learning import Training
+from skills.learning.tube_certificate import TubeCertificate
 from skills.planning.plan import DrivenPass
 from skills.schemas import DemoOutcome, Given, Grid, Page, PolicyName, VersionNumber
 from skills.schemas.recordings import DemoReport
@@ -318,6 +320,55 @@ class NextStep(PolicyName):
     done: bool
     confidence: float
     correction_mm: Point | None = Field(description="The way back to the path; null on it.")
+
+
+class PoseAnswer(Given):
+    """The next pose for a pose that was reached.
+
+    Outside the tube the certificate proves nothing: a client stops there, or brings the hand back by other means.
+    """
+
+    position_mm: Point
+    rotation_xyzw: Quaternion
+    jaw_rad: float | None
+    phase: Count = Field(description="After this tick; to be sent with the pose that is reached then.")
+    elapsed_s: float = Field(description="Time of that phase from the start of the motion.")
+    off_mm: float = Field(description="Distance of the pose that was sent from that of its phase.")
+    off_rad: float
+    inside: bool = Field(description="Whether the pose that was sent lies in the tube.")
+    finished: bool = Field(description="Whether the last pose was reached.")
+
+
+class NextPose(PoseAnswer, PolicyName):
+    """The next pose of the pose style, to be reached within `tick_s`."""
+
+    frame: str
+    tick_s: float
+
+
+class PoseStyle(PolicyName):
+    """The poses of a hand along one phase, learnt from the demonstrations of a policy version.
+
+    Phase k of N is the share k / (N - 1) of the time; the lists have an entry for each. The motion lies at the start
+    and the goal pose of one demonstration. `tube` certifies the rule by which `POST .../next` follows it.
+    """
+
+    format: Literal["suture-skills pose style 1"]
+    surgeon: Slug
+    suture: Slug
+    arm: str
+    frame: str
+    demos: list[Sha256]
+    position_mm: list[Point]
+    rotation_xyzw: list[Quaternion]
+    jaw_rad: list[float] | None = Field(description="null where a demonstration has no jaw.")
+    elapsed_s: list[float]
+    spread_mm: list[float] = Field(description="Standard deviation of the demonstrations about the path.")
+    spread_rad: list[float]
+    tick_s: float = Field(description="Time between two phases.")
+    tube: TubeCertificate
+    partner: Partner | None = Field(description="The other arm as it took the needle, where that was recorded.")
+    created_at: datetime
 
 
 class CardPolicy(Given):

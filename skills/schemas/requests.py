@@ -349,11 +349,18 @@ class RolloutIn(Schema):
 
 
 class NextIn(Schema):
-    """A position in mm, in the policy's frame, and the phase in which it was reached; null: the start of a pass."""
+    """A position in mm, in the policy's frame, and the phase in which it was reached; null: the start of a pass.
 
-    model_config = shown({"position_mm": [-10.0, 55.0, -135.0]}, {"position_mm": [-15.0, 55.0, -130.0], "phase": 1})
+    With an orientation it is a pose, and the pose style answers; the phases are then those of the pose style.
+    """
+
+    model_config = shown(
+        {"position_mm": [-10.0, 55.0, -135.0]},
+        {"position_mm": [-15.0, 55.0, -130.0], "phase": 1},
+    )
 
     position_mm: Point
+    rotation_xyzw: tuple[Component, Component, Component, Component] | None = None
     phase: Annotated[StrictInt, Field(ge=0, le=10**6)] | None = None
 
 

@@ -16,7 +16,7 @@ OPERATIONS = {
     "add_demo", "add_recording", "alive", "cancel_job", "compare", "delete_recording", "draw_pictures", "end_key",
     "erase_surgeon",
     "get_animation", "get_animation_gif", "get_atlas", "get_clearance_plot", "get_demo", "get_demo_recording",
-    "get_job", "get_joints_plot", "get_path", "get_picture", "get_plan", "get_playback", "get_policy",
+    "get_job", "get_joints_plot", "get_path", "get_picture", "get_plan", "get_playback", "get_policy", "get_pose_style",
     "get_policy_card", "get_policy_version", "get_policy_version_card", "get_recording", "get_report",
     "get_retraining", "get_reward_map", "get_surgeon", "get_suture_type", "get_trajectory", "get_version",
     "list_all_keys", "list_demos", "list_jobs", "list_policies", "list_surgeons", "list_suture_types",

@@ -125,7 +125,14 @@ def test_type_checkers_know_what_both_clients_take_and_answer(tmp_path):
 
 WORDS: dict[str, Any] = {
     **dict.fromkeys(("surgeon", "suture", "recording", "demo", "job", "policy", "plan", "playback", "key"), "a"),
-    **{"version": 1, "start_mm": (0, 0, 0), "position_mm": (0, 0, 0), "suture_points": [], "owner": "me"},
+    **{
+        "version": 1,
+        "start_mm": (0, 0, 0),
+        "position_mm": (0, 0, 0),
+        "rotation_xyzw": (0, 0, 0, 1),
+        "suture_points": [],
+        "owner": "me",
+    },
     **{
         "name": "n",
         "family": "f",

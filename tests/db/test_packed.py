@@ -28,6 +28,7 @@ from skills.learning.max_ent_irl import MaxEntIRL
 from skills.learning.networks import DDPG, DQN, TRPO
 from skills.learning.policy import learn_tabular
 from skills.learning.q_learning import CellQLearning, PhaseQLearning
+from skills.learning.tube import certified_poses
 from skills.planning.handoff import PsmM
 from skills.planning.plan import SuturePoint, stack
 from skills.verification.playback import Pictures, Playback
@@ -89,6 +90,7 @@ VALUES = [
     PLAN,
     replace(PLAN, psm_m=PsmM((1.0, 0.0, 0.0), (160.0, 20.0, 20.0), (0.0, 0.0, 0.0, 1.0), "420006", "start", "a", "b")),
     certify(POLICY)[1],
+    certified_poses([DEMO]),
     PLAYBACK,
     Pictures(b"mp4", b"gif", b"joints", b"clearance"),
     Measured(None, np.array([], np.int64), np.array([]), np.array([])),

@@ -32,6 +32,7 @@ FROZEN = (
     "reward_maps",
     "policy_versions",
     "policy_demonstrations",
+    "pose_styles",
     "plans",
     "playbacks",
     "playback_pictures",
@@ -61,6 +62,8 @@ def full(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
     demo, other = (cases.add_demo(database, cases.hand_off((shift, 0.0, 0.0))) for shift in (0.0, 2.5))
     cases.train(database, demos=[demo.sha256, other.sha256])
     cases.train(database, release=True)
+    posed = cases.store(database, cases.upload(cases.bag(), "application/vnd.mcap"))
+    cases.train(database, demos=[posed.sha256])
     plan = cases.add_plan(database)
     retrain(database)
     with database.writing() as session:

@@ -17,7 +17,7 @@ from tests.waiting import END_S
 
 WARM = """
 from threading import enumerate as threads
-from skills.jobs.readiness import align_once, learn_once, warm_up
+from skills.jobs.readiness import TWO_POSES, align_once, learn_once, warm_up
 from skills.packing import palette_of
 def finish():
     [thread.join() for thread in threads() if thread.name == "warm-up"]
@@ -35,10 +35,11 @@ def test_a_worker_warms_up_first_so_its_job_loads_and_compiles_nothing():
 
 def test_a_server_warms_up_what_a_rollout_calls():
     asked = "dtw(path.tip_mm, path.tip_mm[::-1])\npalette_of(path.tip_mm)\n"
+    asked += "next_pose(TWO_POSES, TWO_POSES.tip_mm[1], TWO_POSES.rotation_xyzw[0], None, TubeLimits())\n"
     code = f"warm_up(align_once).join()\nwarm = touched()\n{asked}"
     each = told(start(WARM + code + "tell(warm=warm, after=touched())"))
     assert each["warm"] == each["after"]
-    assert sum(each["after"].values()) == 2
+    assert sum(each["after"].values()) == 4
 
 
 @pytest.mark.nightly  # it compiles everything
@@ -51,7 +52,7 @@ def test_what_a_power_cut_left_half_written_is_made_anew(tmp_path):
     mended, after = (told(start(code, NUMBA_CACHE_DIR=str(tmp_path))) for _ in range(2))
     assert whole["aligned"] == mended["aligned"] == after["aligned"] > 0
     assert "cannot be loaded; they are compiled again" in mended["logged"]
-    assert (mended["compiled"], after["compiled"], after["loaded"], after["logged"]) == (2, 0, 2, "")
+    assert (mended["compiled"], after["compiled"], after["loaded"], after["logged"]) == (4, 0, 4, "")
 
 
 # ---- folders that others can write to

@@ -24,6 +24,8 @@ from skills.learning import _kernels
 from skills.learning.q_learning import CellQLearning, PhaseQLearning
 from skills.packing import palette_of
 from skills.learning.policy import learn_tabular
+from skills.learning.pose_style import PosePath
+from skills.learning.tube import Hands, TubeLimits, advance, certify_tube, next_pose
 from skills.gridworld.reward import RewardLevels, sparse_reward
 loops = {name: loop for name, loop in vars(_kernels).items() if name.endswith("_compiled")}
 path = GridPath(GridWorld((0.0, 0.0, 0.0), 5.0, (3, 3, 3)), np.array([0, 1, 4, 3, 0, 13, 26]))
@@ -106,6 +108,10 @@ for levels, cell in [(whole, cell) for cell in cells] + [(costly, CellQLearning(
 dtw(path.tip_mm, path.tip_mm), dtw(path.tip_mm[::-1], path.tip_mm.astype(int).tolist()[1:])
 unaligned = np.frombuffer(bytes(17), np.float64, offset=1)
 palette_of(np.zeros((2, 3))), palette_of(np.zeros((2, 3)).T), palette_of(unaligned), palette_of(np.zeros(0))
+pose, still = [0, 0, 0, 1], np.zeros(2)
+along, far = PosePath(np.eye(2, 3), np.tile(pose, (2, 1)), [0, 1], None, still, still), TubeLimits(3, 1, 0, 0, 9, 1)
+next_pose(along, [0, 0, 5], pose, None, far), next_pose(along, np.eye(3)[0], pose, np.int32(1), TubeLimits())
+certify_tube(along, far), advance(along, Hands(np.zeros((3, 4)).T, np.eye(4).T, np.zeros(4, np.int32)), far)
 tell(signatures={name: len(loop.machine.signatures) for name, loop in loops.items()})"""
     signatures = told(start(code))["signatures"]
     assert signatures == dict.fromkeys(signatures, 1)

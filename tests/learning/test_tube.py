@@ -7,8 +7,10 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
 from skills.errors import BadInput, BadSettings
+from skills.learning import tube
 from skills.learning.pose_style import PHASES, PosePath
 from skills.learning.tube import Hands, TubeLimits, Update, advance, certify_tube, next_pose
+from tests.learning.test_kernels import both
 
 LIMITS = TubeLimits(step_mm=6.0, step_rad=0.2, disturbance_mm=1.0, disturbance_rad=0.02, start_mm=20.0, start_rad=0.5)
 
@@ -154,19 +156,79 @@ def test_a_replay_by_the_clock_leaves_the_tube() -> None:
     assert worst > certify_tube(path, limits).radius_mm
 
 
+def by_scipy(path: PosePath, hands: Hands, limits: TubeLimits) -> tuple[Hands, np.ndarray]:
+    """Compute a tick with scipy's rotations, for all hands at once; return also distance and angle before it."""
+    poses, last = Rotation.from_quat(path.rotation_xyzw), len(path.tip_mm) - 1
+    back = hands.rotations.inv()
+    phases, reached = hands.phases.copy(), np.zeros(len(hands.phases), bool)
+    for ahead in range(limits.ahead, -1, -1):
+        there = np.minimum(hands.phases + ahead, last)
+        off_mm = np.linalg.norm(path.tip_mm[there] - hands.tip_mm, axis=1)
+        off_rad = (back * poses[there]).magnitude()
+        now = ~reached & (off_mm <= limits.step_mm) & (off_rad <= limits.step_rad)
+        phases[now], reached = there[now], reached | now
+    to_mm, turn = path.tip_mm[phases] - hands.tip_mm, (back * poses[phases]).as_rotvec()
+    far_mm, far_rad = np.linalg.norm(to_mm, axis=1), np.linalg.norm(turn, axis=1)
+    tip = hands.tip_mm + to_mm * (limits.step_mm / np.maximum(far_mm, limits.step_mm))[:, None]
+    shorter = Rotation.from_rotvec(turn * (limits.step_rad / np.maximum(far_rad, limits.step_rad))[:, None])
+    tip[reached] = path.tip_mm[phases[reached]]
+    rotation = np.where(reached[:, None], path.rotation_xyzw[phases], (hands.rotations * shorter).as_quat())
+    return Hands(tip, rotation, phases), np.stack([off_mm, off_rad], axis=1)
+
+
+@pytest.mark.parametrize("ahead", [1, 3])
+def test_the_compiled_tick_equals_that_of_scipy(ahead: int) -> None:
+    path, limits, rng, runs = a_path(), replace(LIMITS, ahead=ahead), np.random.default_rng(3), 5000
+    phases = rng.integers(0, PHASES, runs)
+    turned = Rotation.from_rotvec(unit(rng, runs) * rng.choice([0.0, 1e-9, 0.1, 0.5, 3.1], (runs, 1)))
+    rotation = (Rotation.from_quat(path.rotation_xyzw[phases]) * turned).as_quat() * rng.choice([-1.0, 1.0], (runs, 1))
+    far = rng.choice([0.0, 1e-12, 2.0, 15.0, 500.0], (runs, 1))
+    hands = Hands(path.tip_mm[phases] + far * unit(rng, runs), rotation, phases)
+    ours, (theirs, off) = advance(path, hands, limits), by_scipy(path, hands, limits)
+    assert (ours.phases == theirs.phases).all()
+    assert np.abs(ours.tip_mm - theirs.tip_mm).max() < 1e-9
+    assert (ours.rotations.inv() * theirs.rotations).magnitude().max() < 1e-9
+    for run in range(0, runs, 100):
+        step = next_pose(path, hands.tip_mm[run], hands.rotation_xyzw[run], int(phases[run]), limits)
+        assert np.abs(np.array(step.position_mm) - theirs.tip_mm[run]).max() < 1e-9
+        assert (step.phase, step.elapsed_s) == (theirs.phases[run], path.elapsed_s[theirs.phases[run]])
+        assert (step.off_mm, step.off_rad) == pytest.approx(tuple(off[run]), abs=1e-8)
+
+
+def test_the_compiled_and_the_plain_ticks_agree_to_the_last_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+    agreed: list[str] = []
+    for loop in ("step_along", "nearest_pose"):
+        monkeypatch.setattr(tube, f"{loop}_compiled", both(loop, agreed))
+    certify_tube(a_path(), LIMITS)
+    next_pose(a_path(), (10.0, 3.0, -118.0), (0.0, 0.0, 0.0, 1.0), None, LIMITS)
+    assert set(agreed) == {"step_along", "nearest_pose"}
+
+
+def test_a_motion_is_finished_once_its_last_pose_was_reached() -> None:
+    path, phase, finished = a_path(), 90, []
+    hand = path.tip_mm[90], path.rotation_xyzw[90]
+    while not any(finished):
+        step = next_pose(path, *hand, phase, LIMITS)
+        finished.append(step.finished)
+        hand, phase = (np.array(step.position_mm), np.array(step.rotation_xyzw)), step.phase
+    assert len(finished) == 11 and phase == PHASES - 1
+
+
 def test_a_hand_that_is_held_is_waited_for() -> None:
     path = a_path()
     held = path.tip_mm[20] + (0.0, 0.0, 12.0)
     phase: int | None = 20
     for _ in range(30):
-        tip, _, phase = next_pose(path, held, path.rotation_xyzw[20], phase, LIMITS)
-    assert phase == 20 and np.linalg.norm(tip - held) == pytest.approx(LIMITS.step_mm)
+        step = next_pose(path, held, path.rotation_xyzw[20], phase, LIMITS)
+        phase = step.phase
+    assert phase == 20 and np.linalg.norm(step.position_mm - held) == pytest.approx(LIMITS.step_mm)
+    assert (step.off_mm, step.finished) == (pytest.approx(12.0), False)
 
 
 def test_a_start_joins_at_the_nearest_pose_and_not_the_nearest_position() -> None:
     path = a_path()
-    assert next_pose(path, path.tip_mm[30], path.rotation_xyzw[30], None, LIMITS)[2] == 31
-    turned = next_pose(path, path.tip_mm[30], path.rotation_xyzw[60], None, LIMITS)[2]
+    assert next_pose(path, path.tip_mm[30], path.rotation_xyzw[30], None, LIMITS).phase == 31
+    turned = next_pose(path, path.tip_mm[30], path.rotation_xyzw[60], None, LIMITS).phase
     assert 30 < turned < 60
 
 

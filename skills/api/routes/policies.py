@@ -14,7 +14,7 @@ from skills.api.dependencies import Actor, Db, Digest, Jobs, Limit, RowCursor, S
 from skills.api.openapi import ends, gives, gives_page, gives_stream, router_of, says, starts_job
 from skills.api.pages import HTML, standalone_headers, wants_page
 from skills.api.pages.drawings import card_page
-from skills.api.policy_cache import PolicyCache
+from skills.api.policy_cache import POSES, PolicyCache
 from skills.api.responses import (
     JSON,
     NPZ,
@@ -41,10 +41,22 @@ from skills.library.catalogue import find_surgeon, find_suture_type
 from skills.library.integrity import learnt
 from skills.library.jobs import PART, count, job_json, to_tell
 from skills.library.policies import summary_json, version_json
+from skills.library.pose_styles import about_next, poses_of
 from skills.library.releases import outcomes_of, outcomes_of_styles
 from skills.library.retraining import find_retraining, list_styles, request_retraining, retrained_json
 from skills.library.training import request_training
-from skills.schemas.given import Job, NextStep, Page, Policy, PolicyCard, PolicySummary, Retraining, Rollout
+from skills.schemas.given import (
+    Job,
+    NextPose,
+    NextStep,
+    Page,
+    Policy,
+    PolicyCard,
+    PolicySummary,
+    PoseStyle,
+    Retraining,
+    Rollout,
+)
 from skills.schemas.given import Version as GivenVersion
 from skills.schemas.requests import JOB, SLUG, NextIn, RetrainingIn, RolloutIn, TrainingIn
 from skills.settings import MEBIBYTE
@@ -205,6 +217,21 @@ async def get_policy(
 
 
 @router.get(
+    "/policies/{surgeon}/{suture}/pose-style", dependencies=[needs("reader")], **gives(PoseStyle, 404, 410, 412)
+)
+async def get_pose_style(
+    surgeon: Slug, suture: Slug, request: Request, if_none_match: Condition = None, if_match: Condition = None
+) -> Response:
+    """Return the pose style of the style's released policy, if its tube is certified.
+
+    404 says why there is none: nothing is released, the version is older than pose styles, its demonstrations have no
+    orientation, or the certificate does not hold.
+    """
+    served: PolicyCache = request.app.state.served
+    return answer(await served.body(surgeon, suture, POSES), if_none_match, if_match)
+
+
+@router.get(
     "/policies/{surgeon}/{suture}/versions", dependencies=[needs("reader")], **gives_page(Page[GivenVersion], 404, 410)
 )
 def list_versions(
@@ -299,11 +326,15 @@ def roll_out(surgeon: Slug, suture: Slug, body: RolloutIn, db: Db) -> Response:
         return say(found.model_dump(mode="json"))
 
 
-@router.post("/policies/{surgeon}/{suture}/next", dependencies=[needs("reader")], **says(NextStep, 404, 410))
+@router.post("/policies/{surgeon}/{suture}/next", dependencies=[needs("reader")], **says(NextStep | NextPose, 404, 410))
 def next_action(surgeon: Slug, suture: Slug, body: NextIn, db: Db) -> Response:
-    """Return the policy's next action at a position; nothing moves."""
+    """Return the policy's next action at a position, or the next pose of the pose style at a pose; nothing moves."""
     with db.reading() as session:
         policy = policies.policy_of(session, surgeon, suture).policy
+        if body.rotation_xyzw is not None:
+            poses = poses_of(policy)
+            found = about_next(policy, poses, body.position_mm, body.rotation_xyzw, body.phase)
+            return say(found.model_dump(mode="json"))
         step = next_step(learnt(policy), body.position_mm, body.phase)
         about = {"version": policy.version, "sha256": policy.sha256, "frame": policy.manifest["frame"]}
         return say(NextStep(**about, **vars(step)).model_dump(mode="json"))

@@ -1,0 +1,95 @@
+"""Pose styles over HTTP: the one of the released policy, the link to it, and the next pose."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from skills.client import Problem
+from skills.library.keys import create_key
+from skills.library.pose_styles import FORMAT
+from tests import backends
+from tests.api.service import KESTREL, MCAP, POLICY, Service, assert_problem, serving
+from tests.library import cases
+from tests.library.test_pose_styles import turning
+
+POSES, NEXT = f"{POLICY}/pose-style", f"{POLICY}/next"
+
+
+@pytest.fixture(params=backends.BACKENDS)
+def posed(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Service]:
+    """Yield a service in which kestrel's style, with orientation, is released."""
+    url = backends.fresh(request.param, tmp_path)
+    with serving(url) as service:
+        service.client.put_surgeon("kestrel")
+        service.client.add_demo(turning(), media_type=MCAP, **KESTREL)
+        job = service.train(release=True)
+        assert job["result"]["released"], job["result"]
+        yield service
+    backends.drop(url)
+
+
+def test_the_pose_style_of_the_released_policy_is_linked_and_served(posed: Service):
+    policy = posed.http.get(POLICY)
+    assert policy.headers["link"] == f'<{cases.SUTURE}/pose-style>; rel="related"; title="pose style"'
+    assert posed.http.get(POLICY, headers={"If-None-Match": policy.headers["etag"]}).headers["link"]
+    answer = posed.http.get(POSES)
+    style = answer.json()
+    assert (style["format"], style["sha256"], style["frame"]) == (FORMAT, policy.json()["sha256"], "PSM2_base")
+    assert len({len(style[name]) for name in ("position_mm", "rotation_xyzw", "elapsed_s", "spread_mm")}) == 1
+    tube = style["tube"]
+    assert (tube["faults"], tube["radius_mm"], tube["limits"]["ahead"]) == ([], 20.0, 1)
+    assert tube["radius_deg"] == pytest.approx(np.degrees(tube["radius_rad"]))
+    assert posed.http.get(POSES, headers={"If-None-Match": answer.headers["etag"]}).status_code == 304
+    assert posed.client.pose_style(**KESTREL) == style
+
+
+def test_next_follows_the_poses_to_the_end(posed: Service):
+    style = posed.http.get(POSES).json()
+    position, rotation, phase, ticks = np.add(style["position_mm"][0], (0.0, 12.0, 0.0)), [0.0, 1.0, 0.0, 0.0], None, 0
+    rotation = style["rotation_xyzw"][0]
+    while True:
+        step = posed.client.next_pose(**KESTREL, position_mm=position, rotation_xyzw=rotation, phase=phase)
+        assert step["inside"] and step["tick_s"] == style["tick_s"]
+        if step["finished"]:
+            break
+        position, rotation, phase, ticks = step["position_mm"], step["rotation_xyzw"], step["phase"], ticks + 1
+    assert ticks <= style["tube"]["ticks"]
+    assert (position, step["elapsed_s"]) == (style["position_mm"][-1], style["elapsed_s"][-1])
+
+
+def test_a_pose_outside_the_tube_is_named(posed: Service):
+    style = posed.http.get(POSES).json()
+    far = np.add(style["position_mm"][0], (0.0, 0.0, -21.0)).tolist()
+    body = {"position_mm": far, "rotation_xyzw": style["rotation_xyzw"][0], "phase": 0}
+    step = posed.http.post(NEXT, json=body).json()
+    assert (step["inside"], step["phase"], step["off_mm"]) == (False, 0, pytest.approx(21.0))
+    assert_problem(posed.http.post(NEXT, json=body | {"rotation_xyzw": [0, 0, 0, 2]}), 422)
+    assert_problem(posed.http.post(NEXT, json=body | {"phase": 101}), 422)
+    assert posed.http.post(NEXT, json={"position_mm": far}).json().keys() >= {"action", "correction_mm"}
+
+
+def test_a_withdrawn_policy_has_no_pose_style(posed: Service):
+    assert posed.http.get(POSES).status_code == 200
+    posed.client.withdraw(**KESTREL)
+    assert_problem(posed.http.get(POSES), 404, "not-found")
+    body = {"position_mm": [0, 0, 0], "rotation_xyzw": [0, 0, 0, 1]}
+    assert_problem(posed.http.post(NEXT, json=body), 404, "not-found")
+
+
+def test_a_key_for_others_sees_no_pose_style(posed: Service):
+    posed.client.put_surgeon("heron")
+    with posed.database.writing() as session:
+        _, theirs = create_key(session, "lab", "reader", "test", surgeons=["heron"])
+        _, ours = create_key(session, "ours", "reader", "test", surgeons=["kestrel"])
+    headers = {"Authorization": f"Bearer {theirs}"}
+    assert_problem(posed.http.get(POSES, headers=headers), 404, "not-found")
+    assert posed.http.get(POSES, headers={"Authorization": f"Bearer {ours}"}).status_code == 200
+
+
+def test_positions_alone_have_no_pose_style_and_no_link(trained: Service):
+    assert "link" not in trained.http.get(POLICY).headers
+    assert "has no orientation" in assert_problem(trained.http.get(POSES), 404, "not-found")["detail"]
+    with pytest.raises(Problem, match="has no orientation"):
+        trained.client.next_pose(**KESTREL, position_mm=[0, 0, 0], rotation_xyzw=[0, 0, 0, 1])
