@@ -31,6 +31,7 @@ from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 from skills import logs
 from skills.api.app import create_app, prepare_database
+from skills.api.sessions import MESSAGE_BYTES
 from skills.client import Client
 from skills.compiled import check_wanted
 from skills.db.session import Database
@@ -282,6 +283,10 @@ def serve(settings: Settings, *, samples: bool = False) -> None:
             ssl_keyfile=settings.tls_key,
             proxy_headers=False,  # the caller is not derived from headers that anybody can send
             http=connections(settings),
+            ws_max_size=MESSAGE_BYTES,
+            ws_ping_interval=settings.heartbeat_s,
+            ws_ping_timeout=settings.heartbeat_s,
+            ws_per_message_deflate=False,  # a message has 200 bytes; compressing them would take longer than a tick
             log_config=None,  # its records go through our logging
             log_level="warning",
             access_log=False,

@@ -89,7 +89,10 @@ class Settings(BaseSettings):
     key_requests_per_s: float = Field(default=200.0, gt=0)  # per key: a robot with requests at 100 Hz, and a web page
     key_upload_bytes_per_day: int = Field(default=20480 * MEBIBYTE, gt=0)  # 80 of the largest recordings
     key_watchers: int = Field(default=100, ge=1)  # event streams of a key at once: as many as its owner may have jobs
-    heartbeat_s: float = Field(default=15.0, gt=0)  # of event streams: proxies close an idle one after 30 to 60 s
+    key_sessions: int = Field(default=100, ge=1)  # sessions of pose styles of a key at once
+    session_idle_s: float = Field(default=30.0, gt=0)  # a session without a message for longer is closed
+    # of event streams and sessions: proxies close an idle one after 30 to 60 s
+    heartbeat_s: float = Field(default=15.0, gt=0)
     key_jobs: int = Field(default=100, ge=1)  # unfinished jobs of an owner; a batch counts as one
     log_level: Literal["debug", "info", "warning", "error"] = "warning"  # "info" adds a line for each request and job
     log_format: Literal["text", "json"] = "text"

@@ -19,6 +19,7 @@ from skills.api.policy_cache import AtHand, PolicyCache
 from skills.api.problems import TOO_LARGE, answer_refusals
 from skills.api.responses import DOWNLOADS_READ, Encoded, Watching
 from skills.api.routes import catalogue, datasets, demos, operating, pages, plans, policies
+from skills.api.sessions import Sessions
 from skills.db.session import Database
 from skills.jobs import Engine
 from skills.library.catalogue import seed_catalogue
@@ -67,6 +68,8 @@ def create_app(settings: Settings) -> FastAPI:
     app.state.served = PolicyCache(app.state.database, app.state.encoded)
     app.state.watching = Watching(app.state.database, app.state.served.changes, settings)
     app.state.metrics = ServiceMetrics(app.state.database, settings.lease_s)
+    app.state.sessions = Sessions(app.state.database, app.state.served.changes, settings)
+    app.state.metrics.sessions.set_function(lambda: app.state.sessions.count)
     app.state.downloads = CapacityLimiter(DOWNLOADS_READ)
     app.state.access = Access(app.state.database, settings)
     # `include_router` would analyse every route again, at the first request of each application: 90 ms.

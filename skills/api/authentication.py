@@ -54,6 +54,7 @@ from skills.settings import Settings
 COOKIE = "skills_sign_in"
 PROXY_SECRET = b"x-skills-proxy-secret"
 SAFE = frozenset({"GET", "HEAD", "OPTIONS"})
+WEB_SOCKET = "WebSocket"  # a request to open one has no method here
 OPEN = frozenset({"/healthz", "/openapi.json", "/docs", "/sign-in"})  # they reveal nothing of the stored data
 OPEN_BELOW = "/static/"
 # also for callers who were authenticated before the database failed
@@ -310,13 +311,14 @@ class Gate:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a request on, or answer it with the problem document of its refusal."""
-        if scope["type"] != "http":
+        if scope["type"] not in ("http", "websocket"):
             await self.app(scope, receive, send)
             return
         try:
             headers = self._read(scope)
             _refuse_wrong_host(headers, self._names)
-            _refuse_foreign(scope["method"], headers)
+            # No same-origin policy holds for WebSockets, so the origin of one is checked as that of a change.
+            _refuse_foreign(scope.get("method", WEB_SOCKET), headers)
             if not is_open(_path(scope)):
                 scope["caller"] = await self._caller(scope, headers)
                 # a stream repeats the check while it is open
@@ -359,7 +361,7 @@ class Gate:
         cookie = cookie_parser(headers.get(b"cookie", b"").decode("latin-1")).get(COOKIE)
         caller = await self._access.by_cookie(cookie, address, counted=counted) if cookie else None
         if caller is not None:
-            if scope["method"] not in SAFE and _path(scope) not in TOKEN_IN_FORM:
+            if scope.get("method", "GET") not in SAFE and _path(scope) not in TOKEN_IN_FORM:
                 refuse_without_token(caller, headers.get(b"x-csrf-token", b"").decode("latin-1"))
             return caller
         caller = await self._access.locally(stale=stale)
@@ -428,7 +430,7 @@ def _refuse_foreign(method: str, headers: dict[bytes, bytes]) -> None:
 def _refusal(scope: Scope, error: SkillsError) -> Response:
     """Return the problem document of an error; a browser that is not signed in is redirected to the sign-in page."""
     accept = next((value for name, value in scope["headers"] if name == b"accept"), b"")
-    if isinstance(error, NotSignedIn) and scope["method"] in ("GET", "HEAD") and accept.startswith(b"text/html"):
+    if isinstance(error, NotSignedIn) and scope.get("method") in ("GET", "HEAD") and accept.startswith(b"text/html"):
         asked = _path(scope) + ("?" + scope["query_string"].decode("latin-1") if scope["query_string"] else "")
         where = f"{scope.get('root_path', '')}/sign-in" + ("" if asked == "/" else f"?next={quote(asked)}")
         return Response(status_code=303, headers={"Location": where, "Cache-Control": "no-store"})

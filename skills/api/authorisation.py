@@ -9,7 +9,8 @@ covers lists, digests and job ids.
 from dataclasses import dataclass
 from typing import Annotated, Any
 
-from fastapi import Depends, Request
+from fastapi import Depends
+from fastapi.requests import HTTPConnection
 
 from skills.db.row_visibility import Only
 from skills.errors import NotAllowed, NotFound, NotSignedIn
@@ -68,7 +69,7 @@ class Needs:
     role: Role | None
     whole: bool = False
 
-    async def __call__(self, request: Request) -> None:
+    async def __call__(self, request: HTTPConnection) -> None:
         """Check the caller of a request against the requirements.
 
         Raises:
@@ -110,7 +111,7 @@ def open_to_all() -> Any:
     return Depends(Needs(None))
 
 
-async def _caller(request: Request) -> Caller:
+async def _caller(request: HTTPConnection) -> Caller:
     """Return the caller that the middleware stored in the request's scope.
 
     Raises:

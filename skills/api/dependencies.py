@@ -49,7 +49,16 @@ class _Strictly(Request):
         Raises:
             JSONDecodeError: It is not JSON, an object repeats a name, or a number is not finite.
         """
-        return json.loads(await self.body(), object_pairs_hook=_once, parse_constant=_refuse)
+        return strictly_read(await self.body())
+
+
+def strictly_read(text: str | bytes) -> Any:
+    """Return parsed JSON.
+
+    Raises:
+        JSONDecodeError: It is not JSON, an object repeats a name, or a number is not finite.
+    """
+    return json.loads(text, object_pairs_hook=_once, parse_constant=_refuse)
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

@@ -51,6 +51,7 @@ class ServiceMetrics:
         self._in_progress = Gauge(
             "skills_requests_in_progress", "Requests whose response is not complete yet.", registry=self._registry
         )
+        self.sessions = Gauge("skills_sessions_open", "Sessions of pose styles.", registry=self._registry)
         self._known: dict[tuple[str, str, int], Histogram] = {}
         about = {"version": __version__, "schema": revisions()[0], "python": platform.python_version()}
         Info("skills_build", "Version, database schema and Python of this process.", registry=self._registry).info(

@@ -33,6 +33,7 @@ from skills.learning.evaluation import dtw
 
 PHASES = 101  # ours: a hundredth of a hand-off of 5 s is a twentieth of a second, in which a hand does not turn back
 WARP_SMOOTHING = 3.0  # ours: standard deviation in phases; the steps of a DTW path are no tempo
+UNIT_TOLERANCE = 1e-3  # of a quaternion's length; three printed decimals pass
 LIKE_FLOOR = 1e-6  # of squared distances between situations; several demonstrations may share one
 
 
@@ -233,7 +234,7 @@ def unit_quaternion(values: ArrayLike, name: str) -> Floats:
         BadInput: It has another shape, or its length is not 1.
     """
     quaternion = frozen(values, np.float64, (4,), name)
-    if not abs(float(np.linalg.norm(quaternion)) - 1.0) <= 1e-3:
+    if not abs(float(np.linalg.norm(quaternion)) - 1.0) <= UNIT_TOLERANCE:
         raise BadInput(f"{name} must be a unit quaternion x, y, z, w; it has length {np.linalg.norm(quaternion):g}.")
     return quaternion
 

@@ -26,7 +26,7 @@ at every phase, at the distances at which its branches meet. It does not prove a
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from math import ceil, sqrt
+from math import ceil, isfinite, sqrt
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -38,7 +38,7 @@ from skills.demonstration.partner import Partner
 from skills.errors import BadSettings
 from skills.fields import Point, Quaternion
 from skills.learning._kernels import nearest_pose_compiled, step_along_compiled
-from skills.learning.pose_style import PosePath, learn_pose_style, unit_quaternion
+from skills.learning.pose_style import UNIT_TOLERANCE, PosePath, learn_pose_style, unit_quaternion
 from skills.learning.tube_certificate import TubeCertificate, TubeLimits
 
 __all__ = [
@@ -126,9 +126,12 @@ def next_pose(
         BadInput: A number is not finite, or the quaternion is not a unit quaternion.
         BadSettings: There is no such phase.
     """
-    tip = np.array([frozen(tip_mm, np.float64, (3,), "tip_mm")])
-    rotation = np.array([unit_quaternion(rotation_xyzw, "rotation_xyzw")])
-    rotation /= sqrt(sum(part * part for part in rotation[0].tolist()))
+    tip, rotation = _row(tip_mm, 3, "tip_mm"), _row(rotation_xyzw, 4, "rotation_xyzw")
+    x, y, z, w = rotation[0].tolist()
+    length = sqrt(x * x + y * y + z * z + w * w)
+    if not abs(length - 1.0) <= UNIT_TOLERANCE:
+        unit_quaternion(rotation[0], "rotation_xyzw")  # raises
+    rotation /= length
     last, along = len(path.tip_mm) - 1, (path.tip_mm, path.rotation_xyzw)
     if phase is None:
         starts = max(float(limits.start_mm), ROUNDING), max(float(limits.start_rad), ROUNDING)
@@ -150,6 +153,18 @@ def next_pose(
         off_rad,
         bool(phase == last and off_mm <= limits.step_mm and off_rad <= limits.step_rad),
     )
+
+
+def _row(values: ArrayLike, count: int, name: str) -> Floats:
+    """Return a row of finite numbers, shape (1, count); faster than `frozen`, because it is called 100 times a second.
+
+    Raises:
+        BadInput: The shape is another one, or a number is not finite.
+    """
+    row = np.array([values], np.float64)
+    if row.shape != (1, count) or not all(map(isfinite, row[0].tolist())):
+        frozen(values, np.float64, (count,), name)  # raises
+    return row
 
 
 def advance(path: PosePath, hands: Hands, limits: TubeLimits) -> Hands:

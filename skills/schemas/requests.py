@@ -364,6 +364,14 @@ class NextIn(Schema):
     phase: Annotated[StrictInt, Field(ge=0, le=10**6)] | None = None
 
 
+class PoseIn(Schema):
+    """A message of a session: a pose that was reached, and its phase; null: that of the answer before."""
+
+    position_mm: Point
+    rotation_xyzw: tuple[Component, Component, Component, Component]
+    phase: Annotated[StrictInt, Field(ge=0, le=10**6)] | None = None
+
+
 class SuturePointIn(Schema):
     """The position of a pass's goal, and the rotation of its grid world about this position."""
 

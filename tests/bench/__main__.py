@@ -18,6 +18,7 @@ from tests.bench.pose_styles import pose_styles
 from tests.bench.reading import reading
 from tests.bench.scaling import scaling
 from tests.bench.serving import serving
+from tests.bench.session import session
 
 PARTS = {
     "reading": reading,
@@ -33,6 +34,7 @@ PARTS = {
     "combining": combining,
     "geometry": geometry,
     "pose-styles": pose_styles,
+    "session": session,
 }
 
 

@@ -6,7 +6,7 @@ values only.
 
 from typing import Annotated, Any, Literal
 
-from fastapi import Header, Path, Query, Request, Response
+from fastapi import Header, Path, Query, Request, Response, WebSocket
 from sqlalchemy.orm import Session
 
 from skills.api.authorisation import Asking, needs, refuse_release
@@ -31,6 +31,7 @@ from skills.api.responses import (
     say,
     tag_of,
 )
+from skills.api.sessions import Sessions
 from skills.db.session import Database
 from skills.errors import PreconditionFailed
 from skills.learning.policy import next_step
@@ -338,6 +339,13 @@ def next_action(surgeon: Slug, suture: Slug, body: NextIn, db: Db) -> Response:
         step = next_step(learnt(policy), body.position_mm, body.phase)
         about = {"version": policy.version, "sha256": policy.sha256, "frame": policy.manifest["frame"]}
         return say(NextStep(**about, **vars(step)).model_dump(mode="json"))
+
+
+@router.websocket("/policies/{surgeon}/{suture}/session", dependencies=[needs("reader")])
+async def follow(surgeon: Slug, suture: Slug, socket: WebSocket) -> None:
+    """Open a session of the released pose style (`skills.api.sessions`)."""
+    sessions: Sessions = socket.app.state.sessions
+    await sessions.serve(socket, surgeon, suture)
 
 
 def _refuse_overtaken(session: Session, encoded: Encoded, surgeon: str, suture: str, if_match: str) -> None:

@@ -1,0 +1,310 @@
+"""Sessions of pose styles: a WebSocket on which each message is a pose, and each answer the next pose.
+
+    client: opens WS /policies/{surgeon}/{suture}/session with the credentials of any other call
+    service: what it is pinned to, and the limits      client: {"position_mm": ..., "rotation_xyzw": ...}
+    service: the next pose                             ...
+
+A session is pinned to the version that is released when it opens; answers name a newer one, and do not change. It is
+closed when its release is withdrawn, the surgeon's consent ends, the style is erased, or the key is revoked: two tasks
+watch for all sessions together, as `Watching` does for the streams of jobs. A message that is no pose is answered with
+`error`; one that is no JSON object closes the session. The codes 44xx are statuses of HTTP plus 4000.
+
+The serving task of a session is the only one that sends. A watcher ends a session by cancelling that task, which then
+sends the reason: a client that does not read cannot hold up a watcher.
+"""
+
+import asyncio
+from collections import Counter
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from datetime import date
+from time import monotonic
+from typing import Any
+
+import orjson
+from anyio import to_thread
+from pydantic import ValidationError
+from sqlalchemy.exc import SQLAlchemyError
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from skills.api.authorisation import Caller
+from skills.api.dependencies import strictly_read
+from skills.api.rate_limits import Bucket
+from skills.api.responses import json_of
+from skills.db.changes import Changes
+from skills.db.models import Release
+from skills.db.session import Database
+from skills.errors import Busy, SkillsError, TooMany
+from skills.fields import as_json
+from skills.learning.tube import CertifiedPoses, next_pose
+from skills.library import consent, releases
+from skills.library.policies import policy_of
+from skills.library.pose_styles import next_json, poses_of
+from skills.schemas.requests import PoseIn
+from skills.settings import Settings
+
+RATE_HZ = 100.0  # nominal; the bucket is refilled faster, so that a clock that runs fast by a quarter is not refused
+BURST, REFILL_HZ = 50.0, 125.0
+MESSAGE_BYTES = 4096  # a pose has about 200
+MOST = 400  # sessions of this process; 50 at 100 Hz take about a core
+WATCH_S = 0.2  # between two looks for changes of releases
+CALLER_S = 0.5  # between two checks of the callers; a look-up of a key is cached for a second
+UNKNOWN_S = 1.5  # without an answer of the database for so long, a release may have been withdrawn
+CLOSE_S = 1.0  # for a client that does not read to take the reason
+AGAIN_S = 10.0
+WITHDRAWN, ERASED, FORBIDDEN, SIGNED_OUT, IDLE, FLOODED, BUSY = 4404, 4410, 4403, 4401, 4408, 4429, 4503
+NO_JSON, NO_TEXT = 1007, 1003  # of RFC 6455
+UNREADABLE = "The database cannot be read, so a withdrawal would not be seen; open the session again."
+
+
+@dataclass(frozen=True, eq=False)
+class Pinned:
+    """What a session follows: a release with its pose style, and the last day of the surgeon's consent."""
+
+    release: int
+    released_at: Any
+    version: int
+    sha256: str
+    last_day: date | None
+    poses: CertifiedPoses
+
+
+@dataclass(eq=False)
+class Follower:
+    """One open session: what it follows, the phase of the hand, and the reason for which it ends."""
+
+    pinned: Pinned
+    ask_again: Callable[[], Awaitable[Caller]]
+    task: "asyncio.Task[Any]"
+    heard_s: float = field(default_factory=monotonic)
+    bucket: Bucket = field(default_factory=lambda: Bucket(BURST, REFILL_HZ))
+    phase: int | None = None
+    newer_version: int | None = None
+    ended: tuple[int, str] | None = None
+
+    def end(self, code: int, reason: str) -> None:
+        """Let its task send the reason and return."""
+        if self.ended is None:
+            self.ended = code, reason
+            self.task.cancel()
+
+    async def ask_caller(self) -> None:
+        """End it if its caller may not use it any more."""
+        try:
+            caller = await self.ask_again()
+            caller.must_be("reader")
+        except Busy:
+            self.end(BUSY, UNREADABLE)
+        except SkillsError:
+            self.end(SIGNED_OUT, "The key is revoked or expired.")
+
+    def answer(self, text: str) -> bytes:
+        """Return the answer to a message.
+
+        Raises:
+            ValueError: It is not a JSON object, or repeats a name.
+        """
+        said = strictly_read(text)
+        if not isinstance(said, dict):
+            raise ValueError("not an object")
+        try:
+            pose = PoseIn.model_validate(said)
+            phase = self.phase if pose.phase is None else pose.phase
+            poses = self.pinned.poses
+            step = next_pose(poses.path, pose.position_mm, pose.rotation_xyzw, phase, poses.tube.limits)
+        except ValidationError as wrong:
+            (first, *_) = wrong.errors(include_url=False, include_input=False, include_context=False)
+            where = ".".join(map(str, first["loc"]))
+            return orjson.dumps({"error": f"{where}: {first['msg']}." if where else f"{first['msg']}."})
+        except SkillsError as wrong:
+            return orjson.dumps({"error": wrong.words()})
+        self.phase = step.phase
+        return orjson.dumps(next_json(poses, step) | {"newer_version": self.newer_version})
+
+
+class Sessions:
+    """The open sessions of this process, on one event loop."""
+
+    def __init__(self, database: Database, changes: Changes, settings: Settings) -> None:
+        self._database, self._changes = database, changes
+        self._most_of_key, self._idle_s = settings.key_sessions, settings.session_idle_s
+        self._open: set[Follower] = set()
+        self._of_key: Counter[str] = Counter()
+        self._watching: list[asyncio.Task[None]] = []
+        self._version: int | None = None  # of the database at the last look
+        self._known_s = 0.0  # when the last look began that was answered
+
+    @property
+    def count(self) -> int:
+        """The number of open sessions."""
+        return self._of_key.total()
+
+    async def serve(self, socket: WebSocket, surgeon: str, suture: str) -> None:
+        """Serve one session until it ends.
+
+        Raises:
+            SkillsError: It is refused before it is opened: too many are open, or nothing is served.
+        """
+        caller: Caller = socket.scope["caller"]
+        with self._place(caller.key):
+            began_s = monotonic()
+            pinned = await to_thread.run_sync(_pin, self._database.seen_by(caller.only), surgeon, suture)
+            task = asyncio.current_task()
+            assert task is not None
+            follower = Follower(pinned, socket.scope["ask_again"], task)
+            with self._watched(follower, began_s):
+                await self._hold(socket, follower)
+
+    async def _hold(self, socket: WebSocket, follower: Follower) -> None:
+        """Accept a session and answer its messages until it ends."""
+        try:
+            await socket.accept()
+            await socket.send_text(self._opening(follower.pinned))
+            while True:
+                await self._next(socket, follower)
+        except WebSocketDisconnect:
+            return
+        except asyncio.CancelledError:
+            if follower.ended is None:
+                raise
+            follower.task.uncancel()
+        code, reason = follower.ended
+        with suppress(TimeoutError, WebSocketDisconnect, RuntimeError):  # it may have left, or not read
+            async with asyncio.timeout(CLOSE_S):
+                await socket.close(code, reason)
+
+    async def _next(self, socket: WebSocket, follower: Follower) -> None:
+        """Answer one message, or end the session for it."""
+        message = await socket.receive()
+        if message["type"] == "websocket.disconnect":
+            raise WebSocketDisconnect(message.get("code", 1005))
+        follower.heard_s = monotonic()
+        text = message.get("text")
+        if text is None:
+            follower.end(NO_TEXT, "Send poses as JSON text.")
+        elif follower.bucket.take(1.0) > 0:
+            follower.end(FLOODED, f"At most {RATE_HZ:g} messages a second, and {BURST:g} at once.")
+        else:
+            try:
+                answer = follower.answer(text)
+            except (ValueError, RecursionError):
+                follower.end(NO_JSON, "A message is one JSON object, without repeated names or NaN.")
+            else:
+                await socket.send_text(answer.decode())
+                return
+        await asyncio.sleep(0)  # the cancellation arrives here
+
+    def _opening(self, pinned: Pinned) -> str:
+        poses = pinned.poses
+        limits = {"rate_hz": RATE_HZ, "burst": BURST, "message_bytes": MESSAGE_BYTES, "idle_s": self._idle_s}
+        said = {
+            **{"version": pinned.version, "sha256": pinned.sha256, "arm": poses.arm, "frame": poses.frame},
+            **{"phases": len(poses.path.tip_mm), "tick_s": poses.tick_s, "tube": as_json(poses.tube)},
+            "limits": limits,
+        }
+        return json_of(said).decode()
+
+    @contextmanager
+    def _place(self, key: str | None) -> Iterator[None]:
+        """Count a session while it is open.
+
+        Raises:
+            TooMany: The key has as many sessions open as it may, or this process has.
+        """
+        mine = key or ""  # a local caller is counted, and has no limit of its own
+        if self.count >= MOST or (key is not None and self._of_key[key] >= self._most_of_key):
+            raise TooMany("Too many sessions are open; close one, or request single poses.", AGAIN_S)
+        self._of_key[mine] += 1
+        try:
+            yield
+        finally:
+            self._of_key[mine] -= 1
+            if not self._of_key[mine]:
+                del self._of_key[mine]
+
+    @contextmanager
+    def _watched(self, follower: Follower, began_s: float) -> Iterator[None]:
+        """Watch a session while it is open; the watchers run while there is one."""
+        self._version = None  # a commit may have come in between: look again
+        self._open.add(follower)
+        if not self._watching:
+            self._known_s = began_s
+            self._watching = [asyncio.create_task(self._watch_releases()), asyncio.create_task(self._watch_callers())]
+        try:
+            yield
+        finally:
+            self._open.discard(follower)
+            if not self._open:
+                for one in self._watching:
+                    one.cancel()
+                self._watching = []
+
+    async def _watch_releases(self) -> None:
+        """End sessions whose release must not be followed any more, and those that nobody uses."""
+        while True:
+            await asyncio.sleep(WATCH_S)
+            began_s = monotonic()
+            # Read before the tables, so that a commit in between is not missed.
+            version = self._changes.version()
+            looking = set(self._open)
+            if version is None or version != self._version:
+                with suppress(SkillsError, SQLAlchemyError, TimeoutError):
+                    async with asyncio.timeout(UNKNOWN_S):
+                        found = await to_thread.run_sync(
+                            _look, self._database, {one.pinned for one in looking}, abandon_on_cancel=True
+                        )
+                    self._version, self._known_s = version, began_s
+                    _tell(looking, found)
+            else:
+                self._known_s = began_s
+            for one in looking:
+                if monotonic() - self._known_s > UNKNOWN_S:
+                    one.end(BUSY, UNREADABLE)
+                elif one.pinned.last_day is not None and not consent.today() <= one.pinned.last_day:
+                    one.end(FORBIDDEN, "The surgeon's consent has ended.")
+                elif monotonic() - one.heard_s > self._idle_s:
+                    one.end(IDLE, f"No message for {self._idle_s:g} s.")
+
+    async def _watch_callers(self) -> None:
+        """End the sessions of callers who may not use them any more."""
+        while True:
+            await asyncio.sleep(CALLER_S)
+            await asyncio.gather(*(one.ask_caller() for one in self._open))
+
+
+def _pin(database: Database, surgeon: str, suture: str) -> Pinned:
+    with database.reading() as session:
+        served = policy_of(session, surgeon, suture)
+        policy, release = served.policy, served.release
+        last_day = consent.last_day(policy.surgeon.consent)
+        return Pinned(release.row, release.released_at, policy.version, policy.sha256, last_day, poses_of(policy))
+
+
+Found = tuple[tuple[int, str] | None, int | None]  # why a release must not be followed, and a newer version
+
+
+def _look(database: Database, pinned: set[Pinned]) -> dict[Pinned, Found]:
+    with database.reading() as session:
+        found: dict[Pinned, Found] = {}
+        for one in pinned:
+            release = session.get(Release, one.release)
+            # Row numbers are used again after an erasure.
+            if release is None or (release.policy.sha256, release.released_at) != (one.sha256, one.released_at):
+                found[one] = (ERASED, "The style was erased."), None
+            elif release.withdrawn_at is not None:
+                found[one] = (WITHDRAWN, "The release was withdrawn."), None
+            elif not consent.may(release.policy.surgeon, "training"):
+                found[one] = (FORBIDDEN, "The surgeon's consent has ended."), None
+            else:
+                served = releases.served(session, release.policy.surgeon, release.suture)
+                newer = served is not None and served.row != release.row
+                found[one] = None, served.policy.version if served is not None and newer else None
+        return found
+
+
+def _tell(looking: set[Follower], found: dict[Pinned, Found]) -> None:
+    for one in looking:
+        why, one.newer_version = found[one.pinned]
+        if why is not None:
+            one.end(*why)

@@ -1,0 +1,205 @@
+"""Sessions of pose styles: poses in, next poses out, and the reasons for which one is refused or closed."""
+
+import json
+from collections.abc import Iterator
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from starlette.testclient import WebSocketDenialResponse, WebSocketTestSession
+from starlette.websockets import WebSocketDisconnect
+
+from skills.api.sessions import BURST, ERASED, FLOODED, FORBIDDEN, IDLE, NO_JSON, NO_TEXT, SIGNED_OUT, WITHDRAWN
+from skills.library.catalogue import put_surgeon
+from skills.library.erasure import erase_surgeon
+from skills.library.keys import create_key, revoke_key
+from skills.library.policies import find_version
+from skills.library.releases import release
+from tests import backends
+from tests.api.service import KESTREL, MCAP, POLICY, Service, serving
+from tests.library import cases
+from tests.library.test_pose_styles import turning
+from tests.waiting import until
+
+SESSION = f"ws://localhost{POLICY}/session"
+
+
+@pytest.fixture(params=backends.BACKENDS)
+def posed(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Service]:
+    """Yield a service that serves a pose style, with a second version that is not released."""
+    url = backends.fresh(request.param, tmp_path)
+    with serving(url, key_sessions=2) as service:
+        service.client.put_surgeon("kestrel")
+        service.client.add_demo(turning(), media_type=MCAP, **KESTREL)
+        assert service.train(release=True)["result"]["released"]
+        service.train(seed=2)
+        yield service
+        until(lambda: service.app.state.sessions.count == 0)
+    backends.drop(url)
+
+
+def opened(service: Service, key: str | None = None) -> AbstractContextManager[WebSocketTestSession]:
+    return service.http.websocket_connect(SESSION, headers={"Authorization": f"Bearer {key}"} if key else {})
+
+
+def a_key(service: Service, *surgeons: str) -> tuple[str, str]:
+    """Create a key of a reader, and return its id and its text."""
+    with service.database.writing() as session:
+        row, text = create_key(session, "lab", "reader", "test", surgeons=list(surgeons) or None)
+        return row.id, text
+
+
+def start_of(service: Service) -> dict[str, Any]:
+    style = service.http.get(f"{POLICY}/pose-style").json()
+    return {name: style[name][0] for name in ("position_mm", "rotation_xyzw")}
+
+
+def closed(socket: WebSocketTestSession) -> tuple[int, str]:
+    """Return the code and the reason with which the service closes a session; answers before are left out."""
+    while True:
+        try:
+            socket.receive_text()
+        except WebSocketDisconnect as ended:
+            return ended.code, ended.reason
+
+
+def denied(answer: WebSocketDenialResponse, status: int) -> None:
+    """Assert that a session was refused before it was opened, with a problem document."""
+    assert answer.status_code == status, answer.text
+    assert answer.headers["content-type"] == "application/problem+json"
+    assert answer.json()["status"] == status
+
+
+def test_a_session_follows_the_poses_as_next_does(posed: Service):
+    hand, phase = start_of(posed), None
+    with opened(posed) as socket:
+        opening = socket.receive_json()
+        assert (opening["version"], opening["frame"], opening["phases"]) == (1, "PSM2_base", 101)
+        assert opening["limits"] == {"rate_hz": 100.0, "burst": 50.0, "message_bytes": 4096, "idle_s": 30.0}
+        for _ in range(20):
+            socket.send_json(hand)
+            answer = socket.receive_json()
+            asked = posed.http.post(f"{POLICY}/next", json=hand | {"phase": phase}).json()
+            assert answer == {name: asked[name] for name in answer if name in asked} | {"newer_version": None}
+            hand, phase = {name: answer[name] for name in hand}, answer["phase"]
+    assert phase == 20
+
+
+def test_a_message_that_is_no_pose_is_answered_and_the_session_stays(posed: Service):
+    hand = start_of(posed)
+    wrong = [
+        {},
+        {"position_mm": [0, 0], "rotation_xyzw": [0, 0, 0, 1]},
+        hand | {"rotation_xyzw": [0, 0, 0, 2]},
+        hand | {"position_mm": [0, 0, True]},
+        hand | {"phase": 101},
+        hand | {"faster": 1},
+    ]
+    with opened(posed) as socket:
+        socket.receive_json()
+        for message in wrong:
+            socket.send_json(message)
+            assert [*socket.receive_json()] == ["error"], message
+        socket.send_text(json.dumps(hand).replace("-135.0", "1e999"))
+        assert [*socket.receive_json()] == ["error"]
+        socket.send_json(hand)
+        assert socket.receive_json()["phase"] == 1
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "1", '{"phase": NaN}', '{"phase": 1, "phase": 2}', "[" * 4000])
+def test_what_is_no_object_of_json_closes_the_session(posed: Service, text: str):
+    with opened(posed) as socket:
+        socket.send_text(text)
+        assert closed(socket)[0] == NO_JSON
+
+
+def test_bytes_and_a_flood_close_the_session(posed: Service):
+    with opened(posed) as socket:
+        socket.send_bytes(b"{}")
+        assert closed(socket)[0] == NO_TEXT
+    with opened(posed) as socket:
+        for _ in range(20 * int(BURST)):
+            socket.send_text("{}")
+        assert closed(socket)[0] == FLOODED
+
+
+def test_a_withdrawal_closes_the_session_with_the_reason(posed: Service):
+    with opened(posed) as socket:
+        posed.client.withdraw(**KESTREL)
+        assert closed(socket) == (WITHDRAWN, "The release was withdrawn.")
+    with pytest.raises(WebSocketDenialResponse) as refused, opened(posed):
+        pass
+    denied(refused.value, 404)
+
+
+def test_an_erasure_and_the_end_of_consent_close_the_session(posed: Service):
+    with opened(posed) as socket:
+        with posed.database.writing() as session:
+            put_surgeon(session, "kestrel", {"consent": {"uses": ["atlas"]}}, "test")
+        assert closed(socket)[0] in (WITHDRAWN, FORBIDDEN)
+    with posed.database.writing() as session:
+        put_surgeon(session, "kestrel", {"consent": {"uses": ["training"]}}, "test")
+        release(session, find_version(session, "kestrel", cases.SUTURE, 1), "test")
+    with opened(posed) as socket:
+        with posed.database.writing() as session:
+            erase_surgeon(session, "kestrel", "test")
+        assert closed(socket) == (ERASED, "The style was erased.")
+
+
+def test_a_new_release_is_told_and_changes_nothing(posed: Service):
+    hand = start_of(posed)
+    with opened(posed) as socket:
+        assert socket.receive_json()["version"] == 1
+        posed.client.release(**KESTREL, version=2)
+
+        def newer() -> int | None:
+            socket.send_json(hand | {"phase": 0})
+            found: int | None = socket.receive_json()["newer_version"]
+            return found
+
+        until(lambda: newer() == 2)
+    with opened(posed) as socket:
+        assert socket.receive_json()["version"] == 2
+
+
+def test_a_revoked_key_closes_its_session_and_no_other(posed: Service):
+    (first, one), (_, other) = a_key(posed), a_key(posed, "kestrel")
+    hand = {"position_mm": [-10, 55, -135], "rotation_xyzw": [0.5**0.5, 0.5**0.5, 0, 0]}
+    with opened(posed, one) as socket, opened(posed, other) as beside:
+        with posed.database.writing() as session:
+            revoke_key(session, first, "test")
+        assert closed(socket)[0] == SIGNED_OUT
+        beside.receive_json()
+        beside.send_json(hand)
+        assert beside.receive_json()["inside"]
+
+
+def test_who_may_not_open_one_is_refused_before_it_opens(posed: Service):
+    posed.client.put_surgeon("heron")
+    (_, key), (_, theirs) = a_key(posed), a_key(posed, "heron")
+    for headers, status in (
+        ({"Authorization": f"Bearer {theirs}"}, 404),
+        ({"Authorization": "Bearer skills_nothing"}, 401),
+        ({"Authorization": f"Bearer {key}", "Origin": "http://elsewhere.org"}, 403),
+        ({"Authorization": f"Bearer {key}", "Host": "elsewhere.org"}, 400),
+    ):
+        with (
+            pytest.raises(WebSocketDenialResponse) as refused,
+            posed.http.websocket_connect(SESSION, headers=headers),
+        ):
+            pass
+        denied(refused.value, status)
+    with opened(posed, key), opened(posed, key):
+        with pytest.raises(WebSocketDenialResponse) as refused, opened(posed, key):
+            pass
+        denied(refused.value, 429)
+
+
+def test_a_session_that_nobody_uses_is_closed(tmp_path: Path):
+    with serving(backends.fresh("sqlite", tmp_path), session_idle_s=0.3) as service:
+        service.client.put_surgeon("kestrel")
+        service.client.add_demo(turning(), media_type=MCAP, **KESTREL)
+        service.train(release=True)
+        with opened(service) as socket:
+            assert closed(socket) == (IDLE, "No message for 0.3 s.")
