@@ -73,7 +73,7 @@ def test_paths_to_kestrels_objects_are_404_for_heron_and_exist_for_admin(service
         assert "kestrel" not in answer.text, (method, path)
         if method == "GET" and not path.endswith("/events"):
             there = admin("GET", where).status_code
-            assert there == 200 or path.endswith((".png", ".gif", ".mp4", "comparison")), (path, there)
+            assert there == 200 or path.endswith((".png", ".gif", ".mp4", "comparison", "pose-style")), (path, there)
             seen += there == 200
     assert seen > 20
 

@@ -10,7 +10,21 @@ import pytest
 from starlette.testclient import WebSocketDenialResponse, WebSocketTestSession
 from starlette.websockets import WebSocketDisconnect
 
-from skills.api.sessions import BURST, ERASED, FLOODED, FORBIDDEN, IDLE, NO_JSON, NO_TEXT, SIGNED_OUT, WITHDRAWN
+from skills.api import sessions
+from skills.api.sessions import (
+    BURST,
+    BUSY,
+    ERASED,
+    FLOODED,
+    FORBIDDEN,
+    IDLE,
+    NO_JSON,
+    NO_TEXT,
+    SIGNED_OUT,
+    UNREADABLE,
+    WITHDRAWN,
+)
+from skills.errors import Busy
 from skills.library.catalogue import put_surgeon
 from skills.library.erasure import erase_surgeon
 from skills.library.keys import create_key, revoke_key
@@ -20,9 +34,15 @@ from tests import backends
 from tests.api.service import KESTREL, MCAP, POLICY, Service, serving
 from tests.library import cases
 from tests.library.test_pose_styles import turning
-from tests.waiting import until
+from tests.waiting import END_S, until
 
 SESSION = f"ws://localhost{POLICY}/session"
+
+
+@pytest.fixture(autouse=True)
+def _patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let a busy machine take its time to read the database."""
+    monkeypatch.setattr(sessions, "UNKNOWN_S", END_S)
 
 
 @pytest.fixture(params=backends.BACKENDS)
@@ -145,6 +165,16 @@ def test_an_erasure_and_the_end_of_consent_close_the_session(posed: Service):
         with posed.database.writing() as session:
             erase_surgeon(session, "kestrel", "test")
         assert closed(socket) == (ERASED, "The style was erased.")
+
+
+def test_sessions_close_where_a_withdrawal_would_not_be_seen(posed: Service, monkeypatch: pytest.MonkeyPatch):
+    def unread(*_: object) -> None:
+        raise Busy("The database is busy.")
+
+    monkeypatch.setattr(sessions, "UNKNOWN_S", 0.3)
+    monkeypatch.setattr(sessions, "_look", unread)
+    with opened(posed) as socket:
+        assert closed(socket) == (BUSY, UNREADABLE)
 
 
 def test_a_new_release_is_told_and_changes_nothing(posed: Service):
