@@ -294,6 +294,40 @@ def spread_distances(
                     distance[x, y, z] = fewest
 
 
+def spread_worth(
+    best: Any,  # (nx, ny, nz) int64: the worth of the best move in each cell, at first less than any; filled in place
+    worth: Any,  # (nx, ny, nz) int64: that of entering each cell, at first less than any but at the given cells; filled
+    given: Any,  # (nx, ny, nz) bool: cells whose worth is given and does not change
+    step: int,  # change of the worth with each move
+) -> None:
+    """Spread the worth of given cells over a grid, forwards and backwards in turn, until nothing changes.
+
+    Each move adds `step`, which is negative, so that every cell ends with the best way to a given cell; a way ends at
+    the first given cell that it enters. Integers, so that equally good ways are equal.
+    """
+    nx, ny, nz = best.shape
+    changed = True
+    while changed:
+        changed = False
+        for way in range(2):
+            for i in range(nx):
+                x = i if way == 0 else nx - 1 - i
+                for j in range(ny):
+                    y = j if way == 0 else ny - 1 - j
+                    for k in range(nz):
+                        z = k if way == 0 else nz - 1 - k
+                        top = best[x, y, z]
+                        for to_x in range(max(x - 1, 0), min(x + 2, nx)):
+                            for to_y in range(max(y - 1, 0), min(y + 2, ny)):
+                                for to_z in range(max(z - 1, 0), min(z + 2, nz)):
+                                    top = max(top, worth[to_x, to_y, to_z])
+                        if top > best[x, y, z]:
+                            best[x, y, z] = top
+                            changed = True
+                            if not given[x, y, z]:
+                                worth[x, y, z] = top + step
+
+
 def warp(distance: Any, cost: Any) -> None:
     """Fill the table of accumulated costs of dynamic time warping.
 
@@ -437,6 +471,7 @@ explore_compiled = compiled(explore)
 sweep_compiled = compiled(sweep)
 settle_compiled = compiled(settle)
 spread_distances_compiled = compiled(spread_distances)
+spread_worth_compiled = compiled(spread_worth)
 warp_compiled = compiled(warp)
 tell_apart_compiled = compiled(tell_apart)
 step_along_compiled = compiled(step_along)

@@ -4,9 +4,13 @@
 
 The exact values come from dynamic programming (`skills.learning.dynamic_programming`), not from learning. The
 certificate makes no statement about the accuracy of the arm.
+
+Two actions are equally good if their exact values differ by less than `TIE`, relatively. Values below `FAINT`, far from
+the path, are compared by their logarithms, so the comparison does not depend on the size of the grid.
 """
 
 from dataclasses import dataclass
+from math import ceil
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +19,7 @@ from skills.arrays import Floats, frozen
 from skills.gridworld.domain import FINISHED
 from skills.gridworld.reward import sparse_reward
 from skills.learning import _kernels
-from skills.learning.dynamic_programming import Mdp, action_values, exact_q, exact_values
+from skills.learning.dynamic_programming import FAINT, Mdp, action_values, exact_q, exact_values, log_losses
 from skills.learning.policy import Policy
 
 TIE = 1e-9  # relative; two actions closer than this are equally good (a Q value carries about 1e-15 of rounding)
@@ -54,6 +58,7 @@ class Certificate:
         starts_joining_nearest: Number of starts from which it joins the demonstration in the fewest moves and follows
             it.
         demonstration_reproduced: The rollout from the demonstrated start visits the demonstration's states, in order.
+        faint: Number of checked states whose exact value is below `FAINT`, so that logarithms were compared.
     """
 
     checked: int
@@ -63,6 +68,7 @@ class Certificate:
     starts_reaching: int
     starts_joining_nearest: int
     demonstration_reproduced: bool
+    faint: int = 0
 
     @property
     def every_action_optimal(self) -> bool:
@@ -85,6 +91,10 @@ def certify(policy: Policy) -> tuple[Certificate, Coverage]:
     live = policy.domain.certified & ~policy.domain.terminal
     achieved, best = _achieved(policy)
     optimal = achieved >= best - TIE * np.abs(best)  # written so that NaN fails
+    # Only where `other` is 0 do the values of distant states approach 0.
+    faint = live & (best < FAINT) & (policy.levels.other == 0)
+    if faint.any():
+        optimal[faint] = log_losses(mdp_of(policy), best, policy.greedy, policy.moves)[faint] <= TIE
     finishing = finishes(policy)
     covered = _coverage(policy, finishing)
     certificate = Certificate(
@@ -95,6 +105,7 @@ def certify(policy: Policy) -> tuple[Certificate, Coverage]:
         starts_reaching=int(covered.reaches.sum()),
         starts_joining_nearest=int(covered.joins_nearest.sum()),
         demonstration_reproduced=np.array_equal(policy.replay.states, policy.path.states),
+        faint=int(np.count_nonzero(faint)),
     )
     return certificate, covered
 
@@ -143,6 +154,25 @@ def finishes(policy: Policy) -> NDArray[np.bool_]:
     for _ in range(policy.domain.n_rows.bit_length()):
         walk = walk[walk]
     return np.asarray(done[walk])
+
+
+def least_gamma(policy: Policy) -> float | None:
+    """Return a gamma, in steps of 0.01, with which no value in the policy's grid is faint (below `FAINT`).
+
+    Args:
+        policy: The policy.
+
+    Returns:
+        The gamma; None if the bound that slips leave says nothing about any below 1.
+    """
+    path, slip = policy.path, policy.learner.slip
+    moves = np.full(path.grid.n_states, path.grid.n_states)
+    moves[path.states] = 0
+    _kernels.spread_distances_compiled(moves.reshape(path.grid.shape))
+    # A move multiplies a value by gamma (1 - slip) or more, and the worth of the path is at least `visited`.
+    least = (FAINT / policy.levels.visited) ** (1 / max(1, int(moves.max()))) / (1 - slip)
+    gamma = ceil(100 * least) / 100
+    return gamma if gamma < 1 else None
 
 
 def coverage(policy: Policy) -> Coverage:

@@ -10,6 +10,10 @@ fixed point of value iteration over the grid.
 A move *slips* with a given probability: then one of the 27 moves is made instead of it, each with equal probability;
 off the grid the arm stays. In that case all values are the fixed point of value iteration over the whole domain.
 
+With gamma 0.1 a state 300 moves from the path has a value below 10^-300, where floating-point numbers lose digits, and
+soon all. Such *faint* values are compared by their logarithms (`log_losses`): without slips as integers, in units of
+2^-36, so that any number of moves adds up exactly; with slips as the fixed point of value iteration in logarithms.
+
 As a learner in the phase state, `ValueIteration` gives the exact Q values of Algorithm 1's rewards without a move of
 the arm. The paper tried value iteration first, in its *cell* state, and gave it up (Sec. III-C;
 `skills.learning.max_ent_irl` explains one reason for the failure there, a path that crosses itself is another). In the
@@ -21,8 +25,9 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from skills.arrays import Floats, Ints
+from skills.arrays import Bytes, Flags, Floats, Ints
 from skills.errors import BadSettings
 from skills.gridworld.domain import Domain, Moves
 from skills.gridworld.grid import MOVES
@@ -33,6 +38,10 @@ MAX_SWEEPS = 100_000
 STAY = 13  # the action that stays: (0, 0, 0), the middle one of the moves
 ENDLESS = "The exact values do not converge: a cycle has a positive reward; use a smaller gamma."
 SETTLED = 1e-14  # relative: a value that changes by less has settled
+FAINT = 1e-300  # a smaller value is compared by its logarithm; the smallest normal number is 2e-308
+LOG_UNIT = 2.0**-36  # of a logarithm as an integer: 1.5e-11
+LOG_NONE = -(2**62)  # in place of the logarithm of 0; less than that of any value
+LOG_SETTLED = 1e-12  # a logarithm that changes by less has settled; added is its own rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,20 +75,28 @@ def exact_values(mdp: Mdp) -> Floats:
     """
     if mdp.slip > 0:
         return np.asarray(exact_q(mdp).max(axis=1))
-    domain, levels, gamma = mdp.domain, mdp.reward.levels, mdp.gamma
-    assert not domain.phased or levels.other == 0, "otherwise a longer path earns more, and the formula is wrong"
-    waypoints = domain.path.cells
-    values = np.zeros(domain.n_rows)
-    arrival = levels.goal  # A_p, from the last phase down
-    for phase in range(domain.phases - 1, 0, -1):
-        rows = slice(domain.offset[phase], domain.offset[phase + 1])
-        distance = np.abs(domain.cell_of[rows] - waypoints[phase]).max(axis=1).clip(1)
-        values[rows] = gamma ** (distance - 1.0) * arrival
-        behind = max(1, int(np.abs(waypoints[phase - 1] - waypoints[phase]).max()))
-        arrival = levels.visited + gamma * gamma ** (behind - 1.0) * arrival
+    domain = mdp.domain
+    assert not domain.phased or mdp.reward.levels.other == 0, "otherwise a longer path earns more"
+    moves, arrival = _moves_to_go(mdp)
+    values = mdp.gamma**moves * arrival
     values[domain.terminal] = 0.0  # before phase 0, which joins other phases and reads their values
     values[: domain.offset[1]] = _phase_0_values(mdp, values)
     return values
+
+
+def _moves_to_go(mdp: Mdp) -> tuple[Floats, Floats]:
+    """Return d - 1 and A_p of each row above phase 0, both (rows,); 0 in phase 0."""
+    domain, levels, gamma = mdp.domain, mdp.reward.levels, mdp.gamma
+    waypoints = domain.path.cells
+    moves, arrivals = np.zeros(domain.n_rows), np.zeros(domain.n_rows)
+    arrival = levels.goal  # A_p, from the last phase down
+    for phase in range(domain.phases - 1, 0, -1):
+        rows = slice(domain.offset[phase], domain.offset[phase + 1])
+        moves[rows] = np.abs(domain.cell_of[rows] - waypoints[phase]).max(axis=1).clip(1) - 1.0
+        arrivals[rows] = arrival
+        behind = max(1, int(np.abs(waypoints[phase - 1] - waypoints[phase]).max()))
+        arrival = levels.visited + gamma * gamma ** (behind - 1.0) * arrival
+    return moves, arrivals
 
 
 def _phase_0_values(mdp: Mdp, values: Floats) -> Floats:
@@ -132,13 +149,9 @@ def exact_q(mdp: Mdp) -> Floats:
 
 def _slipping_q(mdp: Mdp) -> Floats:
     """Iterate values over the whole domain with slips until nothing changes; returns Q values, (rows, 27)."""
-    domain = mdp.domain
-    moves = [domain.move(*_everywhere(domain, action)) for action in range(len(MOVES))]
-    pays = np.stack([_pays(mdp, moved) for moved in moves])
-    after = np.stack([moved.row for moved in moves])
-    off_grid = np.stack([moved.off_grid for moved in moves])
-    nothing = ~domain.certified | domain.terminal
-    values = np.zeros(domain.n_rows)
+    pays, after, off_grid = _each_action(mdp)
+    nothing = ~mdp.domain.certified | mdp.domain.terminal
+    values = np.zeros(mdp.domain.n_rows)
     for _ in range(MAX_SWEEPS):
         made = pays + mdp.gamma * np.append(values, 0.0)[after]
         # A slip off the grid stays at no cost: only an intended move off the grid is a fault of the policy.
@@ -149,6 +162,13 @@ def _slipping_q(mdp: Mdp) -> Floats:
         if (change <= SETTLED * np.abs(values)).all():
             return np.ascontiguousarray(q.T)
     raise BadSettings(ENDLESS)
+
+
+def _each_action(mdp: Mdp) -> tuple[Floats, Ints, Flags]:
+    """Return the reward of each move from each row, the row after it, and whether it is off the grid, (27, rows)."""
+    moves = [mdp.domain.move(*_everywhere(mdp.domain, action)) for action in range(len(MOVES))]
+    pays = np.stack([_pays(mdp, moved) for moved in moves])
+    return pays, np.stack([moved.row for moved in moves]), np.stack([moved.off_grid for moved in moves])
 
 
 def _everywhere(domain: Domain, action: int) -> tuple[Ints, Ints]:
@@ -169,6 +189,81 @@ def action_values(mdp: Mdp, values: Floats, moves: Moves) -> Floats:
     """
     # Row -1 (finished, or outside the domain) reads the 0 that is appended.
     return np.asarray(_pays(mdp, moves) + mdp.gamma * np.append(values, 0.0)[moves.row])
+
+
+def log_losses(mdp: Mdp, values: Floats, greedy: Bytes, moves: Moves) -> Floats:
+    """Return how much less than the best action the greedy one is worth, as log(best / greedy), in faint rows.
+
+    Args:
+        mdp: The decision process, with `other` 0, so that all values are positive.
+        values: Its exact values, shape (rows,), as `exact_values` returns them.
+        greedy: The greedy action of every row, shape (rows,).
+        moves: The result of that action from every row if it does not slip, arrays of shape (rows,).
+
+    Returns:
+        Losses, shape (rows,); 0 or more, infinite for a move off the grid. They are meaningful in rows whose value is
+        below `FAINT`.
+
+    Raises:
+        BadSettings: With slips the logarithms do not settle, because the grid is too long.
+    """
+    assert mdp.reward.levels.other == 0, "a negative value has no logarithm"
+    if mdp.slip > 0:
+        q = _slipping_logs(mdp, values)
+        with np.errstate(invalid="ignore"):  # a finished row has no action
+            return np.asarray(q.max(axis=0) - q[greedy.astype(np.int64).clip(0), np.arange(len(values))])
+    best, entering = _logs(mdp, values)
+    step = _as_log(mdp.gamma)
+    reached = np.where(mdp.domain.phase_of == 0, entering[moves.state], np.append(best, LOG_NONE)[moves.row] + step)
+    # A move off the grid stays, so it is worth at most gamma of what the row is.
+    return np.where(moves.off_grid | (reached <= LOG_NONE), np.inf, (best - reached) * LOG_UNIT)
+
+
+def _as_log(numbers: ArrayLike) -> Ints:
+    """Return logarithms of positive numbers as integers, in units of `LOG_UNIT`."""
+    return np.asarray(np.rint(np.log(numbers) / LOG_UNIT), np.int64)
+
+
+def _logs(mdp: Mdp, values: Floats) -> tuple[Ints, Ints]:
+    """Return the logarithms of all values, (rows,), and of entering each state in phase 0, (n_states,), without slips.
+
+    In phase 0 a faint value is gamma^(d-1) W, with W the worth of entering a state of the path, which is not faint. In
+    the cell state too, where a pass may go on from there along any states.
+    """
+    domain, grid, on_path = mdp.domain, mdp.domain.path.grid, np.unique(mdp.domain.path.states)
+    moves, arrival = _moves_to_go(mdp)
+    best, step = np.full(domain.n_rows, LOG_NONE), _as_log(mdp.gamma)
+    above = domain.phase_of > 0
+    best[above] = moves[above].astype(np.int64) * step + _as_log(arrival[above])
+    after = domain.rows_of(domain.joins[on_path], grid.cells_of(on_path))
+    entering = np.full(grid.n_states, LOG_NONE)
+    entering[on_path] = _as_log(mdp.reward.rewards[on_path] + mdp.gamma * values[after])
+    given = np.zeros(grid.n_states, bool)
+    given[on_path] = True
+    of_phase_0 = best[: grid.n_states]
+    _kernels.spread_worth_compiled(
+        of_phase_0.reshape(grid.shape), entering.reshape(grid.shape), given.reshape(grid.shape), int(step)
+    )
+    return best, entering
+
+
+def _slipping_logs(mdp: Mdp, values: Floats) -> Floats:
+    """Iterate the logarithms of Q values with slips until nothing changes, from values on; returns (27, rows)."""
+    pays, after, off_grid = _each_action(mdp)
+    nothing = ~mdp.domain.certified | mdp.domain.terminal
+    with np.errstate(divide="ignore", invalid="ignore"):  # the logarithm of 0 is -inf, and its change may be NaN
+        pays = np.log(np.where(off_grid, 0.0, pays))
+        logs = np.log(np.where(values < FAINT, 0.0, values))
+        for _ in range(MAX_SWEEPS):
+            made = np.logaddexp(pays, np.log(mdp.gamma) + np.append(logs, -np.inf)[after])
+            made[off_grid] = -np.inf  # it is worth at most gamma of what the row is
+            anywhere = np.logaddexp.reduce(np.where(off_grid, made[STAY], made)) - np.log(len(MOVES))
+            q = np.logaddexp(np.log1p(-mdp.slip) + made, np.log(mdp.slip) + anywhere)
+            q[:, nothing] = -np.inf
+            before, logs = logs, q.max(axis=0)
+            if ((logs == before) | (np.abs(logs - before) <= LOG_SETTLED + SETTLED * np.abs(logs))).all():
+                return q
+    raise BadSettings(f"The exact values do not settle in {MAX_SWEEPS} sweeps: the grid is too long; use larger cells.")
 
 
 def _pays(mdp: Mdp, moves: Moves) -> Floats:

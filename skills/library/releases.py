@@ -156,6 +156,10 @@ _REMEDIES = (
     ("was released", "Request the release again if this version is to be served in its place."),
     ("was withdrawn.", "Request the release again if this version is to be served."),
     ("is worse than", "Release it by its number if it is to replace the released version anyway."),
+    (
+        "too small to be learnt",
+        "Train it with a gamma nearer to 1, or lay the demonstration on larger cells.",
+    ),
     ("not optimal", _OTHERWISE),
     ("do not reach the goal", _OTHERWISE),
     ("joint limits", "Record the hand-off further inside the arm's reach, or with the arm's base elsewhere."),

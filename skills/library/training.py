@@ -35,7 +35,8 @@ from skills.fields import as_json
 from skills.gridworld.grid import discretisation_rmse
 from skills.gridworld.reward import RewardMap, sparse_reward
 from skills.kinematics import instrument_of
-from skills.learning.certificate import Certificate, certify
+from skills.learning.certificate import Certificate, certify, least_gamma
+from skills.learning.dynamic_programming import FAINT
 from skills.learning.evaluation import check_in_space, measure
 from skills.learning.policy import LEARNER_VERSION, Learner, Policy, describe_learner, learner_of, refuse_too_large
 from skills.learning.q_learning import PhaseQLearning
@@ -410,6 +411,13 @@ def refusals(policy: Policy, certificate: Certificate) -> list[str]:
     reasons = []
     if not certificate.every_action_optimal:
         reasons.append(f"{certificate.suboptimal} of {certificate.checked} greedy actions are not optimal")
+    if not certificate.every_action_optimal and certificate.faint:
+        gamma = least_gamma(policy)
+        reasons.append(
+            f"{certificate.faint} of them are so far from the path that their values, with gamma "
+            f"{policy.learner.gamma:g}, are below {FAINT:g}, too small to be learnt; train with larger cells, or with "
+            f"a gamma {'nearer to 1' if gamma is None else f'of {gamma:g}'}"
+        )
     if certificate.starts_reaching < certificate.starts:
         missing = certificate.starts - certificate.starts_reaching
         reasons.append(f"{missing} of {certificate.starts} starts do not reach the goal")

@@ -6,11 +6,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skills.errors import BadSettings
-from skills.gridworld.grid import MOVES
+from skills.gridworld.grid import MOVES, GridPath, GridWorld
+from skills.gridworld.reward import sparse_reward
 from skills.learning.certificate import certify, coverage, mdp_of
-from skills.learning.dynamic_programming import exact_values
-from skills.learning.policy import rollout_from
-from skills.learning.q_learning import CellQLearning
+from skills.learning.dynamic_programming import ValueIteration, exact_values
+from skills.learning.policy import learn_tabular, rollout_from
+from skills.learning.q_learning import CellQLearning, PhaseQLearning
 from tests.gridworld.paths import WALKS, follow, joins_nearest, learnt, named_path
 
 STAY = 13
@@ -18,7 +19,7 @@ both_states = pytest.mark.parametrize("phased", [True, False], ids=["phase", "ce
 every_walk = pytest.mark.parametrize("name", WALKS)
 
 
-def values_everywhere(path, gamma, *, phased, goal_pays=10.0, visited_pays=1.0, off_grid_pays=-1.0):
+def values_everywhere(path, gamma, *, phased, goal_pays=10.0, visited_pays=1.0, off_grid_pays=-1.0, kind=float):
     """Iterate values over all phases and all cells, without a domain: (phases, n_states, 27), and their maximum.
 
     A second method, from the interface's rules: it shares nothing with the certificate but the numbering of states.
@@ -28,7 +29,7 @@ def values_everywhere(path, gamma, *, phased, goal_pays=10.0, visited_pays=1.0, 
     cells = np.stack(np.unravel_index(np.arange(n), path.grid.shape), axis=-1)[:, None] + MOVES
     on_grid = ((cells >= 0) & (cells < path.grid.shape)).all(axis=-1)
     to = np.where(on_grid, cells @ (ny * nz, nz, 1), np.arange(n)[:, None])
-    pays = np.where(on_grid, 0.0, off_grid_pays) * np.ones((phases, 1, 1))
+    pays = np.where(on_grid, 0.0, off_grid_pays) * np.ones((phases, 1, 1), kind)
     after = np.arange(phases)[:, None, None] * np.ones((1, n, 27), int)
     ends = np.zeros((phases, n, 27), bool)
     for k, waypoint in reversed(list(enumerate(waypoints))):  # in phase 0; backwards, so that the first visit wins
@@ -40,7 +41,7 @@ def values_everywhere(path, gamma, *, phased, goal_pays=10.0, visited_pays=1.0, 
         pays[phase][enters] = goal_pays if last else visited_pays
         after[phase][enters] = phase if last else phase + 1
         ends[phase] = enters & last
-    values = np.zeros((phases, n))
+    values = np.zeros((phases, n), kind)
     finished = np.zeros((phases, n), bool)
     finished[[0, -1], path.goal] = True
     while True:
@@ -174,3 +175,86 @@ def test_rewards_that_never_settle_are_said_so():
     endless = replace(policy, learner=replace(CellQLearning(), gamma=1.0))
     with pytest.raises(BadSettings, match="a cycle has a positive reward"):
         exact_values(mdp_of(endless))
+
+
+# ---- values too small for floating-point numbers
+
+TINY = np.longdouble(2.0) ** -400  # as gamma: a value is faint from three moves on, and a `longdouble` holds 40 moves
+
+
+def spoilt_at_random(policy, seed):
+    """Return the policy with other actions in half of its rows."""
+    rng, q = np.random.default_rng(seed), policy.q.copy()
+    rows = np.flatnonzero(rng.random(len(q)) < 0.5)
+    q[rows, rng.integers(27, size=len(rows))] = q.max() + 1
+    return replace(policy, q=q)
+
+
+@pytest.mark.skipif(np.finfo(np.longdouble).maxexp < 16000, reason="`longdouble` has no larger exponents here")
+@every_walk
+@both_states
+@pytest.mark.parametrize("seed", range(3))
+def test_faint_values_are_compared_as_wider_numbers_compare_them(name, phased, seed):
+    policy = learnt(name, phased=phased)
+    policy = spoilt_at_random(replace(policy, learner=replace(policy.learner, gamma=float(TINY))), seed)
+    domain = policy.domain
+    live = np.flatnonzero(domain.certified & ~domain.terminal)
+    q, values = values_everywhere(policy.path, TINY, phased=phased, kind=np.longdouble)
+    phases, states = domain.phase_of[live], domain.state_of[live]
+    worse = q[phases, states, policy.greedy[live]] < values[phases, states] * (1 - np.longdouble(1e-9))
+    certificate, _ = certify(policy)
+    assert certificate.suboptimal == worse.sum() > 0
+    assert certificate.faint == (values[phases, states] < np.longdouble(1e-300)).sum()
+
+
+def long_path():
+    """Return a path of two cells at the end of a grid of 450 cells."""
+    grid = GridWorld((0.0, 0.0, 0.0), 1.0, (450, 3, 3))
+    return GridPath(grid, grid.states_of([[448, 1, 1], [449, 1, 1]]))
+
+
+@pytest.mark.parametrize("learner", [PhaseQLearning(), ValueIteration()], ids=lambda learner: learner.kind)
+def test_on_a_long_grid_an_action_is_optimal_where_it_comes_nearer(learner):
+    """At gamma 0.1 and 445 cells from the path a value is 10^-444; every action was equally good there."""
+    path = long_path()
+    grid, policy = path.grid, learn_tabular(sparse_reward(path), learner)
+    before, after = (grid.cells_of(one)[:, 0] for one in (np.arange(grid.n_states), policy.moves.state[:4050]))
+    further = np.count_nonzero((after <= before)[before < 447])
+    certificate, _ = certify(policy)
+    assert certificate.faint > 100 * 9
+    assert certificate.suboptimal == further > 100 * 9
+    assert not certificate.every_action_optimal
+
+
+def test_on_a_long_grid_a_gamma_nearer_1_is_certified():
+    path = long_path()
+    for learner in (PhaseQLearning(gamma=0.22), ValueIteration(gamma=0.22), ValueIteration(gamma=0.4, slip=0.2)):
+        certificate, covered = certify(learn_tabular(sparse_reward(path), learner))
+        assert certificate.every_action_optimal
+        assert covered.reaches.all()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_faint_values_of_a_world_that_slips_are_compared_too(seed):
+    """Actions that are best at gamma 0.4, and others, judged at gamma 10^-60 by value iteration in wider numbers."""
+    grid, slip, gamma = GridWorld((0.0, 0.0, 0.0), 1.0, (12, 4, 3)), 0.3, 1e-60
+    path = GridPath(grid, grid.states_of([[9, 1, 1], [10, 1, 1], [10, 2, 1]]))
+    policy = spoilt_at_random(learn_tabular(sparse_reward(path), ValueIteration(gamma=0.4, slip=slip)), seed)
+    policy = replace(policy, learner=ValueIteration(gamma=gamma, slip=slip))
+    domain, rows = policy.domain, np.arange(policy.domain.n_rows)
+    live = domain.certified & ~domain.terminal
+    each = [domain.move(rows, np.full(len(rows), action)) for action in range(27)]
+    rewards = sparse_reward(path).rewards
+    pays = [np.where(domain.phase_of == 0, rewards[m.state], m.advances + 10.0 * m.finishes) for m in each]
+    pays = [np.where(m.off_grid, -1.0, p) for p, m in zip(pays, each, strict=True)]
+    values = np.zeros(len(rows) + 1, np.longdouble)
+    for _ in range(60):
+        made = np.stack([p + np.longdouble(gamma) * values[m.row] for p, m in zip(pays, each, strict=True)])
+        off = np.stack([m.off_grid for m in each])
+        anywhere = np.where(off, made[STAY], made).mean(axis=0)
+        q = (1 - np.longdouble(slip)) * made + slip * anywhere
+        values[:-1] = np.where(live, q.max(axis=0), 0)
+    worse = q[policy.greedy[live], np.flatnonzero(live)] < values[:-1][live] * (1 - np.longdouble(1e-9))
+    certificate, _ = certify(policy)
+    assert certificate.faint == (values[:-1][live] < np.longdouble(1e-300)).sum() > 20
+    assert certificate.suboptimal == worse.sum() > 20

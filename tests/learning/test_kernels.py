@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from skills.gridworld.grid import GridPath, GridWorld
+from skills.gridworld.grid import MOVES, GridPath, GridWorld
 from skills.gridworld.reward import sparse_reward
 from skills.learning import _kernels
 from skills.learning.policy import learn_tabular
@@ -228,6 +228,26 @@ def test_the_fewest_moves_to_some_places_are_those_of_the_distance_to_each(shape
         distance[tuple(places.T)] = 0
         spread(distance)
         assert np.array_equal(distance, expected)
+
+
+@settings(deadline=None)
+@given(st.tuples(*[st.integers(1, 6)] * 3), st.integers(1, 5), st.integers(0, 2**32))
+def test_worth_spreads_from_given_cells_and_never_through_them(shape, count, seed):
+    rng = np.random.default_rng(seed)
+    given_cells = np.zeros(shape, bool)
+    given_cells[tuple(rng.integers(shape, size=(count, 3)).T)] = True
+    start = np.where(given_cells, rng.integers(-50, 50, size=shape), -(2**62))
+    expected, worth = np.full(shape, -(2**62)), start.copy()
+    for _ in range(given_cells.size + 1):  # all neighbours at once, as often as a way can be long
+        padded = np.pad(worth, 1, constant_values=-(2**62))
+        around = [padded[a : a + shape[0], b : b + shape[1], c : c + shape[2]] for a, b, c in MOVES + 1]
+        expected = np.maximum(expected, np.max(around, axis=0))
+        worth = np.where(given_cells, start, np.where(expected > -(2**61), expected - 7, -(2**62)))
+    for spread in (_kernels.spread_worth, _kernels.spread_worth_compiled):
+        best, entering = np.full(shape, -(2**62)), start.copy()
+        spread(best, entering, given_cells, -7)
+        assert np.array_equal(best, expected)
+        assert np.array_equal(entering, worth)
 
 
 @pytest.mark.parametrize("sweeps", [2, 10])

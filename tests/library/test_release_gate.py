@@ -5,6 +5,7 @@ the tip, so |pitch| = atan2(y, -(z + 9.1)), and its limit is 53 degrees.
 """
 
 import io
+from dataclasses import replace
 from itertools import pairwise
 from math import atan2, radians
 
@@ -14,7 +15,13 @@ import pytest
 from skills.demonstration.recording import Joints, Motion, Recording
 from skills.errors import Conflict
 from skills.formats import read_recording, write_mcap
+from skills.gridworld.grid import GridPath, GridWorld
+from skills.gridworld.reward import sparse_reward
 from skills.kinematics import POINTING_DOWN, inverse, matrix_of, quaternion_of
+from skills.learning.certificate import certify
+from skills.learning.dynamic_programming import ValueIteration
+from skills.learning.policy import learn_tabular
+from skills.learning.q_learning import PhaseQLearning
 from skills.library import releases, retraining, training
 from tests.formats.bags import sample_folder
 from tests.library import cases
@@ -125,3 +132,24 @@ def test_an_instrument_without_constants_is_named_and_not_released(database):
     (reason,) = version.manifest["grid_certificate"]["refused_because"]
     assert "'400194' is unknown" in reason
     assert not version.releasable
+
+
+@pytest.mark.parametrize("learner", [PhaseQLearning(), ValueIteration(), ValueIteration(slip=0.3)], ids=str)
+def test_values_too_small_to_be_learnt_are_refused_with_a_gamma_that_does(learner):
+    grid = GridWorld((0.0, 0.0, 0.0), 1.0, (450, 3, 3))
+    reward = sparse_reward(GridPath(grid, grid.states_of([[448, 1, 1], [449, 1, 1]])))
+    policy = learn_tabular(reward, learner)
+    certificate, _ = certify(policy)
+    reason = training.refusals(policy, certificate)[1]
+    assert reason.startswith(f"{certificate.faint} of them are so far from the path that their values, with gamma 0.1,")
+    assert "larger cells" in releases.remedy(reason)
+    better = learn_tabular(reward, replace(learner, gamma=float(reason.rpartition(" gamma of ")[2])))
+    assert training.refusals(better, certify(better)[0]) == []
+
+
+def test_where_slips_leave_no_gamma_to_name_the_reason_names_none():
+    grid = GridWorld((0.0, 0.0, 0.0), 1.0, (450, 3, 3))
+    path = GridPath(grid, grid.states_of([[448, 1, 1], [449, 1, 1]]))
+    policy = learn_tabular(sparse_reward(path), ValueIteration(slip=0.9))
+    reason = training.refusals(policy, certify(policy)[0])[1]
+    assert reason.endswith("too small to be learnt; train with larger cells, or with a gamma nearer to 1")
