@@ -56,7 +56,7 @@ PAUSES_S = (0.05, 0.5)  # between two polls of a job: the first pause, and the l
 EVENTS = "text/event-stream"
 JSON, NPZ = "application/json", "application/x-npz"
 # Fields of a version or of its response, which the digest of a policy does not cover.
-OF_THE_VERSION = ("version", "sha256", "created_at", "released_at", "released_by", "actions", "arrays")
+OF_THE_VERSION = ("version", "sha256", "created_at", "released_at", "released_by", "actions", "live_actions", "arrays")
 
 
 class Jobs(Connection):
@@ -414,12 +414,15 @@ def rebuilt(about: dict[str, Any], arrays: bytes, demo: dict[str, Any]) -> "Lear
         Corrupt: It does not match its digest.
     """
     from skills.library.integrity import policy_identity  # here, because the library is slow to import
+    from skills.library.policies import live_actions_of
 
     try:
         policy = _policy(about, arrays, demo)
         manifest = {name: value for name, value in about.items() if name not in OF_THE_VERSION}
         whole = policy_identity(manifest, policy) == about["sha256"]
         told = about["actions"] is None or about["actions"] == policy.table().tolist()
+        live = about.get("live_actions")  # an older service has none
+        told = told and (live is None or live == live_actions_of(policy))
     except Exception as error:  # data of another kind can raise any class
         raise Corrupt("This version of the client cannot verify the received policy; update the client.") from error
     if not (whole and told):

@@ -216,7 +216,7 @@ def log_losses(mdp: Mdp, values: Floats, greedy: Bytes, moves: Moves) -> Floats:
     step = _as_log(mdp.gamma)
     reached = np.where(mdp.domain.phase_of == 0, entering[moves.state], np.append(best, LOG_NONE)[moves.row] + step)
     # A move off the grid stays, so it is worth at most gamma of what the row is.
-    return np.where(moves.off_grid | (reached <= LOG_NONE), np.inf, (best - reached) * LOG_UNIT)
+    return np.asarray(np.where(moves.off_grid | (reached <= LOG_NONE), np.inf, (best - reached) * LOG_UNIT))
 
 
 def _as_log(numbers: ArrayLike) -> Ints:
@@ -262,7 +262,7 @@ def _slipping_logs(mdp: Mdp, values: Floats) -> Floats:
             q[:, nothing] = -np.inf
             before, logs = logs, q.max(axis=0)
             if ((logs == before) | (np.abs(logs - before) <= LOG_SETTLED + SETTLED * np.abs(logs))).all():
-                return q
+                return np.asarray(q)
     raise BadSettings(f"The exact values do not settle in {MAX_SWEEPS} sweeps: the grid is too long; use larger cells.")
 
 

@@ -33,7 +33,7 @@ from skills.remedies import Action, Remedy
 from skills.schemas import policies as described
 from skills.schemas.policies import Rollout
 
-MAX_JSON_ACTIONS = 10**6  # ours: above it, JSON has null and names the arrays
+MAX_JSON_ACTIONS = 10**6  # ours: above it, JSON has the certified domain alone, in `live_actions`
 MOST_DEMOS = 50  # ours: all pairs are compared, and the combined path with each some ten times, in a third of a second
 BEST = Corridor()  # nearest to left-out demonstrations, with an outlier and without: docs/results.md
 
@@ -179,10 +179,30 @@ def actions_of(policy: Policy) -> list[list[int]] | None:
     return table
 
 
+def live_actions_of(policy: Policy) -> list[dict[str, list[int]]] | None:
+    """Return the greedy actions of the certified domain as JSON (`schemas.policies.PhaseActions`), by phase.
+
+    There are at most `skills.learning.policy.MAX_BYTES` / `BYTES_A_ROW` actions, 7 million; a larger policy cannot be
+    learnt.
+
+    Returns:
+        None where `actions_of` returns the actions of all states.
+    """
+    domain = policy.domain
+    if domain.phases * policy.path.grid.n_states <= MAX_JSON_ACTIONS:
+        return None
+    of_phases = np.split(policy.greedy, domain.offset[1:-1])
+    return [
+        {"low": low, "size": size, "actions": actions.tolist()}
+        for low, size, actions in zip(domain.low.tolist(), domain.size.tolist(), of_phases, strict=True)
+    ]
+
+
 def arrays_of(version: PolicyVersion) -> bytes:
     """Return a policy's arrays as the bytes of an .npz, Q values and confidence on the certified domain only.
 
-    If the policy has a network, `network` holds the bytes of its safetensors file.
+    The grid is in it, so that the file alone runs the policy (docs/running.md). If the policy has a network, `network`
+    holds the bytes of its safetensors file.
     """
     policy, coverage = learnt(version), covered(version)
     domain = policy.domain
@@ -199,6 +219,9 @@ def arrays_of(version: PolicyVersion) -> bytes:
         action=policy.greedy[kept],
         q=policy.q[kept],
         confidence=policy.confidence[kept],
+        origin_mm=np.array(policy.path.grid.origin_mm),
+        cell_mm=np.float64(policy.path.grid.cell_mm),
+        shape=np.array(policy.path.grid.shape, np.int64),
         waypoints=policy.path.states,
         reaches_goal=coverage.reaches,
         joins_nearest=coverage.joins_nearest,

@@ -251,6 +251,14 @@ class PolicySummary(Version):
     released_by: str
 
 
+class PhaseActions(Given):
+    """The actions of one phase: those of a box of cells; outside the box the action is -2."""
+
+    low: list[int] = Field(min_length=3, max_length=3, description="The lowest cell of the box.")
+    size: list[int] = Field(min_length=3, max_length=3, description="Number of cells of the box along x, y and z.")
+    actions: list[int] = Field(description="By cell of the box, that along z running fastest, then y, then x.")
+
+
 class Policy(PolicyName):
     """A policy, complete enough that a client can run it.
 
@@ -295,6 +303,10 @@ class Policy(PolicyName):
     released_at: datetime | None
     released_by: str | None
     actions: list[list[int]] | None = Field(description="By phase, then by state; null where there are over 10^6.")
+    live_actions: list[PhaseActions] | None = Field(
+        default=None,
+        description="Where `actions` is null: the actions of the certified domain, by phase; otherwise absent.",
+    )
     arrays: str = Field(description="Where the arrays with the Q values are.")
 
 

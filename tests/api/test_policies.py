@@ -9,7 +9,7 @@ import numpy as np
 import orjson
 import pytest
 
-from skills.client import Problem
+from skills.client import Client, Problem
 from skills.learning.q_learning import CellQLearning
 from tests import backends
 from tests.api.service import CSV, GOAL_MM, KESTREL, POLICY, Service, assert_problem, copy_of_trained, serving
@@ -98,13 +98,23 @@ def test_a_policy_has_every_field_of_the_interface(still: Service):
     assert "accuracy" in policy["grid_certificate"]["note"]
 
 
-def test_above_its_limit_the_json_names_the_arrays_that_have_the_actions(tmp_path, monkeypatch):
+def test_above_its_limit_the_json_has_the_actions_of_the_domain_alone(tmp_path, monkeypatch):
     with serving(copy_of_trained(tmp_path)) as service:
         policy = service.client.policy(**KESTREL)
         entries = policy["phases"] * policy["coverage"]["n_states"]
         monkeypatch.setattr("skills.library.policies.MAX_JSON_ACTIONS", entries - 1)
         served = service.http.get(f"/policy-versions/{policy['sha256']}").json()
         assert served["actions"] is None
+        assert "live_actions" not in policy
+        for row, box in zip(policy["actions"], served["live_actions"], strict=True):
+            cells = [range(low, low + size) for low, size in zip(box["low"], box["size"], strict=True)]
+            inside = np.ravel_multi_index(np.meshgrid(*cells, indexing="ij"), policy["grid"]["shape"]).ravel()
+            assert box["actions"] == np.array(row)[inside].tolist()
+            assert set(np.delete(row, inside).tolist()) <= {-2}
+        client = Client(service.http)
+        assert client.learnt(**KESTREL, version=1).table().tolist() == policy["actions"]
+        typed = client.policy(**KESTREL, version=1).live_actions
+        assert [box.model_dump() for box in typed or ()] == served["live_actions"]
         path, _, accept = served["arrays"].partition(" with Accept: ")
         arrays = np.load(io.BytesIO(service.http.get(path, headers={"Accept": accept}).content))
         table = np.full(np.shape(policy["actions"]), -2)

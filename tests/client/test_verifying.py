@@ -16,6 +16,7 @@ import skills
 from skills.client import Client
 from skills.client.policies import rebuilt
 from skills.errors import BadInput, Corrupt
+from skills.library import policies
 from tests.api.service import KESTREL, POLICY
 from tests.library import cases
 
@@ -81,6 +82,19 @@ def test_nothing_that_is_said_of_it_can_be_changed(fetched: Fetched):
     for path in tried:
         with pytest.raises(Corrupt):
             rebuilt(changed(about, path), arrays, demo)
+
+
+def test_no_live_action_of_a_large_policy_can_be_changed(fetched: Fetched, monkeypatch: pytest.MonkeyPatch):
+    about, arrays, demo = fetched
+    monkeypatch.setattr(policies, "MAX_JSON_ACTIONS", 0)
+    live = policies.live_actions_of(rebuilt(about, arrays, demo))
+    large = about | {"actions": None, "live_actions": live}
+    rebuilt(large, arrays, demo)
+    for path in (("live_actions", 1, "low", 0), ("live_actions", 1, "size", 2), ("live_actions", 2, "actions", 7)):
+        with pytest.raises(Corrupt):
+            rebuilt(changed(large, path), arrays, demo)
+    with pytest.raises(Corrupt):
+        rebuilt(large | {"live_actions": (live or [])[:-1]}, arrays, demo)
 
 
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
