@@ -14,7 +14,8 @@ import numpy as np
 
 from skills.compiled import compiled, inner
 
-UNKNOWN, OFF_GRID = -2, -1  # in a model: never tried; would have left the grid, so the arm stays
+# In a model: never tried; would have left the grid, so the arm stays; touches the scene, which ends the pass.
+UNKNOWN, OFF_GRID, TOUCHED = -2, -1, -3
 # Unsigned integers, because numba makes a float of a uint64 and a Python integer.
 NONE, ONE, THREE, SEVEN, NINE, THIRTEEN, SEVENTEEN = (np.uint64(n) for n in (0, 1, 3, 7, 9, 13, 17))
 SMALLEST_SINE = 1e-6  # of half an angle: below it, a share of the chord equals a share of the arc to rounding
@@ -129,7 +130,7 @@ def run_episodes(
 
 
 def explore(
-    model: Any,  # (n_states, 27) int32: the state that each action led to, `OFF_GRID` or `UNKNOWN`
+    model: Any,  # (n_states, 27) int32: the state that each action led to, `OFF_GRID`, `TOUCHED` or `UNKNOWN`
     shape: Any,  # (3,) int64
     first: int,  # start state of the first episode times 27, plus its first action; the others follow in order
     slip: float,  # probability that one of the 27 moves, drawn uniformly, is made instead
@@ -137,11 +138,13 @@ def explore(
     goal: int,
     rng: Any,
     tally: Any,  # as for `run_episodes`
+    touches: Any,  # (n_states, 27) bool: moves that touch the scene and end the episode; (0, 27) without a scene
 ) -> None:
     """Move in the grid and record the result of each action: one episode for every pair of state and action."""
     nx, ny, nz = shape[0], shape[1], shape[2]
     slips = np.uint64(slip * 4294967296.0)
     random = rng[0]
+    in_scene = len(touches) > 0
     episodes = nx * ny * nz * 27
     for episode in range(episodes):
         state = (first + episode) % episodes // 27
@@ -160,6 +163,9 @@ def explore(
             y = state // nz % ny + made // 3 % 3 - 1
             z = state % nz + made % 3 - 1
             tally[0] += 1
+            if in_scene and touches[state, made]:
+                model[state, action] = TOUCHED
+                break
             if x >= 0 and x < nx and y >= 0 and y < ny and z >= 0 and z < nz:
                 after = (x * ny + y) * nz + z
                 model[state, action] = after
@@ -185,8 +191,9 @@ def sweep(
     first: int,  # row of the phase
     last: int,  # row of the phase, exclusive
     backwards: bool,  # whether rows are processed from the last to the first
-    other: float,  # the reward for entering a state without a change of phase
+    entering: Any,  # (n_states,) float64: the reward for entering each state without a change of phase
     off_grid: float,
+    touched: float,  # the reward of touching the scene
     alpha: float,
     gamma: float,
     tolerance: float,
@@ -208,8 +215,10 @@ def sweep(
             new = q[row, action]
             if to != UNKNOWN:
                 target = off_grid + gamma * value[row]
-                if to != OFF_GRID:
+                if to >= 0:
                     target = worth[to]
+                elif to == TOUCHED:
+                    target = touched
                 old = new
                 new = (1 - alpha) * old + alpha * target
                 q[row, action] = new
@@ -219,7 +228,7 @@ def sweep(
                 top = new
         value[row] = top
         if stays[row]:
-            worth[state] = other + gamma * top
+            worth[state] = entering[state] + gamma * top
     return changed
 
 

@@ -32,10 +32,10 @@ from skills.errors import BadSettings
 from skills.gridworld.domain import Domain, Moves
 from skills.gridworld.grid import MOVES
 from skills.gridworld.reward import RewardMap
+from skills.gridworld.scene import STAY, Hazards
 from skills.learning import _kernels
 
 MAX_SWEEPS = 100_000
-STAY = 13  # the action that stays: (0, 0, 0), the middle one of the moves
 ENDLESS = "The exact values do not converge: a cycle has a positive reward; use a smaller gamma."
 SETTLED = 1e-14  # relative: a value that changes by less has settled
 FAINT = 1e-300  # a smaller value is compared by its logarithm; the smallest normal number is 2e-308
@@ -53,12 +53,19 @@ class Mdp:
         reward: The rewards.
         gamma: The discount.
         slip: The probability that a move slips.
+        hazards: A scene on the path's grid, or None; a move that touches it ends the pass.
     """
 
     domain: Domain
     reward: RewardMap
     gamma: float
     slip: float = 0.0
+    hazards: Hazards | None = None
+
+    @property
+    def closed_form(self) -> bool:
+        """Whether the values follow from distances: nothing slips, and nothing is in the way."""
+        return self.slip == 0 and self.hazards is None
 
 
 def exact_values(mdp: Mdp) -> Floats:
@@ -73,7 +80,7 @@ def exact_values(mdp: Mdp) -> Floats:
     Raises:
         BadSettings: Value iteration does not settle, because the rewards pay for going round in circles.
     """
-    if mdp.slip > 0:
+    if not mdp.closed_form:
         return np.asarray(exact_q(mdp).max(axis=1))
     domain = mdp.domain
     assert not domain.phased or mdp.reward.levels.other == 0, "otherwise a longer path earns more"
@@ -137,8 +144,8 @@ def exact_q(mdp: Mdp) -> Floats:
     Raises:
         BadSettings: As for `exact_values`.
     """
-    if mdp.slip > 0:
-        return _slipping_q(mdp)
+    if not mdp.closed_form:
+        return _iterated_q(mdp)
     domain, values = mdp.domain, exact_values(mdp)
     q = np.zeros((domain.n_rows, len(MOVES)))
     for action in range(len(MOVES)):
@@ -147,10 +154,17 @@ def exact_q(mdp: Mdp) -> Floats:
     return q
 
 
-def _slipping_q(mdp: Mdp) -> Floats:
-    """Iterate values over the whole domain with slips until nothing changes; returns Q values, (rows, 27)."""
+def _iterated_q(mdp: Mdp) -> Floats:
+    """Iterate values over the whole domain until nothing changes, with slips or hazards; returns Q values, (rows, 27).
+
+    Hazards make values that nearly cancel, so these settle absolutely, in proportion to the cost of touching.
+    """
     pays, after, off_grid = _each_action(mdp)
     nothing = ~mdp.domain.certified | mdp.domain.terminal
+    floor = 0.0
+    if mdp.hazards is not None:
+        nothing |= mdp.hazards.forbidden[mdp.domain.state_of]
+        floor = SETTLED * mdp.hazards.touch
     values = np.zeros(mdp.domain.n_rows)
     for _ in range(MAX_SWEEPS):
         made = pays + mdp.gamma * np.append(values, 0.0)[after]
@@ -159,16 +173,24 @@ def _slipping_q(mdp: Mdp) -> Floats:
         q = (1 - mdp.slip) * made + mdp.slip * anywhere
         q[:, nothing] = 0.0
         change, values = np.abs(q.max(axis=0) - values), q.max(axis=0)
-        if (change <= SETTLED * np.abs(values)).all():
+        if (change <= SETTLED * np.abs(values) + floor).all():
             return np.ascontiguousarray(q.T)
     raise BadSettings(ENDLESS)
 
 
 def _each_action(mdp: Mdp) -> tuple[Floats, Ints, Flags]:
-    """Return the reward of each move from each row, the row after it, and whether it is off the grid, (27, rows)."""
+    """Make each move from each row, without slips; returns arrays of shape (27, rows).
+
+    The reward, the row after the move (-1: none), and whether the move is off the grid.
+    """
     moves = [mdp.domain.move(*_everywhere(mdp.domain, action)) for action in range(len(MOVES))]
     pays = np.stack([_pays(mdp, moved) for moved in moves])
-    return pays, np.stack([moved.row for moved in moves]), np.stack([moved.off_grid for moved in moves])
+    after = np.stack([moved.row for moved in moves])
+    if mdp.hazards is not None:
+        touches = mdp.hazards.touches[mdp.domain.state_of].T
+        pays = np.where(touches, -mdp.hazards.touch, pays - mdp.hazards.cost[np.stack([m.state for m in moves])])
+        after[touches] = -1
+    return pays, after, np.stack([moved.off_grid for moved in moves])
 
 
 def _everywhere(domain: Domain, action: int) -> tuple[Ints, Ints]:

@@ -27,6 +27,7 @@ from skills.gridworld import paper
 from skills.gridworld.domain import Domain
 from skills.gridworld.grid import GridPath
 from skills.gridworld.reward import RewardMap
+from skills.gridworld.scene import Hazards
 from skills.learning import _kernels
 
 Model = NDArray[np.int32]
@@ -146,13 +147,15 @@ def _check(
         raise BadSettings("step_s and max_episode_s must be finite, with 0 < step_s <= max_episode_s.")
 
 
-def learn_q(reward: RewardMap, learner: QLearner, seed: int) -> tuple[Floats, Training]:
+def learn_q(reward: RewardMap, learner: QLearner, seed: int, hazards: Hazards | None = None) -> tuple[Floats, Training]:
     """Learn the Q values of a reward map's domain; the same arguments give the same bytes.
 
     Args:
         reward: The reward map of the demonstrated path.
         learner: The settings of the learner.
         seed: Seed of all random numbers.
+        hazards: A scene on the path's grid, in the phase state; an episode that touches it ends. Such episodes are
+            counted with those that ran out of steps.
 
     Returns:
         Q values, shape (rows, 27), and the counts of the training.
@@ -161,7 +164,7 @@ def learn_q(reward: RewardMap, learner: QLearner, seed: int) -> tuple[Floats, Tr
     cap = floor(min(learner.max_steps, moves_in_time))
     chance = _Chance(seed)
     if isinstance(learner, PhaseQLearning):
-        q, updates, settled = _learn_in_phases(reward, learner, cap, chance)
+        q, updates, settled = _learn_in_phases(reward, learner, cap, chance, hazards)
     else:
         q, settled = _run_episodes(reward, learner, cap, chance), False
     steps, finished, capped = (int(n) for n in chance.tally)
@@ -182,36 +185,39 @@ class _Chance:
         self.tally = np.zeros(3, np.int64)
 
 
-def _learn_in_phases(reward: RewardMap, learner: PhaseQLearning, cap: int, chance: _Chance) -> tuple[Floats, int, bool]:
+def _learn_in_phases(
+    reward: RewardMap, learner: PhaseQLearning, cap: int, chance: _Chance, hazards: Hazards | None
+) -> tuple[Floats, int, bool]:
     """Try every action in every cell and apply Eq. 1 to the results: returns Q values, updates, settled.
 
     Without slips one round of trials is complete, and phases are swept until nothing changes. With slips every sweep
     has a round of its own, since the same action may have another result.
     """
-    sweeper = Sweeper(reward, learner)
+    sweeper = Sweeper(reward, learner, hazards)
     model = np.full((reward.path.grid.n_states, paper.N_ACTIONS), _kernels.UNKNOWN, np.int32)
     if learner.slip == 0:
-        _explore(model, reward.path, learner.slip, cap, chance)
+        _explore(model, reward.path, learner.slip, cap, chance, hazards)
         settled = sweeper.settle(model)
         return sweeper.q, sweeper.updates, settled
     for number in range(learner.max_sweeps):
-        _explore(model, reward.path, learner.slip, cap, chance)
+        _explore(model, reward.path, learner.slip, cap, chance, hazards)
         for phase in sweeper.phases:
             sweeper.sweep(phase, model, (number,))
     return sweeper.q, sweeper.updates, False
 
 
-def _explore(model: Model, path: GridPath, slip: float, cap: int, chance: _Chance) -> None:
+def _explore(model: Model, path: GridPath, slip: float, cap: int, chance: _Chance, hazards: Hazards | None) -> None:
     """Start an episode with every action in every cell, beginning with a random pair, and record the results."""
     first = int(chance.draw.integers(model.size))
     shape = np.array(path.grid.shape)
-    _kernels.explore_compiled(model, shape, first, float(slip), cap, path.goal, chance.bits, chance.tally)
+    touches = np.zeros((0, paper.N_ACTIONS), bool) if hazards is None else hazards.touches
+    _kernels.explore_compiled(model, shape, first, float(slip), cap, path.goal, chance.bits, chance.tally, touches)
 
 
 class Sweeper:
     """The Q values of a domain in the phase state, and the sweeps that apply Eq. 1 to them."""
 
-    def __init__(self, reward: RewardMap, learner: PhaseQLearning) -> None:
+    def __init__(self, reward: RewardMap, learner: PhaseQLearning, hazards: Hazards | None = None) -> None:
         self.reward, self.learner, self.domain = reward, learner, Domain(reward.path, phased=True)
         domain, path = self.domain, reward.path
         self.cells = path.cells
@@ -220,8 +226,14 @@ class Sweeper:
         self.live = domain.certified & ~domain.terminal
         advances = np.where(domain.phase_of > 0, domain.state_of == path.states[domain.phase_of], False)
         advances[: domain.offset[1]] = domain.joins > 0
+        self.rewards, self.touched = reward.rewards, 0.0
+        self.entering = np.full(path.grid.n_states, reward.levels.other)
+        if hazards is not None:
+            self.rewards, self.touched = self.rewards - hazards.cost, -hazards.touch
+            self.entering -= hazards.cost
+            self.live &= ~hazards.forbidden[domain.state_of]
         self.stays = self.live & ~advances
-        self.worth = np.full(path.grid.n_states, reward.levels.other)
+        self.worth = self.entering.copy()
         self.updates = 0
 
     def settle(self, model: Model) -> bool:
@@ -255,8 +267,9 @@ class Sweeper:
                 first,
                 last,
                 number % 2 == 1,
-                levels.other,
+                self.entering,
                 levels.off_grid,
+                float(self.touched),
                 float(learner.alpha),  # always of one type: see `skills.compiled.compiled`
                 float(learner.gamma),
                 SETTLED,
@@ -264,24 +277,27 @@ class Sweeper:
             self.updates += tried
             if changed == 0:
                 break
-        self.worth[states] = levels.other  # the array is shared by all phases, and the next one expects the default
+        self.worth[states] = self.entering[states]  # shared by all phases; the next one expects these
         return int(changed)
 
     def _enter(self, phase: int, first: int, last: int) -> None:
-        """Set the value of entering each state in a phase; the value beyond the certified domain is 0."""
+        """Set the value of entering each state in a phase; the value beyond the certified domain is 0.
+
+        The reward of other states is 0, so that of a waypoint is added to what entering it costs.
+        """
         domain, path, gamma = self.domain, self.reward.path, self.learner.gamma
         stays = first + np.flatnonzero(self.stays[first:last])
         if phase == 0:
             joining = np.flatnonzero(domain.joins)
             after = domain.rows_of(domain.joins[joining], path.grid.cells_of(joining))
-            self.worth[:] = self.reward.rewards
+            self.worth[:] = self.rewards
             self.worth[joining] += gamma * self.value[after]
         elif phase == domain.phases - 1:
-            self.worth[path.goal] = self.reward.levels.goal
+            self.worth[path.goal] += self.reward.levels.goal
         else:
             after = domain.rows_of(phase + 1, self.cells[phase])
-            self.worth[path.states[phase]] = self.reward.levels.visited + gamma * self.value[after]
-        self.worth[domain.state_of[stays]] = self.reward.levels.other + gamma * self.value[stays]
+            self.worth[path.states[phase]] += self.reward.levels.visited + gamma * self.value[after]
+        self.worth[domain.state_of[stays]] = self.entering[domain.state_of[stays]] + gamma * self.value[stays]
 
 
 def _run_episodes(reward: RewardMap, learner: CellQLearning, cap: int, chance: _Chance) -> Floats:

@@ -1,4 +1,4 @@
-"""Slip: seeded runs of controllers on a grid whose moves slip, and two replay controllers to compare a policy with.
+"""Slip: seeded runs of controllers on a grid whose moves slip, and controllers to compare a policy with.
 
     Controller, slips --walk--> Walks --judge--> Outcome
 
@@ -7,11 +7,12 @@ the intended one; off the grid the arm stays. A *controller* returns the next ac
 sequence of states that results, and an *outcome* summarises walks. `odds` computes the result for a policy exactly,
 without random numbers. The paper has no disturbances; all of this is ours.
 
-Two replay controllers take the shortest path to the demonstration, planned once from the start, and then replay it.
-Replay has two fair interpretations: of *moves*, one after the other, wherever the arm is; and of *positions by the
-clock*, as position control does it: at each tick the next recorded position is commanded, and the arm moves towards it,
-at most a cell along each axis. Neither takes its progress in the demonstration into account: a replay that did, and
-waited for each waypoint, would be the policy of the phase state.
+`TwoLineRule` needs no learning, only its progress along the demonstration. Two replay controllers take the shortest
+path to the demonstration, planned once from the start, and then replay it. Replay has two fair interpretations: of
+*moves*, one after the other, wherever the arm is; and of *positions by the clock*, as position control does it: at each
+tick the next recorded position is commanded, and the arm moves towards it, at most a cell along each axis. Neither
+takes its progress in the demonstration into account: a replay that did, and waited for each waypoint, would be the
+policy of the phase state, or this rule.
 """
 
 from dataclasses import dataclass
@@ -162,11 +163,14 @@ class Walks:
         path: The demonstrated path.
         states: States of each run, shape (T, N); the last one is repeated after the end.
         moves: Number of moves of each run, shape (N,).
+        touched: Whether each run ended by touching the scene, shape (N,); None without a scene. The move that touches
+            is counted, and the state before it is the last one.
     """
 
     path: GridPath
     states: Ints
     moves: Ints
+    touched: Flags | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "states", frozen(self.states, np.int64, (None, None), "states"))
@@ -178,7 +182,7 @@ class Walks:
         return states[np.concatenate(([True], np.diff(states) != 0))]
 
 
-def walk(controller: Controller, path: GridPath, start: int, slips: Bytes) -> Walks:
+def walk(controller: Controller, path: GridPath, start: int, slips: Bytes, touches: Flags | None = None) -> Walks:
     """Run a controller with slips from a state, until it stops or the moves are used up.
 
     Args:
@@ -186,6 +190,7 @@ def walk(controller: Controller, path: GridPath, start: int, slips: Bytes) -> Wa
         path: The demonstrated path.
         start: State index of the start, the same for all runs.
         slips: The slips, shape (moves, runs), as `draw_slips` returns them.
+        touches: Moves that touch a scene and end a run, shape (n_states, 27); None without a scene.
 
     Returns:
         The walks.
@@ -193,7 +198,7 @@ def walk(controller: Controller, path: GridPath, start: int, slips: Bytes) -> Wa
     runs = slips.shape[1]
     leads_to = _leads_to(path.grid)
     states, going = np.full(runs, start), np.ones(runs, bool)
-    phases, moves = np.zeros(runs, np.int64), np.zeros(runs, np.int64)
+    phases, moves, touched = np.zeros(runs, np.int64), np.zeros(runs, np.int64), np.zeros(runs, bool)
     visited = [states]
     for tick, slipped in enumerate(slips):
         actions, phases = controller.decide(tick, states, phases)
@@ -201,11 +206,14 @@ def walk(controller: Controller, path: GridPath, start: int, slips: Bytes) -> Wa
         if not going.any():
             break
         made = np.where(slipped == STEADY, actions, slipped)
+        if touches is not None:
+            now = going & touches[states, made]
+            moves, touched, going = moves + now, touched | now, going & ~now
         # A run that has stopped has a negative action; the state looked up for it is discarded.
         states = np.where(going, leads_to[states, made], states)
         moves = moves + going
         visited.append(states)
-    return Walks(path, np.stack(visited), moves)
+    return Walks(path, np.stack(visited), moves, None if touches is None else touched)
 
 
 def _leads_to(grid: GridWorld) -> Ints:
@@ -482,6 +490,26 @@ class ReplayPositions:
         commanded = self.grid.cells_of(self.plan[min(tick + 1, last)])
         actions = _action((commanded - self.grid.cells_of(states)).clip(-1, 1))
         return np.where((tick >= last) & (states == self.plan[last]), STOPS, actions), phases
+
+
+@dataclass(frozen=True, eq=False)
+class TwoLineRule:
+    """A controller that goes straight to the nearest waypoint (Chebyshev; the last of equals), then to each in turn.
+
+    On a path that does not cross itself, without slips and obstacles, each of its moves is optimal in the phase state
+    with the default gamma, where joining later pays more.
+    """
+
+    path: GridPath
+
+    def decide(self, tick: int, states: Ints, phases: Ints) -> tuple[Ints, Ints]:
+        """Update the phases with the states, and move each run towards its waypoint."""
+        domain, cells = Domain(self.path, phased=True), self.path.grid.cells_of(states)
+        phases, done = start_all(domain, states) if tick == 0 else enter_all(domain, phases, states)
+        apart = np.abs(self.path.cells - cells[:, None]).max(axis=2)
+        nearest = len(self.path.states) - 1 - apart[:, ::-1].argmin(axis=1)
+        ahead = self.path.cells[np.where(phases > 0, phases, nearest)]
+        return np.where(done, STOPS, _action((ahead - cells).clip(-1, 1))), phases
 
 
 def _action(steps: Ints) -> Ints:

@@ -19,6 +19,7 @@ from tests.bench.reading import reading
 from tests.bench.scaling import scaling
 from tests.bench.serving import serving
 from tests.bench.session import session
+from tests.bench.tissue import tissue
 
 PARTS = {
     "reading": reading,
@@ -35,6 +36,7 @@ PARTS = {
     "geometry": geometry,
     "pose-styles": pose_styles,
     "session": session,
+    "tissue": tissue,
 }
 
 

@@ -8,13 +8,16 @@ from hypothesis.extra.numpy import arrays
 
 from skills.gridworld.grid import MOVES, GridPath, GridWorld
 from skills.gridworld.reward import sparse_reward
+from skills.gridworld.scene import Box, Scene, SceneCosts, hazards_of
 from skills.learning import _kernels
+from skills.learning.in_scene import learn_in_scene
 from skills.learning.policy import learn_tabular
 from skills.learning.q_learning import CellQLearning, PhaseQLearning, Sweeper
 from tests.gridworld.paths import named_path
 
 GOAL, VISITED, OTHER, OFF_GRID = (10.0, 1.0, 0.0, -1.0)
 STAY, UP = 13, 14
+NOTHING = np.zeros((0, 27), bool)  # touches
 TWO_CELLS = GridPath(GridWorld((0.0, 0.0, 0.0), 5.0, (1, 1, 2)), np.array([0, 1]))
 LEARNERS = [
     CellQLearning(alpha=0.3, epsilon_start=0.9, epsilon_end=0.2, episodes=60, max_steps=30),
@@ -33,6 +36,18 @@ def test_the_compiled_loops_and_the_plain_ones_agree_to_the_last_bit(monkeypatch
     assert set(agreed) == ({"run_episodes"} if isinstance(learner, CellQLearning) else {"explore", "sweep"})
     assert policy.q.any()
     assert policy.training.steps > policy.training.episodes // 2
+
+
+def test_compiled_and_plain_loops_agree_in_a_scene_too(monkeypatch):
+    agreed: list[str] = []
+    for loop in ("explore", "sweep"):
+        monkeypatch.setattr(_kernels, f"{loop}_compiled", both(loop, agreed))
+    path = named_path("to and fro")
+    wall = Box((1.0, 0.0, -200.0), (2.0, 100.0, 0.0))  # between the path and the last row of cells
+    hazards = hazards_of(Scene("base", (wall,)), path, "base", SceneCosts(close=0.3))
+    assert 0 < hazards.touches.sum() < hazards.touches.size
+    learn_in_scene(sparse_reward(path), PhaseQLearning(alpha=0.5, max_steps=2, max_sweeps=3, slip=0.4), hazards, seed=5)
+    assert set(agreed) == {"explore", "sweep"}
 
 
 def both(loop, agreed):
@@ -136,7 +151,7 @@ def explored(max_steps=1, first=0, slip=0.0):
     """Try every action in both cells."""
     model, tally = np.full((2, 27), _kernels.UNKNOWN, np.int32), np.zeros(3, int)
     shape, rng = np.array(TWO_CELLS.grid.shape), np.ones(1, np.uint64)
-    _kernels.explore_compiled(model, shape, first, slip, max_steps, TWO_CELLS.goal, rng, tally)
+    _kernels.explore_compiled(model, shape, first, slip, max_steps, TWO_CELLS.goal, rng, tally, NOTHING)
     return model, tally.tolist()
 
 
@@ -207,7 +222,7 @@ def test_a_move_slips_at_its_rate_and_a_slip_off_the_grid_stays():
     rng, tally, moved, stayed = np.ones(1, np.uint64), np.zeros(3, int), 0, 0
     model = np.full((27, 27), _kernels.UNKNOWN, np.int32)
     for _ in range(rounds):
-        _kernels.explore_compiled(model, np.array(grid.shape), 0, slip, 1, 26, rng, tally)
+        _kernels.explore_compiled(model, np.array(grid.shape), 0, slip, 1, 26, rng, tally, NOTHING)
         moved += np.count_nonzero(model[13] != np.arange(27))  # from the middle, an action leads to its own number
         stayed += np.count_nonzero(
             model[0][np.arange(27) // 9 == 0] == 0

@@ -1,5 +1,7 @@
 """Arms that slip: laws, a case worked by hand, and the Markov chain as a second method for the sampling."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -7,6 +9,7 @@ from skills.errors import BadSettings
 from skills.gridworld.domain import Domain
 from skills.gridworld.grid import MOVES, GridPath, GridWorld
 from skills.gridworld.reward import sparse_reward
+from skills.learning.certificate import certify
 from skills.learning.policy import learn_tabular, rollout_from
 from skills.learning.q_learning import PhaseQLearning
 from skills.learning.slip import (
@@ -15,6 +18,7 @@ from skills.learning.slip import (
     ReplayMoves,
     ReplayPositions,
     StartAnew,
+    TwoLineRule,
     Walks,
     arrives,
     budget,
@@ -223,3 +227,21 @@ def test_a_run_that_enters_the_waypoints_in_another_order_does_not_follow():
 )
 def test_the_wilson_interval_is_the_one_in_tables(count, low, high):
     assert wilson(count, 10) == pytest.approx((low, high), abs=5e-5)
+
+
+@pytest.mark.parametrize("name", ["an angle", "closed", "two cells"])
+def test_on_a_simple_path_every_move_of_the_two_line_rule_is_optimal(name):
+    policy = learnt(name)
+    domain = policy.domain
+    actions, phases = TwoLineRule(named_path(name)).decide(1, domain.state_of, domain.phase_of)
+    live = domain.certified & ~domain.terminal & (phases == domain.phase_of)  # others are in the next phase already
+    q = policy.q.copy()
+    q[live] = np.eye(27)[actions[live]]
+    assert certify(replace(policy, q=q))[0].every_action_optimal
+
+
+@pytest.mark.parametrize("name", WALKS)
+def test_without_slips_the_two_line_rule_follows_from_every_start(name):
+    path = named_path(name)
+    for start in range(path.grid.n_states):
+        assert follows(walk(TwoLineRule(path), path, start, steady(60))).all()

@@ -1,0 +1,339 @@
+"""The scene around a demonstration: what an arm must not touch, in the grid world; all of this is ours.
+
+    Scene, GridPath --hazards_of--> Hazards: the moves that touch, and the cost of entering each cell
+
+A *scene* has keep-out boxes, capsules (the links of another arm) and tissue, in the frame of the demonstration, in mm.
+Each is grown by `margin_mm`. A *cell* is forbidden if its centre touches something, because centres are what a policy
+commands; a *move* touches if the straight line between the two centres does, so no move passes through a thin box. The
+distance of the tip from the centre of its cell, and the size of the tool, belong into the margin.
+
+Tissue is a plane or a height map above a plane; meshes are not supported yet.
+"""
+
+from collections.abc import Mapping
+from dataclasses import asdict, astuple, dataclass
+from math import isfinite
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from skills.arrays import Flags, Floats
+from skills.errors import BadSettings
+from skills.fields import Point
+from skills.gridworld.grid import MOVES, GridPath
+
+STAY = 13  # the action that stays: (0, 0, 0), the middle one of the moves
+SAMPLES_A_STEP = 4  # a move is compared with tissue at points at most a quarter of the map's step apart
+SQUARE = 1e-9  # greatest cosine of the angle between two directions that count as perpendicular
+
+
+@dataclass(frozen=True)
+class Box:
+    """A box that must not be entered, along the axes of the frame, from its lowest to its highest corner in mm."""
+
+    low_mm: Point
+    high_mm: Point
+
+    def __post_init__(self) -> None:
+        _check_finite("A box", self.low_mm, self.high_mm)
+        if not all(low < high for low, high in zip(self.low_mm, self.high_mm, strict=True)):
+            raise BadSettings("low_mm of a box must be below high_mm along each axis.", box=astuple(self))
+
+
+@dataclass(frozen=True)
+class Capsule:
+    """A cylinder with round ends, such as a link of the other arm: its axis from a to b, and its radius, in mm."""
+
+    a_mm: Point
+    b_mm: Point
+    radius_mm: float
+
+    def __post_init__(self) -> None:
+        _check_finite("A capsule", self.a_mm, self.b_mm, (self.radius_mm,))
+        if not self.radius_mm > 0:
+            raise BadSettings("radius_mm of a capsule must be positive.", radius_mm=self.radius_mm)
+
+
+@dataclass(frozen=True)
+class Tissue:
+    """A surface that must not be entered: heights above a plane, bilinear between the points of a regular map.
+
+    Attributes:
+        at_mm: The point of the plane at which the map begins.
+        normal: Direction out of the tissue; any length.
+        along: Direction of the rows of the map, perpendicular to the normal; any length.
+        step_mm: Distance of the map's points.
+        heights_mm: Height of the surface above the plane at i steps along `along` and j steps along normal x along, as
+            rows of equal length. Beyond its edges the map continues with the height at the edge.
+    """
+
+    at_mm: Point
+    normal: Point
+    along: Point
+    step_mm: float = 1.0
+    heights_mm: tuple[tuple[float, ...], ...] = ((0.0,),)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "heights_mm", tuple(tuple(map(float, row)) for row in self.heights_mm))
+        _check_finite("Tissue", self.at_mm, self.normal, self.along, (self.step_mm,), *self.heights_mm)
+        if not self.step_mm > 0 or not self.heights_mm or len({len(row) for row in self.heights_mm} | {0}) != 2:
+            raise BadSettings("A height map needs a positive step_mm, and rows of one number or more, equally long.")
+        normal, along = np.array(self.normal), np.array(self.along)
+        lengths = np.linalg.norm(normal) * np.linalg.norm(along)
+        if not (lengths > 0 and abs(normal @ along) <= SQUARE * lengths):
+            raise BadSettings("`normal` and `along` of tissue must be perpendicular directions, neither of length 0.")
+
+    @classmethod
+    def plane(cls, at_mm: Point, normal: Point) -> "Tissue":
+        """Return flat tissue below a point, with a direction out of it."""
+        least = np.eye(3)[int(np.abs(normal).argmin())]
+        x, y, z = np.cross(normal, least).tolist()
+        return cls(at_mm, normal, (x, y, z))
+
+    def above_mm(self, points_mm: ArrayLike) -> Floats:
+        """Return the height of points, (..., 3), above the surface along the normal, (...,); negative inside."""
+        normal, along = (np.array(one) / np.linalg.norm(one) for one in (self.normal, self.along))
+        apart = np.asarray(points_mm, float) - self.at_mm
+        heights = np.array(self.heights_mm)
+        row, u = _between(apart @ along / self.step_mm, heights.shape[0])
+        column, v = _between(apart @ np.cross(normal, along) / self.step_mm, heights.shape[1])
+        next_row, next_column = (np.minimum(i + 1, n - 1) for i, n in zip((row, column), heights.shape, strict=True))
+        near = (1 - v) * heights[row, column] + v * heights[row, next_column]
+        far = (1 - v) * heights[next_row, column] + v * heights[next_row, next_column]
+        return np.asarray(apart @ normal - ((1 - u) * near + u * far))
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What an arm must not touch.
+
+    Attributes:
+        frame: The frame, that of the demonstration.
+        boxes: Keep-out boxes.
+        capsules: The other arm.
+        tissue: The tissue, or None.
+        margin_mm: Distance by which everything is grown.
+    """
+
+    frame: str
+    boxes: tuple[Box, ...] = ()
+    capsules: tuple[Capsule, ...] = ()
+    tissue: Tissue | None = None
+    margin_mm: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not self.frame:
+            raise BadSettings("A scene needs the name of its frame.")
+        if not (isfinite(self.margin_mm) and self.margin_mm >= 0):
+            raise BadSettings("margin_mm of a scene must be 0 or more.", margin_mm=self.margin_mm)
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the scene as plain JSON, of which `skills.packing` computes a digest."""
+        return {name: _lists(value) for name, value in asdict(self).items()}
+
+    @classmethod
+    def of_json(cls, described: Mapping[str, Any]) -> "Scene":
+        """Return a scene from its JSON.
+
+        Raises:
+            BadSettings: A part is missing, unknown or impossible.
+        """
+        try:
+            tissue = described.get("tissue")
+            return cls(
+                **dict(described)
+                | {
+                    "boxes": tuple(Box(**_tuples(one)) for one in described.get("boxes", ())),
+                    "capsules": tuple(Capsule(**_tuples(one)) for one in described.get("capsules", ())),
+                    "tissue": None if tissue is None else Tissue(**_tuples(tissue)),
+                }
+            )
+        except (TypeError, ValueError, AttributeError) as error:
+            raise BadSettings("This is no scene: give the fields that `Scene.as_json` writes.") from error
+
+    def clearance_mm(self, points_mm: ArrayLike) -> Floats:
+        """Return the distance of points, (..., 3), from the nearest part, margin included, (...,); 0 inside.
+
+        The distance from tissue is measured along its normal. Without parts it is infinite.
+        """
+        points = np.asarray(points_mm, float)
+        nearest = np.full(points.shape[:-1], np.inf)
+        for box in self.boxes:
+            outside = np.maximum(np.maximum(box.low_mm - points, points - box.high_mm), 0.0)
+            nearest = np.minimum(nearest, np.linalg.norm(outside, axis=-1))
+        for capsule in self.capsules:
+            apart = _between_segments_mm(points, points, np.array(capsule.a_mm), np.array(capsule.b_mm))
+            nearest = np.minimum(nearest, apart - capsule.radius_mm)
+        if self.tissue is not None:
+            nearest = np.minimum(nearest, self.tissue.above_mm(points))
+        return np.maximum(nearest - self.margin_mm, 0.0)
+
+    def touches(self, from_mm: ArrayLike, to_mm: ArrayLike) -> Flags:
+        """Return for each straight line between two points, (..., 3), whether it touches a part, (...,).
+
+        Boxes grow by the margin along each axis, so their edges stay sharp. Tissue is compared at points at most a
+        quarter of its map's step apart, which for a plane is exact.
+        """
+        a, b = np.broadcast_arrays(np.asarray(from_mm, float), np.asarray(to_mm, float))
+        touched = np.zeros(a.shape[:-1], bool)
+        for box in self.boxes:
+            touched |= _crosses(a, b, np.array(box.low_mm) - self.margin_mm, np.array(box.high_mm) + self.margin_mm)
+        for capsule in self.capsules:
+            apart = _between_segments_mm(a, b, np.array(capsule.a_mm), np.array(capsule.b_mm))
+            touched |= apart <= capsule.radius_mm + self.margin_mm
+        if self.tissue is not None:
+            longest = float(np.linalg.norm(b - a, axis=-1).max(initial=0.0))
+            flat = len(self.tissue.heights_mm) == len(self.tissue.heights_mm[0]) == 1
+            samples = 2 if flat else 2 + int(SAMPLES_A_STEP * longest / self.tissue.step_mm)
+            for share in np.linspace(0.0, 1.0, samples):
+                touched |= self.tissue.above_mm((1 - share) * a + share * b) <= self.margin_mm
+        return touched
+
+
+@dataclass(frozen=True)
+class SceneCosts:
+    """Costs in addition to the rewards of Algorithm 1; the paper has none.
+
+    Attributes:
+        touch: Of touching, which ends the pass. More than a path of 90 states can earn, so no style is worth a touch.
+        close: Of entering a cell whose centre touches, less with its clearance, down to 0 at `close_mm`.
+        close_mm: Clearance from which on a cell costs nothing.
+        deeper_per_mm: Of entering a cell, for each mm that it is deeper than all states of the demonstration, along
+            the normal of the tissue.
+    """
+
+    touch: float = 100.0
+    close: float = 0.1
+    close_mm: float = 5.0
+    deeper_per_mm: float = 0.01
+
+    def __post_init__(self) -> None:
+        costs = astuple(self)
+        if not (all(map(isfinite, costs)) and min(costs) >= 0 and self.touch > 0 and self.close_mm > 0):
+            raise BadSettings("Costs must be finite and 0 or more; `touch` and `close_mm` positive.", costs=costs)
+
+
+@dataclass(frozen=True, eq=False)
+class Hazards:
+    """A scene on a grid.
+
+    Attributes:
+        touches: Whether the move by each action from each state touches, (n_states, 27); off the grid it stays.
+        cost: Cost of entering each state, (n_states,).
+        touch: Cost of touching.
+    """
+
+    touches: Flags
+    cost: Floats
+    touch: float
+
+    @property
+    def forbidden(self) -> Flags:
+        """Whether the centre of each state's cell touches, (n_states,)."""
+        return np.asarray(self.touches[:, STAY])
+
+
+def hazards_of(scene: Scene, path: GridPath, frame: str, costs: SceneCosts | None = None) -> Hazards:
+    """Return which moves of a path's grid touch a scene, and the cost of each state.
+
+    Args:
+        scene: The scene, in the frame of the path.
+        path: The demonstrated path.
+        frame: The frame of the path.
+        costs: The costs; None for the defaults.
+
+    Returns:
+        The hazards.
+
+    Raises:
+        BadSettings: The scene is in another frame; or the demonstration itself touches it, and cannot be followed.
+    """
+    if scene.frame != frame:
+        raise BadSettings(
+            f"The scene is in the frame '{scene.frame}', the demonstration in '{frame}'; give the scene in that frame."
+        )
+    costs, grid = costs or SceneCosts(), path.grid
+    cells = grid.cells_of(np.arange(grid.n_states))
+    centres = grid.centres_of(cells)
+    touches = np.zeros((grid.n_states, len(MOVES)), bool)
+    for action, move in enumerate(MOVES):
+        after = np.where(grid.holds(cells + move)[:, None], cells + move, cells)
+        touches[:, action] = scene.touches(centres, grid.centres_of(after))
+    bad = np.flatnonzero(scene.touches(path.tip_mm[:-1], path.tip_mm[1:]))
+    if len(bad):
+        x, y, z = path.tip_mm[bad[0]]
+        raise BadSettings(
+            f"The demonstration itself touches the scene in {len(bad)} of {len(path.states) - 1} moves, first from "
+            f"({x:.1f}, {y:.1f}, {z:.1f}) mm; check the scene's frame and margin, or record the hand-off further away.",
+            moves=len(bad),
+        )
+    cost = costs.close * (1 - scene.clearance_mm(centres) / costs.close_mm).clip(0)
+    if scene.tissue is not None:
+        below_mm = scene.tissue.above_mm(path.tip_mm).min() - scene.tissue.above_mm(centres)
+        cost = cost + costs.deeper_per_mm * below_mm.clip(0)
+    return Hazards(touches, np.asarray(cost), costs.touch)
+
+
+def _check_finite(name: str, *rows: tuple[float, ...]) -> None:
+    if not all(isfinite(number) for row in rows for number in row):
+        raise BadSettings(f"{name} has a number that is not finite.")
+
+
+def _lists(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _lists(part) for name, part in value.items()}
+    return [_lists(part) for part in value] if isinstance(value, list | tuple) else value
+
+
+def _tuples(described: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: _tuple(value) for name, value in described.items()}
+
+
+def _tuple(value: Any) -> Any:
+    return tuple(map(_tuple, value)) if isinstance(value, list | tuple) else value
+
+
+def _between(places: Floats, n: int) -> tuple[np.ndarray[Any, Any], Floats]:
+    """Return the index of the map's point at or before each place, and the share of the way to the next one."""
+    inside = places.clip(0, n - 1)
+    index = np.floor(inside).astype(np.int64)
+    return index, inside - index
+
+
+def _crosses(a: Floats, b: Floats, low: Floats, high: Floats) -> Flags:
+    """Return whether lines from a to b, (..., 3), touch a box: the parts within each axis' bounds overlap."""
+    way = b - a
+    still = way == 0
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        to_low, to_high = (low - a) / way, (high - a) / way
+    within = (a >= low) & (a <= high)
+    enters = np.where(still, np.where(within, -np.inf, np.inf), np.minimum(to_low, to_high)).max(axis=-1)
+    leaves = np.where(still, np.where(within, np.inf, -np.inf), np.maximum(to_low, to_high)).min(axis=-1)
+    return np.asarray(np.maximum(enters, 0.0) <= np.minimum(leaves, 1.0))
+
+
+def _between_segments_mm(a: Floats, b: Floats, c: Floats, d: Floats) -> Floats:
+    """Return the distance between lines from a to b, (..., 3), and the line from c to d, (3,).
+
+    The nearest points are inside both, or one is an end.
+    """
+    u, v, w = b - a, d - c, a - c
+    uu, vv, uv = (u * u).sum(-1), float(v @ v), u @ v
+    uw, vw = (u * w).sum(-1), w @ v
+    det = uu * vv - uv * uv
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        s, t = (uv * vw - vv * uw) / det, (uu * vw - uv * uw) / det
+    inside = (det > 0) & (s >= 0) & (s <= 1) & (t >= 0) & (t <= 1)
+    s, t = np.where(inside, s, 0.0), np.where(inside, t, 0.0)
+    middle = np.linalg.norm(w + s[..., None] * u - t[..., None] * v, axis=-1)
+    ends = [_to_segment(a, c, d), _to_segment(b, c, d), _to_segment(c, a, b), _to_segment(d, a, b)]
+    return np.asarray(np.minimum(np.where(inside, middle, np.inf), np.min(np.broadcast_arrays(*ends), axis=0)))
+
+
+def _to_segment(point: Floats, a: Floats, b: Floats) -> Floats:
+    """Return the distance of points from lines from a to b; shapes broadcast to (..., 3)."""
+    way = b - a
+    length = (way * way).sum(-1)
+    share = ((point - a) * way).sum(-1) / np.where(length > 0, length, 1.0)
+    return np.asarray(np.linalg.norm(point - a - share.clip(0, 1)[..., None] * way, axis=-1))
