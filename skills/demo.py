@@ -49,7 +49,7 @@ def main() -> int:
     PICTURES.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="suture-skills-") as folder, running_service(Path(folder)) as client:
         styles = tell_styles(client)
-        report = Table("style", "states", "DTW mm", "starts", "verdict", "train s", "plan s", "play s", box=None)
+        report = Table("style", "states", "DTW mm", "share", "verdict", "train s", "plan s", "play s", box=None)
         checked = []
         for style in styles:
             checked.append(check_style(client, *style, report))
@@ -141,7 +141,7 @@ def check_style(client: Client, surgeon: str, suture: str, report: Table) -> tup
         f"{surgeon} {suture}",
         f"{policy.metrics.exact_states}/{policy.metrics.path_states}",
         f"{total:g}",
-        f"{coverage.starts_reaching_goal}/{coverage.n_states}",
+        f"{coverage.mean_share:.0%}",
         verdict(playback),
         *(f"{after - before:.2f}" for before, after in pairwise(laps)),
     )
@@ -223,7 +223,7 @@ def real_recording(client: Client) -> None:
     metrics, coverage = policy.metrics, policy.coverage
     out.print(
         f"{metrics.exact_states} of {metrics.path_states} states, DTW {metrics.dtw_total_mm:g} mm, "
-        f"{coverage.starts_reaching_goal} of {coverage.n_states} starts reach the goal; "
+        f"{coverage.mean_share:.0%} of the demonstration from a start on average; "
         + ("released." if result["released"] else f"not released: {result['not_released_because']}")
     )
     try:

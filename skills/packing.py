@@ -199,4 +199,7 @@ def _part(value: Any, name: str) -> Any:
 
 
 def _is_written(value: Any, field: Field[Any]) -> bool:
-    return (type(value), field.name) not in _ADDED or getattr(value, field.name) != field.default
+    if (type(value), field.name) not in _ADDED:
+        return True
+    part = getattr(value, field.name)
+    return isinstance(part, np.ndarray) or part != field.default

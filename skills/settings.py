@@ -72,6 +72,10 @@ class Settings(BaseSettings):
     replay_tip_error_mm: float = Field(default=0.65, ge=0)
     # ... with this probability; samples: 0.99, with an error of 3 mm 0.28
     replay_lower_bound: float = Field(default=0.95, ge=0, le=1)
+    # the release gate requires that every start so near to the demonstrated one, an uncalibrated arm's error, ...
+    near_radius_mm: float = Field(default=3.0, gt=0, allow_inf_nan=False)
+    # ... follows this share of the demonstration; recordings and samples: 0.76 or more, see docs/joining.md
+    near_least_share: float = Field(default=0.4, ge=0, le=1)
     workers: int = Field(default_factory=_cores, ge=0, le=64)  # worker processes; 0: workers run elsewhere
     lease_s: float = Field(default=2.0, gt=0)  # a worker without a heartbeat for longer is considered dead
     job_attempts: int = Field(default=3, ge=1)

@@ -209,9 +209,10 @@ def _encode(policy: PolicyVersion, release: Release | None, media_type: str) -> 
         content = policies.arrays_of(policy)
     else:
         about = policies.about_policy(policy, release)
-        about["actions"] = policies.actions_of(learnt(policy))
+        about[policies.table_name(about, "actions")] = policies.actions_of(learnt(policy))
         live = policies.live_actions_of(learnt(policy))
-        about |= {} if live is None else {"live_actions": live}  # left out otherwise: a client of before verifies it
+        if live is not None:  # left out otherwise: a client of before verifies it
+            about[policies.table_name(about, "live_actions")] = live
         about["arrays"] = f"/policy-versions/{policy.sha256} with Accept: {NPZ}"
         content = orjson.dumps(about)
     # A header and no field: the bytes, and so the ETag and what older clients verify, stay those of the policy.

@@ -2,7 +2,7 @@
 
 import json
 import time
-from math import degrees
+from math import degrees, nan
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -32,6 +32,7 @@ from skills.errors import BadInput, Conflict
 if TYPE_CHECKING:
     from skills.client import Client
     from skills.schemas.given import RetrainedStyle, Retraining
+    from skills.schemas.policies import Coverage
 
 WATCH_S = 0.3
 MANY = 64  # workers for a batch: as many as the settings say, which allow no more
@@ -46,6 +47,14 @@ Kind = Annotated[str | None, typer.Option("--learner", help="Kind of the learner
 Chosen = Annotated[
     list[str] | None, typer.Option("--setting", help="A setting of the learner, such as steps=100000; repeatable.")
 ]
+Join = Annotated[
+    str | None,
+    typer.Option(
+        help="Where a start joins the demonstration: nearest; start; or a share such as 0.5, so much of it is followed."
+    ),
+]
+JOINING = {"nearest": 0.0, "start": 1.0}
+DEFAULT_LEARNER = "phase-q-learning"
 plan_commands = typer.Typer()
 
 PlanId = Annotated[str, typer.Argument(help="The plan's digest.")]
@@ -69,13 +78,14 @@ def train(
     seed: int = 0,
     learner: Kind = None,
     setting: Chosen = None,
+    join: Join = None,
     as_json: AsJson = False,
 ) -> None:
     """Learn a style from its newest demonstration, or from the given ones, and wait until it is learnt.
 
     With --release, the exit code is 1 if the style does not serve the version afterwards.
     """
-    chosen = _learner(learner, setting or [])
+    chosen = _learner(learner, setting or [], join)
     with service(workers=1) as client:
         asked = client.train(
             surgeon,
@@ -103,10 +113,11 @@ def retrain(
     release: Annotated[bool, typer.Option(help="Release versions that pass the gate and are not worse.")] = False,
     learner: Kind = None,
     setting: Chosen = None,
+    join: Join = None,
     as_json: AsJson = False,
 ) -> None:
     """Learn many styles again, and wait for them; exit code 1 if one failed, or with --release was not released."""
-    chosen = _learner(learner, setting or [])
+    chosen = _learner(learner, setting or [], join)
     with service(workers=MANY) as client:
         job = client.retrain(surgeon=surgeon, suture=suture, only_stale=only_stale, learner=chosen, release=release)
         ended = _watched(client, job.id)
@@ -136,13 +147,15 @@ def _not_released(version: int | None, because: str) -> str:
     return because if because.startswith("Version ") else f"Version {version} is not released: {because}"
 
 
-def _learner(kind: str | None, settings: list[str]) -> dict[str, Any] | None:
+def _learner(kind: str | None, settings: list[str], join: str | None) -> dict[str, Any] | None:
     """Return the learner as JSON for the service; None for the default one."""
-    if kind is None:
-        if settings:
-            raise BadInput("--setting needs --learner.", "Example: --learner dqn --setting steps=100000")
+    if kind is None and settings:
+        raise BadInput("--setting needs --learner.", "Example: --learner dqn --setting steps=100000")
+    if kind is None and join is None:
         return None
-    learner: dict[str, Any] = {"kind": kind}
+    learner: dict[str, Any] = {"kind": kind or DEFAULT_LEARNER}
+    if join is not None:
+        learner["join_share"] = _join_share(join)
     for setting in settings:
         name, _, value = setting.partition("=")
         try:
@@ -151,6 +164,17 @@ def _learner(kind: str | None, settings: list[str]) -> dict[str, Any] | None:
         except ValueError:
             raise BadInput(f"{setting!r} is not a setting.", "Write it as name=number, such as steps=100000") from None
     return learner
+
+
+def _join_share(join: str) -> float:
+    """Return the least share of the demonstration that a joining rule leaves, as a learner's setting."""
+    try:
+        share = JOINING[join] if join in JOINING else float(join)
+    except ValueError:
+        share = nan
+    if not 0 <= share <= 1:
+        raise BadInput(f"--join {join} is no joining rule.", "Write nearest, start, or a share from 0 to 1 such as 0.5")
+    return share
 
 
 def _watched(client: "Client", job: str) -> "Retraining":
@@ -215,7 +239,7 @@ commands = typer.Typer()
 policies = typer.Typer(no_args_is_help=True, help="Learnt policies.")
 commands.add_typer(policies, name="policy")
 
-FIGURES = ("metrics.dtw_total_mm", "metrics.exact_states", "metrics.path_states", "coverage.starts_reaching_goal")
+FIGURES = ("metrics.dtw_total_mm", "metrics.exact_states", "metrics.path_states", "coverage.mean_share")
 
 
 @policies.command("list")
@@ -247,6 +271,7 @@ def policy_show(surgeon: Surgeon, suture: Suture, version: int | None = None, as
     metrics, coverage = policy.metrics, policy.coverage
     out.print(f"{surgeon} {suture} version {policy.version}  {policy.sha256}", soft_wrap=True)
     out.print(f"path    {metrics.exact_states} of {metrics.path_states} states, DTW {metrics.dtw_total_mm:g} mm")
+    out.print(f"share   {_share(coverage)}")
     out.print(f"starts  {coverage.starts_reaching_goal} of {coverage.n_states} reach the goal")
     out.print(f"release {cell(policy.released_at) or 'not released'}")
 
@@ -267,6 +292,16 @@ def policy_pose_style(surgeon: Surgeon, suture: Suture, as_json: AsJson = False)
     out.print(f"tube    {tube.radius_mm:.1f} mm and {tube.radius_deg:.1f} degrees, at the end after {tube.ticks} ticks")
     out.print(f"step    {limits.step_mm:g} mm and {turn:.1f} degrees a tick of {1000 * style.tick_s:.0f} ms")
     out.print(f"assumes {limits.disturbance_mm:g} mm and {degrees(limits.disturbance_rad):.1f} degrees of disturbance")
+
+
+def _share(coverage: "Coverage") -> str:
+    """Return how much of the demonstration a version follows from its starts, in words."""
+    if coverage.mean_share is None or coverage.median_share is None:
+        return "not known for this version; train again to know it"
+    return (
+        f"{coverage.mean_share:.0%} of the demonstration from a start on average, median {coverage.median_share:.0%}; "
+        f"{coverage.starts_goal_alone} of {coverage.n_states} starts see the goal alone"
+    )
 
 
 @policies.command("release")

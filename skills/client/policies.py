@@ -56,7 +56,11 @@ PAUSES_S = (0.05, 0.5)  # between two polls of a job: the first pause, and the l
 EVENTS = "text/event-stream"
 JSON, NPZ = "application/json", "application/x-npz"
 # Fields of a version or of its response, which the digest of a policy does not cover.
-OF_THE_VERSION = ("version", "sha256", "created_at", "released_at", "released_by", "actions", "live_actions", "arrays")
+OF_THE_VERSION = (
+    *("version", "sha256", "created_at", "released_at", "released_by", "arrays"),
+    *("actions", "actions_joining", "live_actions", "live_actions_joining"),
+)
+FORMATS = (1, 2)  # of a policy, that this client can follow
 
 
 class Jobs(Connection):
@@ -414,14 +418,15 @@ def rebuilt(about: dict[str, Any], arrays: bytes, demo: dict[str, Any]) -> "Lear
         Corrupt: It does not match its digest.
     """
     from skills.library.integrity import policy_identity  # here, because the library is slow to import
-    from skills.library.policies import live_actions_of
+    from skills.library.policies import live_actions_of, table_name
 
     try:
         policy = _policy(about, arrays, demo)
         manifest = {name: value for name, value in about.items() if name not in OF_THE_VERSION}
         whole = policy_identity(manifest, policy) == about["sha256"]
-        told = about["actions"] is None or about["actions"] == policy.table().tolist()
-        live = about.get("live_actions")  # an older service has none
+        actions = about[table_name(about, "actions")]
+        live = about.get(table_name(about, "live_actions"))  # an older service has none
+        told = about.get("format", 1) in FORMATS and (actions is None or actions == policy.table().tolist())
         told = told and (live is None or live == live_actions_of(policy))
     except Exception as error:  # data of another kind can raise any class
         raise Corrupt("This version of the client cannot verify the received policy; update the client.") from error
@@ -446,7 +451,7 @@ def _policy(about: dict[str, Any], arrays: bytes, demo: dict[str, Any]) -> "Lear
     bridged, hysteresis = shown.get("bridged_cells") or 0, shown["hysteresis"]
     path = GridPath(grid, np.array(about["waypoints"]), bridged=bridged, hysteresis=hysteresis)
     learner = learner_of({"kind": about["learner"], **about["settings"]})
-    domain = Domain(path, learner.phased)
+    domain = Domain(path, learner.phased, learner.join_share)
     q = np.zeros((domain.n_rows, 27))
     with np.load(io.BytesIO(arrays), allow_pickle=False) as sent:
         q[domain.certified] = sent["q"]

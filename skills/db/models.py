@@ -59,6 +59,10 @@ added_later(Partner, "base_xyzw")
 added_later(Partner, "instrument")
 added_later(PhaseQLearning, "slip")
 added_later(ValueIteration, "slip")
+added_later(PhaseQLearning, "join_share")
+added_later(ValueIteration, "join_share")
+added_later(Coverage, "share")
+few_numbers(Coverage, "share")  # one for each waypoint
 few_numbers(Policy, "q")  # some 130 different values in 200,000 places: stored as a palette
 
 

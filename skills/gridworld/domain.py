@@ -5,6 +5,11 @@ p means "the next waypoint is p"; so a path that crosses itself has a different 
 domain is all cells in phase 0, and in phase p the cells within `REACH` cells (Chebyshev) of waypoint p - 1 or p. Values
 are stored in *rows*: phase p owns the box of cells around its two waypoints, and the rows of all boxes are
 concatenated.
+
+The *joining rule* says at which waypoints a pass joins the path: at those from which at least a share `join_share` of
+the demonstration's moves is left. 0 is the rule *nearest*: every waypoint joins, and the goal itself finishes. 1 is the
+rule *start*: only the first waypoint joins. A waypoint that does not join is, in phase 0, a cell like any other. The
+paper's cell state has no phases to join, so it has the rule nearest only.
 """
 
 from dataclasses import dataclass
@@ -13,20 +18,42 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from skills.arrays import Ints
+from skills.arrays import Floats, Ints
+from skills.errors import BadSettings
 from skills.gridworld.grid import MOVES, GridPath
+from skills.gridworld.reward import RewardMap
 
 REACH = 2  # cells; part of the interface: a hand or an arm pushed two cells off its path is still led back
 FINISHED = -1  # in place of an action: the task is finished here
 OUTSIDE = -2  # in place of an action: outside the certified domain, a client stops
 
 
+def check_join_share(join_share: float) -> None:
+    """Refuse a joining rule that is not a share.
+
+    Args:
+        join_share: The least share of the demonstration that must be left where a pass joins it.
+
+    Raises:
+        BadSettings: It is not a number from 0 to 1.
+    """
+    if not 0 <= join_share <= 1:
+        raise BadSettings("join_share must lie in [0, 1].", join_share=join_share)
+
+
 @dataclass(frozen=True, eq=False)
 class Domain:
-    """The rows of a path's certified domain, in the phase state or, if `phased` is false, in the paper's cell state."""
+    """The rows of a path's certified domain, in the phase state or, if `phased` is false, in the paper's cell state.
+
+    Attributes:
+        path: The demonstrated path.
+        phased: Whether it is in the phase state.
+        join_share: The joining rule, 0 to 1; 0 in the cell state.
+    """
 
     path: GridPath
     phased: bool
+    join_share: float = 0.0
 
     @property
     def phases(self) -> int:
@@ -88,8 +115,8 @@ class Domain:
 
     @cached_property
     def terminal(self) -> NDArray[np.bool_]:
-        """Flags of the rows at which the task is finished, (rows,): the goal in phase 0 or in the last phase."""
-        ends = (self.phase_of == 0) | (self.phase_of == self.phases - 1)
+        """Flags of the rows where the task is finished, (rows,): the goal in the last phase, by rule in phase 0 too."""
+        ends = (self.phase_of == 0) & self.finishes_unjoined | (self.phase_of == self.phases - 1)
         return np.asarray(ends & (self.state_of == self.path.goal))
 
     def holds(self, phases: ArrayLike, cells: ArrayLike) -> NDArray[np.bool_]:
@@ -125,34 +152,81 @@ class Domain:
             self.offset[phases] + (at[..., 0] * size[..., 1] + at[..., 1]) * size[..., 2] + at[..., 2], np.int64
         )
 
+    @property
+    def finishes_unjoined(self) -> bool:
+        """Whether a pass that has not joined the path finishes at the goal: in the cell state, or by the rule nearest.
+
+        By any other rule the goal, from which nothing is left of the demonstration, is no place to join.
+        """
+        return not self.phased or self.join_share == 0
+
+    @cached_property
+    def may_join(self) -> NDArray[np.bool_]:
+        """Flags of the waypoints at which the path may be joined, (R,): the first ones, with enough left."""
+        moves = len(self.path.states) - 1
+        # A quotient of integers, so that a share such as 0.7 is met exactly where 7 of 10 moves are left.
+        return np.asarray(np.arange(moves, -1, -1) / moves >= self.join_share)
+
     @cached_property
     def joins(self) -> Ints:
         """The phase after *moving* onto each state in phase 0, (n_states,); 0 means that it stays "not joined".
 
-        A state visited more than once joins at its first visit. The goal has 0: moving onto it in phase 0 finishes.
+        A state visited more than once joins at its first visit. A goal at which an unjoined pass finishes has 0.
         """
         joins = np.zeros(self.path.grid.n_states, np.int64)
         if self.phased:
+            first = self.path.states[self.may_join]
             # Assigned backwards, so that the first visit of a state overwrites later ones.
-            joins[self.path.states[::-1]] = np.arange(self.phases, 0, -1)
+            joins[first[::-1]] = np.arange(len(first), 0, -1)
+        if self.finishes_unjoined:
             joins[self.path.goal] = 0
         return joins
+
+    @cached_property
+    def may_meet(self) -> NDArray[np.bool_]:
+        """Flags of the states at which an unjoined pass meets the path, (n_states,): it joins or finishes there."""
+        meets = np.zeros(self.path.grid.n_states, np.bool_)
+        meets[self.path.states[self.may_join] if self.phased else self.path.states] = True
+        return meets
+
+    def rewards_unjoined(self, reward: RewardMap) -> Floats:
+        """Return the rewards for entering each state in phase 0, (n_states,): Algorithm 1's, for progress only.
+
+        By another rule than nearest a waypoint that does not join has the reward of any other state, or standing on
+        it would pay for ever; and joining in the goal's cell, which a path may cross early, pays as any waypoint does.
+
+        Args:
+            reward: The rewards of Algorithm 1, or those that a learner recovered.
+        """
+        if self.finishes_unjoined:
+            return reward.rewards
+        return np.where(self.joins > 0, reward.levels.visited, reward.levels.other)
 
     def start(self, state: int) -> tuple[int, bool]:
         """Return the phase of a pass that starts in a state, and whether it is finished there already."""
         if not self.phased:
             return 0, state == self.path.goal
         visits = np.flatnonzero(self.path.states == state)
-        if len(visits) == 0:
+        if len(visits) == 0 or not self.may_join[visits[0]]:
             return 0, False
         first = int(visits[0])
         done = first == self.phases - 1
         return (first if done else first + 1), done
 
+    @cached_property
+    def start_rows(self) -> Ints:
+        """The row in which a pass from each state begins, (n_states,); -1 where it is finished there already."""
+        states, goal = np.arange(self.path.grid.n_states), self.path.goal
+        phases = self.joins.copy()  # a start on the path counts as the move onto it, but for the goal
+        phases[goal], done = self.start(goal)
+        rows = self.rows_of(phases, self.path.grid.cells_of(states))
+        rows[goal] = -1 if done else rows[goal]
+        return rows
+
     def enter(self, phase: int, state: int) -> tuple[int, bool]:
         """Return the phase after moving onto a state (or staying in it) in a phase, and whether that finishes."""
         if phase == 0:
-            return int(self.joins[state]), state == self.path.goal
+            return int(self.joins[state]), self.finishes_unjoined and state == self.path.goal
         if state != self.path.states[phase]:
             return phase, False
         done = phase == self.phases - 1
@@ -175,7 +249,7 @@ class Domain:
         state = self.path.grid.states_of(cells)
         ahead = ~off_grid & (phase > 0) & (state == self.path.states[phase])
         joins = np.where(off_grid | (phase > 0), 0, self.joins[state])
-        at_goal = ~off_grid & (phase == 0) & (state == self.path.goal)
+        at_goal = ~off_grid & (phase == 0) & (state == self.path.goal) & self.finishes_unjoined
         finishes = at_goal | (ahead & (phase == self.phases - 1))
         after = np.where(joins > 0, joins, phase + (ahead & ~finishes))
         inside = self.holds(after, cells) & ~finishes

@@ -9,13 +9,15 @@ Two actions are equally good if their exact values differ by less than `TIE`, re
 the path, are compared by their logarithms, so the comparison does not depend on the size of the grid.
 """
 
-from dataclasses import dataclass
-from math import ceil
+from dataclasses import asdict, dataclass
+from math import ceil, inf
 
 import numpy as np
 from numpy.typing import NDArray
 
-from skills.arrays import Floats, frozen
+from skills.arrays import Floats, Ints, frozen
+from skills.errors import BadSettings
+from skills.fields import Count, schema
 from skills.gridworld.domain import FINISHED
 from skills.gridworld.reward import sparse_reward
 from skills.learning import _kernels
@@ -31,15 +33,61 @@ class Coverage:
 
     Attributes:
         reaches: The policy reaches the goal.
-        joins_nearest: The policy joins the demonstration in the fewest moves (Chebyshev) and then follows it.
+        joins_nearest: The policy joins the demonstration in the fewest moves (Chebyshev) that its joining rule allows,
+            and then follows it.
+        share: The share of the demonstration that the policy follows, see `shares_of`; None in a coverage that was
+            stored before shares were computed.
     """
 
     reaches: NDArray[np.bool_]
     joins_nearest: NDArray[np.bool_]
+    share: Floats | None = None
 
     def __post_init__(self) -> None:
         for name in ("reaches", "joins_nearest"):
             object.__setattr__(self, name, frozen(getattr(self, name), np.bool_, (None,), name))
+        if self.share is not None:
+            object.__setattr__(self, "share", frozen(self.share, np.float64, self.reaches.shape, "share"))
+
+
+@dataclass(frozen=True)
+class NearLimits:
+    """The limit that a release must meet at the starts near the demonstrated one.
+
+    Attributes:
+        radius_mm: A start is near if a position within this distance of the demonstrated start's centre lies in its
+            cell. Ours: 3 mm, the tip error of an uncalibrated arm, which may start there when sent to the demonstrated
+            start.
+        least_share: Least share of the demonstration that every near start must follow. Ours: 0.4, between the 0.76 or
+            more of all recordings and samples, and the 0.1 or less of paths that come back beside their start
+            (docs/joining.md).
+    """
+
+    radius_mm: float = 3.0
+    least_share: float = 0.4
+
+    def __post_init__(self) -> None:
+        if not (0 < self.radius_mm < inf and 0 <= self.least_share <= 1):
+            raise BadSettings("radius_mm must be positive, and least_share in [0, 1].", **asdict(self))
+
+
+@schema
+@dataclass(frozen=True, kw_only=True)
+class NearStarts(NearLimits):
+    """The starts near the demonstrated one, and the limit that they must meet.
+
+    Attributes:
+        starts: Number of near starts; the demonstrated one is among them.
+        share: The smallest share of the demonstration that the policy follows from one of them.
+    """
+
+    starts: Count
+    share: float
+
+    @property
+    def within(self) -> bool:
+        """Whether every near start follows enough of the demonstration; written so that NaN fails."""
+        return self.share >= self.least_share
 
 
 @dataclass(frozen=True)
@@ -55,8 +103,11 @@ class Certificate:
         finishing: Number of them from which the policy rejoins the demonstration and finishes.
         starts: Number of states as starts of a pass.
         starts_reaching: Number of starts from which the policy reaches the goal.
-        starts_joining_nearest: Number of starts from which it joins the demonstration in the fewest moves and follows
-            it.
+        starts_joining_nearest: Number of starts from which it joins the demonstration in the fewest moves that its
+            joining rule allows, and follows it.
+        starts_goal_alone: Number of starts from which it reaches the goal and follows no move of the demonstration.
+        mean_share: Share of the demonstration that it follows, see `shares_of`: the mean over all starts.
+        median_share: The median over all starts.
         demonstration_reproduced: The rollout from the demonstrated start visits the demonstration's states, in order.
         faint: Number of checked states whose exact value is below `FAINT`, so that logarithms were compared.
     """
@@ -67,6 +118,9 @@ class Certificate:
     starts: int
     starts_reaching: int
     starts_joining_nearest: int
+    starts_goal_alone: int
+    mean_share: float
+    median_share: float
     demonstration_reproduced: bool
     faint: int = 0
 
@@ -96,7 +150,8 @@ def certify(policy: Policy) -> tuple[Certificate, Coverage]:
     if faint.any():
         optimal[faint] = log_losses(mdp_of(policy), best, policy.greedy, policy.moves)[faint] <= TIE
     finishing = finishes(policy)
-    covered = _coverage(policy, finishing)
+    share = shares_of(policy, finishing)
+    covered = Coverage(_reaches(policy, finishing), _joins_nearest(policy), share)
     certificate = Certificate(
         checked=int(live.sum()),
         suboptimal=int(np.count_nonzero(live & ~optimal)),
@@ -104,10 +159,30 @@ def certify(policy: Policy) -> tuple[Certificate, Coverage]:
         starts=len(covered.reaches),
         starts_reaching=int(covered.reaches.sum()),
         starts_joining_nearest=int(covered.joins_nearest.sum()),
+        starts_goal_alone=int(np.count_nonzero(covered.reaches & (share == 0))),
+        mean_share=float(share.mean()),
+        median_share=float(np.median(share)),
         demonstration_reproduced=np.array_equal(policy.replay.states, policy.path.states),
         faint=int(np.count_nonzero(faint)),
     )
     return certificate, covered
+
+
+def near_starts(policy: Policy, share: Floats, limits: NearLimits) -> NearStarts:
+    """Return how much of the demonstration the policy follows from the starts near the demonstrated one.
+
+    Args:
+        policy: The policy.
+        share: The share of each start, shape (n_states,), as `shares_of` returns it.
+        limits: The radius, and the least share.
+
+    Returns:
+        The number of near starts, and the smallest share among them.
+    """
+    grid = policy.path.grid
+    away_mm = grid.cell_mm * np.abs(grid.cells_of(np.arange(grid.n_states)) - policy.path.cells[0])
+    near = np.linalg.norm((away_mm - grid.cell_mm / 2).clip(0), axis=1) <= limits.radius_mm
+    return NearStarts(**asdict(limits), starts=int(near.sum()), share=float(share[near].min()))
 
 
 def mdp_of(policy: Policy) -> Mdp:
@@ -138,22 +213,58 @@ def _achieved(policy: Policy) -> tuple[Floats, Floats]:
 def finishes(policy: Policy) -> NDArray[np.bool_]:
     """Return for every row whether the walk from it finishes.
 
-    The walks of all rows are computed at once, by doubling their length.
-
     Args:
         policy: The policy.
 
     Returns:
         Flags of shape (rows,).
     """
-    moves = policy.moves
-    done = (policy.greedy == FINISHED) | (moves.finishes & (policy.greedy >= 0))
-    walk = np.arange(policy.domain.n_rows)
-    walk = np.where(done | (policy.greedy < 0) | (moves.row < 0), walk, moves.row)
-    # A walk without a loop has fewer moves than there are rows, and each pass doubles the length.
-    for _ in range(policy.domain.n_rows.bit_length()):
+    done = (policy.greedy == FINISHED) | (policy.moves.finishes & (policy.greedy >= 0))
+    return _along(policy, done) > 0
+
+
+def shares_of(policy: Policy, finishing: NDArray[np.bool_]) -> Floats:
+    """Return for every state as a start the share of the demonstration that the policy follows.
+
+    The share is the number of moves with which both the walk from the start and the demonstration end, over all moves
+    of the demonstration: 1 where the walk ends with the whole demonstration, 0 where it comes to the goal by another
+    way or does not reach it. Moves are counted and not millimetres, because they are what the policy learnt one by
+    one, and whole numbers are compared exactly.
+
+    Args:
+        policy: The policy.
+        finishing: Flags of the rows whose walks finish, shape (rows,), as `finishes` returns them.
+
+    Returns:
+        Shares from 0 to 1, shape (n_states,).
+    """
+    states, moving = policy.path.states, policy.greedy >= 0
+    last = len(states) - 1
+    left = _along(policy, moving)  # moves to the end, where the walk finishes
+    # The state at which the demonstration has as many moves left.
+    as_shown = moving & (left <= last) & (policy.domain.state_of == states[(last - left).clip(0)])
+    followed = _along(policy, finishing & (_along(policy, ~as_shown) == 0))
+    rows = policy.domain.start_rows
+    return np.asarray(np.where(rows >= 0, followed[rows], 0) / last)
+
+
+def _along(policy: Policy, counted: NDArray[np.bool_]) -> Ints:
+    """Count the marked rows along the walk from every row, itself included, (rows,).
+
+    The walks of all rows are computed at once, by doubling their length. For a walk that goes in circles the count is
+    positive if a row of it is marked, and means nothing else.
+    """
+    moves, end = policy.moves, policy.domain.n_rows
+    stops = (policy.greedy < 0) | moves.finishes | (moves.row < 0)
+    walk = np.append(np.where(stops, end, moves.row), end)
+    count = np.append(counted.astype(np.int64), 0)
+    # A walk without a loop has fewer moves than there are rows.
+    for _ in range(end.bit_length()):
+        if (walk == end).all():
+            break
+        count += count[walk]
         walk = walk[walk]
-    return np.asarray(done[walk])
+    return np.asarray(count[:-1])
 
 
 def least_gamma(policy: Policy) -> float | None:
@@ -167,7 +278,7 @@ def least_gamma(policy: Policy) -> float | None:
     """
     path, slip = policy.path, policy.learner.slip
     moves = np.full(path.grid.n_states, path.grid.n_states)
-    moves[path.states] = 0
+    moves[policy.domain.may_meet] = 0
     _kernels.spread_distances_compiled(moves.reshape(path.grid.shape))
     # A move multiplies a value by gamma (1 - slip) or more, and the worth of the path is at least `visited`.
     least = (FAINT / policy.levels.visited) ** (1 / max(1, int(moves.max()))) / (1 - slip)
@@ -184,27 +295,24 @@ def coverage(policy: Policy) -> Coverage:
     Returns:
         The success from every start.
     """
-    return _coverage(policy, finishes(policy))
+    finishing = finishes(policy)
+    return Coverage(_reaches(policy, finishing), _joins_nearest(policy), shares_of(policy, finishing))
 
 
-def _coverage(policy: Policy, finishing: NDArray[np.bool_]) -> Coverage:
-    domain, path = policy.domain, policy.path
-    reaches = finishing[: path.grid.n_states].copy()  # phase 0
-    # A start on the path counts as its first visit of that state, so its phase is the next one.
-    visited, first = np.unique(path.states, return_index=True)
-    last = len(path.states) - 1
-    phases = np.minimum(first + 1, last) if domain.phased else np.zeros_like(first)
-    over = first == last if domain.phased else visited == path.goal
-    reaches[visited] = over | finishing[domain.rows_of(phases, path.grid.cells_of(visited))]
-    return Coverage(reaches, _joins_nearest(policy))
+def _reaches(policy: Policy, finishing: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    rows = policy.domain.start_rows
+    return np.asarray((rows < 0) | finishing[rows])
 
 
 def _joins_nearest(policy: Policy) -> NDArray[np.bool_]:
-    """Return for every state whether the walk from it meets the path in the fewest moves and then follows it."""
+    """Return for every state whether the walk from it meets the path in the fewest moves and then follows it.
+
+    It meets the path at the waypoints at which its joining rule lets it join.
+    """
     path = policy.path
     states = np.arange(path.grid.n_states)
     stepped = policy.moves.state[: len(states)]
-    on_path = np.isin(states, path.states)
+    on_path = policy.domain.may_meet
     fewest = np.where(on_path, 0, len(states))
     _kernels.spread_distances_compiled(fewest.reshape(path.grid.shape))
     at, moved = states.copy(), np.zeros(len(states), np.int64)
@@ -212,7 +320,7 @@ def _joins_nearest(policy: Policy) -> NDArray[np.bool_]:
         walking = ~on_path[at]
         moved += walking
         at = np.where(walking, stepped[at], at)
-    follows = _follows(policy)[at] | ((at == path.goal) & (moved > 0))
+    follows = _follows(policy)[at] | ((at == path.goal) & (moved > 0) & policy.domain.finishes_unjoined)
     return np.asarray(on_path[at] & (moved == fewest) & follows)
 
 

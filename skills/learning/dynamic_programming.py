@@ -29,13 +29,14 @@ from numpy.typing import ArrayLike
 
 from skills.arrays import Bytes, Flags, Floats, Ints
 from skills.errors import BadSettings
-from skills.gridworld.domain import Domain, Moves
+from skills.gridworld.domain import Domain, Moves, check_join_share
 from skills.gridworld.grid import MOVES
 from skills.gridworld.reward import RewardMap
 from skills.gridworld.scene import STAY, Hazards
 from skills.learning import _kernels
 
 MAX_SWEEPS = 100_000
+NO_STATE = -1  # of the state at which an unjoined pass finishes, where there is none
 ENDLESS = "The exact values do not converge: a cycle has a positive reward; use a smaller gamma."
 SETTLED = 1e-14  # relative: a value that changes by less has settled
 FAINT = 1e-300  # a smaller value is compared by its logarithm; the smallest normal number is 2e-308
@@ -110,18 +111,19 @@ def _phase_0_values(mdp: Mdp, values: Floats) -> Floats:
     """Iterate values over the whole grid until nothing changes; returns shape (n_states,)."""
     domain, reward = mdp.domain, mdp.reward
     grid, joining = domain.path.grid, np.flatnonzero(domain.joins)
-    worth = reward.rewards.copy()  # reward and discounted value of entering each state
+    rewards = domain.rewards_unjoined(reward)
+    worth = rewards.copy()  # reward and discounted value of entering each state
     worth[joining] += mdp.gamma * values[domain.rows_of(domain.joins[joining], grid.cells_of(joining))]
     stays = domain.joins == 0
-    stays[domain.path.goal] = False
+    stays[domain.path.goal] &= not domain.finishes_unjoined
     best, shape = np.zeros(grid.n_states), np.array(grid.shape)
     settled = _kernels.settle_compiled(
         best,
         worth,
-        reward.rewards,
+        rewards,
         stays,
         shape,
-        domain.path.goal,
+        domain.path.goal if domain.finishes_unjoined else NO_STATE,
         reward.levels.off_grid,
         float(mdp.gamma),
         SETTLED,
@@ -252,14 +254,15 @@ def _logs(mdp: Mdp, values: Floats) -> tuple[Ints, Ints]:
     In phase 0 a faint value is gamma^(d-1) W, with W the worth of entering a state of the path, which is not faint. In
     the cell state too, where a pass may go on from there along any states.
     """
-    domain, grid, on_path = mdp.domain, mdp.domain.path.grid, np.unique(mdp.domain.path.states)
+    domain, grid = mdp.domain, mdp.domain.path.grid
+    on_path = np.flatnonzero(domain.may_meet)
     moves, arrival = _moves_to_go(mdp)
     best, step = np.full(domain.n_rows, LOG_NONE), _as_log(mdp.gamma)
     above = domain.phase_of > 0
     best[above] = moves[above].astype(np.int64) * step + _as_log(arrival[above])
     after = domain.rows_of(domain.joins[on_path], grid.cells_of(on_path))
     entering = np.full(grid.n_states, LOG_NONE)
-    entering[on_path] = _as_log(mdp.reward.rewards[on_path] + mdp.gamma * values[after])
+    entering[on_path] = _as_log(domain.rewards_unjoined(mdp.reward)[on_path] + mdp.gamma * values[after])
     given = np.zeros(grid.n_states, bool)
     given[on_path] = True
     of_phase_0 = best[: grid.n_states]
@@ -292,7 +295,7 @@ def _pays(mdp: Mdp, moves: Moves) -> Floats:
     """Return the reward of a move from every row, (rows,)."""
     levels = mdp.reward.levels
     in_phase_0 = mdp.domain.phase_of == 0
-    reward = np.where(in_phase_0, mdp.reward.rewards[moves.state], levels.other)
+    reward = np.where(in_phase_0, mdp.domain.rewards_unjoined(mdp.reward)[moves.state], levels.other)
     reward[moves.advances] = levels.visited
     reward[moves.finishes & ~in_phase_0] = levels.goal
     reward[moves.off_grid] = levels.off_grid
@@ -312,8 +315,10 @@ class ValueIteration:
 
     gamma: float = 0.1
     slip: float = 0.0  # probability that one of the 27 moves, drawn uniformly, replaces the intended one
+    join_share: float = 0.0  # the joining rule: least share of the demonstration that a start is led to follow
 
     def __post_init__(self) -> None:
+        check_join_share(self.join_share)
         if not 0 <= self.slip < 1:
             raise BadSettings("slip must lie in [0, 1).", slip=self.slip)
         if not 0 < self.gamma < 1:
@@ -335,4 +340,5 @@ def iterate_values(reward: RewardMap, settings: ValueIteration) -> Floats:
     Raises:
         BadSettings: Value iteration does not settle.
     """
-    return exact_q(Mdp(Domain(reward.path, settings.phased), reward, settings.gamma, settings.slip))
+    domain = Domain(reward.path, settings.phased, settings.join_share)
+    return exact_q(Mdp(domain, reward, settings.gamma, settings.slip))

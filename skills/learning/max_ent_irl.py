@@ -50,6 +50,7 @@ class MaxEntIRL:
     kind: ClassVar[str] = "max-ent-irl"
     phased: ClassVar[bool] = False
     slip: ClassVar[float] = 0.0
+    join_share: ClassVar[float] = 0.0
 
     iterations: int = 200
     learning_rate: float = 0.1  # of Adam

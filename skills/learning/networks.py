@@ -232,6 +232,7 @@ class DQN:
     kind: ClassVar[str] = "dqn"
     phased: ClassVar[bool] = False
     slip: ClassVar[float] = 0.0
+    join_share: ClassVar[float] = 0.0
 
     gamma: float = 0.8  # at 0.1, the table's, values a few cells off the path are too small for a network to resolve
     steps: int = 400_000  # in all environments together: about ten minutes on one core
@@ -261,6 +262,7 @@ class DDPG:
     kind: ClassVar[str] = "ddpg"
     phased: ClassVar[bool] = False
     slip: ClassVar[float] = 0.0
+    join_share: ClassVar[float] = 0.0
     gamma: ClassVar[float] = 0.1
 
     discount: float = 0.98  # the end of a path of 28 states still counts for half; at 0.95 the shortcut wins
@@ -286,6 +288,7 @@ class TRPO:
     kind: ClassVar[str] = "trpo"
     phased: ClassVar[bool] = False
     slip: ClassVar[float] = 0.0
+    join_share: ClassVar[float] = 0.0
     gamma: ClassVar[float] = 0.1
 
     discount: float = 0.98

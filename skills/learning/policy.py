@@ -41,7 +41,18 @@ GUIDED_MM = 50.0  # ours: greatest distance of a start outside the grid; metres 
 
 def describe_learner(learner: Learner) -> dict[str, Any]:
     """Return a learner as JSON: its kind and its settings."""
-    return {"kind": learner.kind, **asdict(learner)}
+    return {"kind": learner.kind, **describe_settings(learner)}
+
+
+def describe_settings(learner: Learner) -> dict[str, Any]:
+    """Return the settings of a learner as JSON; the joining rule is left out where it is the nearest waypoint.
+
+    So a training by that rule has the identity that it had before there was another one.
+    """
+    settings = {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(learner).items()}
+    if not learner.join_share:
+        settings.pop("join_share", None)
+    return settings
 
 
 def learner_of(described: dict[str, Any]) -> Learner:
@@ -174,7 +185,7 @@ class Policy:
     @cached_property
     def domain(self) -> Domain:
         """The certified domain."""
-        return Domain(self.path, self.learner.phased)
+        return Domain(self.path, self.learner.phased, self.learner.join_share)
 
     @cached_property
     def greedy(self) -> Bytes:
@@ -323,8 +334,8 @@ class Step:
 def next_step(policy: Policy, position_mm: ArrayLike, phase: int | None) -> Step:
     """Return the policy's answer for a position reached in a phase.
 
-    Off the path the correction leads back: in phase 0 to the nearest waypoint, later to the one just passed. From there
-    the policy continues to the goal. Outside the grid there is no action, only the correction.
+    Off the path the correction leads back: in phase 0 to the nearest waypoint that may be joined, later to the one just
+    passed. From there the policy continues to the goal. Outside the grid there is no action, only the correction.
 
     Args:
         policy: The policy.
@@ -348,7 +359,7 @@ def next_step(policy: Policy, position_mm: ArrayLike, phase: int | None) -> Step
         return Step(phase, None, None, None, False, 0.0, _correction(policy, here, phase))
     # On a closed path the goal's cell finishes when it is entered, not when it is the start.
     phase, done = domain.start(state) if phase is None else domain.enter(phase, state)
-    on_path = state == policy.path.states[phase - 1] if phase > 0 else state in policy.path.states
+    on_path = state == policy.path.states[phase - 1] if phase > 0 else domain.may_meet[state]
     correction = None if done or on_path else _correction(policy, here, phase)
     row = None if done else policy.row(phase, state)
     if row is None or policy.greedy[row] < 0:
@@ -382,7 +393,8 @@ def _state_at(policy: Policy, here: Floats) -> int | None:
 
 
 def _correction(policy: Policy, here: Floats, phase: int) -> tuple[float, float, float]:
-    """Return the vector from a position to the waypoint just passed, or to the nearest one in phase 0."""
+    """Return the vector from a position to the waypoint just passed, or in phase 0 to the nearest that it may join."""
     tip = policy.path.tip_mm
-    nearest = phase - 1 if phase > 0 else np.abs(tip - here).max(axis=1).argmin()
+    # Those that may be joined are the first ones, so an index among them is one of the path.
+    nearest = phase - 1 if phase > 0 else np.abs(tip[policy.domain.may_join] - here).max(axis=1).argmin()
     return xyz(tip[nearest] - here)

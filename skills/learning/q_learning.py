@@ -24,7 +24,7 @@ from skills.arrays import Floats
 from skills.errors import BadSettings
 from skills.fields import Count
 from skills.gridworld import paper
-from skills.gridworld.domain import Domain
+from skills.gridworld.domain import Domain, check_join_share
 from skills.gridworld.grid import GridPath
 from skills.gridworld.reward import RewardMap
 from skills.gridworld.scene import Hazards
@@ -61,11 +61,13 @@ class PhaseQLearning:
     step_s: float = 0.25  # a cell of 5 mm at 20 mm/s
     slip: float = 0.0  # probability that one of the 27 moves, drawn uniformly, replaces the intended one
     max_sweeps: int = 1000  # per phase; with alpha 1 and no slips a few are enough
+    join_share: float = 0.0  # the joining rule: least share of the demonstration that a start is led to follow
 
     def __post_init__(self) -> None:
         if not 0 <= self.slip < 1:
             raise BadSettings("slip must lie in [0, 1).", slip=self.slip)
         _check(self.alpha, self.gamma, (), self.max_steps, self.max_episode_s, self.step_s)
+        check_join_share(self.join_share)
         if not 1 <= self.max_sweeps <= 100_000:
             raise BadSettings("max_sweeps must lie between 1 and 100 000.", max_sweeps=self.max_sweeps)
 
@@ -81,6 +83,7 @@ class CellQLearning:
     kind: ClassVar[str] = "cell-q-learning"
     phased: ClassVar[bool] = False
     slip: ClassVar[float] = 0.0
+    join_share: ClassVar[float] = 0.0
 
     alpha: float = 1.0
     gamma: float = 0.1
@@ -218,7 +221,8 @@ class Sweeper:
     """The Q values of a domain in the phase state, and the sweeps that apply Eq. 1 to them."""
 
     def __init__(self, reward: RewardMap, learner: PhaseQLearning, hazards: Hazards | None = None) -> None:
-        self.reward, self.learner, self.domain = reward, learner, Domain(reward.path, phased=True)
+        self.reward, self.learner = reward, learner
+        self.domain = Domain(reward.path, learner.phased, learner.join_share)
         domain, path = self.domain, reward.path
         self.cells = path.cells
         self.phases = range(domain.phases - 1, -1, -1)  # the last one first, because values depend on later phases
@@ -226,7 +230,7 @@ class Sweeper:
         self.live = domain.certified & ~domain.terminal
         advances = np.where(domain.phase_of > 0, domain.state_of == path.states[domain.phase_of], False)
         advances[: domain.offset[1]] = domain.joins > 0
-        self.rewards, self.touched = reward.rewards, 0.0
+        self.rewards, self.touched = domain.rewards_unjoined(reward), 0.0
         self.entering = np.full(path.grid.n_states, reward.levels.other)
         if hazards is not None:
             self.rewards, self.touched = self.rewards - hazards.cost, -hazards.touch

@@ -111,7 +111,8 @@ def enter_all(domain: Domain, phases: Ints, states: Ints) -> tuple[Ints, Flags]:
         The phases after the moves, and whether each move finishes, both of shape (N,).
     """
     ahead = (phases > 0) & (states == domain.path.states[phases])
-    finishes = np.where(phases == 0, states == domain.path.goal, ahead & (phases == domain.phases - 1))
+    unjoined = (states == domain.path.goal) & domain.finishes_unjoined
+    finishes = np.where(phases == 0, unjoined, ahead & (phases == domain.phases - 1))
     return np.where(phases == 0, domain.joins[states], phases + (ahead & ~finishes)), finishes
 
 

@@ -33,8 +33,8 @@ from skills.learning.policy import Policy
 from skills.library import integrity, jobs, releases
 from skills.library.consent import refusal
 from skills.library.demos import newest_demos
-from skills.library.jobs import PartRequest, RetrainingRequest, Store, TrainingRequest
-from skills.library.policies import Recipe, recipes_of, refuse_unlike
+from skills.library.jobs import KEPT, PartRequest, RetrainingRequest, Store, TrainingRequest, with_rule
+from skills.library.policies import Recipe, joining_rules, recipes_of, refuse_unlike
 from skills.library.releases import fit_of, not_worse, shown_mm, taught, way_of
 from skills.library.training import Learnt, Lesson, Stored, combined_lesson, learn_style, lessons, store_styles
 from skills.schemas.policies import FitOnTheSame, PolicyFigures, StoredComparison
@@ -110,13 +110,14 @@ class _Style:
     """A queued style of a part: its lesson, and the number of times that it was started.
 
     With a recipe, the style serves a policy of several demonstrations, and is learnt from as many, combined in the same
-    way.
+    way. With a rule, it serves a policy with that joining rule.
     """
 
     row: int
     tries: int
     lesson: Lesson
     recipe: Recipe | None
+    rule: float | None = None
 
 
 _Group = Sequence[_Style]  # started in one transaction, trained one after another
@@ -132,14 +133,14 @@ class _Batch:
     asked_by: str
     settings: Settings
 
-    def training_of(self, lesson: Lesson, demos: Sequence[str], how: Combining | None = None) -> TrainingRequest:
+    def training_of(self, style: _Style, demos: Sequence[str], how: Combining | None = None) -> TrainingRequest:
         """Return the request for one style as `request_training` writes it, so that an equal training is recognised."""
-        shared = self.request
+        shared, lesson = self.request, style.lesson
         request: TrainingRequest = {
             "surgeon": lesson.surgeon.slug,
             "suture": lesson.suture,
             "demos": [*demos],
-            "learner": shared["learner"],
+            "learner": with_rule(shared["learner"], style.rule if shared.get("joins") == KEPT else None),
             "learner_version": shared["learner_version"],
             "seed": shared["seed"],
             "release": shared["release"],
@@ -148,6 +149,8 @@ class _Batch:
             request["gate"] = shared["gate"]
         if "poses" in shared:
             request["poses"] = shared["poses"]
+        if "near" in shared:
+            request["near"] = shared["near"]
         if how is not None:
             request["combine"] = {"kind": how.kind}
         return request
@@ -201,9 +204,14 @@ def _waiting(database: Database, part: int) -> list[_Style]:
     with database.reading() as session:
         rows = session.execute(left.order_by(of.tries, of.row)).all()
         read = {lesson.row: lesson for lesson in lessons(session, [demonstration for demonstration, *_ in rows])}
-        recipes = recipes_of(session, {lesson.surgeon.row for lesson in read.values()})
-    found = ((row, tries, read[demonstration]) for demonstration, row, tries in rows)
-    return [_Style(row, tries, one, recipes.get((one.surgeon.row, one.suture))) for row, tries, one in found]
+        surgeons = {lesson.surgeon.row for lesson in read.values()}
+        recipes, rules = recipes_of(session, surgeons), joining_rules(session, surgeons)
+    styles = []
+    for demonstration, row, tries in rows:
+        lesson = read[demonstration]
+        name = lesson.surgeon.row, lesson.suture
+        styles.append(_Style(row, tries, lesson, recipes.get(name), rules.get(name)))
+    return styles
 
 
 def _groups(styles: Sequence[_Style]) -> list[_Group]:
@@ -240,7 +248,7 @@ def _learn(database: Database, batch: _Batch, style: _Style) -> Learnt | SkillsE
     lesson, recipe = style.lesson, style.recipe
     try:
         if recipe is None:
-            return learn_style(lesson, batch.training_of(lesson, [lesson.sha256]), batch.settings)
+            return learn_style(lesson, batch.training_of(style, [lesson.sha256]), batch.settings)
         with database.reading() as session:
             newest = newest_demos(session, lesson.surgeon.row, lesson.suture, recipe.demos)
             refuse_unlike(newest)
@@ -248,8 +256,8 @@ def _learn(database: Database, batch: _Batch, style: _Style) -> Learnt | SkillsE
         if not found:
             return Conflict("All demonstrations of the style were withdrawn or marked since the batch was requested.")
         if len(found) == 1:  # the others were withdrawn since, and the served policy with them
-            return learn_style(found[0], batch.training_of(found[0], [found[0].sha256]), batch.settings)
-        asked = batch.training_of(lesson, [one.sha256 for one in found], recipe.how)
+            return learn_style(found[0], batch.training_of(style, [found[0].sha256]), batch.settings)
+        asked = batch.training_of(style, [one.sha256 for one in found], recipe.how)
         return learn_style(combined_lesson(found, recipe.how), asked, batch.settings)
     except SkillsError as refused:
         return refused
@@ -390,6 +398,7 @@ def figures(version: int, sha256: str, manifest: dict[str, Any]) -> PolicyFigure
         dtw_total_mm=metrics["dtw_total_mm"],
         exact_share=metrics["exact_states"] / metrics["path_states"],
         reaching_share=coverage["starts_reaching_goal"] / coverage["n_states"],
+        mean_share=coverage.get("mean_share"),
     )
 
 
@@ -417,6 +426,10 @@ def _worse(released: PolicyFigures, trained: PolicyFigures, fit: FitOnTheSame) -
         yield f"{trained.exact_share:.1%} of the path exact against {released.exact_share:.1%}"
     if not trained.reaching_share >= released.reaching_share:
         yield f"{trained.reaching_share:.1%} of starts reach the goal against {released.reaching_share:.1%}"
+    # Beside another demonstration a share of another path says nothing.
+    before, after = released.mean_share, trained.mean_share
+    if released.demos == trained.demos and before is not None and after is not None and not after >= before:
+        yield f"a start follows {after:.1%} of the demonstration on average against {before:.1%}"
 
 
 def _release(session: Session, policy: int, comparison: StoredComparison, actor: str) -> StoredComparison:

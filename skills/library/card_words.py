@@ -215,14 +215,22 @@ def learner(phases: int, settled: bool, outcomes: Sequence[str | None] | None, m
     return f"{state} {ended} {same} It was asked to learn from any outcome; that of its demonstrations was: {known}."
 
 
-def coverage(counts: StartCounts, starts: int) -> str:
-    """Return the sentences on how many starts reach the goal, and in which way."""
+def coverage(counts: StartCounts, starts: int, mean_share: float, median_share: float, goal_alone: int) -> str:
+    """Return the sentences on how much of the demonstration the starts follow, and how many reach the goal and how."""
     reach = counts.follow + counts.reach_otherwise
+    share = (
+        f"From a start the policy follows {mean_share:.0%} of the demonstration's moves on average, in the median "
+        f"{median_share:.0%}; from {goal_alone} of {starts} starts it goes to the goal alone."
+    )
     if counts.follow == starts:
-        return f"All of {starts} starts join the demonstration in the fewest moves and follow it to the goal."
+        return (
+            f"{share} All of them join the demonstration in the fewest moves that the joining rule allows, and follow "
+            "it to the goal."
+        )
     return (
-        f"{reach} of {starts} starts reach the goal. {counts.follow} join the demonstration in the fewest "
-        f"moves and follow it from there; {counts.reach_otherwise} reach it in another way."
+        f"{share} {reach} of {starts} starts reach the goal. {counts.follow} join the demonstration in the fewest "
+        f"moves that the joining rule allows and follow it from there; {counts.reach_otherwise} reach it in another "
+        "way."
     )
 
 

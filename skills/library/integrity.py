@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
+from skills.arrays import Floats
 from skills.db.changes import Kept
 from skills.db.models import Demonstration, Plan, PolicyVersion, StoredPlayback, StoredPoses, StoredRecording
 from skills.db.packed import digest
@@ -22,7 +23,7 @@ from skills.db.service_tables import StoredDataset
 from skills.demonstration.demonstration import Demo
 from skills.errors import AmbiguousDigest, Corrupt, NotFound
 from skills.gridworld.grid import GridPath
-from skills.learning.certificate import Coverage
+from skills.learning.certificate import Coverage, finishes, shares_of
 from skills.learning.policy import Policy
 from skills.learning.tube import CertifiedPoses
 from skills.packing import canonical, sha256
@@ -127,6 +128,18 @@ def covered(version: PolicyVersion) -> Coverage:
     if digest(coverage) != version.manifest["coverage"]["sha256"]:
         raise Corrupt("The coverage of a stored policy does not match its digest; restore it from a backup.")
     return coverage
+
+
+def shares(version: PolicyVersion) -> Floats:
+    """Return the share of the demonstration that each start of a version follows, (n_states,).
+
+    An older version has none stored; then they are computed from its verified policy.
+    """
+    stored = covered(version).share
+    if stored is not None:
+        return stored
+    policy = learnt(version)
+    return shares_of(policy, finishes(policy))
 
 
 def planned(plan: Plan) -> SuturePlan:

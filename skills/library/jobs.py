@@ -142,6 +142,14 @@ QUEUED = "A new job is queued."  # `Asked.did` of a new job
 JOBS_WAIT_S = 10.0  # the `Retry-After` of `TooMany`: some trainings later
 
 
+KEPT = "kept"  # `joins` of a batch in which each style keeps the joining rule of the policy that it serves
+
+
+def with_rule(learner: dict[str, Any], join_share: float | None) -> dict[str, Any]:
+    """Return the JSON of a learner with a joining rule; None leaves it as it is."""
+    return learner if join_share is None else learner | {"join_share": join_share}
+
+
 class TrainingRequest(TypedDict):
     """The request of a training's job, all defaults resolved; its digest is the identity of the training."""
 
@@ -152,6 +160,7 @@ class TrainingRequest(TypedDict):
     learner_version: int
     gate: NotRequired[int]  # requests of older versions have none
     poses: NotRequired[int]  # likewise
+    near: NotRequired[dict[str, float]]  # of the gate, where it is not the default
     seed: int
     release: bool
     combine: NotRequired[dict[str, str]]  # of several demonstrations
@@ -168,6 +177,8 @@ class RetrainingRequest(TypedDict):
     learner_version: int
     gate: NotRequired[int]
     poses: NotRequired[int]
+    near: NotRequired[dict[str, float]]
+    joins: NotRequired[str]  # `KEPT`; left out where the request names a learner, and in older batches
     seed: int
     release: bool
     styles: NotRequired[int]

@@ -44,7 +44,7 @@ from skills.gridworld.reward import RewardMap, sparse_reward
 from skills.learning.policy import Policy
 from skills.library import playbacks
 from skills.library.catalogue import find_surgeon, find_suture_type
-from skills.library.integrity import covered, learnt
+from skills.library.integrity import covered, learnt, shares
 from skills.library.policies import learnt_from
 from skills.library.recordings import Teller, stored_recording
 from skills.library.releases import is_served, served
@@ -149,6 +149,7 @@ def view_of_version(session: Session, version: PolicyVersion) -> dict[str, Any]:
             "reaches": coverage.reaches[shown].tolist(),
             "nearest": coverage.joins_nearest[shown].tolist(),
             "moves": moves[shown].tolist(),
+            "share": _rounded(shares(version)[shown]),
         },
     }
 
@@ -160,11 +161,7 @@ def moves_to_goal(policy: Policy, reaches: NDArray[np.bool_]) -> NDArray[np.int6
         policy: The policy.
         reaches: The starts that reach the goal, shape (n_states,).
     """
-    domain, path, moves = policy.domain, policy.path, policy.moves
-    at = np.arange(path.grid.n_states)  # the rows of phase 0
-    for state in np.unique(path.states):
-        phase, done = domain.start(int(state))
-        at[state] = -1 if done else domain.rows_of(phase, path.grid.cells_of(state))
+    moves, at = policy.moves, policy.domain.start_rows
     counted = np.where(reaches, 0, -1)
     walking = reaches & (at >= 0) & (policy.greedy[at] >= 0)
     while walking.any():

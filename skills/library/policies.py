@@ -171,6 +171,18 @@ def about_policy(policy: PolicyVersion, release: Release | None) -> dict[str, An
     }
 
 
+def table_name(manifest: dict[str, Any], name: str) -> str:
+    """Return the name under which a policy's actions are served: another one in a format with a joining table.
+
+    A client that does not know the joining table then finds no actions, and cannot follow them by the wrong rule.
+
+    Args:
+        manifest: The policy's manifest.
+        name: The name in the first format.
+    """
+    return f"{name}_joining" if "joining" in manifest else name
+
+
 def actions_of(policy: Policy) -> list[list[int]] | None:
     """Return the greedy actions as JSON, by phase and state; None if there are more than `MAX_JSON_ACTIONS`."""
     if policy.domain.phases * policy.path.grid.n_states > MAX_JSON_ACTIONS:
@@ -202,21 +214,27 @@ def arrays_of(version: PolicyVersion) -> bytes:
     """Return a policy's arrays as the bytes of an .npz, Q values and confidence on the certified domain only.
 
     The grid is in it, so that the file alone runs the policy (docs/running.md). If the policy has a network, `network`
-    holds the bytes of its safetensors file.
+    holds the bytes of its safetensors file. By another joining rule than the nearest waypoint there are `format` and
+    `joins`, (n_states,), the phase after starting in a state or moving onto it in phase 0; and `action` is called
+    `action_joining`, see `table_name`.
     """
-    policy, coverage = learnt(version), covered(version)
+    policy, coverage, manifest = learnt(version), covered(version), version.manifest
     domain = policy.domain
     kept = domain.certified
     out = io.BytesIO()
     learnt_too: dict[str, Any] = {}
     if policy.network is not None:
         learnt_too["network"] = np.frombuffer(policy.network.tensors, np.uint8)
+    if coverage.share is not None:  # an older version is served as it was
+        learnt_too["share"] = coverage.share
+    if "joining" in manifest:
+        learnt_too |= {"format": np.int32(manifest["format"]), "joins": domain.joins.astype(np.int32)}
     np.savez_compressed(
         out,
         sha256=np.frombuffer(bytes.fromhex(version.sha256), np.uint8),
         phase=domain.phase_of[kept].astype(np.int32),
         state=domain.state_of[kept].astype(np.int32),
-        action=policy.greedy[kept],
+        **{table_name(manifest, "action"): policy.greedy[kept]},  # type: ignore[arg-type]
         q=policy.q[kept],
         confidence=policy.confidence[kept],
         origin_mm=np.array(policy.path.grid.origin_mm),
@@ -361,6 +379,26 @@ def recipes_of(session: Session, surgeons: Collection[int] | None = None) -> dic
         query = query.where(Release.surgeon_row.in_(surgeons))
     found = session.execute(query)
     return {(who, suture): Recipe(more + 1, combining_of({"kind": how})) for who, suture, how, more in found}
+
+
+def joining_rules(session: Session, surgeons: Collection[int] | None = None) -> dict[tuple[int, str], float]:
+    """Return the joining rules of the styles that serve a policy with another one than the nearest waypoint.
+
+    Args:
+        session: The caller's transaction.
+        surgeons: The rows of surgeons; None: all.
+
+    Returns:
+        The least share, by style: a surgeon's row and a suture type.
+    """
+    rule = PolicyVersion.manifest["settings"]["join_share"].as_float()
+    query = select(Release.surgeon_row, Release.suture, rule).join(
+        PolicyVersion, PolicyVersion.row == Release.policy_row
+    )
+    query = query.where(is_served(), rule.is_not(None))
+    if surgeons is not None:
+        query = query.where(Release.surgeon_row.in_(surgeons))
+    return {(who, suture): share for who, suture, share in session.execute(query)}
 
 
 def refuse_unlike(demonstrations: Sequence[Demonstration]) -> None:

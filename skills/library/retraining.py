@@ -5,7 +5,7 @@
 
 import secrets
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from sqlalchemy import ColumnElement, func, insert, select
@@ -16,13 +16,14 @@ from skills.db.models import Demonstration, PolicyVersion, Surgeon, SutureType
 from skills.db.service_tables import Job, StyleToRetrain
 from skills.deep import require_installed
 from skills.errors import Conflict, NotFound
+from skills.learning.certificate import NearLimits
 from skills.learning.policy import LEARNER_VERSION, describe_learner
 from skills.learning.q_learning import PhaseQLearning
 from skills.library import jobs
 from skills.library.catalogue import find_surgeon, find_suture_type
 from skills.library.demos import newest_demos
-from skills.library.jobs import BATCH, PART, Asked, PartRequest, RetrainingRequest, did_nothing
-from skills.library.policies import Recipe, recipes_of
+from skills.library.jobs import BATCH, KEPT, PART, Asked, PartRequest, RetrainingRequest, did_nothing, with_rule
+from skills.library.policies import Recipe, joining_rules, recipes_of
 from skills.library.releases import Outcome
 from skills.library.training import GATE_VERSION, POSES_VERSION
 from skills.packing import canonical, sha256
@@ -33,12 +34,12 @@ MOST_IN_A_PART = 50  # styles: the engine's overhead for a part, some 30 ms, is 
 FEWEST_PARTS = 16  # if there are so many styles: workers share a batch part by part
 
 
-def request_retraining(session: Session, batch: RetrainingIn, actor: str) -> Asked:
+def request_retraining(session: Session, batch: RetrainingIn, actor: str, near: NearLimits | None = None) -> Asked:
     """Queue a batch that trains styles again, each from its newest demonstration that may be learnt from.
 
     One that is marked recovery or failure is left out, even if the style serves a version trained from any outcome. A
     style that serves a policy of several demonstrations is learnt from the same number of its newest ones, combined in
-    the same way.
+    the same way. Unless the request names a learner, a style keeps the joining rule of the policy that it serves.
 
     The styles are chosen now; they and all defaults are the job's identity. With `only_stale` a style is left out if
     its newest version was learnt from that demonstration, with these settings and this learner, and was not refused by
@@ -53,6 +54,7 @@ def request_retraining(session: Session, batch: RetrainingIn, actor: str) -> Ask
         batch: The request. Without `surgeon` or `suture` styles of all of them are trained, and without `learner` phase
             Q-learning with its defaults learns.
         actor: The owner of the caller's key.
+        near: The gate's limit at the starts near the demonstrated one; None for its defaults.
 
     Raises:
         NotFound: The surgeon or the suture type is unknown.
@@ -78,9 +80,14 @@ def request_retraining(session: Session, batch: RetrainingIn, actor: str) -> Ask
         "seed": 0,
         "release": batch.release,
     }
-    stale = _reasons(session, demos, asked, who, what)
+    if near is not None and near != NearLimits():
+        asked["near"] = asdict(near)
+    if batch.chosen is None:
+        asked["joins"] = KEPT
+    rules = {} if batch.chosen is not None else joining_rules(session, {demo.surgeon_row for demo in demos})
+    stale = _reasons(session, demos, asked, rules, who, what)
     chosen = [demo for demo in demos if stale[demo.row] or not batch.only_stale]
-    request, unsettled = _unsettled(session, asked, chosen)
+    request, unsettled = _unsettled(session, asked, chosen, rules)
     job, new = jobs.ask(session, BATCH, request, who, actor)
     if not new:
         return Asked(job, False, _did_nothing(session, job))
@@ -96,7 +103,7 @@ def request_retraining(session: Session, batch: RetrainingIn, actor: str) -> Ask
 
 
 def _unsettled(
-    session: Session, asked: RetrainingRequest, chosen: Sequence["_Newest"]
+    session: Session, asked: RetrainingRequest, chosen: Sequence["_Newest"], rules: dict[tuple[int, str], float]
 ) -> tuple[RetrainingRequest, Sequence["_Newest"]]:
     """Return the request to make, and its styles; if an equal batch is done, only the styles that it would now release.
 
@@ -104,7 +111,7 @@ def _unsettled(
     """
     recipes = recipes_of(session, None if asked["surgeon"] is None else {demo.surgeon_row for demo in chosen})
     while True:
-        digest = sha256(canonical([_made_of(session, demo, recipes) for demo in chosen]))
+        digest = sha256(canonical([_made_of(session, demo, recipes, rules) for demo in chosen]))
         request: RetrainingRequest = {**asked, "styles": len(chosen), "demos_sha256": digest}
         known = jobs.find_live(session, BATCH, request)
         if known is None or known.state != "succeeded" or not asked["release"]:
@@ -116,13 +123,19 @@ def _unsettled(
         asked = {**asked, "after": known.id}
 
 
-def _made_of(session: Session, demo: "_Newest", recipes: dict[tuple[int, str], Recipe]) -> str | list[str]:
-    """Return the digest of a style's newest demonstration, or the combination and digests of several."""
-    recipe = recipes.get((demo.surgeon_row, demo.suture))
+def _made_of(
+    session: Session,
+    demo: "_Newest",
+    recipes: dict[tuple[int, str], Recipe],
+    rules: dict[tuple[int, str], float],
+) -> str | list[Any]:
+    """Return the digest of a style's newest demonstration, or the combination, digests and joining rule of others."""
+    style = demo.surgeon_row, demo.suture
+    recipe, rule = recipes.get(style), [rules[style]] if style in rules else []
     if recipe is None:
-        return demo.sha256
+        return [demo.sha256, *rule] if rule else demo.sha256
     newest = newest_demos(session, demo.surgeon_row, demo.suture, recipe.demos)
-    return [recipe.how.kind, *(one.sha256 for one in newest)]
+    return [recipe.how.kind, *(one.sha256 for one in newest), *rule]
 
 
 def _did_nothing(session: Session, job: Job) -> str:
@@ -162,6 +175,7 @@ def _reasons(
     session: Session,
     demos: Sequence[_Newest],
     asked: RetrainingRequest,
+    rules: dict[tuple[int, str], float],
     surgeon: Surgeon | None,
     suture: SutureType | None,
 ) -> dict[int, list[str]]:
@@ -180,8 +194,6 @@ def _reasons(
         (of.surgeon_row == newest.c.surgeon_row) & (of.suture == newest.c.suture) & (of.version == newest.c.version),
     )
     versions = {(surgeon, suture): about for surgeon, suture, *about in session.execute(query)}
-    settings = {name: value for name, value in asked["learner"].items() if name != "kind"}
-    learnt = (asked["learner"]["kind"], settings, asked["seed"])
     reasons: dict[int, list[str]] = {}
     for demo in demos:
         version = versions.get((demo.surgeon_row, demo.suture))
@@ -189,9 +201,11 @@ def _reasons(
             reasons[demo.row] = ["never trained"]
             continue
         rests_on, *how, learner_version, releasable, gate = version
+        learner = with_rule(asked["learner"], rules.get((demo.surgeon_row, demo.suture)))
+        settings = {name: value for name, value in learner.items() if name != "kind"}
         found = {
             "a newer demonstration": demo.sha256 not in rests_on,
-            "other settings": tuple(how) != learnt,
+            "other settings": how != [learner["kind"], settings, asked["seed"]],
             "a newer learner": learner_version != asked["learner_version"],
             "refused by an older gate": not releasable and gate != asked["gate"],
         }

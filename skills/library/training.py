@@ -7,9 +7,10 @@ Learning and certifying run outside any transaction; the result is packed before
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any, NamedTuple, cast
 
+import numpy as np
 from sqlalchemy import LargeBinary, Result, Table, bindparam, func, insert, select, type_coerce
 from sqlalchemy.orm import Session
 
@@ -35,10 +36,17 @@ from skills.fields import as_json
 from skills.gridworld.grid import discretisation_rmse
 from skills.gridworld.reward import RewardMap, sparse_reward
 from skills.kinematics import instrument_of
-from skills.learning.certificate import Certificate, certify, least_gamma
+from skills.learning.certificate import Certificate, NearLimits, NearStarts, certify, least_gamma, near_starts
 from skills.learning.dynamic_programming import FAINT
 from skills.learning.evaluation import check_in_space, measure
-from skills.learning.policy import LEARNER_VERSION, Learner, Policy, describe_learner, learner_of, refuse_too_large
+from skills.learning.policy import (
+    LEARNER_VERSION,
+    Policy,
+    describe_learner,
+    describe_settings,
+    learner_of,
+    refuse_too_large,
+)
 from skills.learning.q_learning import PhaseQLearning
 from skills.learning.tube import certified_poses
 from skills.library import jobs, releases
@@ -51,7 +59,7 @@ from skills.library.policies import BEST, choose_demos, combining_of, describe_c
 from skills.packing import canonical, sha256
 from skills.planning.plan import DrivenPass, driven_pass
 from skills.remedies import Action, Remedy
-from skills.schemas.policies import Coverage, GridCertificate
+from skills.schemas.policies import JOINING_FORMAT, Coverage, GridCertificate, Joining
 from skills.schemas.requests import TrainingIn
 from skills.settings import Settings
 
@@ -80,7 +88,7 @@ HAVE_POSES = select(StoredPoses.policy_row).where(StoredPoses.policy_row.in_(bin
 ADD = insert(_VERSIONS).returning(_VERSIONS.c.sha256, _VERSIONS.c.row, _VERSIONS.c.version)
 ANY = "any"  # `outcomes` of a training from demonstrations of any outcome
 POSES_VERSION = 1  # part of a training's identity: raise it when equal demonstrations give another pose style
-GATE_VERSION = 2  # part of a training's identity: raise it when the gate's result for an equal policy changes
+GATE_VERSION = 3  # part of a training's identity: raise it when the gate's result for an equal policy changes
 CERTIFICATE_NOTE = (
     "Checked on the grid: every greedy action against exact dynamic programming, and every start by following it; "
     "the demonstrated pass as it is driven (`driven.path`) against the arm's joint limits in closed form. It says "
@@ -88,7 +96,7 @@ CERTIFICATE_NOTE = (
 )
 
 
-def request_training(session: Session, training: TrainingIn, actor: str) -> Asked:
+def request_training(session: Session, training: TrainingIn, actor: str, near: NearLimits | None = None) -> Asked:
     """Queue the training of a style, with all defaults resolved.
 
     Several demonstrations are combined, independently of the order in which they are named. If an equal training with
@@ -100,6 +108,7 @@ def request_training(session: Session, training: TrainingIn, actor: str) -> Aske
         training: The request. Without `demos` the newest demonstration of the style is meant that may be learnt from,
             without `combine` `BEST`, and without `learner` phase Q-learning with its defaults.
         actor: The owner of the caller's key.
+        near: The gate's limit at the starts near the demonstrated one; None for its defaults.
 
     Raises:
         NotFound: The surgeon, the suture type or a demonstration is unknown.
@@ -132,6 +141,8 @@ def request_training(session: Session, training: TrainingIn, actor: str) -> Aske
         request["combine"] = {"kind": (training.combining or BEST).kind}
     elif training.combining is not None:
         raise BadInput("A single demonstration is not combined; name several in `demos`, or omit `combine`.")
+    if near is not None and near != NearLimits():  # left out otherwise, for the same reason
+        request["near"] = asdict(near)
     if any_outcome:  # left out otherwise, for the same reason
         request["outcomes"] = ANY
     job, new = jobs.ask(session, "training", request, who, actor)
@@ -139,6 +150,11 @@ def request_training(session: Session, training: TrainingIn, actor: str) -> Aske
         return Asked(job, True, QUEUED)
     again = training.release and job.state == "succeeded"
     return Asked(job, False, _release_again(session, job, actor) if again else did_nothing(job))
+
+
+def near_limits(settings: Settings) -> NearLimits:
+    """Return the gate's limit at the starts near the demonstrated one, as an installation sets it."""
+    return NearLimits(settings.near_radius_mm, settings.near_least_share)
 
 
 def _release_again(session: Session, job: Job, actor: str) -> str:
@@ -300,8 +316,10 @@ def certified(lesson: Lesson, request: TrainingRequest, demo: Demo, policy: Poli
     poses = certified_poses([unpack_as(Demo, one) for one in lesson.shown] or [demo], lesson.at)
     numbers, coverage = seal(policy), seal(covered)
     driven, undriven = _driven(policy, demo)
-    refused_because = [*refusals(policy, certificate), *undriven]
-    manifest = describe_policy(policy, certificate, coverage.digest, demo, request, refused_because, driven)
+    assert covered.share is not None, "a new certificate has the shares"
+    near = near_starts(policy, covered.share, NearLimits(**request.get("near", {})))
+    refused_because = [*refusals(policy, certificate, near), *undriven]
+    manifest = describe_policy(policy, certificate, near, coverage.digest, demo, request, refused_because, driven)
     if lesson.combined is not None:  # left out for one demonstration, so that older digests stay the same
         manifest["combined"] = lesson.combined
     if request.get("outcomes") == ANY:  # left out otherwise: then none of them is marked recovery or failure
@@ -406,7 +424,7 @@ def _version(learnt: Learnt, version: int) -> dict[str, Any]:
     }
 
 
-def refusals(policy: Policy, certificate: Certificate) -> list[str]:
+def refusals(policy: Policy, certificate: Certificate, near: NearStarts) -> list[str]:
     """Return the reasons on the grid against a release; the comparisons are written so that NaN fails."""
     reasons = []
     if not certificate.every_action_optimal:
@@ -423,6 +441,12 @@ def refusals(policy: Policy, certificate: Certificate) -> list[str]:
         reasons.append(f"{missing} of {certificate.starts} starts do not reach the goal")
     if policy.learner.phased and not certificate.demonstration_reproduced:
         reasons.append("the rollout from the demonstrated start is not the demonstration")
+    if policy.learner.phased and not near.within:
+        reasons.append(
+            f"of {near.starts} starts within {near.radius_mm:g} mm of the demonstrated one, one follows only "
+            f"{near.share:.0%} of the demonstration, and the gate requires {near.least_share:.0%}; train with a "
+            f"joining rule such as --join {max(near.least_share, 0.5):g}, which leads them back to an earlier part"
+        )
     return reasons
 
 
@@ -463,6 +487,7 @@ def _driven(policy: Policy, demo: Demo) -> tuple[DrivenPass | None, list[str]]:
 def describe_policy(
     policy: Policy,
     certificate: Certificate,
+    near: NearStarts,
     coverage_sha256: str,
     demo: Demo,
     request: TrainingRequest,
@@ -474,6 +499,7 @@ def describe_policy(
     Args:
         policy: The policy.
         certificate: The certificate of its grid.
+        near: The starts near the demonstrated one.
         coverage_sha256: The digest of its coverage.
         demo: The demonstration that it was learnt from.
         request: The training's request.
@@ -497,7 +523,7 @@ def describe_policy(
         "phases": policy.domain.phases,
         "learner": policy.learner.kind,
         "learner_version": request["learner_version"],
-        "settings": _settings(policy.learner),
+        "settings": describe_settings(policy.learner),
         "reward_levels": as_json(policy.levels),
         "seed": policy.seed,
         "demos": request["demos"],
@@ -509,6 +535,9 @@ def describe_policy(
                 starts_joining_nearest=certificate.starts_joining_nearest,
                 n_states=certificate.starts,
                 sha256=coverage_sha256,
+                mean_share=certificate.mean_share,
+                median_share=certificate.median_share,
+                starts_goal_alone=certificate.starts_goal_alone,
             )
         ),
         "grid_certificate": as_json(
@@ -519,21 +548,31 @@ def describe_policy(
                 demonstration_reproduced=certificate.demonstration_reproduced,
                 refused_because=tuple(refused_because),
                 gate=GATE_VERSION,
+                near=near,
                 driven=driven,
                 note=CERTIFICATE_NOTE,
             )
         ),
         **({} if wandered is None else {"rollouts": as_json(wandered)}),  # left out on the grid: older digests
+        **_joining(policy),
     }
+
+
+def _joining(policy: Policy) -> dict[str, Any]:
+    """Return the format and the joining table of a policy; nothing by the rule nearest, which every client knows."""
+    domain = policy.domain
+    if domain.finishes_unjoined:
+        return {}
+    states = np.flatnonzero(domain.joins)
+    table = Joining(
+        join_share=domain.join_share,
+        states=tuple(states.tolist()),
+        phases=tuple(domain.joins[states].tolist()),
+    )
+    return {"format": JOINING_FORMAT, "joining": as_json(table)}
 
 
 def describe_grid(policy: Policy) -> dict[str, Any]:
     """Return the JSON of a policy's grid world."""
     grid = policy.path.grid
     return {"origin_mm": list(grid.origin_mm), "cell_mm": grid.cell_mm, "shape": list(grid.shape)}
-
-
-def _settings(learner: Learner) -> dict[str, Any]:
-    """Return the settings of a learner as JSON, tuples as lists, equal to their value when read from the database."""
-    named = ((field.name, getattr(learner, field.name)) for field in fields(learner))
-    return {name: list(value) if isinstance(value, tuple) else value for name, value in named}

@@ -13,6 +13,7 @@ from pydantic import Field
 from skills.demonstration.partner import Partner
 from skills.fields import Count, Fraction, Point, Quaternion, Sha256, Slug, schema, stored_schema
 from skills.gridworld.reward import RewardLevels
+from skills.learning.certificate import NearStarts
 from skills.learning.evaluation import Metrics, SpaceRollouts
 from skills.learning.q_learning import Training
 from skills.learning.tube_certificate import TubeCertificate
@@ -60,6 +61,7 @@ class PolicyFigures:
         dtw_total_mm: Distance from the path that it was learnt from.
         exact_share: Share of the path's states.
         reaching_share: Share of all states.
+        mean_share: Mean share of the demonstration that its starts follow; null in an older batch or version.
     """
 
     version: VersionNumber
@@ -69,6 +71,7 @@ class PolicyFigures:
     dtw_total_mm: float
     exact_share: Fraction
     reaching_share: Fraction
+    mean_share: Fraction | None = None
 
 
 @schema
@@ -154,22 +157,32 @@ class Retraining(Job, Page[RetrainedStyle]):
     styles: StyleCounts
 
 
-@schema
-@dataclass(frozen=True)
+@stored_schema
+@dataclass(frozen=True, kw_only=True)
 class Coverage:
-    """The number of starts from which the policy works, out of `n_states`; the map itself is among the arrays.
+    """How much of the demonstration the policy follows from its starts; the map itself is among the arrays.
+
+    The share of a start is the number of the demonstration's moves that the policy makes from where it joins, over all
+    of them: 1 for the demonstrated start, 0 for a start from which it goes to the goal by itself or does not reach it.
 
     Attributes:
         starts_reaching_goal: Number of starts from which it reaches the goal.
-        starts_joining_nearest: Number of starts from which it joins the demonstration in the fewest moves.
+        starts_joining_nearest: Number of starts from which it joins the demonstration in the fewest moves that its
+            joining rule allows.
         n_states: Number of states, each of them a start.
         sha256: Digest of the map.
+        mean_share: Mean of the shares; null where an older version did not compute it.
+        median_share: Median of the shares; null as `mean_share`.
+        starts_goal_alone: Number of starts that reach the goal with a share of 0; null as `mean_share`.
     """
 
     starts_reaching_goal: Count
     starts_joining_nearest: Count
     n_states: Count
     sha256: Sha256
+    mean_share: Fraction | None = None
+    median_share: Fraction | None = None
+    starts_goal_alone: Count | None = None
 
 
 @stored_schema
@@ -184,6 +197,7 @@ class GridCertificate:
         demonstration_reproduced: The rollout from the demonstrated start is the demonstration.
         refused_because: The reasons against a release.
         gate: The gate's version; null in an older certificate, which asked the centres of cells.
+        near: The starts near the demonstrated one; null in an older certificate.
         driven: The pass as the arm drives it; null where joint limits cannot be checked, and in an older certificate.
         note: The scope of the certificate.
     """
@@ -194,8 +208,28 @@ class GridCertificate:
     demonstration_reproduced: bool
     refused_because: tuple[str, ...]
     gate: int | None = None
+    near: NearStarts | None = None
     driven: DrivenPass | None = None
     note: str
+
+
+JOINING_FORMAT = 2  # of a policy's JSON and arrays with a joining table; without one they name no format, which is 1
+
+
+@schema
+@dataclass(frozen=True)
+class Joining:
+    """Where a pass joins the path, by another rule than at the nearest waypoint.
+
+    Attributes:
+        join_share: Least share of the demonstration that is left where a pass joins it; 1: at its first state.
+        states: The states in which a pass joins the path.
+        phases: The phase after starting in each of them, or moving onto it in phase 0.
+    """
+
+    join_share: Fraction
+    states: tuple[int, ...]
+    phases: tuple[int, ...]
 
 
 @schema
@@ -271,6 +305,11 @@ class Policy(PolicyName):
     waypoint is in the phase after its first visit, and finished if that is the last waypoint. In phase 0 a move onto
     the goal ends the pass, and one onto another waypoint leads to the phase after its first visit. In phase p > 0 a
     move onto waypoint p leads to phase p + 1, or ends the pass if it is the last.
+
+    In format 2, `joining` replaces the rules of starting and of phase 0: a pass that starts in one of its states, or
+    moves onto it in phase 0, is then in the phase beside it; any other start is in phase 0, and any other move in phase
+    0 stays in it, also one onto a waypoint or the goal. There is no `actions`, which clients that know no `joining`
+    would follow wrongly; the same table is `actions_joining`. A client stops at a format that it does not know.
     """
 
     surgeon: Slug
@@ -299,13 +338,24 @@ class Policy(PolicyName):
         default=None,
         description="Where it was trained from demonstrations of any outcome: that of each as it was then.",
     )
+    format: Literal[1, 2] = Field(default=1, description="Left out: 1. 2: with `joining`, see above.")
+    joining: Joining | None = Field(default=None, description="Of format 2.")
     created_at: datetime
     released_at: datetime | None
     released_by: str | None
-    actions: list[list[int]] | None = Field(description="By phase, then by state; null where there are over 10^6.")
+    actions: list[list[int]] | None = Field(
+        default=None,
+        description="By phase, then by state; null where there are over 10^6. Only of format 1, and always there.",
+    )
+    actions_joining: list[list[int]] | None = Field(
+        default=None, description="The same of format 2, for clients that know `joining`."
+    )
     live_actions: list[PhaseActions] | None = Field(
         default=None,
         description="Where `actions` is null: the actions of the certified domain, by phase; otherwise absent.",
+    )
+    live_actions_joining: list[PhaseActions] | None = Field(
+        default=None, description="The same where `actions_joining` is null."
     )
     arrays: str = Field(description="Where the arrays with the Q values are.")
 
@@ -557,8 +607,8 @@ class StartShares(Given):
     do_not_reach: Fraction
 
 
-@schema
-@dataclass(frozen=True)
+@stored_schema
+@dataclass(frozen=True, kw_only=True)
 class CardCoverage(StartCounts, Coverage):
     """The starts from which the goal is reached, out of `n_states`.
 

@@ -30,10 +30,13 @@ def test_every_start_is_drawn_as_what_it_is(shape: tuple[int, int, int], random)
     n = int(np.prod(shape))
     reaches = np.array([random.random() < 0.7 for _ in range(n)])
     joins = reaches & np.array([random.random() < 0.5 for _ in range(n)])
+    share = np.array([random.choice((0.0, 0.25, 0.5, 1.0)) for _ in range(n)])
     path = path_in(shape)
     assert drawings.block_of(path) == 1
-    assert drawn(Coverage(reaches, joins), path) == {
-        "follows": joins.sum(),
+    assert drawn(Coverage(reaches, joins, share), path) == {
+        "most": (joins & (share >= 0.5)).sum(),
+        "part": (joins & (share == 0.25)).sum(),
+        "alone": (joins & (share == 0)).sum(),
         "otherwise": (reaches & ~joins).sum(),
         "fails": (~reaches).sum(),
     }
@@ -45,17 +48,19 @@ def test_a_large_grid_is_drawn_in_blocks_that_hide_no_failure():
     reaches[79, 49, 29] = reaches[40, 10, 0] = False
     path = path_in(shape)
     assert drawings.block_of(path) == 3
-    area = drawn(Coverage(reaches.ravel(), reaches.ravel()), path)
-    assert area == {"fails": 2, "otherwise": 0, "follows": 27 * 17 * 10 - 2}
-    assert [name for name, _ in drawings.layers(Coverage(reaches.ravel(), reaches.ravel()), path)][-1] == (
-        "z 135 to 145 mm"
-    )
+    share = np.ones(shape)
+    share[0, 0, 0] = 0.0
+    coverage = Coverage(reaches.ravel(), reaches.ravel(), share.ravel())
+    assert drawn(coverage, path) == {"fails": 2, "otherwise": 0, "alone": 1, "part": 0, "most": 27 * 17 * 10 - 3}
+    assert [name for name, _ in drawings.layers(coverage, path)][-1] == "z 135 to 145 mm"
 
 
 def test_a_layer_stands_as_its_cells_stand():
     """x points right and y up: the one failing start has the least x and the greatest y, so it is drawn top left."""
     reaches = np.ones((3, 2, 2), bool)
     reaches[0, 1, 0] = False
-    (_, lowest), (_, upper) = drawings.layers(Coverage(reaches.ravel(), reaches.ravel()), path_in((3, 2, 2)))
+    (_, lowest), (_, upper) = drawings.layers(
+        Coverage(reaches.ravel(), reaches.ravel(), np.ones(reaches.size)), path_in((3, 2, 2))
+    )
     assert '<rect class="fails" x="0" y="0" width="10" height="10"/>' in lowest
     assert "fails" not in upper

@@ -11,6 +11,7 @@ from tests.bench.beyond import learners
 from tests.bench.combining import combining
 from tests.bench.doubt import doubting
 from tests.bench.geometry import geometry
+from tests.bench.joining import joining
 from tests.bench.kinematics import kinematics
 from tests.bench.learning import learning
 from tests.bench.playing import playing
@@ -34,6 +35,7 @@ PARTS = {
     "atlas": atlas,
     "combining": combining,
     "geometry": geometry,
+    "joining": joining,
     "pose-styles": pose_styles,
     "session": session,
     "tissue": tissue,

@@ -36,9 +36,10 @@ def named_path(name: str) -> GridPath:
 
 
 @cache
-def learnt(name: str, *, phased: bool = True) -> Policy:
-    """Learn one of `WALKS` with the defaults."""
-    return learn_tabular(sparse_reward(named_path(name)), PhaseQLearning() if phased else CellQLearning(), seed=0)
+def learnt(name: str, *, phased: bool = True, join_share: float = 0.0) -> Policy:
+    """Learn one of `WALKS` with the defaults, and with a joining rule in the phase state."""
+    learner = PhaseQLearning(join_share=join_share) if phased else CellQLearning()
+    return learn_tabular(sparse_reward(named_path(name)), learner, seed=0)
 
 
 def random_path(seed: int) -> GridPath:
@@ -86,14 +87,21 @@ def _without_gaps(cells: list[np.ndarray]) -> np.ndarray:
 
 
 def follow(
-    actions: np.ndarray, shape: tuple[int, int, int], waypoints: list[int], start: int
+    actions: np.ndarray,
+    shape: tuple[int, int, int],
+    waypoints: list[int],
+    start: int,
+    joining: dict[int, int] | None = None,
 ) -> tuple[list[int], bool]:
     """Follow served actions, (phases, n_states), as the OpenAPI document describes: states, and whether it finishes.
 
-    Written from that text alone.
+    Written from that text alone. `joining` is the table of format 2, the phase by state.
     """
-    goal, phased, (_, ny, nz) = waypoints[-1], len(actions) > 1, shape
-    phase = waypoints.index(start) + 1 if phased and start in waypoints else 0
+    phased, (_, ny, nz) = len(actions) > 1, shape
+    goal = waypoints[-1] if joining is None else None  # at which an unjoined pass ends
+    if joining is None:
+        joining = {state: waypoints.index(state) + 1 for state in waypoints} if phased else {}
+    phase = joining.get(start, 0)
     state, states = start, [start]
     if phase == len(waypoints):
         return states, True
@@ -110,8 +118,8 @@ def follow(
             state = (cell[0] * ny + cell[1]) * nz + cell[2]
             if phase == 0 and state == goal:
                 return [*states, state], True
-            if phase == 0 and phased and state in waypoints:
-                phase = waypoints.index(state) + 1
+            if phase == 0:
+                phase = joining.get(state, 0)
             elif phase > 0 and state == waypoints[phase]:
                 if phase == len(waypoints) - 1:
                     return [*states, state], True
@@ -120,12 +128,30 @@ def follow(
     return states, False
 
 
-def joins_nearest(path: GridPath, states: list[int]) -> bool:
-    """Return whether a rollout meets the path in the fewest moves (Chebyshev) and then follows it to the end."""
+def joins_nearest(path: GridPath, states: list[int], join_share: float = 0.0) -> bool:
+    """Return whether a rollout meets the path in the fewest moves (Chebyshev) and then follows it to the end.
+
+    It meets the path at the waypoints after which at least `join_share` of the path's moves are left.
+    """
     waypoints = path.states.tolist()
-    fewest = int(np.abs(path.cells - path.grid.cells_of(states[0])).max(axis=1).min())
-    met = next((i for i, state in enumerate(states) if state in waypoints), None)
+    moves = len(waypoints) - 1
+    first = sum((moves - i) / moves >= join_share for i in range(moves + 1))
+    fewest = int(np.abs(path.cells[:first] - path.grid.cells_of(states[0])).max(axis=1).min())
+    met = next((i for i, state in enumerate(states) if state in waypoints[:first]), None)
     if met is None or met != fewest:
         return False
     rest = states[met:]
-    return rest == waypoints[waypoints.index(rest[0]) :] or (met > 0 and rest == [path.goal])
+    return rest == waypoints[waypoints.index(rest[0]) :] or (join_share == 0 and met > 0 and rest == [path.goal])
+
+
+def share_of(path: GridPath, states: list[int], *, finished: bool) -> float:
+    """Return the share of a path that a walk follows: the moves with which both end, over those of the path."""
+    waypoints = path.states.tolist()
+    if not finished:
+        return 0.0
+    alike = 0
+    for one, other in zip(reversed(states), reversed(waypoints), strict=False):
+        if one != other:
+            break
+        alike += 1
+    return (alike - 1) / (len(waypoints) - 1)

@@ -19,10 +19,13 @@ both_states = pytest.mark.parametrize("phased", [True, False], ids=["phase", "ce
 every_walk = pytest.mark.parametrize("name", WALKS)
 
 
-def values_everywhere(path, gamma, *, phased, goal_pays=10.0, visited_pays=1.0, off_grid_pays=-1.0, kind=float):
+def values_everywhere(
+    path, gamma, *, phased, joinable=None, goal_pays=10.0, visited_pays=1.0, off_grid_pays=-1.0, kind=float
+):
     """Iterate values over all phases and all cells, without a domain: (phases, n_states, 27), and their maximum.
 
     A second method, from the interface's rules: it shares nothing with the certificate but the numbering of states.
+    With `joinable` only so many waypoints, the first ones, may be joined, and an unjoined pass does not finish.
     """
     n, (_, ny, nz), waypoints = path.grid.n_states, path.grid.shape, path.states.tolist()
     phases = len(waypoints) if phased else 1
@@ -32,10 +35,11 @@ def values_everywhere(path, gamma, *, phased, goal_pays=10.0, visited_pays=1.0, 
     pays = np.where(on_grid, 0.0, off_grid_pays) * np.ones((phases, 1, 1), kind)
     after = np.arange(phases)[:, None, None] * np.ones((1, n, 27), int)
     ends = np.zeros((phases, n, 27), bool)
-    for k, waypoint in reversed(list(enumerate(waypoints))):  # in phase 0; backwards, so that the first visit wins
-        pays[0][on_grid & (to == waypoint)] = goal_pays if waypoint == path.goal else visited_pays
-        after[0][on_grid & (to == waypoint)] = k + 1 if phased and waypoint != path.goal else 0
-    ends[0] = on_grid & (to == path.goal)
+    ends_at = path.goal if joinable is None else None
+    for k, waypoint in reversed([*enumerate(waypoints)][:joinable]):  # in phase 0; backwards: the first visit wins
+        pays[0][on_grid & (to == waypoint)] = goal_pays if waypoint == ends_at else visited_pays
+        after[0][on_grid & (to == waypoint)] = k + 1 if phased and waypoint != ends_at else 0
+    ends[0] = on_grid & (to == ends_at)
     for phase in range(1, phases):
         enters, last = on_grid & (to == waypoints[phase]), phase == phases - 1
         pays[phase][enters] = goal_pays if last else visited_pays
@@ -43,7 +47,7 @@ def values_everywhere(path, gamma, *, phased, goal_pays=10.0, visited_pays=1.0, 
         ends[phase] = enters & last
     values = np.zeros((phases, n), kind)
     finished = np.zeros((phases, n), bool)
-    finished[[0, -1], path.goal] = True
+    finished[[0, -1] if joinable is None else [-1], path.goal] = True
     while True:
         q = pays + gamma * np.where(ends, 0.0, values[after, to])
         better = np.where(finished, 0.0, q.max(axis=-1))

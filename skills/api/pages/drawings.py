@@ -49,7 +49,8 @@ OF_SCORE = (
     (1, 2, "left", "up", "head on"),
 )
 STEPS_MM = tuple(paper.CELL_MM * times for times in (0.5, 1.0, 2.0, 4.0))  # bounds between five line widths and colours
-KINDS = ("fails", "otherwise", "follows")  # the worst first
+KINDS = ("fails", "otherwise", "alone", "part", "most")  # the worst first
+HALF = 0.5  # share of the demonstration that separates the two last kinds
 MOST_TILES, MOST_LAYERS = 36, 24  # tiles along x and y, and layers along z: more cannot be seen on a page
 TILE = 10  # side of a tile, in units of the drawing; the mark patterns in the template have the same size
 SEEN_WELL = 11  # tiles along a side: with more, start and goal are drawn larger than a tile
@@ -404,7 +405,9 @@ def block_of(path: GridPath) -> int:
 def _tiles(coverage: Coverage, path: GridPath) -> tuple[NDArray[np.int8], int]:
     """Classify the starts by `KINDS`: tiles, shape (X, Y, Z), each as its worst start; and the cells per side."""
     block, shape = block_of(path), path.grid.shape
-    kinds = np.where(coverage.reaches, np.where(coverage.joins_nearest, 2, 1), 0).astype(np.int8).reshape(shape)
+    assert coverage.share is not None, "a card computes those of an older version"
+    followed = np.select([coverage.share == 0, coverage.share < HALF], [KINDS.index("alone"), KINDS.index("part")], 4)
+    kinds = np.where(coverage.reaches, np.where(coverage.joins_nearest, followed, 1), 0).astype(np.int8).reshape(shape)
     for axis, side in enumerate(shape):
         kinds = np.minimum.reduceat(kinds, np.arange(0, side, block), axis=axis)
     return kinds, block

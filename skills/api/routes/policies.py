@@ -10,7 +10,18 @@ from fastapi import Header, Path, Query, Request, Response, WebSocket
 from sqlalchemy.orm import Session
 
 from skills.api.authorisation import Asking, needs, refuse_release
-from skills.api.dependencies import Actor, Db, Digest, Jobs, Limit, RowCursor, Slug, Strict, room_for_a_job
+from skills.api.dependencies import (
+    Actor,
+    Configured,
+    Db,
+    Digest,
+    Jobs,
+    Limit,
+    RowCursor,
+    Slug,
+    Strict,
+    room_for_a_job,
+)
 from skills.api.openapi import ends, gives, gives_page, gives_stream, router_of, says, starts_job
 from skills.api.pages import HTML, standalone_headers, wants_page
 from skills.api.pages.drawings import card_page
@@ -45,7 +56,7 @@ from skills.library.policies import summary_json, version_json
 from skills.library.pose_styles import about_next, poses_of
 from skills.library.releases import outcomes_of, outcomes_of_styles
 from skills.library.retraining import find_retraining, list_styles, request_retraining, retrained_json
-from skills.library.training import request_training
+from skills.library.training import near_limits, request_training
 from skills.schemas.given import (
     Job,
     NextPose,
@@ -74,7 +85,7 @@ Accept = Annotated[str, Header(max_length=500)]
 
 
 @job_router.post("/trainings", dependencies=[needs("trainer"), room_for_a_job], **starts_job(404, 409, 410))
-def train(body: TrainingIn, db: Db, jobs: Jobs, actor: Actor, caller: Asking) -> Response:
+def train(body: TrainingIn, db: Db, jobs: Jobs, actor: Actor, caller: Asking, settings: Configured) -> Response:
     """Request the training of a style; an equal request returns the same job.
 
     With `release`, an equal request whose version is not the one that the style serves now releases it, if it passes
@@ -82,7 +93,7 @@ def train(body: TrainingIn, db: Db, jobs: Jobs, actor: Actor, caller: Asking) ->
     """
     refuse_release(caller, body.release)
     with db.writing() as session:
-        job, new, did = request_training(session, body, actor)
+        job, new, did = request_training(session, body, actor, near_limits(settings))
         answer = accepted(session, job, did)
     # after the commit; if the engine cannot be notified now, a worker finds the job's row later
     if new:
@@ -143,7 +154,7 @@ retraining_router = router_of(route_class=Strict, tags=["jobs"], max_body_size=M
 
 
 @retraining_router.post("/retrainings", dependencies=[needs("trainer"), room_for_a_job], **starts_job(404, 409, 410))
-def retrain(body: RetrainingIn, db: Db, jobs: Jobs, actor: Actor, caller: Asking) -> Response:
+def retrain(body: RetrainingIn, db: Db, jobs: Jobs, actor: Actor, caller: Asking, settings: Configured) -> Response:
     """Request the training of many styles again; an equal request for the same styles returns the same job.
 
     With `release`, an equal request creates a new job if some of the styles serve another version now than when the job
@@ -151,7 +162,7 @@ def retrain(body: RetrainingIn, db: Db, jobs: Jobs, actor: Actor, caller: Asking
     """
     refuse_release(caller, body.release)
     with db.writing() as session:
-        job, new, did = request_retraining(session, body, actor)
+        job, new, did = request_retraining(session, body, actor, near_limits(settings))
         told = to_tell(session, job) if new else []
         answer = accepted(session, job, did)
     for row, attempt in told:

@@ -81,23 +81,26 @@ function learnt({ path_mm: points, number }) {
   ];
 }
 
+const percent = (part) => `${Math.floor(100 * part)} %`; // less than all is never 100 %
+
 // The cells from which the policy reaches the goal; those from which it does not are crosses, in every colouring.
 function starts() {
-  const { at_mm: at, reaches, nearest, moves } = view.starts;
+  const { at_mm: at, reaches, nearest, moves, share } = view.starts;
   const height = heights[Number(get("slice").value)];
   const shown = at.map((_, i) => i).filter((i) => height === undefined || at[i][2] === height);
   const some = (wanted) => shown.filter(wanted);
   const narrow = get("view").clientWidth < 500;
   const size = height !== undefined ? 6 : narrow ? 1.6 : 2.6;
   const told = (which, name, marker) => dots(which.map((i) => at[i]), {
-    name, marker: { size, opacity: height === undefined ? 0.4 : 0.9, line: { width: 0 }, ...marker }, customdata: which.map((i) => [at[i], moves[i]]),
-    hovertemplate: "%{x:.1f}, %{y:.1f}, %{z:.1f} mm<br>%{customdata[1]} moves to the goal<extra>%{fullData.name}</extra>", legendgroup: "starts",
+    name, marker: { size, opacity: height === undefined ? 0.4 : 0.9, line: { width: 0 }, ...marker }, customdata: which.map((i) => [at[i], moves[i], percent(share[i])]),
+    hovertemplate: "%{x:.1f}, %{y:.1f}, %{z:.1f} mm<br>%{customdata[2]} of the demonstration<br>%{customdata[1]} moves to the goal<extra>%{fullData.name}</extra>", legendgroup: "starts",
   });
   const lost = told(some((i) => !reaches[i]), "does not reach the goal", { color: colour("learnt"), symbol: "x", opacity: 1, size: 4 });
-  if (get("starts-of").value === "moves") {
+  const by = get("starts-of").value;
+  if (by !== "kind") {
     const covered = some((i) => reaches[i]);
-    const most = Math.max(1, ...moves);
-    return [told(covered, "reaches the goal", { color: covered.map((i) => moves[i]), colorscale: scale(), cmin: 0, cmax: most, symbol: "square" }), lost];
+    const [value, most] = by === "share" ? [share, 1] : [moves, Math.max(1, ...moves)];
+    return [told(covered, "reaches the goal", { color: covered.map((i) => value[i]), colorscale: scale(), cmin: 0, cmax: most, symbol: "square" }), lost];
   }
   return [
     told(some((i) => reaches[i] && nearest[i]), "joins in the fewest moves", { color: colour("path"), symbol: "square" }),
@@ -107,17 +110,19 @@ function starts() {
 }
 
 function prepareStarts() {
-  const { at_mm: at, every, reaches, nearest, moves } = view.starts;
+  const { at_mm: at, every, reaches, nearest, moves, share } = view.starts;
   heights = [...new Set(at.map((point) => point[2]))].sort((a, b) => a - b);
   get("slice").max = heights.length - 1;
   const count = (which) => which.filter(Boolean).length;
   const key = () => {
-    const kinds = get("starts-of").value === "kind";
     const lost = reaches.length - count(reaches);
-    const words = kinds
-      ? `■ ${count(nearest)} join the path in the fewest moves, ◆ ${count(reaches.map((yes, i) => yes && !nearest[i]))} take a longer way, `
-      : `■ blue is near, yellow far: 0 to ${Math.max(...moves)} moves to the goal; `;
-    get("starts-key").textContent = `${words}✕ ${lost} do not reach it.${every > 1 ? ` Every ${every}th cell along each axis is shown.` : ""}`;
+    const mean = share.reduce((sum, one) => sum + one, 0) / share.length;
+    const words = {
+      share: () => `■ blue follows little of the demonstration, yellow all of it: ${percent(mean)} on average; ${count(reaches.map((yes, i) => yes && share[i] === 0))} see the goal alone; `,
+      moves: () => `■ blue is near, yellow far: 0 to ${Math.max(...moves)} moves to the goal; `,
+      kind: () => `■ ${count(nearest)} join the path in the fewest moves, ◆ ${count(reaches.map((yes, i) => yes && !nearest[i]))} take a longer way, `,
+    };
+    get("starts-key").textContent = `${words[get("starts-of").value]()}✕ ${lost} do not reach it.${every > 1 ? ` Every ${every}th cell along each axis is shown.` : ""}`;
   };
   key();
   get("starts-of").addEventListener("change", () => {
