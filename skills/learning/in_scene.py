@@ -105,7 +105,9 @@ def learn_in_scene(
     if isinstance(learner, PhaseQLearning):
         q, training = learn_q(reward, learner, seed, hazards)
         return Policy(reward.path, reward.levels, learner, seed, training, q)
-    q = exact_q(Mdp(Domain(reward.path, learner.phased, learner.join_share), reward, learner.gamma, learner.slip, hazards))
+    q = exact_q(
+        Mdp(Domain(reward.path, learner.phased, learner.join_share), reward, learner.gamma, learner.slip, hazards)
+    )
     training = Training(steps=0, updates=0, episodes=0, finished=0, out_of_steps=0, out_of_time=0, settled=True)
     return Policy(reward.path, reward.levels, learner, seed, training, q)
 
