@@ -74,6 +74,10 @@ def train(
         Literal["success", "any"],
         typer.Option(help="any learns also from demonstrations that are marked recovery or failure."),
     ] = "success",
+    depth_along: Annotated[
+        str | None,
+        typer.Option(help="Direction in which depth increases, as X,Y,Z, in a frame other than the base of the arm."),
+    ] = None,
     release: Annotated[bool, typer.Option(help="Release the version if it passes the gate.")] = False,
     seed: int = 0,
     learner: Kind = None,
@@ -96,6 +100,7 @@ def train(
             seed=seed,
             release=release,
             outcomes=outcomes,
+            depth_along=None if depth_along is None else triple(depth_along),
         )
         job = finished(client, asked)
     result = result_of(job)

@@ -78,6 +78,7 @@ class Jobs(Connection):
         seed: int = 0,
         release: bool = False,
         outcomes: Literal["success", "any"] = "success",
+        depth_along: Sequence[float] | None = None,
     ) -> Job:
         """Request the training of a style; an equal request returns the same job.
 
@@ -96,11 +97,13 @@ class Jobs(Connection):
                 version is
                 not the one that the style serves now.
             outcomes: "any" learns also from demonstrations that are marked recovery or failure.
+            depth_along: The direction in which depth increases, of a demonstration in another frame than its arm's
+                base; of equally short ways the policy takes the shallower one.
         """
         asked = {"surgeon": surgeon, "suture": suture, "seed": seed, "release": release}
         how = None if combine is None else {"kind": combine}
         of = None if outcomes == "success" else outcomes  # left out, so that an older service accepts the rest
-        asked |= given({"demos": demos, "combine": how, "learner": learner, "outcomes": of})
+        asked |= given({"demos": demos, "combine": how, "learner": learner, "outcomes": of, "depth_along": depth_along})
         return await self._ask(Job, "POST", at("trainings"), asked, harmless=not release)
 
     @call
@@ -445,6 +448,7 @@ def _policy(about: dict[str, Any], arrays: bytes, demo: dict[str, Any]) -> "Lear
     from skills.learning.policy import Policy as LearntPolicy
     from skills.learning.policy import learner_of
     from skills.learning.q_learning import Training
+    from skills.learning.ties import ShortestWay
 
     grid = GridWorld(**{name: about["grid"][name] for name in ("origin_mm", "cell_mm", "shape")})
     shown = about.get("combined") or demo["report"] | {"hysteresis": demo["hysteresis"]}
@@ -457,4 +461,5 @@ def _policy(about: dict[str, Any], arrays: bytes, demo: dict[str, Any]) -> "Lear
         q[domain.certified] = sent["q"]
         network = Network(sent["network"].tobytes()) if "network" in sent else None
     levels, training = RewardLevels(**about["reward_levels"]), Training(**about["training"])
-    return LearntPolicy(path, levels, learner, about["seed"], training, q, network)
+    ties = ShortestWay(**about["ties"]) if about.get("ties") else None
+    return LearntPolicy(path, levels, learner, about["seed"], training, q, network, ties)

@@ -40,18 +40,20 @@ from skills.learning.networks import Network
 from skills.learning.policy import LEARNERS, Policy
 from skills.learning.pose_style import PosePath
 from skills.learning.q_learning import PhaseQLearning, Training
+from skills.learning.ties import ShortestWay
 from skills.learning.tube import CertifiedPoses, TubeCertificate, TubeLimits
 from skills.packing import added_later, few_numbers
 from skills.planning.handoff import PsmM
 from skills.planning.plan import Pass, SuturePlan, SuturePoint
 from skills.verification.playback import Pictures, Playback
 
-stored(GridWorld, GridPath, RewardLevels, *LEARNERS.values(), Training, Network)
+stored(GridWorld, GridPath, RewardLevels, *LEARNERS.values(), Training, Network, ShortestWay)
 stored(SuturePoint, Pass, Pause, Partner, PsmM)
 stored(PosePath, TubeLimits, TubeCertificate)
 # Left out of the serialised value while they hold their default, so that the digests of older values stay the same.
 added_later(GridPath, "hysteresis")
 added_later(Policy, "network")
+added_later(Policy, "ties")
 added_later(Demo, "pauses")
 added_later(Demo, "partner")
 added_later(Partner, "base_mm")

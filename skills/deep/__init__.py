@@ -21,6 +21,7 @@ from skills.learning import policy as table
 from skills.learning.networks import DDPG, DQN, TRPO, Deep, Network, network_q
 from skills.learning.policy import Learner, Policy, check_learnable
 from skills.learning.q_learning import Training
+from skills.learning.ties import REMOTE_CENTRE, ShortestWay
 from skills.packing import known
 from skills.sandbox import ProcessLimits
 from skills.sandbox.forked import call_alone
@@ -86,6 +87,7 @@ def learn_policy(
     learner: Learner,
     seed: int = 0,
     *,
+    ties: ShortestWay | None = REMOTE_CENTRE,
     tell: Tell | None = None,
     timeout_s: float = TIMEOUT_S,
     memory_bytes: int = MEMORY_BYTES,
@@ -97,6 +99,7 @@ def learn_policy(
         learner: The settings of the learner; those of `skills.learning.networks` are trained in a separate
             process.
         seed: Seed of all random numbers.
+        ties: The rule among equally good actions, as for `learn_tabular`; not used by learners with a network.
         tell: Callback for the progress, from 0 to 1, about every second; an exception that it raises ends the training.
         timeout_s: Seconds of wall time after which the separate process is killed.
         memory_bytes: Limit of the separate process's address space.
@@ -110,7 +113,7 @@ def learn_policy(
         LearningFailed: The separate process crashed, or exceeded its time or memory.
     """
     if not isinstance(learner, DQN | DDPG | TRPO):
-        return table.learn_tabular(reward, learner, seed)
+        return table.learn_tabular(reward, learner, seed, ties)
     check_learnable(reward, learner, seed)
     require_installed(learner)
     learnt = _learn_aside(NetworkLesson(reward, learner, seed), tell, ProcessLimits(memory_bytes, timeout_s))

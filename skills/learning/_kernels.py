@@ -21,6 +21,8 @@ NONE, ONE, THREE, SEVEN, NINE, THIRTEEN, SEVENTEEN = (np.uint64(n) for n in (0, 
 SMALLEST_SINE = 1e-6  # of half an angle: below it, a share of the chord equals a share of the arc to rounding
 SCATTER = np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio (Knuth 6.4): spreads similar bits over the table
 ACTIONS, HALF, LOW_HALF = np.uint64(27), np.uint64(32), np.uint64(0xFFFFFFFF)
+STEPS = (0, 4294967296, 6074001000, 7439101574)  # lengths of moves along 0 to 3 axes, in 2^-32 of a cell
+NEVER, SHALLOWEST = 2**62, -(2**62)  # length of an approach that never enters a waypoint; less than any depth
 
 
 @inner
@@ -337,6 +339,148 @@ def spread_worth(
                                 worth[x, y, z] = top + step
 
 
+def find_equal(
+    q: Any,  # (rows, 27) float64
+    tie: float,  # relative difference up to which two actions are equally good
+    value: Any,  # (rows,) float64: the largest Q value of each row, filled
+    equal: Any,  # (rows,) int32: the actions that are as good as that one, a bit for each, filled
+) -> None:
+    """Find the best actions of each row."""
+    for row in range(len(q)):
+        top = -np.inf
+        for action in range(27):
+            if q[row, action] > top:
+                top = q[row, action]
+        least = top - tie * abs(top)
+        bits = 0
+        for action in range(27):
+            if q[row, action] >= least:
+                bits |= 1 << action
+        value[row] = top
+        equal[row] = bits
+
+
+@inner
+def place_in_box(at: Any, size_y: Any, size_z: Any) -> Any:
+    """Return the place x, y, z of a row in the box of its phase, counted from the box's first row."""
+    rest = at // size_z
+    x = rest // size_y
+    return x, rest - x * size_y, at - rest * size_z
+
+
+def choose_ways(
+    actions: Any,  # (rows,) int64: the action of each row, filled
+    length: Any,  # (rows,) int64: the way left on entering each row, in `STEPS`: 0 at ends, else `NEVER`; filled
+    deepest: Any,  # (rows,) int64: the greatest depth on that way, with that of the row: at first that alone; filled
+    joined: Any,  # (rows,) int64: the waypoint at which that way ends, filled
+    ends: Any,  # (rows,) bool: whether a way ends on entering this row
+    order: Any,  # (N,) int64: the rows that have an action; one pass is enough if every way goes backwards in it
+    equal: Any,  # as for `find_equal`
+    depth: Any,  # (rows,) int64: the depth of each row's cell
+    phase_of: Any,  # (rows,) int64
+    offset: Any,  # (P + 1,) int64: the first row of each phase, and the number of rows
+    size: Any,  # (P, 3) int64: the cells of each phase's box along each axis
+) -> None:
+    """Choose of each row's best actions the one with the shortest, then shallowest, then earliest joining way."""
+    number, changed, waits = 0, 1, 0
+    while changed > 0 and (number != 1 or waits > 0):
+        changed = 0
+        for i in range(len(order)):
+            row = order[i] if number % 2 == 0 else order[len(order) - 1 - i]
+            bits, phase = equal[row], phase_of[row]
+            size_y, size_z = size[phase, 1], size[phase, 2]
+            x, y, z = place_in_box(row - offset[phase], size_y, size_z)
+            chosen, best_length, best_depth, best_joined = -1, NEVER, 0, 0
+            for action in range(27):
+                if not bits >> action & 1:
+                    continue
+                if chosen < 0:
+                    chosen = action  # the lowest index counts where no way is found
+                dx, dy, dz = action // 9 - 1, action // 3 % 3 - 1, action % 3 - 1
+                if x + dx < 0 or x + dx >= size[phase, 0] or y + dy < 0 or y + dy >= size_y:
+                    continue
+                if z + dz < 0 or z + dz >= size_z:
+                    continue
+                after = row + (dx * size_y + dy) * size_z + dz
+                if after == row and not ends[row]:
+                    continue
+                if length[after] == NEVER:
+                    waits += 1  # its way may be found later in this pass
+                    continue
+                way = length[after] + STEPS[dx * dx + dy * dy + dz * dz]
+                if way > best_length:
+                    continue
+                if (
+                    way < best_length
+                    or deepest[after] < best_depth
+                    or (deepest[after] == best_depth and joined[after] < best_joined)
+                ):
+                    chosen, best_length, best_depth, best_joined = action, way, deepest[after], joined[after]
+            actions[row] = max(chosen, 0)
+            best_depth = max(best_depth, depth[row])
+            if not ends[row] and (
+                length[row] != best_length or deepest[row] != best_depth or joined[row] != best_joined
+            ):
+                length[row], deepest[row], joined[row] = best_length, best_depth, best_joined
+                changed += 1
+        number += 1
+
+
+def count_off_rule(
+    rows: Any,  # (N,) int64: the rows to check
+    actions: Any,  # (rows,) int64: the action of each row
+    worth: Any,  # (rows,) float64: reward and discounted value of entering each row from its phase
+    tie: Any,  # (rows,) float64: the difference up to which two actions of each row are equally good
+    length: Any,  # (rows,) int64: as for `choose_ways`, of the walks by these actions
+    deepest: Any,
+    joined: Any,
+    ends: Any,
+    phase_of: Any,  # this and the following as for `choose_ways`
+    offset: Any,
+    size: Any,
+) -> Any:
+    """Count the rows in which an action that is as good leads to a better way, or to an equal one at a lower index.
+
+    Returns:
+        The number of rows, with those whose own way never ends.
+    """
+    off = 0
+    for i in range(len(rows)):
+        row = rows[i]
+        phase = phase_of[row]
+        size_x, size_y, size_z = size[phase, 0], size[phase, 1], size[phase, 2]
+        x, y, z = place_in_box(row - offset[phase], size_y, size_z)
+        dx, dy, dz = actions[row] // 9 - 1, actions[row] // 3 % 3 - 1, actions[row] % 3 - 1
+        made = row + (dx * size_y + dy) * size_z + dz
+        outside = x + dx < 0 or x + dx >= size_x or y + dy < 0 or y + dy >= size_y or z + dz < 0 or z + dz >= size_z
+        if outside or length[made] == NEVER or (made == row and not ends[row]):
+            off += 1
+            continue
+        own = length[made] + STEPS[dx * dx + dy * dy + dz * dz]
+        least = worth[made] - tie[row]
+        better = False
+        for dx in range(-1 if x > 0 else 0, 2 if x < size_x - 1 else 1):
+            for dy in range(-1 if y > 0 else 0, 2 if y < size_y - 1 else 1):
+                for dz in range(-1 if z > 0 else 0, 2 if z < size_z - 1 else 1):
+                    after = row + (dx * size_y + dy) * size_z + dz
+                    if worth[after] < least:
+                        continue
+                    way = length[after] + STEPS[dx * dx + dy * dy + dz * dz]
+                    if way > own or (after == row and not ends[row]):
+                        continue
+                    if (
+                        way < own
+                        or deepest[after] < deepest[made]
+                        or (
+                            deepest[after] == deepest[made]
+                            and (joined[after] < joined[made] or (joined[after] == joined[made] and after < made))
+                        )
+                    ):
+                        better = True
+        off += better
+    return off
+
+
 def warp(distance: Any, cost: Any) -> None:
     """Fill the table of accumulated costs of dynamic time warping.
 
@@ -481,6 +625,9 @@ sweep_compiled = compiled(sweep)
 settle_compiled = compiled(settle)
 spread_distances_compiled = compiled(spread_distances)
 spread_worth_compiled = compiled(spread_worth)
+find_equal_compiled = compiled(find_equal)
+choose_ways_compiled = compiled(choose_ways)
+count_off_rule_compiled = compiled(count_off_rule)
 warp_compiled = compiled(warp)
 tell_apart_compiled = compiled(tell_apart)
 step_along_compiled = compiled(step_along)

@@ -23,8 +23,7 @@ from skills.gridworld.reward import sparse_reward
 from skills.learning import _kernels
 from skills.learning.dynamic_programming import FAINT, Mdp, action_values, exact_q, exact_values, log_losses
 from skills.learning.policy import Policy
-
-TIE = 1e-9  # relative; two actions closer than this are equally good (a Q value carries about 1e-15 of rounding)
+from skills.learning.ties import TIE, off_rule
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,6 +109,8 @@ class Certificate:
         median_share: The median over all starts.
         demonstration_reproduced: The rollout from the demonstrated start visits the demonstration's states, in order.
         faint: Number of checked states whose exact value is below `FAINT`, so that logarithms were compared.
+        off_rule: Number of the checked states whose greedy action is not the one that the policy's rule selects of the
+            exactly best ones (`Policy.ties`); None if it has no rule but the lowest index.
     """
 
     checked: int
@@ -122,6 +123,7 @@ class Certificate:
     mean_share: float
     median_share: float
     demonstration_reproduced: bool
+    off_rule: int | None
     faint: int = 0
 
     @property
@@ -164,6 +166,7 @@ def certify(policy: Policy) -> tuple[Certificate, Coverage]:
         median_share=float(np.median(share)),
         demonstration_reproduced=np.array_equal(policy.replay.states, policy.path.states),
         faint=int(np.count_nonzero(faint)),
+        off_rule=_off_rule(policy, best),
     )
     return certificate, covered
 
@@ -208,6 +211,13 @@ def _achieved(policy: Policy) -> tuple[Floats, Floats]:
         return q[np.arange(len(q)), policy.greedy.astype(np.int64).clip(0)], q.max(axis=1)
     best = exact_values(mdp)
     return action_values(mdp, best, policy.moves), best
+
+
+def _off_rule(policy: Policy, values: Floats) -> int | None:
+    """Return the number of actions that the policy's rule does not select; None if it has no rule."""
+    if policy.ties is None:
+        return None
+    return off_rule(mdp_of(policy), values, policy.greedy.astype(np.int64), policy.moves, policy.ties)
 
 
 def finishes(policy: Policy) -> NDArray[np.bool_]:

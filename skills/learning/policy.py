@@ -3,7 +3,8 @@
     RewardMap --learn_tabular--> Policy --rollout--> Rollout
 
 `skills.deep.learn_policy` learns with all learners, `learn_tabular` with those that need no network. The *greedy*
-action of a row is the first one with the largest Q value.
+action of a row has the largest Q value. Of equally good ones the tabular learners of the phase state take the one of
+the shortest way (`skills.learning.ties`); the others, whose values have not settled, the one with the lowest index.
 """
 
 from dataclasses import asdict, dataclass
@@ -24,11 +25,12 @@ from skills.learning.dynamic_programming import ValueIteration, iterate_values
 from skills.learning.max_ent_irl import MaxEntIRL, learn_from_recovered
 from skills.learning.networks import DDPG, DQN, TRPO, Network
 from skills.learning.q_learning import CellQLearning, PhaseQLearning, Training, learn_q
+from skills.learning.ties import REMOTE_CENTRE, ShortestWay, choose
 
 Tabular = PhaseQLearning | CellQLearning | ValueIteration | MaxEntIRL
 Learner = Tabular | DQN | DDPG | TRPO
 LEARNERS: dict[str, type[Learner]] = {learner.kind: learner for learner in get_args(Learner)}
-LEARNER_VERSION = 4  # part of a training's identity: raise it when the same settings would give another result
+LEARNER_VERSION = 5  # part of a training's identity: raise it when the same settings would give another result
 MAX_SEED = 2**63 - 1
 MAX_BYTES = 4 << 30  # ours: a laptop has 8 GiB, and other trainings run at the same time
 BYTES_A_ROW = 600  # of the domain, measured with 51 and 101 cells a side: Q values twice, plus intermediate results
@@ -169,6 +171,7 @@ class Policy:
         training: The counts of the training.
         q: Q values, shape (rows, 27).
         network: The network of a network learner, from which the Q values were computed at each cell's centre; or None.
+        ties: The rule among equally good actions; None: the lowest index, the first one with the largest Q value.
     """
 
     path: GridPath
@@ -178,8 +181,11 @@ class Policy:
     training: Training
     q: Floats
     network: Network | None = None
+    ties: ShortestWay | None = None
 
     def __post_init__(self) -> None:
+        if self.ties is not None and not self.learner.phased:
+            raise BadSettings("Only in the phase state a way ends where it joins the path; leave `ties` out.")
         object.__setattr__(self, "q", frozen(self.q, np.float64, (self.domain.n_rows, paper.N_ACTIONS), "q"))
 
     @cached_property
@@ -190,7 +196,7 @@ class Policy:
     @cached_property
     def greedy(self) -> Bytes:
         """The action of each row, (rows,): 0 to 26, `FINISHED` or `OUTSIDE`."""
-        actions = self.q.argmax(axis=1)
+        actions = self.q.argmax(axis=1) if self.ties is None else choose(self.domain, self.q, self.ties)
         actions[self.domain.terminal] = FINISHED
         actions[~self.domain.certified] = OUTSIDE
         return frozen(actions, np.int8, (self.domain.n_rows,), "greedy")
@@ -225,7 +231,9 @@ class Policy:
         return int(self.domain.rows_of(phase, cell)) if self.domain.holds(phase, cell) else None
 
 
-def learn_tabular(reward: RewardMap, learner: Tabular, seed: int = 0) -> Policy:
+def learn_tabular(
+    reward: RewardMap, learner: Tabular, seed: int = 0, ties: ShortestWay | None = REMOTE_CENTRE
+) -> Policy:
     """Learn to follow a demonstration from its reward map; the same arguments give the same bytes.
 
     `skills.deep.learn_policy` does this with the network learners as well.
@@ -234,6 +242,7 @@ def learn_tabular(reward: RewardMap, learner: Tabular, seed: int = 0) -> Policy:
         reward: The reward map of the demonstrated path.
         learner: The settings of the learner.
         seed: Seed of all random numbers, 0 to 2^63 - 1.
+        ties: The rule among equally good actions; not used in the cell state, where the lowest index counts.
 
     Returns:
         The policy.
@@ -242,7 +251,7 @@ def learn_tabular(reward: RewardMap, learner: Tabular, seed: int = 0) -> Policy:
         BadSettings: As for `learn_values`.
     """
     q, training = learn_values(reward, learner, seed)
-    return Policy(reward.path, reward.levels, learner, seed, training, q)
+    return Policy(reward.path, reward.levels, learner, seed, training, q, ties=ties if learner.phased else None)
 
 
 @dataclass(frozen=True, eq=False)

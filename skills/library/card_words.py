@@ -191,12 +191,15 @@ def lost(report: dict[str, Any]) -> str:
     )
 
 
-def learner(phases: int, settled: bool, outcomes: Sequence[str | None] | None, marked: bool) -> str:
-    """Return the sentences on a learner's state, on whether learning converged, and on the outcomes it learnt from.
+def learner(
+    phases: int, settled: bool, rule: dict[str, Any] | None, outcomes: Sequence[str | None] | None, marked: bool
+) -> str:
+    """Return the sentences on a learner's state, convergence and ties, and on the outcomes it learnt from.
 
     Args:
         phases: The number of phases of its state.
         settled: Whether learning converged.
+        rule: The rule among equally good actions (`schemas.policies.Policy.ties`); None is the lowest index.
         outcomes: Of a training from demonstrations of any outcome: that of each as it was then.
         marked: Whether one of its demonstrations is marked with an outcome now.
     """
@@ -207,12 +210,28 @@ def learner(phases: int, settled: bool, outcomes: Sequence[str | None] | None, m
         else "Its state is the cell alone, as in the paper, so a path that crosses itself cannot be followed."
     )
     ended = "It ended when the values no longer changed." if settled else "It ended before it had converged."
+    ended = f"{ended} {ties(rule)}"
     same = "The same demonstration, settings, seed and learner version give the same numbers."
     if outcomes is None:
         none = " When it was learnt, no demonstration of it was marked recovery or failure." if marked else ""
         return f"{state} {ended} {same}{none}"
     known = ", ".join("not known" if one is None else one for one in outcomes)
     return f"{state} {ended} {same} It was asked to learn from any outcome; that of its demonstrations was: {known}."
+
+
+def ties(rule: dict[str, Any] | None) -> str:
+    """Return the sentence on the rule among equally good actions, as the manifest states it."""
+    if rule is None:
+        return "Of equally good actions it takes the one with the lowest index."
+    along, depth = rule["depth_along"], "depth is not compared, because the frame is not the base of the arm"
+    if rule["depth_from_mm"] is not None:
+        depth = "depth is the distance from the remote centre"
+    if along is not None:
+        depth = "depth is measured along ({:g}, {:g}, {:g})".format(*along)
+    return (
+        "Of equally good actions it takes the one on the shortest way to the path, then the one that goes least deep, "
+        f"then the one that joins the path earliest; {depth}."
+    )
 
 
 def coverage(counts: StartCounts, starts: int, mean_share: float, median_share: float, goal_alone: int) -> str:

@@ -259,6 +259,7 @@ def _learner(version: PolicyVersion) -> CardLearner:
         in_words=words.learner(
             manifest["phases"],
             manifest["training"]["settled"],
+            manifest.get("ties"),
             manifest.get("outcomes"),
             any(one.outcome is not None for one in version.demonstrations),
         ),

@@ -165,6 +165,7 @@ class TrainingRequest(TypedDict):
     release: bool
     combine: NotRequired[dict[str, str]]  # of several demonstrations
     outcomes: NotRequired[str]  # "any": of any outcome; otherwise left out
+    depth_along: NotRequired[list[float]]  # in a frame that is not the base of the arm
 
 
 class RetrainingRequest(TypedDict):

@@ -48,6 +48,7 @@ from skills.learning.policy import (
     refuse_too_large,
 )
 from skills.learning.q_learning import PhaseQLearning
+from skills.learning.ties import rule_in
 from skills.learning.tube import certified_poses
 from skills.library import jobs, releases
 from skills.library.catalogue import find_surgeon, find_suture_type
@@ -145,6 +146,9 @@ def request_training(session: Session, training: TrainingIn, actor: str, near: N
         request["near"] = asdict(near)
     if any_outcome:  # left out otherwise, for the same reason
         request["outcomes"] = ANY
+    if training.depth_along is not None:
+        _refuse_depth_along(training.depth_along, learner, chosen[-1].frame)
+        request["depth_along"] = list(training.depth_along)
     job, new = jobs.ask(session, "training", request, who, actor)
     if new:
         return Asked(job, True, QUEUED)
@@ -155,6 +159,15 @@ def request_training(session: Session, training: TrainingIn, actor: str, near: N
 def near_limits(settings: Settings) -> NearLimits:
     """Return the gate's limit at the starts near the demonstrated one, as an installation sets it."""
     return NearLimits(settings.near_radius_mm, settings.near_least_share)
+
+
+def _refuse_depth_along(depth_along: Sequence[float], learner: Learner, frame: str) -> None:
+    """Refuse a direction of depth that would not be used, or is none."""
+    if frame.endswith("_base"):
+        raise BadInput(f"In {frame} depth is the distance from the remote centre; omit `depth_along`.")
+    if not learner.phased:
+        raise BadInput(f"The learner '{learner.kind}' does not compare depths; omit `depth_along`.")
+    rule_in(frame, depth_along)
 
 
 def _release_again(session: Session, job: Job, actor: str) -> str:
@@ -303,6 +316,7 @@ def learn_style(lesson: Lesson, request: TrainingRequest, settings: Settings, te
         reward,
         learner_of(request["learner"]),
         request["seed"],
+        ties=rule_in(demo.frame, request.get("depth_along")),
         tell=tell,
         timeout_s=settings.learning_timeout_s,
         memory_bytes=settings.learning_memory_bytes,
@@ -439,6 +453,11 @@ def refusals(policy: Policy, certificate: Certificate, near: NearStarts) -> list
     if certificate.starts_reaching < certificate.starts:
         missing = certificate.starts - certificate.starts_reaching
         reasons.append(f"{missing} of {certificate.starts} starts do not reach the goal")
+    if certificate.off_rule:
+        reasons.append(
+            f"{certificate.off_rule} of {certificate.checked} greedy actions are not the ones that the rule among "
+            "equally good actions selects"
+        )
     if policy.learner.phased and not certificate.demonstration_reproduced:
         reasons.append("the rollout from the demonstrated start is not the demonstration")
     if policy.learner.phased and not near.within:
@@ -545,6 +564,7 @@ def describe_policy(
                 states_checked=certificate.checked,
                 states_finishing=certificate.finishing,
                 suboptimal_actions=certificate.suboptimal,
+                actions_off_rule=certificate.off_rule,
                 demonstration_reproduced=certificate.demonstration_reproduced,
                 refused_because=tuple(refused_because),
                 gate=GATE_VERSION,
@@ -555,6 +575,7 @@ def describe_policy(
         ),
         **({} if wandered is None else {"rollouts": as_json(wandered)}),  # left out on the grid: older digests
         **_joining(policy),
+        **({} if policy.ties is None else {"ties": as_json(policy.ties)}),  # left out as before there was a rule
     }
 
 

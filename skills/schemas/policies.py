@@ -16,6 +16,7 @@ from skills.gridworld.reward import RewardLevels
 from skills.learning.certificate import NearStarts
 from skills.learning.evaluation import Metrics, SpaceRollouts
 from skills.learning.q_learning import Training
+from skills.learning.ties import ShortestWay
 from skills.learning.tube_certificate import TubeCertificate
 from skills.planning.plan import DrivenPass
 from skills.schemas import DemoOutcome, Given, Grid, Page, PolicyName, VersionNumber
@@ -194,6 +195,8 @@ class GridCertificate:
         states_checked: Number of states (phase and cell) whose action was compared with exact values.
         states_finishing: Number of them from which the policy finishes; null in a certificate of an older version.
         suboptimal_actions: Number of them whose action is worse than the best one.
+        actions_off_rule: Number of them whose action is not the one that the policy's rule (`ties`) selects of the best
+            ones; null without a rule, and in an older certificate.
         demonstration_reproduced: The rollout from the demonstrated start is the demonstration.
         refused_because: The reasons against a release.
         gate: The gate's version; null in an older certificate, which asked the centres of cells.
@@ -205,6 +208,7 @@ class GridCertificate:
     states_checked: Count
     states_finishing: Count | None = None
     suboptimal_actions: Count
+    actions_off_rule: Count | None = None
     demonstration_reproduced: bool
     refused_because: tuple[str, ...]
     gate: int | None = None
@@ -340,6 +344,11 @@ class Policy(PolicyName):
     )
     format: Literal[1, 2] = Field(default=1, description="Left out: 1. 2: with `joining`, see above.")
     joining: Joining | None = Field(default=None, description="Of format 2.")
+    ties: ShortestWay | None = Field(
+        default=None,
+        description="The rule among equally good actions; null or absent: the lowest index. The actions follow it: "
+        "take them, and not the first largest of the Q values in the arrays.",
+    )
     created_at: datetime
     released_at: datetime | None
     released_by: str | None

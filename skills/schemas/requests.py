@@ -271,6 +271,11 @@ class TrainingIn(Schema):
         default="success",
         description="success refuses demonstrations that are marked recovery or failure; any learns from them too.",
     )
+    depth_along: Point | None = Field(
+        default=None,
+        description="Direction in which depth increases, of a demonstration whose frame is not the base of its arm: of "
+        "equally short ways the policy takes the shallower one. In a base frame depth is the distance from the origin.",
+    )
 
     @property
     def chosen(self) -> Learner | None:

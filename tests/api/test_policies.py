@@ -131,7 +131,8 @@ def test_the_arrays_agree_with_the_json(still: Service):
     table[arrays["phase"], arrays["state"]] = arrays["action"]
     assert table.tolist() == policy["actions"]
     live = arrays["action"] >= 0
-    assert (arrays["q"].argmax(axis=1)[live] == arrays["action"][live]).all()
+    q, chosen = arrays["q"][live], arrays["action"][live]
+    assert q[np.arange(len(q)), chosen] == pytest.approx(q.max(axis=1), rel=1e-9, abs=0)  # of equals, as `ties` says
     assert arrays["waypoints"].tolist() == policy["waypoints"]
     assert arrays["sha256"].tobytes().hex() == policy["sha256"]
     assert int(arrays["reaches_goal"].sum()) == policy["coverage"]["starts_reaching_goal"]
@@ -226,6 +227,58 @@ def test_a_slip_policy_is_released_if_exact_and_refused_if_sampled(trained: Serv
 def test_every_state_from_which_the_policy_finishes_is_counted(trained: Service):
     certificate = trained.client.policy(**KESTREL)["grid_certificate"]
     assert certificate["states_finishing"] == certificate["states_checked"] > 1331
+
+
+def test_a_policy_states_its_rule_among_equally_good_actions(trained: Service):
+    policy = trained.client.policy(**KESTREL)
+    assert policy["ties"] == {"depth_from_mm": [0.0, 0.0, 0.0], "depth_along": None, "kind": "shortest-way"}
+    assert policy["grid_certificate"]["actions_off_rule"] == 0
+    assert "depth is the distance from the remote centre" in card(trained, 1)["learner"]["in_words"]
+    assert trained.client.learnt(**KESTREL).ties is not None
+    assert "Actions off the rule" in trained.http.get("/pages/styles/kestrel/simple-running").text
+    trained.train(learner={"kind": "cell-q-learning"})
+    cell = trained.client.policy(**KESTREL, version=2)
+    assert "ties" not in trained.http.get(f"/policy-versions/{cell['sha256']}").json()
+    assert cell["grid_certificate"]["actions_off_rule"] is None
+    assert "lowest index" in card(trained, 2)["learner"]["in_words"]
+
+
+def card(service: Service, version: int) -> dict:
+    return service.http.get(f"{POLICY}/versions/{version}/card").json()
+
+
+def test_a_rule_that_is_broken_is_no_release(trained: Service, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("skills.learning.policy.choose", lambda domain, q, rule: q.argmax(axis=1))
+    result = trained.train(seed=5, release=True)["result"]
+    assert not result["released"]
+    assert "not the ones that the rule among equally good actions selects" in result["not_released_because"]
+    assert "are not optimal" not in result["not_released_because"]
+
+
+def test_depth_in_another_frame_is_measured_along_a_given_direction(service: Service):
+    service.client.put_surgeon("kestrel")
+    service.client.add_demo(cases.hand_off(), media_type=CSV, **KESTREL, frame="ECM")
+    service.train()
+    assert service.client.policy(**KESTREL, version=1)["ties"]["depth_along"] is None
+    service.train(depth_along=[0.0, 0.0, 1.0])
+    along = service.client.policy(**KESTREL, version=2)
+    assert along["ties"] == {"depth_from_mm": None, "depth_along": [0.0, 0.0, 1.0], "kind": "shortest-way"}
+    assert service.client.learnt(**KESTREL, version=2).ties.depth_along == (0.0, 0.0, 1.0)
+    assert "along (0, 0, 1)" in card(service, 2)["learner"]["in_words"]
+
+
+@pytest.mark.parametrize(
+    ("frame", "more", "says"),
+    [
+        ("PSM2_base", {"depth_along": [0, 0, 1]}, "depth is the distance from the remote centre"),
+        ("ECM", {"depth_along": [0, 0, 0]}, "must not be"),
+        ("ECM", {"depth_along": [0, 0, 1], "learner": {"kind": "cell-q-learning"}}, "does not compare depths"),
+    ],
+)
+def test_a_direction_of_depth_that_is_not_used_is_refused(service: Service, frame: str, more: dict, says: str):
+    service.client.put_surgeon("kestrel")
+    service.client.add_demo(cases.hand_off(), media_type=CSV, **KESTREL, frame=frame)
+    assert says in assert_problem(service.http.post("/trainings", json=KESTREL | more), 422)["detail"]
 
 
 def test_the_papers_failed_baseline_is_learnt_and_refused_with_reasons(trained: Service):

@@ -20,11 +20,13 @@ from tests.bench.reading import reading
 from tests.bench.scaling import scaling
 from tests.bench.serving import serving
 from tests.bench.session import session
+from tests.bench.ties import ties
 from tests.bench.tissue import tissue
 
 PARTS = {
     "reading": reading,
     "learning": learning,
+    "ties": ties,
     "learners": learners,
     "motion": kinematics,
     "playback": playing,

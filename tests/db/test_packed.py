@@ -28,6 +28,7 @@ from skills.learning.max_ent_irl import MaxEntIRL
 from skills.learning.networks import DDPG, DQN, TRPO
 from skills.learning.policy import learn_tabular
 from skills.learning.q_learning import CellQLearning, PhaseQLearning
+from skills.learning.ties import ShortestWay
 from skills.learning.tube import certified_poses
 from skills.planning.handoff import PsmM
 from skills.planning.plan import SuturePoint, stack
@@ -85,6 +86,8 @@ VALUES = [
     DQN(),
     DDPG(),
     TRPO(),
+    replace(PHASED, ties=None),
+    replace(PHASED, ties=ShortestWay(depth_along=(0.0, 0.1, -1.0))),
     replace(POLICY, network=always((0.5, -0.25, 1e-30))),
     replace(PLAN, psm_m=None),
     PLAN,
@@ -146,6 +149,13 @@ def test_a_path_without_hysteresis_is_stored_as_before_there_was_any():
     assert digest(replace(PATH, hysteresis=0.25)) != digest(PATH)
     older = {"grid": tree_of(PATH.grid), "states": {"array": 0}, "bridged": 0}
     assert_same(unpack(forged({"value": "GridPath", "of": older}, a0=PATH.states)), PATH)
+
+
+def test_a_policy_without_a_rule_among_ties_is_stored_as_before_there_was_one():
+    tree, arrays = parts_of(replace(PHASED, ties=None))
+    assert "ties" not in tree["of"]
+    assert unpack(forged(tree, **arrays)).ties is None
+    assert digest(PHASED) != digest(replace(PHASED, ties=None))
 
 
 def tree_of(grid: GridWorld) -> dict:

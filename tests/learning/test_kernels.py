@@ -10,6 +10,7 @@ from skills.gridworld.grid import MOVES, GridPath, GridWorld
 from skills.gridworld.reward import sparse_reward
 from skills.gridworld.scene import Box, Scene, SceneCosts, hazards_of
 from skills.learning import _kernels
+from skills.learning.certificate import certify
 from skills.learning.in_scene import learn_in_scene
 from skills.learning.policy import learn_tabular
 from skills.learning.q_learning import CellQLearning, PhaseQLearning, Sweeper
@@ -67,6 +68,16 @@ def both(loop, agreed):
         return answer
 
     return run
+
+
+@pytest.mark.parametrize("learner", [PhaseQLearning(), LEARNERS[2]], ids=["settled", "sampled"])
+@pytest.mark.parametrize("name", ["two cells", "to and fro"])
+def test_the_compiled_rule_among_ties_and_the_plain_one_agree(monkeypatch, learner, name):
+    agreed: list[str] = []
+    for loop in ("find_equal", "choose_ways", "count_off_rule"):
+        monkeypatch.setattr(_kernels, f"{loop}_compiled", both(loop, agreed))
+    certify(learn_tabular(sparse_reward(named_path(name)), learner, seed=5))
+    assert agreed == ["find_equal", "choose_ways", "count_off_rule"]
 
 
 @settings(deadline=None)

@@ -28,7 +28,7 @@ from skills.library.inspection import inspect_installation
 from skills.library.recordings import stored_recording
 from skills.settings import settings
 from tests import backends
-from tests.api.service import assert_problem, serving
+from tests.api.service import KESTREL, POLICY, assert_problem, serving
 from tests.migrations.make_fixture import JSON, NPZ, RELEASES, answer_of
 from tests.migrations.test_migrations import go, tables
 from tests.waiting import END_S
@@ -82,6 +82,22 @@ def test_a_release_is_taken_over_and_serves_the_same_bytes(release: Released):
                 assert arrays == kinds[NPZ]
     if expected["zlib"] != zlib.ZLIB_RUNTIME_VERSION:
         pytest.skip("ARRAYS WERE COMPARED BY THEIR NUMBERS ALONE: this Python compresses with another zlib")
+
+
+def test_an_old_version_is_served_again_after_one_with_another_rule(release: Released):
+    database, _ = release
+    with serving(database.url) as service:
+        kept = service.http.get(POLICY)
+        assert "ties" not in kept.json()
+        assert service.client.learnt(**KESTREL).ties is None
+        service.train(seed=9, release=True)
+        new = service.http.get(POLICY).json()
+        assert new["ties"]["kind"] == "shortest-way"
+        assert new["actions"] != kept.json()["actions"]
+        service.client.release(**KESTREL, version=kept.json()["version"])
+        again = service.http.get(POLICY)
+        times = {"released_at", "released_by"}
+        assert all(again.json()[name] == value for name, value in kept.json().items() if name not in times)
 
 
 def test_all_of_a_release_is_whole_after_its_migration(release: Released):
