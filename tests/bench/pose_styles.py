@@ -5,10 +5,15 @@ needle regrasps of SurgicAI in a simulator, in its units. One demonstration afte
 and goal pose are given to all alike. Position: mean Euclidean distance along the DTW alignment; orientation: mean angle
 at equal phase. DMP and ProMP are those of movement_primitives, the mixtures of GMR and TP-GMM those of scikit-learn.
 All but the straight line, the DMP and TP-GMM's positions learn from the demonstrations laid between start and goal.
+
+`SKILLS_TEST_JIGSAWS` names the folder of two tasks of JIGSAWS. Of each trial the longest hand-off is taken that is
+proposed for the right instrument; five of other surgeons, drawn by a seed, are shown for each.
 """
 
 import os
-from collections.abc import Callable, Iterable, Iterator
+import tarfile
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +24,9 @@ from scipy.spatial.transform import Rotation, Slerp
 from sklearn.mixture import GaussianMixture
 
 from skills.arrays import Floats
-from skills.demonstration.demonstration import Demo
+from skills.demonstration.demonstration import Demo, cut_demo
+from skills.demonstration.segments import propose_segments
+from skills.formats.jigsaws import read_jigsaws, trials
 from skills.learning.evaluation import dtw
 from skills.learning.pose_style import PHASES, PoseStyle, laid_rotation, laid_tip, learn_pose_style, mean_rotation
 from tests.bench.timing import best_s
@@ -27,6 +34,8 @@ from tests.bench.timing import best_s
 Poses = tuple[Floats, Floats]  # positions, (PHASES, 3), and unit quaternions, (PHASES, 4)
 Method = Callable[[list[Poses], Poses, Poses], Poses]  # demonstrations, their medoid, start and goal pose: a motion
 PHASE = np.linspace(0.0, 1.0, PHASES)
+TASKS = {"knot_tying": "Knot_Tying", "needle_passing": "Needle_Passing"}  # folders of the archive, and their names
+RIGHT, COMBINED = "PSM_right", 5
 
 
 def motions() -> dict[str, list[Poses]]:
@@ -43,6 +52,40 @@ def motions() -> dict[str, list[Poses]]:
         for one in np.unique(episode)
     ]
     return found
+
+
+def surgeons() -> dict[str, list[tuple[str, Poses]]]:
+    """Return the hand-offs of each task of JIGSAWS with the letters of their surgeons, resampled in time, in mm."""
+    (archive,) = Path(os.environ["SKILLS_TEST_JIGSAWS"]).glob("*.tar.xz")
+    found: dict[str, list[tuple[str, Poses]]] = {task: [] for task in TASKS.values()}
+    with tempfile.TemporaryDirectory() as name, tarfile.open(archive) as packed:
+        for member in packed:
+            task = TASKS.get(Path(member.name).parent.name)
+            content = packed.extractfile(member)
+            if task is None or content is None:
+                continue
+            to = Path(name, task, "kinematics", "AllGestures", Path(member.name).name)
+            to.parent.mkdir(parents=True, exist_ok=True)
+            to.write_bytes(content.read())
+        for trial in trials(Path(name)):
+            if trial.kinematics.stat().st_size == 0:
+                continue  # one trial has an empty file
+            with trial.kinematics.open("rb") as file:
+                recording = read_jigsaws(file)
+            longest = max(propose_segments(recording, RIGHT), key=lambda one: one.end_s - one.start_s, default=None)
+            if longest is None:
+                continue
+            demo = cut_demo(recording, arm=RIGHT, start_s=longest.start_s, end_s=longest.end_s)
+            assert demo.rotation_xyzw is not None, "every row has an orientation"
+            found[trial.task].append((trial.user, _resampled(demo.tip_mm, Rotation.from_quat(demo.rotation_xyzw))))
+    return found
+
+
+def drawn(users: Sequence[str], seed: int = 0) -> list[list[int]]:
+    """Draw for each demonstration `COMBINED` of other surgeons."""
+    rng = np.random.default_rng(seed)
+    others = [[k for k, other in enumerate(users) if other != user] for user in users]
+    return [sorted(rng.choice(one, COMBINED, replace=False).tolist()) for one in others]
 
 
 def _resampled(tip: Floats, rotation: Rotation) -> Poses:
@@ -216,15 +259,25 @@ METHODS: dict[str, Method] = {
 }
 
 
-def left_out(shown: list[Poses], methods: Iterable[Method]) -> Iterator[Floats]:
-    """Yield the errors of each method with one demonstration after the other left out, (demonstrations, 2)."""
+def left_out(
+    shown: list[Poses], methods: Iterable[Method], kept: Sequence[Sequence[int]] | None = None
+) -> Iterator[Floats]:
+    """Yield the errors of each method with one demonstration after the other left out, (demonstrations, 2).
+
+    Args:
+        shown: The demonstrations.
+        methods: The methods.
+        kept: For each demonstration left out, the indices of those to learn from; by default all others.
+    """
+    if kept is None:
+        kept = [[i for i in range(len(shown)) if i != k] for k in range(len(shown))]
     apart = np.array([[0.0 if one is other else errors(one, other)[0] for other in shown] for one in shown])
     for made in methods:
         found = []
-        for k, (tip, rotation) in enumerate(shown):
-            rest = [one for i, one in enumerate(shown) if i != k]
-            middle = rest[int(np.argmin(np.delete(np.delete(apart, k, 0), k, 1).sum(axis=1)))]
-            found.append(errors(made(rest, middle, (tip[[0, -1]], rotation[[0, -1]])), shown[k]))
+        for (tip, rotation), of in zip(shown, kept, strict=True):
+            middle = shown[of[int(np.argmin(apart[np.ix_(of, of)].sum(axis=1)))]]
+            motion = made([shown[i] for i in of], middle, (tip[[0, -1]], rotation[[0, -1]]))
+            found.append(errors(motion, (tip, rotation)))
         yield np.array(found)
 
 
@@ -233,6 +286,27 @@ def interval(differences: Floats, seed: int = 0) -> tuple[float, float]:
     rng = np.random.default_rng(seed)
     means = rng.choice(differences, (10_000, len(differences))).mean(axis=1)
     return float(np.quantile(means, 0.025)), float(np.quantile(means, 0.975))
+
+
+def surgeons_left_out(table: Table) -> None:
+    """Add the errors of all methods on JIGSAWS, each surgeon left out, and the difference of ours from each."""
+    for task, of in surgeons().items():
+        users, shown = [user for user, _ in of], [one for _, one in of]
+        found = dict(zip(METHODS, left_out(shown, METHODS.values(), drawn(users)), strict=True))
+        table.add_row(f"{task}: {len(shown)} hand-offs of {len(set(users))} surgeons, {COMBINED} shown", "", "")
+        for method, one in found.items():
+            differences = (found["ours"] - one) / (1.0 if method == "ours" else one.mean(axis=0))
+            position, turn = (
+                f"{mean:.3g} {unit}"
+                + (
+                    ""
+                    if method == "ours"
+                    else f"; ours {100 * d.mean():+.1f} % ({100 * low:+.1f} to {100 * high:+.1f})"
+                )
+                for mean, unit, d in zip(one.mean(axis=0), ("mm", "degrees"), differences.T, strict=True)
+                for low, high in [interval(d)]
+            )
+            table.add_row(f"{task}, surgeon left out: {method}", position, turn)
 
 
 def pose_styles(table: Table) -> None:
@@ -246,6 +320,8 @@ def pose_styles(table: Table) -> None:
             table.add_row(
                 f"{name}, left out: {method}", f"{position:.3g} {'units' if mm == 1 else 'mm'}", f"{turn:.2f} degrees"
             )
+    if "SKILLS_TEST_JIGSAWS" in os.environ:
+        surgeons_left_out(table)
     together = {method: np.concatenate([found[name][method] for name in list(sets)[:3]]) for method in METHODS}
     for method, one in together.items():
         less = (together["ours"] - one) / one.mean(axis=0)
