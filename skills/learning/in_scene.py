@@ -24,11 +24,12 @@ from skills.gridworld.domain import Domain
 from skills.gridworld.grid import MOVES
 from skills.gridworld.reward import RewardMap
 from skills.gridworld.scene import Hazards
-from skills.learning.certificate import TIE, mdp_of
+from skills.learning.certificate import mdp_of
 from skills.learning.dynamic_programming import MAX_SWEEPS, Mdp, ValueIteration, exact_q
 from skills.learning.policy import Policy, check_learnable
 from skills.learning.q_learning import PhaseQLearning, Training, learn_q
 from skills.learning.slip import start_all
+from skills.learning.ties import TIE
 
 NOISE = 1e-12  # of the cost of touching: values that nearly cancel are exact to less
 FAINTEST = 100  # times that noise: a smaller value is not compared

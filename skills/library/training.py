@@ -41,6 +41,7 @@ from skills.learning.dynamic_programming import FAINT
 from skills.learning.evaluation import check_in_space, measure
 from skills.learning.policy import (
     LEARNER_VERSION,
+    Learner,
     Policy,
     describe_learner,
     describe_settings,
