@@ -367,7 +367,10 @@ def _angles(one_xyzw: Floats, other_xyzw: Floats) -> Floats:
 
 def _turned(rotation_xyzw: Floats, axes: Floats, angles: Floats) -> Floats:
     """Return orientations, (R, 4), turned about their own axes, (R, 3) of length 1, by angles, (R,)."""
-    return np.asarray((Rotation.from_quat(rotation_xyzw) * Rotation.from_rotvec(axes * angles[:, None])).as_quat())
+    turn, stay = axes * np.sin(angles / 2)[:, None], np.cos(angles / 2)[:, None]
+    vector, scalar = rotation_xyzw[:, :3], rotation_xyzw[:, 3:]
+    turned = scalar * turn + stay * vector + np.cross(vector, turn)
+    return np.hstack([turned, scalar * stay - (vector * turn).sum(axis=1, keepdims=True)])
 
 
 def _deciding(step: float, disturbance: float, start: float) -> Floats:
