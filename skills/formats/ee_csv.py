@@ -133,11 +133,11 @@ def _read(
         numbers = read_numbers(text, names, used, separator, said.decimal, None if time is None else (time, "ns"))
     place = {column: k for k, column in enumerate(used)}
     if time is not None:
-        _check_whole(numbers.values[:, place[time]])
+        _check_whole(numbers.columns([place[time]]))
         assert numbers.stamps_ns is not None
         check_steps(TIME, "ns", numbers.stamps_ns)
-    stamps_ns = stamps_of(numbers.stamps_ns, len(numbers.values), said)
-    return stamps_ns, {(one.arm, one.kind): numbers.values[:, [place[k] for k in one.columns]] for one in groups}
+    stamps_ns = stamps_of(numbers.stamps_ns, numbers.rows, said)
+    return stamps_ns, {(one.arm, one.kind): numbers.columns([place[k] for k in one.columns]) for one in groups}
 
 
 def _groups(names: Sequence[str]) -> tuple[list[_Group], dict[str, str]]:

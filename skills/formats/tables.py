@@ -215,11 +215,12 @@ def read_table(file: BinaryIO, reading: TableReading | None = None) -> Recording
         )
     if not is_ended:
         check_last_number(file, separator, said.decimal)
-    stamps_ns = stamps_of(numbers.stamps_ns, len(numbers.values), said)
+    stamps_ns = stamps_of(numbers.stamps_ns, numbers.rows, said)
     if time is not None and time.unit != "s":
         check_steps(names[time.index], time.unit, stamps_ns)
     columns = {
-        name: scaled(numbers.values[:, k], QUANTITIES[name][use.unit]) for k, (name, use) in enumerate(uses.items())
+        name: scaled(numbers.columns([k])[:, 0], QUANTITIES[name][use.unit])
+        for k, (name, use) in enumerate(uses.items())
     }
     recording = _recording(_Table(columns, stamps_ns), said, _listed(names, uses))
     return recording if is_ended else replace(recording, notes=(NOT_ENDED,))

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any, BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
 from skills.arrays import Floats
 from skills.errors import UnreadableRecording
@@ -40,19 +41,28 @@ class ParquetTable:
 
     Attributes:
         rows: The number of rows T.
-        numbers: The numbers by column, shape (T, width).
+        numbers: The numbers by column, shape (T, width), in single precision where the file has no more.
         texts: For each column and position the distinct texts.
-        single: Columns of numbers in single precision or less.
     """
 
     rows: int
-    numbers: dict[str, Floats]
+    numbers: dict[str, NDArray[np.floating]]
     texts: dict[str, list[set[str]]]
-    single: frozenset[str]
+
+    def is_single(self, name: str) -> bool:
+        """Return whether a column has numbers in single precision or less."""
+        return name in self.numbers and self.numbers[name].dtype == np.float32
 
     def column(self, name: str) -> Floats | None:
         """Return a column of one number, shape (T,); None where there is none."""
-        return self.numbers[name][:, 0] if name in self.numbers else None
+        return self.numbers[name][:, 0].astype(np.float64) if name in self.numbers else None
+
+    def stacked(self, places: Sequence[tuple[str, int]]) -> Floats:
+        """Return some numbers of each row, named by column and position, shape (T, number of places)."""
+        (name, first), end = places[0], places[-1][1] + 1
+        if list(places) == [(name, k) for k in range(first, end)]:
+            return self.numbers[name][:, first:end].astype(np.float64)
+        return np.stack([self.numbers[name][:, k] for name, k in places], axis=1, dtype=np.float64)
 
 
 def open_parquet(file: BinaryIO) -> Any:
@@ -93,9 +103,8 @@ def read_columns(file: BinaryIO, columns: Sequence[ParquetColumn], *, most_rows:
     """
     opened = open_parquet(file)
     rows = _checked_rows(opened, [one.name for one in columns], file.seek(0, os.SEEK_END), most_rows)
-    numbers = {one.name: np.empty((rows, one.width)) for one in columns if not one.is_text}
+    numbers: dict[str, NDArray[np.floating]] = {}
     texts: dict[str, list[set[str]]] = {one.name: [set() for _ in range(one.width)] for one in columns if one.is_text}
-    single: set[str] = set()
     at = 0
     with refusing(_WHAT, _ADVICE):
         for batch in opened.iter_batches(BATCH_ROWS, columns=[one.name for one in columns], use_threads=False):
@@ -108,12 +117,14 @@ def read_columns(file: BinaryIO, columns: Sequence[ParquetColumn], *, most_rows:
                     for position, found in enumerate(texts[one.name]):
                         found.update(values[:, position].tolist())
                 else:
+                    if one.name not in numbers:  # the type is that of the whole column
+                        single = values.dtype.kind == "f" and values.dtype.itemsize < 8
+                        numbers[one.name] = np.empty((rows, one.width), np.float32 if single else np.float64)
                     numbers[one.name][at:end] = values
-                    single.update([one.name] if values.dtype.itemsize < 8 and values.dtype.kind == "f" else [])
             at = end
     if at != rows:
         raise UnreadableRecording(f"{_WHAT} has {at} rows and claims {rows}. {_ADVICE}")
-    return ParquetTable(rows, numbers, texts, frozenset(single))
+    return ParquetTable(rows, numbers, texts)
 
 
 def read_rows(file: BinaryIO, names: Sequence[str], *, most_rows: int) -> list[dict[str, Any]]:

@@ -148,7 +148,7 @@ def _read(dataset: Dataset, meanings: Mapping[Quantity, Mapping[int, Place]]) ->
 def _values(table: ParquetTable, meanings: Mapping[Quantity, Mapping[int, Place]]) -> dict[Quantity, Floats]:
     """Return the numbers of each quantity, shape (T, K)."""
     return {
-        quantity: np.stack([table.numbers[feature][:, k] for _, (feature, k) in sorted(places.items())], axis=1)
+        quantity: table.stacked([place for _, place in sorted(places.items())])
         for quantity, places in sorted(meanings.items())
     }
 
@@ -493,7 +493,7 @@ def _stamps_ns(dataset: Dataset, table: ParquetTable) -> tuple[Ints, str]:
     if not np.isfinite(seconds).all():
         first = int(np.argmin(np.isfinite(seconds)))
         raise NotFinite(f"The timestamp of row {first} is NaN or infinite.", sample=first)
-    if "timestamp" not in table.single:
+    if not table.is_single("timestamp"):
         return _in_ns(seconds), "timestamp"
     step_s = float(np.spacing(np.float32(np.abs(seconds).max())))
     if (np.abs(seconds - even_s) <= max(SAME_S, step_s)).all():
