@@ -24,7 +24,7 @@ from skills.formats.lerobot.writer import AboutDataset, ExportedEpisode, dataset
 from skills.library.catalogue import put_surgeon
 from skills.seeds.recordings import sample_recordings
 from skills.settings import Settings, settings
-from tests.formats import bags, lerobots, trials
+from tests.formats import bags, lerobots, trials, videos
 from tests.library import cases, exports
 
 STYLE = ("wren", "simple-running")
@@ -79,6 +79,34 @@ def test_a_dataset_is_exported_verified_and_never_overwritten(skills, tmp_path: 
     for existing in (out, str(file)):
         code, said = skills("export-dataset", existing)
         assert (code, "exists already" in said) == (1, True), said
+
+
+def test_videos_of_the_users_own_dataset_are_exported_with_the_recordings(skills, tmp_path: Path) -> None:
+    theirs = lerobots.write(videos.dataset("v2.1"), tmp_path / "theirs")
+    assert skills("migrate")[0] == 0
+    assert skills("surgeon", "put", "kestrel")[0] == 0
+    assert skills("suture", "list")[0] == 0
+    stated = ("--frame", "ECM", "--surgeon", "kestrel", "--suture", "simple-running", "--arm", "PSM1")
+    for number in (2, 0):
+        code, said = skills("demo", "add", str(theirs), "--episode", str(number), *stated, "--segment", "whole")
+        assert code == 0, said
+    out = tmp_path / "dataset"
+    asked = ("export-dataset", str(out), "--whole", "--videos", str(theirs), "--pictures-consented")
+    for left_out, fault in (("--whole", "not cut at a hand-off"), ("--pictures-consented", "declare it with")):
+        code, said = skills(*(word for word in asked if word != left_out))
+        assert (code, fault in said) == (1, True), said
+    code, said = skills("export-dataset", str(tmp_path / "dataset.zip"), *asked[2:])
+    assert (code, "written to a folder" in said) == (1, True), said
+    code, said = skills("export-dataset", str(out), "--whole", "--pictures-consented")
+    assert (code, "are about --videos" in said) == (1, True), said
+    code, said = skills(*asked)
+    assert (code, "episodes: 2, frames: 100" in said, "declared the consent" in said) == (0, True, True), said
+    shown = [videos.shown(one) for one in sorted(out.glob(f"videos/*/{videos.CAMERAS[0]}/*.mp4"))]
+    assert shown == [[*range(90, 150)], [*range(40)]]
+    (theirs / f"videos/chunk-000/{videos.CAMERAS[1]}/episode_000002.mp4").unlink()
+    code, said = skills("export-dataset", str(tmp_path / "more"), *asked[2:])
+    assert (code, "There is no video of observation.images.wrist for episode 2" in said) == (1, True), said
+    assert sorted(one.name for one in tmp_path.iterdir() if one.is_dir()) == ["dataset", "theirs"]
 
 
 def test_from_a_bag_folder_to_a_released_policy_and_a_plan(skills, tmp_path: Path) -> None:

@@ -156,6 +156,10 @@ Tool = Annotated[
     list[str] | None,
     typer.Option(help="The instrument of an arm in a LeRobot dataset, such as PSM1=400006; repeatable."),
 ]
+DatasetColumns = Annotated[
+    list[str] | None,
+    typer.Option("--column", help="A column under another name in a LeRobot dataset, as in the upload; repeatable."),
+]
 RecordingPath = Annotated[
     Path,
     typer.Argument(
@@ -198,7 +202,7 @@ def ready_episode(
     with TemporaryDirectory() as folder, bar("sending") as sending:
         file = Path(folder) / "episode.zip"
         with file.open("wb") as out:
-            columns, tools = _pairs("--column", column), _pairs("--tool", tool)
+            columns, tools = pairs("--column", column), pairs("--tool", tool)
             cut_episode(dataset, episode, out, columns=columns, tools=tools)
         yield file, sending
 
@@ -230,7 +234,8 @@ def _refuse_statements(path: Path, *given: object) -> None:
         raise BadInput(f"{path} is no LeRobot dataset; --episode and --tool are about one.")
 
 
-def _pairs(option: str, given: Sequence[str] | None) -> dict[str, str]:
+def pairs(option: str, given: Sequence[str] | None) -> dict[str, str]:
+    """Return the two names of each statement of an option such as --tool."""
     pairs = [one.partition("=") for one in given or ()]
     wrong = next((one for one in pairs if not (one[0] and one[2])), None)
     if wrong is not None:

@@ -7,7 +7,7 @@ from typing import Literal
 
 from skills.client.connection import Connection, at, call, given
 from skills.client.transport import Progress
-from skills.schemas.given import Job
+from skills.schemas.given import DatasetEpisodes, Job
 
 
 class Datasets(Connection):
@@ -89,6 +89,11 @@ class Datasets(Connection):
 
             await self._transport.aside(finish)
         return to
+
+    @call
+    async def dataset_episodes(self, dataset: str) -> DatasetEpisodes:
+        """Return the recording and the demonstrations of each episode of a dataset, which does not name them itself."""
+        return await self._get(DatasetEpisodes, at("datasets", dataset, "episodes"))
 
     @call
     async def delete_dataset(self, dataset: str) -> None:

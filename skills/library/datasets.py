@@ -502,6 +502,15 @@ def find_dataset(session: Session, dataset_sha256: str) -> StoredDataset:
     return find_by_digest(session, StoredDataset, dataset_sha256, "dataset", Remedy(Action.LIST_DATASETS))
 
 
+def episodes_json(session: Session, dataset_sha256: str) -> dict[str, Any]:
+    """Return the recording and the demonstrations of each episode of a dataset, in the order of their numbers."""
+    found = _episodes(session, find_dataset(session, dataset_sha256).job_row)
+    return {
+        "whole": all(one.interval_s is None for one in found),
+        "episodes": [{"recording": one.recording, "demos": list(one.demos)} for one in found],
+    }
+
+
 def served_dataset(session: Session, dataset_sha256: str) -> StoredDataset:
     """Return a dataset, for a download.
 

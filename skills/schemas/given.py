@@ -31,7 +31,15 @@ from skills.schemas.policies import (
     Rollout,
     Version,
 )
-from skills.schemas.recordings import Demonstration, DemoPath, Recording, RecordingPreview, RewardMap, SuturePoints
+from skills.schemas.recordings import (
+    DatasetEpisodes,
+    Demonstration,
+    DemoPath,
+    Recording,
+    RecordingPreview,
+    RewardMap,
+    SuturePoints,
+)
 from skills.verification.monte_carlo import Doubt, Probability
 from skills.verification.verdict import PlaybackReport
 
@@ -40,6 +48,7 @@ __all__ = [
     "Atlas",
     "Comparison",
     "Consent",
+    "DatasetEpisodes",
     "DemoPath",
     "Demonstration",
     "Job",

@@ -271,6 +271,20 @@ class DemoReport(PathReport, MotionReport):
     partner: Partner | None = None
 
 
+class DatasetEpisode(Given):
+    """The origin of an episode of a dataset, which names none of this itself."""
+
+    recording: Sha256
+    demos: list[Sha256] = Field(description="The exported demonstrations in it; one, unless it is a whole recording.")
+
+
+class DatasetEpisodes(Given):
+    """The origins of a dataset's episodes, in the order of their numbers."""
+
+    whole: bool = Field(description="Whether each episode is a whole recording.")
+    episodes: list[DatasetEpisode]
+
+
 class Demonstration(Given):
     """One hand-off cut out of a recording, with its measurements."""
 

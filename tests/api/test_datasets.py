@@ -60,6 +60,20 @@ def test_a_dataset_is_requested_and_downloaded(service: Service):
     assert [one["id"] for one in service.client.jobs(kind="dataset")] == [asked.json()["id"]]
 
 
+@pytest.mark.parametrize("whole", [False, True])
+def test_the_episodes_of_a_dataset_are_named_in_their_order(service: Service, whole: bool):
+    demos = [add(service, shift) for shift in (0.0, 1.0)]
+    dataset = exported(service, whole=whole, fps=50)
+    recordings = [service.client.demo(one).recording for one in demos]
+    found = service.client.dataset_episodes(dataset)
+    assert found.whole == whole
+    assert [(one.recording, one.demos) for one in found.episodes] == [
+        (recording, [demo]) for recording, demo in zip(recordings, demos, strict=True)
+    ]
+    service.client.delete_dataset(dataset)
+    assert_problem(service.http.get(f"/datasets/{dataset}/episodes"), 404, "not-found")
+
+
 def test_a_deleted_dataset_is_gone_with_its_job(service: Service):
     add(service)
     dataset = exported(service)
@@ -141,7 +155,8 @@ def test_roles_and_restricted_keys_are_kept(service: Service):
     assert reader("GET", f"/datasets/{dataset}").status_code == 200
     assert trainer("POST", "/datasets", json={}).json()["result"]["dataset"] == dataset
     assert_problem(of_wren("POST", "/datasets", json={}), 409)
-    for method, path in (("GET", f"/datasets/{dataset}"), ("DELETE", f"/datasets/{dataset}"), ("GET", f"/jobs/{job}")):
+    here = f"/datasets/{dataset}"
+    for method, path in (("GET", here), ("GET", f"{here}/episodes"), ("DELETE", here), ("GET", f"/jobs/{job}")):
         assert_problem(of_wren(method, path), 404)
     assert of_wren("GET", "/jobs").json()["items"] == []
 

@@ -24,7 +24,7 @@ OPERATIONS = {
     "put_surgeon", "put_suture_type",
     "read_suture_points", "ready", "release", "retrain", "roll_out", "score", "train", "upload_demo", "watch_job",
     "withdraw", "withdraw_demo",
-    "delete_dataset", "export_dataset", "get_dataset",
+    "delete_dataset", "export_dataset", "get_dataset", "get_dataset_episodes",
 }  # fmt: skip
 EVERY_CALL = {"400", "500", "503"}
 PATH = {**KESTREL, "version": "1"}

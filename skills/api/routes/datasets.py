@@ -6,12 +6,13 @@ from fastapi import Request, Response
 
 from skills.api.authorisation import needs
 from skills.api.dependencies import Actor, Db, Digest, Jobs, Strict, room_for_a_job
-from skills.api.openapi import ends, gives_file, router_of, starts_job
-from skills.api.responses import Condition, Stream, accepted, as_asked, names, stored_pieces
+from skills.api.openapi import ends, gives, gives_file, router_of, starts_job
+from skills.api.responses import Condition, Giving, Stream, accepted, as_asked, names, stored_pieces
 from skills.api.routes.policies import Accept
 from skills.formats import BYTES
 from skills.library import datasets
 from skills.library.jobs import QUEUED, did_nothing
+from skills.schemas.given import DatasetEpisodes
 from skills.schemas.requests import DatasetIn
 from skills.settings import MEBIBYTE
 
@@ -58,6 +59,13 @@ def get_dataset(
     read = partial(datasets.dataset_chunk, db, sha256)
     # outside the session, because a slow client may keep the stream open for long
     return Stream(stored_pieces(read, refuse, sha256, request.app.state.downloads), as_asked(accept, ZIP), headers)
+
+
+@router.get("/datasets/{dataset}/episodes", dependencies=[needs("reader")], **gives(DatasetEpisodes, 404))
+def get_dataset_episodes(dataset: Digest, db: Db, give: Giving) -> Response:
+    """Return the recording and the demonstrations of each episode of a dataset, which does not name them itself."""
+    with db.reading() as session:
+        return give(datasets.episodes_json(session, dataset))
 
 
 @router.delete("/datasets/{dataset}", dependencies=[needs("trainer")], **ends(404))

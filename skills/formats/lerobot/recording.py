@@ -153,6 +153,16 @@ def _values(table: ParquetTable, meanings: Mapping[Quantity, Mapping[int, Place]
     }
 
 
+def episode_stamps(files: Files, root: str) -> Ints:
+    """Return the stamps of a dataset of one episode, shape (T,); arguments and errors as `read_episode`."""
+    dataset = read_dataset(files, root)
+    if len(dataset.data) != 1:
+        raise several_episodes(len(dataset.data))
+    table = _read(dataset, {})
+    _check_one_episode(dataset, table)
+    return _stamps_ns(dataset, table)[0]
+
+
 def several_episodes(episodes: int) -> UnreadableRecording:
     """Return the error that a dataset has no episode, or more than one."""
     if not episodes:

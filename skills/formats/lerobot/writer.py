@@ -11,7 +11,7 @@ recording made at this rate is written as it is. `observation.state` has for eac
     setpoint     the setpoints nearest in time, in the frames of the state: `psmN_sp.position.x` ... and `psmN_jaw_sp`
 
 The frames of the poses and the rule of the action are in `meta/suture-skills.json`, which our reader reads. Kinematics
-only, so `videos/` is empty.
+only, so `videos/` is empty; `skills.formats.lerobot.videos` adds videos of the user's own.
 
 Memory does not grow with the number of frames: files are temporary ones, and statistics are summed. Statistics are
 those of all values; quantiles of the dataset are the means of the episodes', weighted by frames, as LeRobot computes
@@ -45,6 +45,7 @@ TABLE_ROWS = 100  # episodes that are written to the table of v3.0 together, sin
 PARTS = (*(f"position.{axis}" for axis in "xyz"), *(f"orientation.{axis}" for axis in "xyzw"))
 QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 MANIFEST = "SHA256SUMS"
+NO_PICTURES = "There are no pictures."  # in the README, where `skills.formats.lerobot.videos` names the cameras instead
 
 _V21_DATA = "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
 _V30_DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
@@ -274,7 +275,7 @@ class _Total:
             "task_index": np.full(rows, task),
         }
         stats = {name: _stats_of(column) for name, column in columns.items() if not isinstance(column, list)}
-        self.stats = {name: _joined(self.stats[name], one) for name, one in stats.items()} if number else stats
+        self.stats = {name: joined_stats(self.stats[name], one) for name, one in stats.items()} if number else stats
         taken = _Taken(number, (episode.task,), task, self.rows, columns, stats)
         self.episodes, self.rows = number + 1, self.rows + rows
         return taken
@@ -440,12 +441,12 @@ def _stats_of(column: Numbers) -> dict[str, list[float]]:
     return {name: one.tolist() for name, one in (stats | quantiles).items()} | {"count": [len(values)]}
 
 
-def _joined(one: Mapping[str, list[float]], other: Mapping[str, list[float]]) -> dict[str, list[float]]:
-    """Return the statistics of two sets of rows from those of each."""
+def joined_stats(one: Mapping[str, list[float]], other: Mapping[str, list[float]]) -> dict[str, list[float]]:
+    """Return the statistics of two sets of rows from those of each; both have quantiles, or none."""
     n, m = one["count"][0], other["count"][0]
     a, b = ({name: np.array(values) for name, values in stats.items()} for stats in (one, other))
     joined = {"min": np.minimum(a["min"], b["min"]), "max": np.maximum(a["max"], b["max"])}
-    joined |= {name: (n * a[name] + m * b[name]) / (n + m) for name in ("mean", *QUANTILES)}
+    joined |= {name: (n * a[name] + m * b[name]) / (n + m) for name in ("mean", *QUANTILES) if name in a}
     spread = n * (a["std"] ** 2 + (a["mean"] - joined["mean"]) ** 2)
     spread += m * (b["std"] ** 2 + (b["mean"] - joined["mean"]) ** 2)
     joined["std"] = np.sqrt(spread / (n + m))
@@ -632,7 +633,7 @@ quaternions x, y, z, w, and radians. {_ACTIONS[about.action]} The frames of the 
 {frames}
 ## Sensors
 
-The arms' encoders. There are no pictures.
+The arms' encoders. {NO_PICTURES}
 
 ## Synchronization
 
