@@ -12,7 +12,9 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from tests.formats import videos
 from tests.formats.test_lerobot_writer import ABOUT, COMMANDED, commanded_episodes, episodes, written
+from tests.formats.test_videos import exported, source
 from tests.needs import need
 
 pytestmark = pytest.mark.nightly
@@ -77,6 +79,33 @@ def test_lerobot_loads_every_frame_with_equal_numbers(tmp_path: Path, write: Wri
     assert loaded["tasks"] == table["instruction.text"].to_pylist()
 
 
+PICTURES = """
+import json, sys
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+found = LeRobotDataset("local/ours", root=sys.argv[1], video_backend="pyav")  # torchcodec needs ffmpeg's libraries
+frames = [found[k] for k in range(len(found))]
+halves = {name: [[round(float(half.median()) * 219 + 16) for half in frame[name][1].chunk(2, dim=1)]
+                 for frame in frames] for name in found.meta.camera_keys}
+means = {name: found.meta.stats[name]["mean"].ravel().tolist() for name in found.meta.camera_keys}
+print(json.dumps({"halves": halves, "means": means}))
+"""
+
+
+@pytest.mark.parametrize(("lerobot", "version"), [("0.3.3", "v2.1"), ("0.4.4", "v3.0")])
+def test_lerobot_decodes_the_picture_of_every_frame(tmp_path: Path, lerobot: str, version: str):
+    """Its own decoder finds the pictures by their times; green is the luma of a grey picture, between 16 and 235."""
+    folder = exported(source(tmp_path, version), (0, 1, 2), version, tmp_path / "ours")
+    loaded = json.loads(run(interpreters()[lerobot], PICTURES, str(folder)))
+    assert loaded["halves"].keys() == {*videos.CAMERAS}
+    for found in loaded["halves"].values():
+        luma = [np.repeat(np.array([halves]), videos.WIDTH // 2, axis=1) for halves in found]
+        assert [videos.number_of(one) for one in luma] == [*range(150)]
+    counts = [videos.stats_of(k)["count"][0] for k in range(3)]
+    mean = np.average([videos.stats_of(k)["mean"][0][0][0] for k in range(3)], weights=counts)
+    for found in loaded["means"].values():
+        np.testing.assert_allclose(found[0], mean)
+
+
 def test_lerobots_own_conversion_of_v2_equals_our_v3(tmp_path: Path, write: Write):
     python = interpreters()["0.4.4"]
     old, ours = (write(tmp_path / version, version) for version in ("v2.1", "v3.0"))
@@ -90,6 +119,16 @@ def test_lerobots_own_conversion_of_v2_equals_our_v3(tmp_path: Path, write: Writ
         for name, values in found.items():
             np.testing.assert_allclose(our_stats[feature][name], values, rtol=0, atol=1e-12)
     assert json.loads((new / "meta/info.json").read_text()) == json.loads((ours / "meta/info.json").read_text())
+
+
+def test_open_hs_validator_has_no_warning_with_videos(tmp_path: Path):
+    need("openh")
+    folder = exported(source(tmp_path, "v2.1"), (0, 1, 2), "v2.1", tmp_path / "ours")
+    command = [interpreters()["0.3.3"], os.environ["TESTS_OPENH_VALIDATOR"], str(folder), "--verbose"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout[-2000:]
+    assert "ERROR" not in done.stdout
+    assert "Found 6 video files" in done.stdout
 
 
 def test_open_hs_validator_reports_no_error(tmp_path: Path, write: Write):

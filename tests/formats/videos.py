@@ -1,4 +1,7 @@
-"""Videos for tests: encoded with ffmpeg, each frame of one grey that names it; and datasets of LeRobot with them."""
+"""Videos for tests, encoded with ffmpeg, whose frames show their numbers; and datasets of LeRobot with them.
+
+The grey of the left half of frame k is k modulo `BASE`, and that of the right half k divided by it, in steps of 10.
+"""
 
 import json
 import struct
@@ -18,15 +21,17 @@ from tests.formats.lerobots import COUNTS, FPS, info_of
 
 CAMERAS = ("observation.images.endoscope.left", "observation.images.wrist")
 WIDTH, HEIGHT = 64, 48
-DARKEST = 40  # the grey of frame 0; each frame is brighter by 1, and a dataset has 150
+DARKEST, STEP, BASE = 40, 10, 15  # a dataset has 150 frames
 
 
 @cache
 def encoded(first: int, count: int, *more: str, fps: int = FPS, width: int = WIDTH) -> bytes:
     """Return an MP4 file of frames `first` ... of the session, without audio; `more` are arguments of ffmpeg."""
-    pixels = HEIGHT * width
-    grey = bytes([128]) * (pixels // 2)
-    frames = b"".join(bytes([k + DARKEST]) * pixels + grey for k in range(first, first + count))
+    grey = bytes([128]) * (HEIGHT * width // 2)
+    frames = b"".join(
+        (b"".join(bytes([DARKEST + STEP * one]) * (width // 2) for one in (k % BASE, k // BASE)) * HEIGHT) + grey
+        for k in range(first, first + count)
+    )
     raw = ("-f", "rawvideo", "-pix_fmt", "yuv420p", "-s", f"{width}x{HEIGHT}", "-r", str(fps), "-i", "pipe:0")
     how = more or ("-c:v", "libx264", "-bf", "2", "-g", "12", "-crf", "2")
     return _ffmpeg(frames, *raw, *how, "-pix_fmt", "yuv420p", "-f", "mp4", "-movflags", "+faststart")
@@ -44,7 +49,14 @@ def shown(path: Path) -> list[int]:
         [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", *command], capture_output=True, check=True, timeout=60
     )
     frames = np.frombuffer(run.stdout, np.uint8).reshape(-1, HEIGHT * WIDTH * 3 // 2)
-    return [int(np.median(one[: HEIGHT * WIDTH])) - DARKEST for one in frames]
+    return [number_of(one[: HEIGHT * WIDTH].reshape(HEIGHT, WIDTH)) for one in frames]
+
+
+def number_of(luma: Any) -> int:
+    """Return the number that a frame shows, from its luma, shape (HEIGHT, WIDTH)."""
+    halves = luma[:, : WIDTH // 2], luma[:, WIDTH // 2 :]
+    low, high = (round((float(np.median(one)) - DARKEST) / STEP) for one in halves)
+    return low + BASE * high
 
 
 def _ffmpeg(data: bytes, *arguments: str) -> bytes:

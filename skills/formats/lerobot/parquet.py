@@ -130,7 +130,10 @@ def read_columns(file: BinaryIO, columns: Sequence[ParquetColumn], *, most_rows:
 def read_rows(file: BinaryIO, names: Sequence[str], *, most_rows: int) -> list[dict[str, Any]]:
     """Read some columns of a short table as Python's values, of any type; arguments and errors as `read_columns`."""
     opened = open_parquet(file)
-    _checked_rows(opened, names, file.seek(0, os.SEEK_END), most_rows)
+    _named_rows(opened, names, most_rows)
+    # of whole row groups: in a damaged file pyarrow ends the process when it is asked about a column of one
+    groups = (opened.metadata.row_group(group).total_byte_size for group in range(opened.metadata.num_row_groups))
+    _check_plausible(sum(groups), 0, file.seek(0, os.SEEK_END))
     rows: list[dict[str, Any]] = []
     with refusing(_WHAT, _ADVICE):
         for batch in opened.iter_batches(BATCH_ROWS, columns=list(names), use_threads=False):
@@ -147,12 +150,7 @@ def _checked_rows(opened: Any, wanted: Collection[str], size: int, most_rows: in
         UnreadableRecording: A column is missing or there twice, or they would take too much.
     """
     about = opened.metadata
-    names = list(opened.schema_arrow.names)
-    missing = [name for name in wanted if names.count(name) != 1]
-    if missing:
-        raise UnreadableRecording(f"{_WHAT} has the column {printable(missing[0])} {names.count(missing[0])} times.")
-    if about.num_rows > most_rows:
-        raise UnreadableRecording(f"{_WHAT} has {about.num_rows} rows; at most {most_rows} are read. Cut it.")
+    rows = _named_rows(opened, wanted, most_rows)
     # pyarrow reads everything below a dotted name: for `a` also the column `a.b`
     leaves = [k for k in range(about.num_columns) if _is_below(about.schema.column(k).path, wanted)]
     total = texts = 0
@@ -162,13 +160,30 @@ def _checked_rows(opened: Any, wanted: Collection[str], size: int, most_rows: in
             chunk = chunks.column(leaf)
             total += max(8 * chunk.num_values, chunk.total_uncompressed_size)
             texts += chunk.total_uncompressed_size if chunk.physical_type == "BYTE_ARRAY" else 0
+    _check_plausible(total, texts, size)
+    return rows
+
+
+def _named_rows(opened: Any, wanted: Collection[str], most_rows: int) -> int:
+    """Return the number of rows, if there are not too many, and each column is there once."""
+    names = list(opened.schema_arrow.names)
+    missing = [name for name in wanted if names.count(name) != 1]
+    if missing:
+        raise UnreadableRecording(f"{_WHAT} has the column {printable(missing[0])} {names.count(missing[0])} times.")
+    rows = int(opened.metadata.num_rows)
+    if rows > most_rows:
+        raise UnreadableRecording(f"{_WHAT} has {rows} rows; at most {most_rows} are read. Cut it.")
+    return rows
+
+
+def _check_plausible(total: int, texts: int, size: int) -> None:
+    """Refuse a file whose columns claim too much memory, all together or for texts."""
     if total > max(FREE_BYTES, RATIO * size) or texts > FREE_BYTES:
         raise UnreadableRecording(
             f"{_WHAT} declares {total} bytes unpacked from {size}, which is not plausible for a recording.",
             packed_bytes=size,
             unpacked_bytes=total,
         )
-    return int(about.num_rows)
 
 
 def _is_below(path: str, names: Collection[str]) -> bool:
