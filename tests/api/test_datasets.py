@@ -64,12 +64,10 @@ def test_a_dataset_is_requested_and_downloaded(service: Service):
 def test_the_episodes_of_a_dataset_are_named_in_their_order(service: Service, whole: bool):
     demos = [add(service, shift) for shift in (0.0, 1.0)]
     dataset = exported(service, whole=whole, fps=50)
-    recordings = [service.client.demo(one).recording for one in demos]
+    recordings = [service.client.demo(one)["recording"] for one in demos]
     found = service.client.dataset_episodes(dataset)
-    assert found.whole == whole
-    assert [(one.recording, one.demos) for one in found.episodes] == [
-        (recording, [demo]) for recording, demo in zip(recordings, demos, strict=True)
-    ]
+    named = [{"recording": one, "demos": [demo]} for one, demo in zip(recordings, demos, strict=True)]
+    assert found == {"whole": whole, "episodes": named}
     service.client.delete_dataset(dataset)
     assert_problem(service.http.get(f"/datasets/{dataset}/episodes"), 404, "not-found")
 

@@ -142,6 +142,7 @@ def mutations(text: str, count: int, seed: int) -> Iterator[bytes]:
         rows = [line.split(separator) for line in text.splitlines()]
         for _ in range(rng.randint(1, 3)):
             rng.choice(_CHANGES)(rows, rng)
+            rows[:] = [row or [""] for row in rows]  # an empty line is one empty cell
         end = rng.choice(("\n", "\n", "\r\n", "\r"))
         head, *others = (separator.join(row) for row in rows)
         first = rng.choice((end, end, end, "\r"))  # of the header, now and then another line end
