@@ -10,9 +10,9 @@ The model predicts a rating and a level as sums of a few figures, each with its 
 So a weight is the number of points by which the rating changes when a figure changes by one standard deviation of the
 cohort. A figure outside the range of the calibration is reported, because a sum means nothing there.
 
-The fit is ridge regression for the rating and logistic regression for the level, on standardised figures, both from
-scikit-learn and with one fixed strength each: a cohort of eight surgeons is too small to choose it by. A trial with
-several motions has the same weight as any other, and is judged by their mean.
+The fit is ridge regression for the rating and logistic regression, from scikit-learn, for the level, on standardised
+figures and with one fixed strength each: a cohort of eight surgeons is too small to choose it by. A trial with several
+motions has the same weight as any other, and is judged by their mean.
 
 Trials of one surgeon are alike, so a model is judged on surgeons all of whose trials are left out. Leaving out has a
 bias: without a good trial the mean of the others is lower, so that predictions of nothing but the mean fall as the
@@ -232,6 +232,7 @@ LOGISTIC = 1.0  # inverse of the same penalty, scikit-learn's default
 LEAST_SURGEONS = 3  # with two, the model would be fitted to a single one when the other is left out
 WITHIN = 0.90  # share of the ratings of unseen surgeons that are within the margin
 BOOTSTRAPS = 2000
+DRAWN_AT_ONCE = 100_000  # trials, whose ranks take some 10 MB
 PERMUTATIONS = 200
 ACCEPTED_P = 0.05  # ours: greatest p-value of an accepted model against chance
 LEAST_PERMUTATIONS = 19  # p is at least 1 / (permutations + 1): of fewer, it is above `ACCEPTED_P` for every model
@@ -590,17 +591,19 @@ def spearman(one: Floats, other: Floats) -> float:
 
 
 def _spearman(several: Floats, other: Floats) -> Floats:
-    """Return the rank correlations of several series, (K, T), with another, (T,)."""
+    """Return the rank correlations of several series, (K, ..., T), with another, (..., T): shape (K, ...)."""
     from scipy.stats import rankdata
 
-    a, b = (ranks - ranks.mean(axis=-1, keepdims=True) for ranks in (rankdata(several, axis=1), rankdata(other)))
-    lengths = np.sqrt((a * a).sum(axis=1) * (b @ b))
-    return np.asarray(np.divide(a @ b, lengths, out=np.zeros(len(a)), where=lengths > 0))
+    ranks = (rankdata(one, axis=-1) for one in (several, other))
+    a, b = (one - one.mean(axis=-1, keepdims=True) for one in ranks)
+    lengths = np.sqrt((a * a).sum(axis=-1) * (b * b).sum(axis=-1))
+    return np.asarray(np.divide((a * b).sum(axis=-1), lengths, out=np.zeros_like(lengths), where=lengths > 0))
 
 
 def _fitted(cohort: Cohort, inside: Flags, columns: tuple[int, ...] | None, margin: float = 0.0) -> SkillModel:
     """Fit to the trials marked in `inside`, shape (T,)."""
-    from sklearn.linear_model import LogisticRegression, Ridge
+    from sklearn import config_context
+    from sklearn.linear_model import LogisticRegression
 
     chosen = list(range(len(MODELLED)) if columns is None else columns)
     taken = inside[cohort.trials]
@@ -610,23 +613,27 @@ def _fitted(cohort: Cohort, inside: Flags, columns: tuple[int, ...] | None, marg
     scale = np.sqrt(np.average((values - centre) ** 2, axis=0, weights=weights))
     scale[~(scale > 1e-9 * np.abs(centre).clip(1e-9))] = 1.0  # it never varied
     standard = ((values - centre) / scale)[:, chosen]
-    ridge = Ridge(alpha=RIDGE).fit(standard, cohort.ratings[trials], sample_weight=weights)
+    ratings = cohort.ratings[trials]
+    mean = float(np.average(ratings, weights=weights))
+    weighted = (standard * weights[:, None]).T
+    ridge = np.linalg.solve(weighted @ standard + RIDGE * np.eye(len(chosen)), weighted @ (ratings - mean))
     levels = cohort.levels[trials]
     known = np.unique(levels)
     offsets, slopes = np.zeros(len(known)), np.zeros((len(known), len(chosen)))
     if len(known) > 1:
-        logistic = LogisticRegression(C=LOGISTIC, max_iter=1000).fit(standard, levels, sample_weight=weights)
+        with config_context(assume_finite=True, skip_parameter_validation=True):  # `Cohort` has checked the numbers
+            logistic = LogisticRegression(C=LOGISTIC, max_iter=1000).fit(standard, levels, sample_weight=weights)
         first = len(known) - len(logistic.coef_)  # with two levels scikit-learn gives weights to the second alone
         offsets[first:], slopes[first:] = logistic.intercept_, logistic.coef_
     rating_weights, level_weights = np.zeros(len(MODELLED)), np.zeros((len(known), len(MODELLED)))
-    rating_weights[chosen], level_weights[:, chosen] = ridge.coef_, slopes
+    rating_weights[chosen], level_weights[:, chosen] = ridge, slopes
     return SkillModel(
         figures=MODELLED,
         centre=centre,
         scale=scale,
         lowest=values.min(axis=0),
         highest=values.max(axis=0),
-        rating=float(ridge.intercept_),
+        rating=mean,
         rating_weights=rating_weights,
         rating_margin=margin,
         levels=tuple(LEVELS[level] for level in known),
@@ -646,8 +653,14 @@ def _judge(
 ) -> tuple[dict[str, Judged], dict[str, Floats]]:
     """Judge several predictions; return also the rank correlations of each on the same bootstrap draws, shape (B,)."""
     count, predicted = len(cohort.levels), np.stack([one.ratings for one in found.values()])
-    drawn_rhos = [_spearman(predicted[:, drawn], cohort.ratings[drawn]) for drawn in _resampled(cohort.surgeons, rng)]
-    rhos = dict(zip(found, np.stack(drawn_rhos, axis=1), strict=True))
+    draws, drawn_rhos = list(_resampled(cohort.surgeons, rng)), np.empty((len(found), BOOTSTRAPS))
+    lengths = np.array([len(drawn) for drawn in draws])
+    for length in np.unique(lengths):  # many draws of a length at once, in a tenth of the time
+        equal = np.flatnonzero(lengths == length)
+        for at in np.array_split(equal, 1 + len(equal) * length // DRAWN_AT_ONCE):
+            drawn = np.stack([draws[number] for number in at])
+            drawn_rhos[:, at] = _spearman(predicted[:, drawn], cohort.ratings[drawn])
+    rhos = dict(zip(found, drawn_rhos, strict=True))
     judged = {}
     for name, one in found.items():
         low, high = np.quantile(rhos[name], (0.025, 0.975)).tolist()
