@@ -65,8 +65,9 @@ def reading_server() -> Iterator["ForkServer"]:
 
 @pytest.fixture(scope="session", autouse=True)
 def shared_fork_server(reading_server: "ForkServer") -> Iterator[object]:
-    """Let all applications of a process share its fork server."""
+    """Let all applications and verifications of a process share its fork server."""
     from skills.api import app as application
+    from skills.library import recordings
 
     own = application.confined_reader
 
@@ -77,9 +78,12 @@ def shared_fork_server(reading_server: "ForkServer") -> Iterator[object]:
         reading_server.start()
         yield reader
 
-    application.confined_reader = shared
+    modules = (application, recordings)  # the commands import it from the last one
+    for module in modules:
+        module.confined_reader = shared
     yield own
-    application.confined_reader = own
+    for module in modules:
+        module.confined_reader = own
 
 
 @pytest.fixture

@@ -1,4 +1,7 @@
-"""The command line, on the application in its own process: a lab's commands, in order."""
+"""The command line, on the application in its own process: a lab's commands, in order.
+
+Jobs are carried out by a thread (`cases.working`), except in one test, where the commands start their worker.
+"""
 
 import io
 import json
@@ -24,6 +27,7 @@ from skills.formats.lerobot.writer import AboutDataset, ExportedEpisode, dataset
 from skills.library.catalogue import put_surgeon
 from skills.seeds.recordings import sample_recordings
 from skills.settings import Settings, settings
+from skills.simulation import film
 from tests.formats import bags, lerobots, trials, videos
 from tests.library import cases, exports
 
@@ -31,7 +35,7 @@ STYLE = ("wren", "simple-running")
 
 
 @pytest.fixture
-def skills(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def with_worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Yield a function that runs a command on a separate database and returns its exit code and its output."""
     monkeypatch.setenv("SKILLS_DATABASE_URL", f"sqlite:///{tmp_path / 'skills.sqlite'}")
     monkeypatch.setenv("SKILLS_WORKERS", "1")  # tests/jobs has several
@@ -44,6 +48,13 @@ def skills(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 
     yield run
     settings.cache_clear()
+
+
+@pytest.fixture
+def skills(with_worker, monkeypatch: pytest.MonkeyPatch):
+    """Return the same function, of commands that start no worker."""
+    monkeypatch.setattr("skills.serving.working", cases.working)
+    return with_worker
 
 
 def test_a_command_that_waits_for_one_job_starts_one_worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -109,7 +120,8 @@ def test_videos_of_the_users_own_dataset_are_exported_with_the_recordings(skills
     assert sorted(one.name for one in tmp_path.iterdir() if one.is_dir()) == ["dataset", "theirs"]
 
 
-def test_from_a_bag_folder_to_a_released_policy_and_a_plan(skills, tmp_path: Path) -> None:
+def test_from_a_bag_folder_to_a_released_policy_and_a_plan(with_worker, tmp_path: Path) -> None:
+    skills = with_worker
     bag = tmp_path / "rosbag2"
     bag.mkdir()
     (bag / "recording.mcap").write_bytes(next(s for s in sample_recordings() if s.surgeon == "wren").data)
@@ -148,7 +160,11 @@ def test_from_a_bag_folder_to_a_released_policy_and_a_plan(skills, tmp_path: Pat
     assert (code, "erased permanently" in said) == (1, True)
 
 
-def test_a_plan_is_played_drawn_exported_and_its_bag_verified(skills, tmp_path: Path) -> None:
+def test_a_plan_is_played_drawn_exported_and_its_bag_verified(
+    skills, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(film, "FRAMES", 4)
+    monkeypatch.setattr(film, "FRAMES_PER_PASS", 4)
     assert skills("seed")[0] == 0
     assert skills("train", *STYLE, "--release")[0] == 0
     base = "160,20,20,0,0.300705799504273,0,0.953716950748227"
@@ -559,13 +575,21 @@ def test_tab_proposes_the_surgeons_and_sutures_that_there_are(skills, tmp_path: 
     assert complete_surgeons("") == [], "where a service is set, it alone is asked"
 
 
-def test_tab_in_a_shell_is_silent_whatever_is_wrong(tmp_path: Path) -> None:
+def test_tab_in_a_shell_proposes_commands() -> None:
     assert completed("skills poli") == (["policy"], "")
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"SKILLS_DATABASE_URL": "sqlite:///{folder}/no.sqlite"},
+        pytest.param({"SKILLS_SERVER": "http://127.0.0.1:9"}, marks=pytest.mark.nightly),
+        pytest.param({"SKILLS_DATABASE_URL": "no url at all"}, marks=pytest.mark.nightly),
+        pytest.param({"SKILLS_PORT": "no port"}, marks=pytest.mark.nightly),
+    ],
+    ids=lambda wrong: " ".join(wrong.values()),
+)
+def test_tab_in_a_shell_is_silent_whatever_is_wrong(wrong: dict[str, str], tmp_path: Path) -> None:
+    given = {name: value.format(folder=tmp_path) for name, value in wrong.items()}
     (tmp_path / "no.sqlite").write_bytes(b"this is no database" * 100)
-    for nonsense in (
-        {"SKILLS_SERVER": "http://127.0.0.1:9"},
-        {"SKILLS_DATABASE_URL": f"sqlite:///{tmp_path / 'no.sqlite'}"},
-        {"SKILLS_DATABASE_URL": "no url at all"},
-        {"SKILLS_PORT": "no port"},
-    ):
-        assert completed("skills policy show k", **nonsense) == ([], "")
+    assert completed("skills policy show k", **given) == ([], "")

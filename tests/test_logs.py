@@ -190,6 +190,7 @@ class Overheard(Processes):
             wait_until_ready(client, self.process)
 
 
+@pytest.mark.nightly  # a service and its worker; by day requests and jobs are logged in this process
 def test_the_real_service_logs_a_failed_job_without_naming_anybody(tmp_path: Path):
     service = Overheard(tmp_path, log_format="json", log_level="debug", job_attempts=1)
     service.start()

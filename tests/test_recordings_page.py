@@ -37,6 +37,7 @@ def test_the_samples_are_understood_as_the_page_shows(installation: None, tmp_pa
     assert len(shown) > 10
 
 
+@pytest.mark.nightly  # 10 s; by day the samples
 @pytest.mark.needs("recordings")
 @pytest.mark.needs("paper")
 @pytest.mark.needs("jigsaws")

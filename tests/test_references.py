@@ -7,7 +7,8 @@ import subprocess
 import sys
 import tokenize
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
@@ -29,6 +30,8 @@ SLASHED = re.compile(r"`([a-z_]+(?:/[a-z_]+)+)((?:\.\w+)*)`")
 COMMAND = re.compile(r"(?:^(?:\$ )?|`)skills ([a-z][^`\n#|]*)", re.MULTILINE)
 CALL = re.compile(r"\b(?:GET|POST|PUT|DELETE) (/[^\s`\"'?,)|]+)")
 WRONG = ROOT / "docs" / "mistakes.md"  # its commands are misspelt on purpose
+COMMENTED = re.compile(r"#.*(?:`|\.py|\.md)")
+DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 LINK = re.compile(r"\]\((?!https?:)([^)#]*)(?:#([^)]*))?\)")
 OF_OTHERS = {  # files of other projects, a pattern, and one that was rejected
     *("dvrk_bag_replay.py", "launch_crtk_interface.py", "simulator.launch.py", "docs/scene_coordinate_frames.md"),
@@ -53,29 +56,52 @@ ALSO_ELSEWHERE = {"policy.model_dump", "report.path_states"}  # pydantic's and J
 SUFFIXES = {"csv", "json", "jsonl", "lock", "md", "parquet", "py", "sqlite", "toml", "txt", "urdf", "yaml", "zip"}
 
 
+@dataclass(frozen=True)
+class Code:
+    """A file of code: its docstrings and comments, the names that it defines, and its classes with names and bases."""
+
+    prose: str
+    names: set[str]
+    classes: list[tuple[str, set[str], list[str]]]
+
+
+@cache
+def code(file: Path) -> Code:
+    """Read a file of code; it is parsed once for all tests, and its tree is not kept."""
+    text = file.read_text()
+    nodes = list(ast.walk(ast.parse(text)))
+    told = [ast.get_docstring(node) or "" for node in nodes if isinstance(node, DOCUMENTED)]
+    if COMMENTED.search(text):  # only such a comment can refer to anything, and tokenising takes longest
+        tokens = tokenize.generate_tokens(io.StringIO(text).readline)
+        told += [token.string for token in tokens if token.type == tokenize.COMMENT]
+    classes = [
+        (node.name, set(defined(ast.walk(node))), [base.id for base in node.bases if isinstance(base, ast.Name)])
+        for node in nodes
+        if isinstance(node, ast.ClassDef)
+    ]
+    return Code("\n".join(told), set(defined(nodes)), classes)
+
+
 @cache
 def members() -> dict[str, set[str]]:
     """Return the names that are defined in all modules, packages and classes of one name."""
     found: dict[str, set[str]] = defaultdict(set)
     bases: list[tuple[str, str]] = []
     for file in CODE:
-        tree = ast.parse(file.read_text())
-        module = file.parent.name if file.stem == "__init__" else file.stem
         found[file.parent.name].add(file.stem)
         found[file.parent.parent.name].add(file.parent.name)
-        for node in ast.walk(tree):
-            if isinstance(node, ast.ClassDef):
-                found[node.name] |= set(defined(node))
-                bases += [(node.name, base.id) for base in node.bases if isinstance(base, ast.Name)]
-        found[module] |= set(defined(tree))
+        for name, names, of in code(file).classes:
+            found[name] |= names
+            bases += [(name, base) for base in of]
+        found[file.parent.name if file.stem == "__init__" else file.stem] |= code(file).names
     for name, base in bases * 3:  # a class has the names of its bases, and of theirs
         found[name] |= found[base]
     return found
 
 
-def defined(scope: ast.AST) -> Iterator[str]:
-    """Yield every name that is defined or imported in a module or class, those inside its functions included."""
-    for node in ast.walk(scope):
+def defined(nodes: Iterable[ast.AST]) -> Iterator[str]:
+    """Yield every name that is defined or imported by the nodes of a module or class."""
+    for node in nodes:
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
             yield node.name
         elif isinstance(node, ast.Name | ast.Attribute) and isinstance(node.ctx, ast.Store):
@@ -113,13 +139,7 @@ def folders() -> set[Path]:
 
 def prose(file: Path) -> str:
     """Return a page, or the docstrings and comments of a file of code."""
-    text = file.read_text()
-    if file.suffix == ".md":
-        return text
-    nodes = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
-    told = [ast.get_docstring(node) or "" for node in ast.walk(ast.parse(text)) if isinstance(node, nodes)]
-    tokens = tokenize.generate_tokens(io.StringIO(text).readline)
-    return "\n".join([*told, *(token.string for token in tokens if token.type == tokenize.COMMENT)])
+    return file.read_text() if file.suffix == ".md" else code(file).prose
 
 
 def dangling(text: str) -> list[str]:

@@ -11,6 +11,7 @@ from skills.cli import app
 from skills.formats.lerobot.writer import AboutDataset, ExportedEpisode, dataset_files
 from skills.settings import settings
 from tests.formats import written
+from tests.library import cases
 from tests.test_cli_page import AS_SHOWN, HOW, NAME, lasting, steps
 
 DOCS = Path(__file__).parent.parent / "docs"
@@ -33,6 +34,7 @@ def installation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[No
     monkeypatch.setenv("TZ", "UTC")
     monkeypatch.delenv("SKILLS_SERVER", raising=False)
     monkeypatch.setenv("SKILLS_DATABASE_URL", f"sqlite:///{tmp_path}/skills.sqlite")
+    monkeypatch.setattr("skills.serving.working", cases.working)
     settings.cache_clear()
     yield
     settings.cache_clear()

@@ -1,7 +1,7 @@
 """Invalid requests: every JSON route and every path answers 4xx with a message, and never 5xx."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import pytest
@@ -94,6 +94,15 @@ SEGMENTS = (
 )
 
 
+# By day every fourth of the requests, which are other ones for each route or value.
+OF_ALL = pytest.mark.parametrize("of", [4, pytest.param(1, marks=pytest.mark.nightly)], ids=["a fourth", "all"])
+
+
+def some(values: Iterable[Any], number: int, of: int) -> list[Any]:
+    """Return every `of`-th of the values; which of them depends on a number."""
+    return list(values)[number % of :: of]
+
+
 def routes() -> Iterator[tuple[str, str, dict[str, Any]]]:
     for path, calls in conformance().document["paths"].items():
         for method, call in calls.items():
@@ -155,10 +164,13 @@ def test_a_body_that_is_no_request_is_refused(still: Service, untouched: None, r
         assert CANARY not in answer.text
 
 
+@OF_ALL
 @pytest.mark.parametrize("route", SOUND, ids=" ".join)
-def test_a_value_of_the_wrong_kind_anywhere_is_refused(still: Service, untouched: None, route: tuple[str, str]):
-    for path, leaf in leaves(SOUND[route]):
-        for token in tokens_for(leaf):
+def test_a_value_of_the_wrong_kind_anywhere_is_refused(
+    still: Service, untouched: None, route: tuple[str, str], of: int
+):
+    for number, (path, leaf) in enumerate(leaves(SOUND[route])):
+        for token in some(tokens_for(leaf), number, of):
             if FREE_TEXT & {*path} and token.startswith('"') and "\\u" not in token and len(token) < 200:
                 continue  # any short text is valid there
             body = json.dumps(replaced(SOUND[route], path, "@@")).replace('"@@"', token)
@@ -175,9 +187,10 @@ def test_an_unknown_field_is_refused_and_not_repeated(still: Service, untouched:
     assert CANARY not in answer.text
 
 
+@OF_ALL
 @pytest.mark.parametrize("segment", SEGMENTS, ids=lambda segment: segment[:12])
-def test_no_path_is_ours_to_blame(still: Service, untouched: None, segment: str):
-    for method, path, _ in routes():
+def test_no_path_is_ours_to_blame(still: Service, untouched: None, segment: str, of: int):
+    for method, path, _ in some(routes(), SEGMENTS.index(segment), of):
         for name in [part[1:-1] for part in path.split("/") if part.startswith("{")]:
             if segment in ("..", "%2e%2e") and path.endswith(f"{{{name}}}"):
                 continue  # the client itself resolves it to the parent folder
@@ -263,9 +276,10 @@ def test_a_parameter_that_there_is_not_or_that_comes_twice_harms_nobody(still: S
                     assert_problem(answer, range(400, 504))
 
 
+@OF_ALL
 @pytest.mark.parametrize("header", HEADERS, ids=lambda header: str(header)[:30])
-def test_no_header_is_ours_to_blame(still: Service, untouched: None, header: dict[str, str]):
-    for method, path, _ in routes():
+def test_no_header_is_ours_to_blame(still: Service, untouched: None, header: dict[str, str], of: int):
+    for method, path, _ in some(routes(), HEADERS.index(header), of):
         if method == "DELETE":
             continue  # an unsupported header does not cause a refusal
         answer = still.http.request(method, filled(path), headers=header, json=None if method == "GET" else [])

@@ -15,13 +15,13 @@ import tarfile
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from movement_primitives.dmp import CartesianDMP
 from movement_primitives.promp import ProMP
 from rich.table import Table
 from scipy.spatial.transform import Rotation, Slerp
-from sklearn.mixture import GaussianMixture
 
 from skills.arrays import Floats
 from skills.demonstration.demonstration import Demo, cut_demo
@@ -30,6 +30,9 @@ from skills.formats.jigsaws import read_jigsaws, trials
 from skills.learning.evaluation import dtw
 from skills.learning.pose_style import PHASES, PoseStyle, laid_rotation, laid_tip, learn_pose_style, mean_rotation
 from tests.bench.timing import best_s
+
+if TYPE_CHECKING:
+    from sklearn.mixture import GaussianMixture
 
 Poses = tuple[Floats, Floats]  # positions, (PHASES, 3), and unit quaternions, (PHASES, 4)
 Method = Callable[[list[Poses], Poses, Poses], Poses]  # demonstrations, their medoid, start and goal pose: a motion
@@ -192,7 +195,7 @@ def promp(shown: list[Poses], middle: Poses, ends: Poses) -> Poses:
     return _added(base, primitive.mean_trajectory(PHASE))
 
 
-def _given(mixture: GaussianMixture, known: Floats, outputs: slice) -> tuple[Floats, Floats]:
+def _given(mixture: "GaussianMixture", known: Floats, outputs: slice) -> tuple[Floats, Floats]:
     """Return mean (T, D) and covariance (T, D, D) of the outputs of a mixture, given its first variable."""
     means, covariances = mixture.means_, mixture.covariances_
     chance = mixture.weights_ * np.exp(-0.5 * (known[:, None] - means[:, 0]) ** 2 / covariances[:, 0, 0])
@@ -206,7 +209,9 @@ def _given(mixture: GaussianMixture, known: Floats, outputs: slice) -> tuple[Flo
     return middle, np.einsum("tk,kde->tde", chance, rest) + np.einsum("tk,tkd,tke->tde", chance, off, off)
 
 
-def _mixture(data: Floats) -> GaussianMixture:
+def _mixture(data: Floats) -> "GaussianMixture":
+    from sklearn.mixture import GaussianMixture  # slow to import, and tests import this module for other methods
+
     found = GaussianMixture(8, random_state=0, reg_covar=1e-4, n_init=2)
     # Begun at equal parts of the phase, as is usual for trajectories: k-means mixes beginning and end.
     part = np.minimum((data[:, 0] * 8).astype(int), 7)

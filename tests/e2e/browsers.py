@@ -13,6 +13,11 @@ SCREENS = Path("build/screens")
 # No sandbox, because tests may run as root in a container; the 3-D view is drawn without a graphics card.
 ARGUMENTS = ["--no-sandbox", "--enable-unsafe-swiftshader", "--disable-gpu-vsync"]
 DESK, PHONE = {"width": 1280, "height": 860}, {"width": 360, "height": 740}
+# In the place of the script that draws the 3-D view in software, which takes a second or more for each page.
+WITHOUT_VIEW = """window.Plotly = {
+  react: async (place) => { place.on = () => {}; place._fullLayout = { scene: {} }; },
+  relayout: async () => {},
+};"""
 HARMLESS = ("GL Driver Message", "Multiple readback operations")  # messages of the software renderer
 
 
@@ -29,13 +34,27 @@ def browsing() -> Iterator[Browser]:
 class Watched:
     """A page with a record of the browser's complaints and of every address requested."""
 
-    def __init__(self, browser: Browser, url: str, *, phone: bool = False, dark: bool = False) -> None:
+    def __init__(
+        self, browser: Browser, url: str, *, phone: bool = False, dark: bool = False, view: bool = True
+    ) -> None:
+        """Open a page.
+
+        Args:
+            browser: The browser.
+            url: The service.
+            phone: Whether the window is that of a phone.
+            dark: Whether the system's colours are dark.
+            view: Whether 3-D views are drawn.
+        """
         self.url = url
         self.context = browser.new_context(
             viewport=PHONE if phone else DESK, color_scheme="dark" if dark else "light", has_touch=phone
         )
         self.context.set_default_timeout(1000 * END_S)
         self.page: Page = self.context.new_page()
+        if not view:
+            script = "application/javascript"
+            self.page.route("**/plotly.min.js*", lambda asked: asked.fulfill(content_type=script, body=WITHOUT_VIEW))
         self.complaints: list[str] = []
         self.asked: list[str] = []
         self.page.on("console", lambda said: self._heard(said.type, said.text))

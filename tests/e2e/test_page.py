@@ -60,6 +60,13 @@ def tab(browser: Browser, url: str) -> Iterator[Watched]:
         yield opened
 
 
+@pytest.fixture
+def flat(browser: Browser, url: str) -> Iterator[Watched]:
+    """Yield a tab without 3-D views, for tests of what stands beside them."""
+    with visiting(browser, url, view=False) as opened:
+        yield opened
+
+
 def colours(drawn: bytes) -> int:
     """Count the colours of a picture: an empty canvas has one."""
     pixels = np.asarray(Image.open(io.BytesIO(drawn)).convert("RGB"))
@@ -203,7 +210,7 @@ def test_the_view_can_be_turned_and_starts_chosen(tab: Watched) -> None:
 
 
 def test_what_is_refused_is_said_in_words_where_it_arose(browser: Browser, url: str) -> None:
-    tab = Watched(browser, url)
+    tab = Watched(browser, url, view=False)
     tab.open(f"/pages/styles/{STYLE}")
     when_drawn(tab)
     start = tab.page.locator("#start")
@@ -214,9 +221,9 @@ def test_what_is_refused_is_said_in_words_where_it_arose(browser: Browser, url: 
     assert [one for one in tab.complaints if "422" not in one] == []  # Chromium itself logs the refusal
 
 
-def test_a_withdrawal_says_what_it_means_and_needs_a_yes(tab: Watched, client: Client) -> None:
-    page, dialog = tab.page, tab.page.get_by_role("dialog")
-    tab.open(f"/pages/styles/{STYLE}")
+def test_a_withdrawal_says_what_it_means_and_needs_a_yes(flat: Watched, client: Client) -> None:
+    page, dialog = flat.page, flat.page.get_by_role("dialog")
+    flat.open(f"/pages/styles/{STYLE}")
     page.get_by_role("button", name="Withdraw the release").click()
     expect(dialog).to_contain_text("No policy of this style is served")
     dialog.get_by_role("button", name="Cancel").click()
@@ -230,9 +237,9 @@ def test_a_withdrawal_says_what_it_means_and_needs_a_yes(tab: Watched, client: C
     expect(page.locator(".lead").first).to_contain_text("version 1 is served to clients")
 
 
-def test_an_outcome_is_marked_on_the_page_of_its_style(tab: Watched, client: Client) -> None:
-    page, dialog = tab.page, tab.page.get_by_role("dialog")
-    tab.open(f"/pages/styles/{STYLE}")
+def test_an_outcome_is_marked_on_the_page_of_its_style(flat: Watched, client: Client) -> None:
+    page, dialog = flat.page, flat.page.get_by_role("dialog")
+    flat.open(f"/pages/styles/{STYLE}")
     page.get_by_text("Mark the outcome of a demonstration").click()
     page.get_by_label("Outcome").select_option("recovery")
     page.get_by_label("Why, for a recovery or a failure").fill("The needle slipped.")
@@ -337,7 +344,7 @@ def test_everything_is_reached_with_the_keyboard_and_the_focus_is_seen(tab: Watc
 
 @pytest.mark.parametrize("name", ["desk-light", pytest.param("phone-dark", marks=pytest.mark.nightly)])
 def test_a_demonstration_is_scored_from_the_page_of_its_style(browser: Browser, url: str, name: str) -> None:
-    with visiting(browser, url, phone="phone" in name, dark="dark" in name) as tab:
+    with visiting(browser, url, phone="phone" in name, dark="dark" in name, view=False) as tab:
         tab.open(f"/pages/styles/{STYLE}")
         tab.page.get_by_role("link", name="Score").first.click()
         tab.page.wait_for_url(re.compile("/pages/demos/[0-9a-f]{64}/score"))
@@ -360,9 +367,8 @@ def try_out(tab: Watched, call: str) -> Locator:
     return block.locator(".live-responses-table .response")
 
 
-@pytest.mark.parametrize(
-    "name", ["desk", *(pytest.param(name, marks=pytest.mark.nightly) for name in ("desk-dark", "phone"))]
-)
+@pytest.mark.nightly  # a page that takes 5 s of processor time; by day tests/api reads it
+@pytest.mark.parametrize("name", ["desk", "desk-dark", "phone"])
 def test_a_call_is_tried_out_on_the_page_of_the_calls(browser: Browser, url: str, name: str) -> None:
     with visiting(browser, url, phone="phone" in name, dark="dark" in name) as tab:
         tab.open("/docs")
@@ -374,9 +380,11 @@ def test_a_call_is_tried_out_on_the_page_of_the_calls(browser: Browser, url: str
         tab.shoot(f"docs-{name}")
 
 
-@pytest.mark.parametrize("scheme", [pytest.param("bearer", marks=pytest.mark.nightly), "header"])
+@pytest.mark.nightly  # as above, with a service of its own
+@pytest.mark.parametrize("scheme", ["bearer", "header"])
 def test_a_call_with_a_key_is_tried_out_behind_a_prefix(browser: Browser, tmp_path: Path, scheme: str) -> None:
-    with running(tmp_path, root_path=PREFIX) as service, closing(Database(f"sqlite:///{service.database}")) as database:
+    serving = running(tmp_path, root_path=PREFIX, workers=0)
+    with serving as service, closing(Database(f"sqlite:///{service.database}")) as database:
         with database.writing() as session:
             _, key = create_key(session, "anna", "reader", "local")
         with visiting(browser, service.url) as tab:

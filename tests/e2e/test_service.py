@@ -36,24 +36,27 @@ def test_what_was_acknowledged_survives_a_kill_and_the_training_goes_on(tmp_path
         assert client.train(*style, learner=SLOW_LEARNER).id == job.id
 
 
-def test_a_recording_is_returned_exactly_and_two_segments_give_two_demos(client: Client) -> None:
+@pytest.mark.nightly  # by day tests/api, without a server
+def test_a_recording_is_returned_exactly_and_two_segments_give_two_demos(tmp_path: Path) -> None:
     sample = next(s for s in sample_recordings() if len(s.segments) > 1)
-    client.put_surgeon(sample.surgeon)
-    first, again = client.add_recording(sample.data), client.add_recording(sample.data)
-    assert first.id == again.id
-    parts = first.segments[:2]
-    demos = [
-        client.cut_demo(first.id, surgeon=sample.surgeon, suture=sample.suture, start_s=p.start_s, end_s=p.end_s)
-        for p in parts
-    ]
-    assert len({d.id for d in demos}) == 2
-    assert {d.recording for d in demos} == {first.id}
-    assert all(client.demo_recording(d.id) == sample.data for d in demos)
+    with running(tmp_path, workers=0) as service, Client(service.url) as client:
+        client.put_surgeon(sample.surgeon)
+        first, again = client.add_recording(sample.data), client.add_recording(sample.data)
+        assert first.id == again.id
+        parts = first.segments[:2]
+        demos = [
+            client.cut_demo(first.id, surgeon=sample.surgeon, suture=sample.suture, start_s=p.start_s, end_s=p.end_s)
+            for p in parts
+        ]
+        assert len({d.id for d in demos}) == 2
+        assert {d.recording for d in demos} == {first.id}
+        assert all(client.demo_recording(d.id) == sample.data for d in demos)
 
 
-def test_a_stopped_service_exits_with_0_and_takes_its_children_along(tmp_path: Path) -> None:
-    with running(tmp_path, workers=2) as service:
-        until(lambda: len(service.children(WORKER)) == 2)
+@pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.nightly)])  # the second starts 5 s later
+def test_a_stopped_service_exits_with_0_and_takes_its_children_along(tmp_path: Path, workers: int) -> None:
+    with running(tmp_path, workers=workers) as service:
+        until(lambda: len(service.children(WORKER)) == workers)
         children = [*service.children(WORKER), service.child(FORK_SERVER)]
         assert service.stop() == 0
     until(lambda: not any(map(alive, children)))
@@ -70,7 +73,10 @@ def test_a_worker_that_dies_is_replaced_and_its_job_done(tmp_path: Path) -> None
         assert done.result["released"]
 
 
-@pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.0.2.7", "example.org"])
+BY_NIGHT = [pytest.param(host, marks=pytest.mark.nightly) for host in ("::", "192.0.2.7", "example.org")]
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", *BY_NIGHT])  # by day `tests/test_settings.py` has the others
 def test_an_address_that_others_can_reach_is_refused(tmp_path: Path, host: str) -> None:
     environment = os.environ | {"SKILLS_HOST": host, "SKILLS_DATABASE_URL": f"sqlite:///{tmp_path / 's.sqlite'}"}
     ended = subprocess.run([sys.executable, "-m", "skills", "serve"], env=environment, capture_output=True, text=True)

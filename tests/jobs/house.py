@@ -22,6 +22,8 @@ from tests.library import cases
 from tests.waiting import END_S, until
 
 ROOT = Path(__file__).parents[2]
+# As the service starts its workers: `run_worker` enables the garbage collector.
+STANDIN = "import gc; gc.disable(); from tests.jobs.standin import main; main()"
 Worker = subprocess.Popen[bytes]
 
 
@@ -72,7 +74,7 @@ class House:
     def workers(self, number: int) -> Iterator[dict[int, Worker]]:
         """Start several workers, wait until they run, and make sure that they have stopped at the end."""
         started = [
-            subprocess.Popen([sys.executable, "-m", "tests.jobs.standin"], cwd=ROOT, env=environment(self.settings))
+            subprocess.Popen([sys.executable, "-c", STANDIN], cwd=ROOT, env=environment(self.settings))
             for _ in range(number)
         ]
         try:

@@ -37,5 +37,5 @@ def note(journal: Path, word: str, row: int) -> None:
         file.write(f"{word} {row} {os.getpid()}\n")
 
 
-if __name__ == "__main__":
+def main() -> None:
     run_worker(Settings(), perform=perform)

@@ -137,7 +137,8 @@ def test_a_batch_survives_a_dead_worker_a_bad_style_and_eight_requests(database:
     assert len(trained) == len(set(trained)) == STYLES - 1
 
 
-@pytest.mark.parametrize("database", backends.POSTGRESQL_NIGHTLY, indirect=True)
+@pytest.mark.nightly  # by day batches are cancelled in tests/api, without workers
+@pytest.mark.parametrize("database", backends.BACKENDS, indirect=True)
 def test_a_batch_cancelled_midway_keeps_its_results_and_adds_none(database: Database):
     add_styles(database, STYLES)
     job = ask_retraining(database, learner=SLOW)

@@ -1,10 +1,15 @@
 """Small hand-offs as tables and bags, and their way to a playback, with the library calls that the service makes."""
 
 import io
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing, contextmanager
 from itertools import pairwise
+from threading import Event
 from typing import Any
 
 import numpy as np
+from sqlalchemy import select
 
 from skills.db.models import Demonstration, Plan, PolicyVersion
 from skills.db.service_tables import Job
@@ -17,6 +22,7 @@ from skills.learning.q_learning import CellQLearning
 from skills.library import perform_job
 from skills.library.catalogue import put_surgeon, seed_catalogue
 from skills.library.demos import upload_demo
+from skills.library.jobs import BATCH
 from skills.library.plans import plan_sutures
 from skills.library.recordings import Upload
 from skills.library.training import request_training
@@ -93,6 +99,34 @@ def work(database: Database, job: Job) -> Job:
     assert settled, "the job failed inside the service"
     with database.reading() as session:
         return session.get_one(Job, job.row)
+
+
+@contextmanager
+def working(settings: Settings) -> Iterator[None]:
+    """Carry out all jobs in a thread, in the place of `skills.serving.working`: no process to start for each command.
+
+    There is no engine, and a job of which an attempt fails is given up at once.
+    """
+    over = Event()
+
+    def work_on() -> None:
+        with closing(Database(settings.database_url)) as database:
+            carried_out = Work(database, settings, perform_job)
+            while not over.wait(0.02):
+                with database.reading() as session:
+                    active = Job.state.in_(("queued", "running")), Job.kind != BATCH  # a batch ends with its last part
+                    waiting = session.execute(select(Job.row, Job.attempt).where(*active)).all()
+                for row, attempt in waiting:
+                    if not (over.is_set() or carried_out.try_once(row, attempt, 0)):
+                        carried_out.give_up(row, attempt)
+
+    with ThreadPoolExecutor(1) as pool:
+        worker = pool.submit(work_on)
+        try:
+            yield
+        finally:
+            over.set()
+            worker.result()
 
 
 def train(database: Database, surgeon: str = "kestrel", **asked: Any) -> PolicyVersion:

@@ -54,10 +54,7 @@ def jigsaws(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     ("task", "left_out"),
     [
         ("Knot_Tying", "without a kinematics file: Knot_Tying_G004."),
-        (
-            "Needle_Passing",
-            "unrated: Needle_Passing_B005, Needle_Passing_F002",
-        ),
+        pytest.param("Needle_Passing", "unrated: Needle_Passing_B005, Needle_Passing_F002", marks=pytest.mark.nightly),
     ],
 )
 def test_a_user_is_refused_with_the_figures_and_nothing_is_stored(
