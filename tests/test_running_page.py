@@ -109,10 +109,10 @@ def test_the_runner_acts_as_the_service_on_a_recording(loaded, learner, form):
     agrees(loaded(policy, form), policy, np.concatenate((states, policy.path.states[::5])))
 
 
-@pytest.mark.nightly  # a million answers
+@pytest.mark.nightly  # every state and phase, three times
 @pytest.mark.parametrize("learner", LEARNERS, ids=["phase", "cell"])
 def test_the_runner_acts_as_the_service_everywhere_on_a_recording(loaded, learner):
-    policy = recorded(5.0, learner)
+    policy = recorded(10.0, learner)
     for form in ("json", "live", "npz"):
         agrees(loaded(policy, form), policy, np.arange(policy.path.grid.n_states))
 
