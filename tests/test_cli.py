@@ -18,12 +18,13 @@ from typer.main import get_command
 from typer.testing import CliRunner
 
 from skills.cli import app
-from skills.cli.policies import MANY
+from skills.cli.policies import MANY, PHASED
 from skills.cli.shell import complete_surgeons, complete_sutures, connect
 from skills.db.session import Database
 from skills.formats import read_recording, write_mcap
 from skills.formats.lerobot.cut import find_dataset
 from skills.formats.lerobot.writer import AboutDataset, ExportedEpisode, dataset_files
+from skills.learning.policy import LEARNERS
 from skills.library.catalogue import put_surgeon
 from skills.seeds.recordings import sample_recordings
 from skills.settings import Settings, settings
@@ -142,7 +143,15 @@ def test_from_a_bag_folder_to_a_released_policy_and_a_plan(with_worker, tmp_path
     assert (code, json.loads(said)["result"]["released"]) == (0, True), said
     _, said = skills("policy", "show", *STYLE)
     assert "31 of 31 states, DTW 0 mm" in said
+    assert "36% of the demonstration from a start on average, median 23%; 160 of 1331 starts see the goal alone" in said
     assert "1331 of 1331 reach the goal" in said
+    code, said = skills("train", *STYLE, "--join", "0.5", "--json")
+    assert json.loads(said)["request"]["learner"]["join_share"] == 0.5
+    assert "72% of the demonstration" in skills("policy", "show", *STYLE, "--version", "2")[1]
+    code, said = skills("train", *STYLE, "--join", "sometimes")
+    assert (code, "Write nearest, start, or a share from 0 to 1" in said) == (1, True)
+    code, said = skills("train", *STYLE, "--join", "start", "--learner", "cell-q-learning")
+    assert (code, "cell-q-learning has no phases" in said) == (1, True)
     code, said = skills("rollout", *STYLE, "--start", "-30,25,-140", "--json")
     assert json.loads(said)["finished"]
     exported = tmp_path / "policy.json"
@@ -593,3 +602,7 @@ def test_tab_in_a_shell_is_silent_whatever_is_wrong(wrong: dict[str, str], tmp_p
     given = {name: value.format(folder=tmp_path) for name, value in wrong.items()}
     (tmp_path / "no.sqlite").write_bytes(b"this is no database" * 100)
     assert completed("skills policy show k", **given) == ([], "")
+
+
+def test_the_commands_know_every_learner_that_has_a_joining_rule() -> None:
+    assert set(PHASED) == {kind for kind, learner in LEARNERS.items() if learner.phased}

@@ -47,7 +47,7 @@ Kind = Annotated[str | None, typer.Option("--learner", help="Kind of the learner
 Chosen = Annotated[
     list[str] | None, typer.Option("--setting", help="A setting of the learner, such as steps=100000; repeatable.")
 ]
-Join = Annotated[
+Rule = Annotated[
     str | None,
     typer.Option(
         help="Where a start joins the demonstration: nearest; start; or a share such as 0.5, so much of it is followed."
@@ -55,6 +55,7 @@ Join = Annotated[
 ]
 JOINING = {"nearest": 0.0, "start": 1.0}
 DEFAULT_LEARNER = "phase-q-learning"
+PHASED = (DEFAULT_LEARNER, "value-iteration")  # the learners that have a joining rule; a test compares them with all
 plan_commands = typer.Typer()
 
 PlanId = Annotated[str, typer.Argument(help="The plan's digest.")]
@@ -82,7 +83,7 @@ def train(
     seed: int = 0,
     learner: Kind = None,
     setting: Chosen = None,
-    join: Join = None,
+    join: Rule = None,
     as_json: AsJson = False,
 ) -> None:
     """Learn a style from its newest demonstration, or from the given ones, and wait until it is learnt.
@@ -118,7 +119,7 @@ def retrain(
     release: Annotated[bool, typer.Option(help="Release versions that pass the gate and are not worse.")] = False,
     learner: Kind = None,
     setting: Chosen = None,
-    join: Join = None,
+    join: Rule = None,
     as_json: AsJson = False,
 ) -> None:
     """Learn many styles again, and wait for them; exit code 1 if one failed, or with --release was not released."""
@@ -160,6 +161,10 @@ def _learner(kind: str | None, settings: list[str], join: str | None) -> dict[st
         return None
     learner: dict[str, Any] = {"kind": kind or DEFAULT_LEARNER}
     if join is not None:
+        if learner["kind"] not in PHASED:
+            raise BadInput(
+                f"The learner {kind} has no phases, so no joining rule.", f"Name one of {', '.join(PHASED)}."
+            )
         learner["join_share"] = _join_share(join)
     for setting in settings:
         name, _, value = setting.partition("=")

@@ -243,7 +243,7 @@ def coverage(counts: StartCounts, starts: int, mean_share: float, median_share: 
     )
     if counts.follow == starts:
         return (
-            f"{share} All of them join the demonstration in the fewest moves that the joining rule allows, and follow "
+            f"{share} All starts join the demonstration in the fewest moves that the joining rule allows, and follow "
             "it to the goal."
         )
     return (

@@ -44,12 +44,12 @@ def test_the_demo_does_the_main_job_and_exits_with_0(
     printed = ended.stdout.decode()
     assert ended.returncode == 0, printed + ended.stderr.decode()
     styles = re.findall(
-        r"^ (\w+) [a-z-]+ +(\d+)/(\d+) +0 +1331/1331 +feasible, \d+ of 1000 worlds ", printed, re.MULTILINE
+        r"^ (\w+) [a-z-]+ +(\d+)/(\d+) +0 +[2-5]\d% +feasible, \d+ of 1000 worlds ", printed, re.MULTILINE
     )
     assert {surgeon for surgeon, _, _ in styles} == surgeons
     assert all(exact == states for _, exact, states in styles)
     pictures = tmp_path / "build" / "demo"
-    learnt = "333 of 333 states, DTW 0 mm, 9570 of 9570 starts reach the goal; released."
+    learnt = "333 of 333 states, DTW 0 mm, 54% of the demonstration from a start on average; released."
     assert (learnt if real else "No real recording:") in printed
     assert ("Played back at its own place: No hand-off: feasible in an exact simulation" in printed) == real
     assert len(list(pictures.glob("*-playback.png"))) >= len(styles)

@@ -81,7 +81,10 @@ function learnt({ path_mm: points, number }) {
   ];
 }
 
-const percent = (part) => `${Math.floor(100 * part)} %`; // less than all is never 100 %
+// Less than all is never 100 %.
+function percent(part) {
+  return `${Math.floor(100 * part)} %`;
+}
 
 // The cells from which the policy reaches the goal; those from which it does not are crosses, in every colouring.
 function starts() {
