@@ -120,11 +120,6 @@ class Action(Enum):
         command="See it: skills job show {job}",
         python="See it: client.job({job})",
     )
-    SEE_RETRAINING = Words(
-        http="GET /retrainings/{job} names the styles.",
-        command="The command that started it names the styles; again: skills retrain --only-stale",
-        python="See the styles: client.retrained({job})",
-    )
     TRAIN = Words(
         http="POST /trainings with release true learns it and releases it.",
         command="Learn and release it: skills train {surgeon} {suture} --release",

@@ -19,7 +19,6 @@ import time
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
 from typing import Generic, TypeVar
 from urllib.parse import quote
 
@@ -321,12 +320,20 @@ class Gate:
             _refuse_foreign(scope.get("method", WEB_SOCKET), headers)
             if not is_open(_path(scope)):
                 scope["caller"] = await self._caller(scope, headers)
-                # a stream repeats the check while it is open
-                scope["ask_again"] = partial(self._caller, scope, headers, counted=False)
+                # a stream repeats the check while it is open; without the scope, which would be a reference cycle
+                scope["ask_again"] = self.ask_again
         except SkillsError as error:
             await _refusal(scope, error)(scope, receive, send)
             return
         await self.app(scope, receive, send)
+
+    async def ask_again(self, scope: Scope) -> Caller:
+        """Authenticate a request once more, without counting it.
+
+        Raises:
+            NotSignedIn: Its credentials are no longer valid.
+        """
+        return await self._caller(scope, self._read(scope), counted=False)
 
     def _read(self, scope: Scope) -> dict[bytes, bytes]:
         """Return the headers by name.

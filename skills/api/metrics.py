@@ -48,9 +48,11 @@ class ServiceMetrics:
             buckets=BUCKETS_S,
             registry=self._registry,
         )
-        self._in_progress = Gauge(
+        self._in_progress = 0  # a plain number, because a gauge takes a lock at every change
+        gauge = Gauge(
             "skills_requests_in_progress", "Requests whose response is not complete yet.", registry=self._registry
         )
+        gauge.set_function(lambda: self._in_progress)
         self.sessions = Gauge("skills_sessions_open", "Sessions of pose styles.", registry=self._registry)
         self._known: dict[tuple[str, str, int], Histogram] = {}
         about = {"version": __version__, "schema": revisions()[0], "python": platform.python_version()}
@@ -61,12 +63,12 @@ class ServiceMetrics:
         self._registry.register(Installation(database, lease_s))
 
     def begun(self) -> None:
-        """Count the start of a request."""
-        self._in_progress.inc()
+        """Count the start of a request; only the event loop's thread calls this and `seen`."""
+        self._in_progress += 1
 
     def seen(self, method: str, route: str, status: int, seconds: float) -> None:
         """Count the end of a request, with its duration in seconds."""
-        self._in_progress.dec()
+        self._in_progress -= 1
         key = (method, route, status)
         # cached, because `labels` validates its arguments and takes a lock at every call
         one = self._known.get(key)

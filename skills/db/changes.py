@@ -265,7 +265,10 @@ class Kept(Generic[K, V]):
     def get(self, key: K) -> V | None:
         """Return the value of a key, None if it is not cached, and mark it as most recently used."""
         with self._lock:
-            return self._values.get(key)
+            try:
+                return self._values[key]
+            except KeyError:  # not `get`, which looks a key up twice, at every request
+                return None
 
     def put(self, key: K, value: V) -> None:
         """Store a value; the least recently used values are evicted as soon as the total weight exceeds the bound."""

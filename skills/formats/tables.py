@@ -202,7 +202,7 @@ def read_table(file: BinaryIO, reading: TableReading | None = None) -> Recording
     with open_text(file) as text:
         names, separator = header_of(text)
         uses = _uses(names, said)
-        _check_groups(uses, names)
+        _check_groups(uses)
         time = uses.get("t")
         check_time(None if time is None else names[time.index], said)
         numbers = read_numbers(
@@ -383,7 +383,7 @@ def _units(said: TableReading) -> dict[int, str]:
     return units
 
 
-def _check_groups(uses: Mapping[str, _Use], names: Sequence[str]) -> None:
+def _check_groups(uses: Mapping[str, _Use]) -> None:
     """Refuse incomplete groups of columns, and two orientations.
 
     Raises:

@@ -130,7 +130,7 @@ def _view(recorded: Demo, path: GridPath, reward: RewardMap) -> dict[str, Any]:
     }
 
 
-def view_of_version(session: Session, version: PolicyVersion) -> dict[str, Any]:
+def view_of_version(version: PolicyVersion) -> dict[str, Any]:
     """Return the demonstration that a version was learnt from, and for every cell the rollout that starts there."""
     policy, coverage = learnt(version), covered(version)
     grid = policy.path.grid

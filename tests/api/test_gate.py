@@ -1,5 +1,7 @@
 """Authentication: keys, sign-ins and their tokens, proxy headers, host names, cross-origin pages, rate limits."""
 
+import asyncio
+import gc
 import hashlib
 import logging
 import re
@@ -7,12 +9,13 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
+from weakref import ref
 
 import pytest
 from sqlalchemy import event, text
 
 from skills.api.app import ALWAYS
-from skills.api.authentication import COOKIE, PROXY_SECRET
+from skills.api.authentication import COOKIE, PROXY_SECRET, Gate
 from skills.api.rate_limits import BAD_AT_ONCE, Bucket
 from skills.library.keys import revoke_key
 from tests import backends
@@ -417,3 +420,33 @@ def test_a_repeated_wrong_key_is_looked_up_and_counted_once(service: Service):
     assert set(again) == {401}
     assert As(service, wrong(2))("GET", "/surgeons").status_code == 401
     assert anna("GET", "/surgeons").status_code == 200
+
+
+# ---- memory
+
+
+class Mark:
+    """An object that can be referenced weakly."""
+
+
+def test_a_request_is_freed_without_the_garbage_collector(service: Service):
+    """A reference cycle in every request would leave its memory to the collector, which then has work all the time."""
+    passed_on: list[str] = []
+
+    async def application(scope: dict[str, Any], *_: object) -> None:
+        passed_on.append(scope["caller"].name)
+
+    async def request() -> "ref[Mark]":
+        mark = Mark()
+        scope = {"type": "http", "method": "GET", "path": "/surgeons", "headers": [(b"host", b"localhost")]}
+        await Gate(application, service.app.state.access, service.app.state.settings)(
+            scope | {"mark": mark}, None, None
+        )  # type: ignore[arg-type]
+        return ref(mark)
+
+    gc.disable()
+    try:
+        assert asyncio.run(request())() is None
+    finally:
+        gc.enable()
+    assert passed_on == ["local"]

@@ -192,7 +192,7 @@ def test_a_policy_of_any_outcome_names_the_outcomes(database: Database):
     assert wrong(database) == []
 
 
-def test_a_card_states_the_outcomes_of_its_demonstrations_and_an_unmarked_one_none(database: Database):
+def test_a_card_states_outcomes_and_of_an_unmarked_demonstration_none(database: Database):
     def learner() -> str:
         with database.reading() as session:
             return str(card_of(session, find_by_digest(session, version.sha256)).written()["learner"]["in_words"])

@@ -127,7 +127,7 @@ def _chosen(session: Session, whole: overview.WholeStyle, version: int | None) -
 def view_version(surgeon: Slug, suture: Slug, version: Version, caller: Asking, db: Db) -> Response:
     """Return the data of a version's 3-D view."""
     with db.reading() as session:
-        return _json(overview.view_of_version(session, policies.find_version(session, surgeon, suture, version)))
+        return _json(overview.view_of_version(policies.find_version(session, surgeon, suture, version)))
 
 
 @router.get("/pages/demos/{demo}/view", dependencies=[needs("reader")])

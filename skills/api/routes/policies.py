@@ -4,6 +4,7 @@ A retraining is a batch of styles. A policy card is the JSON or HTML description
 values only.
 """
 
+from functools import partial
 from typing import Annotated, Any, Literal
 
 from fastapi import Header, Path, Query, Request, Response, WebSocket
@@ -128,7 +129,7 @@ def get_job(job: JobId, db: Db, give: Giving) -> Response:
 async def watch_job(job: JobId, db: Db, caller: Asking, request: Request) -> Stream:
     """Stream a job's changes as server-sent events until it has ended; comments keep the connection alive."""
     watching: Watching = request.app.state.watching
-    events = watching.events(db, job, caller.key, request.scope["ask_again"])
+    events = watching.events(db, job, caller.key, partial(request.scope["ask_again"], request.scope))
     return Stream(events, "text/event-stream", {"Cache-Control": "no-store"})
 
 
