@@ -76,6 +76,9 @@ class Settings(BaseSettings):
     near_radius_mm: float = Field(default=3.0, gt=0, allow_inf_nan=False)
     # ... follows this share of the demonstration; recordings and samples: 0.76 or more, see docs/joining.md
     near_least_share: float = Field(default=0.4, ge=0, le=1)
+    # greatest turn of the surgeon's, of a plan to export or a version to release that holds the jaw; beyond it the
+    # needle would stand in the jaws as no estimate of success allows for
+    constant_turn_deg: float = Field(default=10.0, ge=0, le=180)
     workers: int = Field(default_factory=_cores, ge=0, le=64)  # worker processes; 0: workers run elsewhere
     lease_s: float = Field(default=2.0, gt=0)  # a worker without a heartbeat for longer is considered dead
     job_attempts: int = Field(default=3, ge=1)

@@ -408,7 +408,17 @@ def plan(
         Path | None,
         typer.Option(help="Take the suture points from a simulator's MCAP file: the exit points of the needle."),
     ] = None,
-    speed_mm_s: float = 20.0,
+    speed_mm_s: Annotated[
+        float, typer.Option(help="Greatest speed of the tip; the surgeon's tempo is slowed to it.")
+    ] = 20.0,
+    orientation: Annotated[
+        Literal["recorded", "constant"] | None,
+        typer.Option(help="The jaw: recorded, as the surgeon turned it, or constant. Recorded where it was."),
+    ] = None,
+    a2: Annotated[
+        Literal["recorded", "paper"] | None,
+        typer.Option(help="The end of A2: recorded, the demonstrated hand-off, or paper. Recorded where it was."),
+    ] = None,
     rate_hz: Annotated[float, typer.Option(help="Samples per second, 100 to 200.")] = 200.0,
     approach: Annotated[str | None, typer.Option(help="PSM_M's approach direction, as x,y,z.")] = None,
     base: Annotated[
@@ -453,6 +463,8 @@ def plan(
             tip_offset_mm=tip_offset_mm,
             psm_m=psm_m or None,
             handoff="none" if no_handoff else None,
+            orientation=orientation,
+            a2=a2,
         )
     show(made, as_json, ("id", "arm", "frame", "orientation", "trajectory.duration_s"))
     if not as_json:

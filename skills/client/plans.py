@@ -35,6 +35,8 @@ class Plans(Connection):
         psm_m: Mapping[str, Any] | None = None,
         realignment: bool | None = None,
         handoff: Literal["none"] | None = None,
+        orientation: Literal["recorded", "constant"] | None = None,
+        a2: Literal["recorded", "paper"] | None = None,
     ) -> Plan:
         """Stack a style at suture points.
 
@@ -49,13 +51,15 @@ class Plans(Connection):
             arm: Refused if it is not the demonstrated one; so are `frame` and `instrument`.
             frame: Frame of the positions.
             instrument: Instrument of the arm.
-            speed_mm_s: Largest speed of the tip.
+            speed_mm_s: Largest speed of the tip; the surgeon's tempo is slowed to it.
             rate_hz: Samples per second, 100 to 200.
             tip_offset_mm: Distance of the planned points from the jaw's hinge along its approach, towards the finger
                 tips.
             psm_m: The arm that takes the needle: `approach`, `base`, `instrument`, `enters`, `source`.
             realignment: False plans A1 alone, without the rotation of A2; `handoff` replaces it.
             handoff: "none" plans A1 alone, which hands nothing over.
+            orientation: "recorded" turns the jaw as the surgeon did, "constant" holds it as in the first sample.
+            a2: "recorded" ends in the demonstrated hand-off, "paper" across PSM_M's approach.
 
         Raises:
             Problem: Of kind "no-hand-off" if neither `psm_m` nor the demonstration gives the pose of PSM_M, and
@@ -67,7 +71,7 @@ class Plans(Connection):
             **{"version": version, "arm": arm, "frame": frame, "instrument": instrument, "psm_m": psm_m},
             **{"starts_mm": None if starts_mm is None else [None if s is None else list(s) for s in starts_mm]},
             **{"speed_mm_s": speed_mm_s, "rate_hz": rate_hz, "tip_offset_mm": tip_offset_mm},
-            **{"realignment": realignment, "handoff": handoff},
+            **{"realignment": realignment, "handoff": handoff, "orientation": orientation, "a2": a2},
         }
         return await self._ask(Plan, "POST", at("plans"), given(body))
 

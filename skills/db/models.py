@@ -43,12 +43,14 @@ from skills.learning.q_learning import PhaseQLearning, Training
 from skills.learning.ties import ShortestWay
 from skills.learning.tube import CertifiedPoses, TubeCertificate, TubeLimits
 from skills.packing import added_later, few_numbers
+from skills.planning.hand import Hand
 from skills.planning.handoff import PsmM
-from skills.planning.plan import Pass, SuturePlan, SuturePoint
+from skills.planning.motion_laws import Pose
+from skills.planning.plan import Departure, Pass, SuturePlan, SuturePoint
 from skills.verification.playback import Pictures, Playback
 
 stored(GridWorld, GridPath, RewardLevels, *LEARNERS.values(), Training, Network, ShortestWay)
-stored(SuturePoint, Pass, Pause, Partner, PsmM)
+stored(SuturePoint, Pass, Pause, Partner, PsmM, Hand, Pose, Departure)
 stored(PosePath, TubeLimits, TubeCertificate)
 # Left out of the serialised value while they hold their default, so that the digests of older values stay the same.
 added_later(GridPath, "hysteresis")
@@ -65,6 +67,12 @@ added_later(PhaseQLearning, "join_share")
 added_later(ValueIteration, "join_share")
 added_later(Coverage, "share")
 few_numbers(Coverage, "share")  # one for each waypoint
+added_later(Pass, "hand")
+added_later(Pass, "taking")
+added_later(PsmM, "taken_mm")
+added_later(PsmM, "taken_xyzw")
+added_later(SuturePlan, "a2")
+added_later(SuturePlan, "departure")
 few_numbers(Policy, "q")  # some 130 different values in 200,000 places: stored as a palette
 
 

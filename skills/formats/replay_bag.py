@@ -56,7 +56,7 @@ class ArmMotion:
         joints: Columns of `kinematics.JOINTS`, rad and m, shape (T, 6).
         tip_m: Position of the tip, shape (T, 3).
         rotation_xyzw: Rotation of the jaw, shape (T, 4).
-        jaw_rad: Angle of the jaw, constant.
+        jaw_rad: Angle of the jaw, shape (T,).
         pass_index: Index of the plan's pass that this is, from 0; None: all passes.
     """
 
@@ -69,7 +69,7 @@ class ArmMotion:
     joints: Floats
     tip_m: Floats
     rotation_xyzw: Floats
-    jaw_rad: float
+    jaw_rad: Floats
     pass_index: int | None
 
     @property
@@ -129,7 +129,8 @@ def arms_of(
         arm: The plan's arm, see `arm_names`.
         frame: The plan's frame.
         other: The arm that took the needle in the demonstration.
-        jaw_rad: The angle of PSM_A's jaw. PSM_M's jaw stays open: only a surgeon closes it on the needle.
+        jaw_rad: The angle of PSM_A's jaw, if the trajectory has none. PSM_M's jaw stays open: only a surgeon closes it
+            on the needle.
         pass_index: A single pass, counted from 0 as in reports; its samples keep their stamps. None: all passes.
 
     Raises:
@@ -148,7 +149,7 @@ def arms_of(
         joints=_metric(trajectory.joints[rows]),
         tip_m=trajectory.tip_mm[rows] / 1000.0,
         rotation_xyzw=trajectory.rotation_xyzw[rows],
-        jaw_rad=jaw_rad,
+        jaw_rad=np.full(len(rows), jaw_rad) if trajectory.jaw_rad is None else trajectory.jaw_rad[rows],
         pass_index=pass_index,
     )
     psm_m = trajectory.psm_m
@@ -165,7 +166,7 @@ def arms_of(
         joints=_metric(psm_m.joints[rows]),
         tip_m=tip_mm / 1000.0,
         rotation_xyzw=quaternion_of(rotation),
-        jaw_rad=2 * OPEN_RAD,
+        jaw_rad=np.full(len(rows), 2 * OPEN_RAD),
         pass_index=pass_index,
     )
 
@@ -184,14 +185,14 @@ def rows_of_pass(trajectory: Trajectory, pass_index: int | None) -> Ints:
 
 
 def velocities_of(stamps_ns: Ints, joints: Floats, rate_hz: float) -> Floats:
-    """Return joint velocities, shape (T, 6): central differences, and 0 at both ends of every stretch without a pause.
+    """Return joint velocities, shape (T, N): central differences, and 0 at both ends of every stretch without a pause.
 
     At those ends the arm is at rest, and a controller may continue with the last commanded velocity until it receives
     the next setpoint.
 
     Args:
         stamps_ns: Shape (T,).
-        joints: Shape (T, 6).
+        joints: Shape (T, N).
         rate_hz: Samples per second without pauses; steps longer than `PAUSE_TICKS` samples are pauses.
     """
     velocities = np.zeros_like(joints)
@@ -206,11 +207,13 @@ def messages_of(motion: ArmMotion) -> Iterator[Message]:
     """Yield an arm's messages: for each sample the joints, the tip and the jaw."""
     on_joints, on_tip, on_jaw = motion.topics
     velocities = velocities_of(motion.stamps_ns, motion.joints, motion.rate_hz)
-    columns = (motion.stamps_ns, motion.joints, velocities, motion.tip_m, motion.rotation_xyzw)
-    for stamp_ns, joints, speeds, tip_m, turn in zip(*(column.tolist() for column in columns), strict=True):
+    jaws = motion.jaw_rad[:, None]
+    turning = velocities_of(motion.stamps_ns, jaws, motion.rate_hz)
+    columns = (motion.stamps_ns, motion.joints, velocities, motion.tip_m, motion.rotation_xyzw, jaws, turning)
+    for stamp_ns, joints, speeds, tip_m, turn, jaw, rate in zip(*(one.tolist() for one in columns), strict=True):
         yield writer.joint_state(on_joints, stamp_ns, joints, JOINTS, velocities=speeds)
         yield writer.pose(on_tip, stamp_ns, motion.frame, tip_m, turn)
-        yield writer.joint_state(on_jaw, stamp_ns, [motion.jaw_rad], ["jaw"], velocities=[0.0])
+        yield writer.joint_state(on_jaw, stamp_ns, jaw, ["jaw"], velocities=rate)
 
 
 def folder_of(motion: ArmMotion, plan_sha256: str) -> dict[str, bytes]:

@@ -248,7 +248,7 @@ def _motion(name: str, topics: dict[str, _Topic], notes: dict[str, str], plan: d
         joints=joints[:, : len(JOINTS)],
         tip_m=tip[:, :3],
         rotation_xyzw=tip[:, 3:],
-        jaw_rad=float(jaw[0, 0]),
+        jaw_rad=jaw[:, 0],
         pass_index=None if number == "all" else int(number),
     )
 
@@ -298,8 +298,11 @@ def _check_joints(motion: ArmMotion, topics: dict[str, _Topic]) -> None:
         on_joints.values[:, len(JOINTS) :] == velocities,
     )
     low, high = tool.jaw_rad
-    if not (low <= motion.jaw_rad <= high and (on_jaw.values == [motion.jaw_rad, 0.0]).all()):
-        raise BadBag(f"{motion.name}: the jaw is not held at one angle that the instrument can have.")
+    opening = velocities_of(motion.stamps_ns, motion.jaw_rad[:, None], motion.rate_hz)
+    if not (((low <= motion.jaw_rad) & (motion.jaw_rad <= high)).all() and (on_jaw.values[:, 1:] == opening).all()):
+        raise BadBag(
+            f"{motion.name}: the jaw has an angle that the instrument cannot have, or a velocity that does not match."
+        )
 
 
 def _first(what: str, motion: ArmMotion, good: np.ndarray[Any, np.dtype[np.bool_]]) -> None:

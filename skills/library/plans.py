@@ -12,9 +12,10 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from skills.db import rfc3339
-from skills.db.models import Plan
+from skills.db.models import Plan, PolicyVersion
 from skills.db.service_tables import record_event
 from skills.db.session import Database
+from skills.demonstration.demonstration import Demo
 from skills.demonstration.partner import Partner
 from skills.errors import BadPlan, BadSpeed, NoApproach, NoHandOff
 from skills.formats.suture_points import PARSE, SuturePoints, suture_points
@@ -23,10 +24,11 @@ from skills.kinematics import DEFAULT_INSTRUMENT
 from skills.learning.policy import Policy
 from skills.library import policies
 from skills.library.integrity import find_by_digest, learnt, plan_identity, planned
-from skills.library.policies import learnt_from
+from skills.library.policies import combined_of, learnt_from
 from skills.library.recordings import Reader, Upload, read_upload
+from skills.planning.hand import styled
 from skills.planning.handoff import PsmM
-from skills.planning.plan import SuturePlan, pose_xyzw, stack
+from skills.planning.plan import SuturePlan, pose_xyzw, stack, turn_deg
 from skills.planning.trajectory import Trajectory, seams, seconds_by_phase, time_parametrise, transfers
 from skills.remedies import Action, Remedy
 from skills.schemas.requests import PlanIn, PsmMIn
@@ -55,14 +57,15 @@ def plan_sutures(database: Database, request: PlanIn, actor: str) -> tuple[Plan,
     """Stack a style's policy at suture points and store the plan; return the row, and whether it is new.
 
     Raises:
-        BadPlan: The arm, frame or instrument is not the demonstration's, or a pass is out of reach of either arm.
+        BadPlan: The arm, frame or instrument is not the demonstration's, an orientation or a hand-off is requested that
+            was not recorded, or a pass is out of reach of either arm.
         Conflict: The surgeon's consent does not cover training.
         NoApproach: A hand-off is requested, and neither request nor demonstration has PSM_M's approach.
         NoHandOff: The plan would have no hand-off, and such a plan was not requested.
     """
     with database.reading() as session:
         policy = policies.choose(session, request.surgeon, request.suture, request.version)
-        demo, followed, sha = learnt_from(policy), learnt(policy), policy.sha256
+        demo, followed, sha = hand_of(policy), learnt(policy), policy.sha256
     for name in ("arm", "frame", "instrument"):
         # The policy is certified for the demonstrated arm, frame and instrument only.
         asked, have = getattr(request, name), getattr(demo, name)
@@ -81,6 +84,8 @@ def plan_sutures(database: Database, request: PlanIn, actor: str) -> tuple[Plan,
         speed_mm_s=request.speed_mm_s,
         rate_hz=request.rate_hz,
         tip_offset_mm=request.tip_offset_mm,
+        orientation=request.orientation,
+        a2=request.a2,
     )
     trajectory = trajectory_of(plan)
     identity = plan_identity(sha, plan)
@@ -97,6 +102,12 @@ def plan_sutures(database: Database, request: PlanIn, actor: str) -> tuple[Plan,
         record_event(session, actor, "plan", "plan", identity, policy.surgeon)
         session.flush()
         return stored, True
+
+
+def hand_of(version: PolicyVersion) -> Demo:
+    """Return the demonstration whose hand a plan of a policy follows: of several, with that of their pose style."""
+    demo, demos = learnt_from(version), [one.demo for one in version.demonstrations]
+    return demo if combined_of(version) is None else styled(demo, demos)
 
 
 def _refuse_metres(policy: Policy, request: PlanIn) -> None:
@@ -163,6 +174,8 @@ def _psm_m(asked: PsmMIn, partner: Partner | None) -> PsmM:
         base_mm, base_xyzw, base_from = asked.base.position_mm, asked.base.rotation_xyzw, requested
     elif partner is not None and partner.base_mm is not None:
         base_mm, base_xyzw, base_from = partner.base_mm, partner.base_xyzw, shown
+    # With another approach than the recorded one, PSM_M cannot take the needle in the recorded pose.
+    seen = partner if asked.approach is None else None
     return PsmM(
         approach=approach,
         base_mm=base_mm,
@@ -171,6 +184,8 @@ def _psm_m(asked: PsmMIn, partner: Partner | None) -> PsmM:
         enters=asked.enters,
         approach_from=approach_from,
         base_from=base_from,
+        taken_mm=None if seen is None else seen.position_mm,
+        taken_xyzw=None if seen is None else seen.rotation_xyzw,
     )
 
 
@@ -193,6 +208,8 @@ def describe_plan(plan: SuturePlan, trajectory: Trajectory) -> dict[str, Any]:
         "frame": plan.frame,
         "instrument": plan.instrument,
         "orientation": plan.orientation,
+        "departure": None if plan.departure is None else asdict(plan.departure),
+        "a2": plan.a2 if plan.psm_m is not None else None,
         "path": plan.path,
         "psm_m": None if plan.psm_m is None else _describe_psm_m(plan.psm_m),
         "realignment": plan.psm_m is not None,
@@ -207,6 +224,7 @@ def describe_plan(plan: SuturePlan, trajectory: Trajectory) -> dict[str, Any]:
                 "path_mm": one.tip_mm.tolist(),
                 "jaw_xyzw": list(pose_xyzw(one.rotation)),
                 "target_xyzw": None if one.target_rotation is None else list(pose_xyzw(one.target_rotation)),
+                "turn_deg": turn_deg(one),
                 "transfer": None if transfer is None else asdict(transfer),
             }
             for one, transfer in zip(plan.passes, moved, strict=True)
@@ -217,6 +235,8 @@ def describe_plan(plan: SuturePlan, trajectory: Trajectory) -> dict[str, Any]:
             "duration_s": trajectory.duration_s,
             "seconds_by_phase": seconds_by_phase(trajectory),
             "speed_used_mm_s": trajectory.speed_mm_s,
+            "tempo": trajectory.tempo,
+            "jaw": "constant" if trajectory.jaw_rad is None else "recorded",
             "peak_joint_speed_ratio": trajectory.speed_ratio,
             "peak_joint_acceleration_ratio": trajectory.acceleration_ratio,
             "deviation_mm": trajectory.deviation_mm,
@@ -243,7 +263,34 @@ def hands_over(about: dict[str, Any]) -> bool:
 
 
 def plan_in_words(about: dict[str, Any]) -> str:
-    """Return the sentence on the motions of a described plan, and on those that it leaves out."""
+    """Return the sentences on the motions of a described plan, and on those that it leaves out."""
+    return " ".join([_moves_in_words(about), *_hand_in_words(about)])
+
+
+def _hand_in_words(about: dict[str, Any]) -> list[str]:
+    """Return the sentences on what is the surgeon's; none for a plan of a version that did not state it."""
+    if "departure" not in about:
+        return []
+    held, departure, tempo = about["orientation"], about["departure"], about["trajectory"]["tempo"]
+    if held == "recorded":
+        words = ["The jaw turns as the surgeon's."]
+    elif departure is None:
+        words = ["The jaw is held: no orientation was recorded." if held != "demonstrated" else "The jaw is held."]
+    else:
+        words = [
+            f"The jaw is held: it departs from the surgeon's by up to {departure['deg']:.1f} degrees, and the needle's "
+            f"tip by {departure['needle_tip_mm']:.1f} mm ({departure['handoff_deg']:.1f} degrees and "
+            f"{departure['handoff_needle_tip_mm']:.1f} mm at the hand-off)."
+        ]
+    if tempo is not None:
+        words.append(f"The tempo is {100 * tempo:.0f} % of the surgeon's.")
+    if about["a2"] is not None:
+        end = "in the recorded hand-off" if about["a2"] == "recorded" else "as in the paper, across PSM_M's approach"
+        words.append(f"A2 ends {end}.")
+    return words
+
+
+def _moves_in_words(about: dict[str, Any]) -> str:
     count = len(about["passes"])
     moves = f"Moves {about['arm']} along {count} pass{'es' if count != 1 else ''}"
     if not hands_over(about):

@@ -195,10 +195,12 @@ def standing_of(session: Session, playback: StoredPlayback) -> dict[str, Any]:
 
 
 def trajectory_digest(trajectory: Trajectory) -> str:
-    """Return the SHA-256 of a motion: of the stamps and joints that were checked, sample by sample."""
+    """Return the SHA-256 of a motion: of the stamps, joints and jaw that were checked, sample by sample."""
     parts = [trajectory.stamps_s, trajectory.joints]
     if trajectory.psm_m is not None:
         parts += [trajectory.psm_m.base_mm, trajectory.psm_m.base_xyzw, trajectory.psm_m.joints]
+    if trajectory.jaw_rad is not None:
+        parts.append(trajectory.jaw_rad)
     return sha256(b"".join(part.tobytes() for part in parts))
 
 

@@ -40,6 +40,7 @@ from skills.learning.policy import Policy
 from skills.library import consent
 from skills.library.consent import refusal
 from skills.library.integrity import learnt
+from skills.planning.plan import CONSTANT_TURN_DEG, departure_of
 from skills.schemas.policies import FitOnTheSame
 
 ROUNDING_MM = 1e-6  # two sums of the same distances in different order differ by less
@@ -204,8 +205,16 @@ def is_served() -> ColumnElement[bool]:
     return and_(Release.withdrawn_at.is_(None), ~superseded.correlate(Release), agreed.scalar_subquery())
 
 
-def release(session: Session, policy: PolicyVersion, actor: str) -> Release:
+def release(
+    session: Session, policy: PolicyVersion, actor: str, *, constant_turn_deg: float = CONSTANT_TURN_DEG
+) -> Release:
     """Release a policy version if it passes the gate; releasing the served version again changes nothing.
+
+    Args:
+        session: The caller's transaction.
+        policy: The version.
+        actor: The user who releases it.
+        constant_turn_deg: The turn of the demonstration beyond which the joint limits must have been checked with it.
 
     Raises:
         Conflict: It does not pass, with the reasons; its demonstration was withdrawn, or marked recovery or failure; or
@@ -219,6 +228,7 @@ def release(session: Session, policy: PolicyVersion, actor: str) -> Release:
         return served[0]
     reasons = list(policy.manifest["grid_certificate"]["refused_because"])
     reasons += [f"its demonstration {what}" for what in policy.objections]
+    reasons += _held(policy, constant_turn_deg)
     # Only phased policies have to reproduce their demonstration; one of the cell state must at least not be worse.
     if policy.manifest["phases"] == 1 and served:
         found = fit_of_versions(session, served[0].policy, policy)
@@ -236,6 +246,24 @@ def release(session: Session, policy: PolicyVersion, actor: str) -> Release:
     session.flush()
     announce(session)
     return released
+
+
+def _held(policy: PolicyVersion, constant_turn_deg: float) -> list[str]:
+    """Return the reason against a version whose joint limits were checked with the jaw held, though it was turned.
+
+    Older versions were checked so, and state no orientation.
+    """
+    driven = policy.manifest["grid_certificate"].get("driven")
+    if driven is None or driven.get("orientation") == "recorded":
+        return []
+    found = [departure_of(one.demo) for one in policy.demonstrations]
+    turn_deg = max((one.deg for one in found if one is not None), default=0.0)
+    if turn_deg <= constant_turn_deg:
+        return []
+    return [
+        f"its joint limits were checked with the jaw held, but its demonstration turns by {turn_deg:.1f} degrees, over "
+        f"{constant_turn_deg:g}, and a plan turns too; train it again"
+    ]
 
 
 def withdraw(session: Session, surgeon: Surgeon, suture: str, actor: str) -> list[Release]:

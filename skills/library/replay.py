@@ -36,6 +36,7 @@ from skills.library.plans import describe_plan, find_plan, plan_in_words, trajec
 from skills.library.playbacks import trajectory_digest
 from skills.library.policies import learnt_from
 from skills.packing import canonical, sha256
+from skills.planning.plan import CONSTANT_TURN_DEG, SuturePlan, departure_of
 from skills.planning.trajectory import Trajectory
 from skills.remedies import Action, Remedy
 
@@ -104,6 +105,7 @@ def replay_bag(
     *,
     tip_error_mm: float,
     lower_bound: float,
+    constant_turn_deg: float = CONSTANT_TURN_DEG,
     pass_index: int | None = None,
     handoff: Literal["none"] | None = None,
 ) -> bytes:
@@ -114,6 +116,7 @@ def replay_bag(
         plan_sha256: The plan's digest.
         tip_error_mm: The tip error under which the plan's probability of success is taken, see `check_doubt`.
         lower_bound: The least probability, by its lower bound, with which every pass has to succeed.
+        constant_turn_deg: The angle by which a constant orientation may depart from the recorded one.
         pass_index: Export this pass alone, counted from 0; None: all of them.
         handoff: "none" asks for the bag of a plan without a hand-off.
 
@@ -124,9 +127,10 @@ def replay_bag(
         BadPlan: The plan has no such pass.
         Corrupt: A stored plan, policy or verdict does not match its digest.
     """
+    asked = {"tip_error_mm": tip_error_mm, "lower_bound": lower_bound, "constant_turn_deg": constant_turn_deg}
     with database.reading() as session:
         row = find_plan(session, plan_sha256)
-        verdict = cleared(session, row, tip_error_mm=tip_error_mm, lower_bound=lower_bound, handoff=handoff)
+        verdict = cleared(session, row, handoff=handoff, **asked)
         plan, demo, policy = planned(row), learnt_from(row.policy), row.policy
         learnt(policy)
         trajectory = trajectory_of(plan)
@@ -151,7 +155,7 @@ def replay_bag(
     bag = seal(members)
     with database.reading() as session:  # again: consent or release may have changed while the bag was composed
         again = find_plan(session, row.sha256)
-        cleared(session, again, tip_error_mm=tip_error_mm, lower_bound=lower_bound, handoff=handoff)
+        cleared(session, again, handoff=handoff, **asked)
     return bag
 
 
@@ -159,7 +163,13 @@ def replay_bag(
 
 
 def cleared(
-    session: Session, plan: Plan, *, tip_error_mm: float, lower_bound: float, handoff: Literal["none"] | None = None
+    session: Session,
+    plan: Plan,
+    *,
+    tip_error_mm: float,
+    lower_bound: float,
+    constant_turn_deg: float = CONSTANT_TURN_DEG,
+    handoff: Literal["none"] | None = None,
 ) -> StoredPlayback:
     """Return the playback that clears a plan for replay: the newest of exactly this plan, feasible and certain enough.
 
@@ -168,10 +178,12 @@ def cleared(
         plan: The plan.
         tip_error_mm: The tip error that is expected of the robot, see `check_doubt`.
         lower_bound: The least probability, by its lower bound, with which every pass has to succeed.
+        constant_turn_deg: The angle by which a constant orientation may depart from the recorded one.
         handoff: "none" accepts a plan without a hand-off.
 
     Raises:
-        Conflict: Consent does not cover training and export; the plan has no hand-off, and `handoff` is not "none"; the
+        Conflict: Consent does not cover training and export; the plan has no hand-off, and `handoff` is not "none"; its
+            orientation is constant where the surgeon's turned by more than allowed; the
             demonstration was withdrawn; another policy than the plan's is released, or none; the plan was not played,
             is not feasible, or not certain enough.
         Corrupt: The stored verdict does not match its digest.
@@ -180,6 +192,7 @@ def cleared(
     consent.require(policies.followable(policy).surgeon, "export")
     if handoff != "none" and planned(plan).psm_m is None:
         raise Conflict("This plan has no hand-off: no PSM_M, no A2.", Remedy(Action.EXPORT_A1_ALONE))
+    _check_departure(planned(plan), plan, constant_turn_deg)
     for what in policy.objections:
         raise Conflict(f"The demonstration that this plan depends on {what}; plan with another policy.")
     served = releases.standing(session, policy.surgeon_row, policy.suture)
@@ -202,6 +215,28 @@ def cleared(
         )
     check_doubt(played.report, tip_error_mm=tip_error_mm, lower_bound=lower_bound)
     return played
+
+
+def _check_departure(planned: SuturePlan, plan: Plan, constant_turn_deg: float) -> None:
+    """Refuse a plan that holds the jaw where the surgeon turned it.
+
+    Raises:
+        Conflict: The departure exceeds the limit; also that of a plan of an older version, which did not state it.
+    """
+    if planned.orientation == "recorded":
+        return
+    departs = planned.departure
+    if departs is None and planned.orientation == "demonstrated" and planned.passes[0].hand is None:
+        departs = departure_of(learnt_from(plan.policy))
+    # negated, so that NaN fails
+    if departs is not None and not departs.deg <= constant_turn_deg:
+        raise Conflict(
+            f"This plan holds the jaw, and the surgeon turned it by up to {departs.deg:.1f} degrees: the needle's tip "
+            f"would be up to {departs.needle_tip_mm:.1f} mm off. The limit is {constant_turn_deg:g} degrees; plan "
+            "again without a constant orientation.",
+            deg=departs.deg,
+            limit_deg=constant_turn_deg,
+        )
 
 
 def check_doubt(report: dict[str, Any], *, tip_error_mm: float, lower_bound: float) -> None:
@@ -286,7 +321,7 @@ def _readme(plan: dict[str, Any], arms: tuple[ArmMotion, ...]) -> str:
         "1. `skills verify FILE.zip` first; `sha256sum -c SHA256SUMS` in the unpacked folder checks the files alone.",
         "2. Then follow docs/replay.md of suture-skills from its beginning: a simulator before a robot.",
     ]
-    if plan["orientation"] != "demonstrated":
+    if plan["orientation"] == "assumed tool-down":
         about += [
             "",
             "The demonstration had no orientation. The tool is ASSUMED to point straight down: check its orientation.",
@@ -299,18 +334,20 @@ def _readme(plan: dict[str, Any], arms: tuple[ArmMotion, ...]) -> str:
 def _arm_lines(arm: ArmMotion, planned_arm: str) -> list[str]:
     low, high = arm.extent_mm.tolist()
     box = [f"   {axis}:[{a:f}, {b:f}]" for axis, a, b in zip("XYZ", low, high, strict=True)]
+    least, most = float(arm.jaw_rad.min()), float(arm.jaw_rad.max())
     if arm.role == "PSM_M":
         jaw = "stays open; the needle is not taken until a surgeon closes it"
         named = f"{arm.name}, PSM_M: it takes the needle."
     else:
-        jaw = "closed, with a holding force" if arm.jaw_rad == JAW_CLOSED_RAD else "as demonstrated (median)"
+        jaw = "closed, with a holding force" if most == JAW_CLOSED_RAD else "as demonstrated"
+        jaw += " (median)" if least == most != JAW_CLOSED_RAD else ""
         known = planned_arm.upper() == arm_names(planned_arm)[0]
         assumed = "" if known else f" ASSUMED: the demonstration calls its arm {planned_arm!r}."
         named = f"{arm.name}, PSM_A: it brings the needle.{assumed}"
     return [
         named,
         f"   instrument {arm.instrument}, base frame {arm.frame}, {len(arm.stamps_ns)} samples at {arm.rate_hz:g} Hz",
-        f"   jaw {arm.jaw_rad:.4f} rad: {jaw}",
+        f"   jaw {f'{least:.4f}' if least == most else f'{least:.4f} to {most:.4f}'} rad: {jaw}",
         "   range of the tip in mm, as `dvrk_bag_replay.py` prints it:",
         *box,
         f"   ros2 run dvrk_python dvrk_bag_replay.py -a {arm.name} -b {arm.name} -m servo_jp",

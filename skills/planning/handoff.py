@@ -39,6 +39,7 @@ HELD_MM = 9.0  # from the hinge along the approach to the place where the jaws h
 TAKEN_MM = 7.0
 HOLDING_RAD = 0.06  # opening of each finger of jaws that hold a needle
 OPEN_RAD = radians(30)  # opening of each finger of PSM_M as it comes in: 60 degrees in all, as `open()` of dvrk_python
+NEEDLE_FREE_RAD = 2 * pi / 3  # of the arc beyond PSM_A's grip: two thirds of a half circle, as in urdf/needle.urdf
 _NO_LENGTH = 1e-12
 _PARALLEL = 1e-9  # of a cosine: 45 microradians, for quaternions of six digits
 
@@ -58,6 +59,8 @@ class PsmM:
             the start.
         approach_from: Source of the approach, in words.
         base_from: Source of the base, in words; None exactly where `base_mm` is None.
+        taken_mm: Its recorded position as it takes the needle; None if it was not recorded, or is not to be used.
+        taken_xyzw: Its recorded rotation there, a unit quaternion; None exactly where `taken_mm` is None.
     """
 
     approach: tuple[float, float, float]
@@ -67,9 +70,16 @@ class PsmM:
     enters: Enters = "after_A1"
     approach_from: str = "the caller"
     base_from: str | None = None
+    taken_mm: tuple[float, float, float] | None = None
+    taken_xyzw: tuple[float, float, float, float] | None = None
 
     def __post_init__(self) -> None:
         unit_approach(self.approach)
+        if (self.taken_mm is None) != (self.taken_xyzw is None):
+            raise BadPlan("PSM_M's recorded pose is a position and a rotation; give both, or neither.")
+        if self.taken_mm is not None and self.taken_xyzw is not None:
+            frozen(self.taken_mm, np.float64, (3,), "taken_mm")
+            matrix_of([self.taken_xyzw])
         instrument_of(self.instrument)
         if self.enters not in get_args(Enters):
             raise BadPlan(f"PSM_M enters at one of {', '.join(get_args(Enters))}.")
@@ -104,6 +114,15 @@ class OtherArm:
         object.__setattr__(self, "base_xyzw", frozen(self.base_xyzw, np.float64, (4,), "base_xyzw"))
         object.__setattr__(self, "joints", frozen(self.joints, np.float64, (None, 6), "joints"))
         matrix_of(self.base_xyzw[None])
+
+
+def needle_tips_mm() -> Floats:
+    """Return the needle's free end relative to the hinge of the jaws that hold it, on either side, mm, shape (2, 3).
+
+    In the frame [n o a] of the jaws: `HELD_MM` along the approach the arc begins along n, to the one side or the other.
+    """
+    along, across = NEEDLE_RADIUS_MM * np.sin(NEEDLE_FREE_RAD), NEEDLE_RADIUS_MM * (1 - np.cos(NEEDLE_FREE_RAD))
+    return np.array([[along, across, HELD_MM], [-along, -across, HELD_MM]])
 
 
 def unit_approach(approach_m: ArrayLike) -> Floats:

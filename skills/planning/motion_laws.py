@@ -194,15 +194,17 @@ class Poses:
 
 @dataclass(frozen=True)
 class Pace:
-    """The greatest speed of a tip, the greatest rate of a jaw, and the sampling rate."""
+    """The greatest speed of a tip, the greatest rate of a jaw, the sampling rate, and the part of a hand's tempo."""
 
     speed_mm_s: float
     turn_rad_s: float
     rate_hz: float
+    tempo: float = 1.0
 
     def slowed(self, part: float) -> "Pace":
-        """Return the pace with both speeds multiplied by a factor."""
-        return replace(self, speed_mm_s=self.speed_mm_s * part, turn_rad_s=self.turn_rad_s * part)
+        """Return the pace with all speeds multiplied by a factor."""
+        speed_mm_s, turn_rad_s, tempo = (value * part for value in (self.speed_mm_s, self.turn_rad_s, self.tempo))
+        return replace(self, speed_mm_s=speed_mm_s, turn_rad_s=turn_rad_s, tempo=tempo)
 
 
 def move(start: Arms, end: Arms, pace: Pace, least_ticks: int = 0) -> tuple[Poses, ...]:

@@ -7,7 +7,7 @@
 A pass has three phases:
 
     transfer   from the end of the previous pass to where A1 begins; ours, so that a plan is one motion
-    A1         PSM_A's tip moves along its polyline, the jaw held
+    A1         PSM_A's tip moves along its polyline, the jaw held or turning as the surgeon's (`skills.planning.hand`)
     A2         PSM_A's jaw turns with the tip held, and PSM_M comes in
 
 A transfer goes through *stations*, at rest in each. Between passes PSM_M goes back, then PSM_A moves to its start while
@@ -15,7 +15,9 @@ its jaw turns back and PSM_M moves to its next stand-off. PSM_A waits until PSM_
 from between its jaws. If a pass starts outside its grid world, its start is one more station.
 
 PSM_M waits at a stand-off, straight back along its approach, and comes in while PSM_A turns its jaw (A2). With
-`PsmM.enters` "start" it waits at the hand-off itself. The paper has PSM_M waiting; the way it comes in is ours.
+`PsmM.enters` "start" it waits at the hand-off itself. The paper has PSM_M waiting; the way it comes in is ours. It
+takes the needle in the pose that was recorded, moved with the pass, or else in the one that follows from the paper's
+A2.
 
 PSM_M's jaws are symmetric about their approach, so of a pose and the same pose with the hinge reversed it takes the one
 that needs less roll; all other joints are the same, except for the signs of the wrist's joints.
@@ -35,6 +37,7 @@ import numpy as np
 from skills.arrays import Bytes, Floats, Ints, frozen
 from skills.errors import BadPlan, NoMotion, Unreachable
 from skills.kinematics import JOINTS, ROLL, check_rotation, instrument_of, inverse, matrix_of
+from skills.planning.hand import Hand
 from skills.planning.handoff import OtherArm, PsmM, hand_off
 from skills.planning.motion_laws import PHASES, SAME_POINT_MM, Arms, Pose, Poses
 
@@ -142,18 +145,20 @@ class Meeting:
     waiting: Pose
 
 
-def meeting(handed: Pose, psm_m: PsmM) -> Meeting:
+def meeting(handed: Pose, psm_m: PsmM, taking: Pose | None = None) -> Meeting:
     """Return the poses of PSM_M around a hand-off.
 
     Args:
         handed: PSM_A's pose after A2, in its base frame.
         psm_m: PSM_M's approach, and the phase in which it enters.
+        taking: PSM_M's recorded pose as it takes the needle, in the same frame; None: that of the paper's A2.
 
     Raises:
         BadPlan: PSM_A's jaw is not turned for the hand-off.
     """
-    tip_mm, rotation = hand_off(handed.tip_mm[None], handed.rotation[None], psm_m.approach)
-    taking = Pose(tip_mm[0], rotation[0])
+    if taking is None:
+        tip_mm, rotation = hand_off(handed.tip_mm[None], handed.rotation[None], psm_m.approach)
+        taking = Pose(tip_mm[0], rotation[0])
     stand_off = Pose(taking.tip_mm - STAND_OFF_MM * taking.rotation[:, 2], taking.rotation)
     return Meeting(stand_off, taking, taking if psm_m.enters == "start" else stand_off)
 
@@ -196,15 +201,26 @@ class PassPath:
 
     Attributes:
         tip_mm: Points of A1 in the PSM base frame, shape (K, 3), K >= 1; a single point means that A1 has no motion.
-        rotation: The jaw's [n o a] held during A1, shape (3, 3).
+        rotation: The jaw's [n o a] at the start of A1, shape (3, 3); held, unless the hand turns it.
         target_rotation: Target of the turn in A2, shape (3, 3), or None for a pass without A2.
         start_mm: Start of the pass, shape (3,), if that is not A1's first point; a transfer leads from there.
+        hand: Orientation, jaw and tempo of A1; None: the jaw held, and the tempo of `skills.planning.motion_laws`.
+        taking: The recorded pose in which PSM_M takes the needle; None: that of the paper's A2.
     """
 
     tip_mm: Floats
     rotation: Floats
     target_rotation: Floats | None = None
     start_mm: Floats | None = None
+    hand: Hand | None = None
+    taking: Pose | None = None
+
+    @property
+    def last_rotation(self) -> Floats:
+        """The jaw's [n o a] at the end of A1, shape (3, 3)."""
+        if self.hand is None or self.hand.rotation_xyzw is None:
+            return self.rotation
+        return np.asarray(matrix_of(self.hand.rotation_xyzw[-1:])[0])
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "tip_mm", frozen(self.tip_mm, np.float64, (None, 3), "tip_mm"))
@@ -229,17 +245,21 @@ class Way:
     Attributes:
         transfer: Stations before A1; the last is where A1 begins.
         line: Points of A1, no two neighbours equal, shape (K, 3).
+        brought: Poses at the end of A1.
         handed: Poses at the end of A2; None for a pass without it.
+        hand: Orientation, jaw and tempo of A1; None: held, at an even tempo.
     """
 
     transfer: tuple[Arms, ...]
     line: Floats
+    brought: Arms
     handed: Arms | None
+    hand: Hand | None = None
 
     @property
     def last(self) -> Arms:
         """The poses at the end of the pass."""
-        return self.handed or (Pose(self.line[-1], self.transfer[-1][0].rotation), *self.transfer[-1][1:])
+        return self.handed or self.brought
 
 
 def ways(passes: Sequence[PassPath], psm_m: PsmM | None) -> list[Way]:
@@ -268,7 +288,8 @@ def ways(passes: Sequence[PassPath], psm_m: PsmM | None) -> list[Way]:
         handed = None
         if one.target_rotation is not None:
             handed = _arms(Pose(line[-1], one.target_rotation), None if meets is None else meets.taking)
-        found.append(Way(stations, line, handed))
+        brought = (Pose(line[-1], one.last_rotation), *stations[-1][1:])
+        found.append(Way(stations, line, brought, handed, one.hand))
         before = meets
     return found
 
@@ -294,7 +315,7 @@ def _arms(psm_a: Pose, psm_m: Pose | None) -> Arms:
 def _meeting(one: PassPath, number: int, psm_m: PsmM) -> Meeting:
     if one.target_rotation is None:
         raise BadPlan(f"Pass {number} has no A2, so PSM_M cannot take the needle.", **{"pass": number})
-    return meeting(Pose(one.tip_mm[-1], one.target_rotation), psm_m)
+    return meeting(Pose(one.tip_mm[-1], one.target_rotation), psm_m, one.taking)
 
 
 def _polyline(one: PassPath, number: int) -> Floats:
@@ -309,6 +330,6 @@ def _polyline(one: PassPath, number: int) -> Floats:
     moves = np.linalg.norm(np.diff(points, axis=0), axis=1) > SAME_POINT_MM
     # Of equal points the last remains, so that the pass ends exactly at its last point.
     kept: Floats = points[np.append(moves, True)]
-    if len(kept) < 2 and one.target_rotation is None:
+    if len(kept) < 2 and one.target_rotation is None and one.hand is None:
         raise NoMotion(f"Pass {number} neither moves nor turns; give it two points or a target.", **{"pass": number})
     return kept

@@ -9,10 +9,13 @@ has the surgeon's actual place in each cell. All of this is ours; the paper driv
   the other is where it *follows* the demonstration; each sample of the recording belongs to the waypoint that
   `discretize` made of it, so a path that crosses itself is followed branch by branch.
 * The *guide* is the curve that the path should follow: the start, the centres of the cells before the demonstration is
-  joined, the demonstration without tremor and rests, the goal. Start and goal are the policy's, which are centres of
-  cells, because those places are promised to clients and a plan puts the goal at its suture point; the demonstration's
-  first and last sample are elsewhere in those cells. The demonstrated part of the guide begins and ends where the
-  demonstration is nearest to them and is shifted to meet them; the shift fades over the length of one cell.
+  joined, the demonstration without tremor and rests, its last sample. Its first and last sample are in the policy's
+  first and last cell, but not in their centres, so the path of a hand begins and ends where the hand did. If a rollout
+  joins the demonstration later, the demonstrated part of the guide begins where the demonstration is nearest to the
+  centre of the cell and is shifted to meet it; the shift fades over the length of one cell.
+* The *clock* of a path tells when the hand was where: times in the demonstration, and the index of the path's point at
+  each, with a fraction. So orientation, jaw and tempo can be those of the hand (`skills.planning.hand`). What comes
+  before the demonstration is joined was not demonstrated, and takes no time on this clock.
 * The path is the smoothest sequence of points near the guide, each in the cell of its visit:
 
       minimise  sum |x_i - guide_i|^2 + STIFFNESS sum |x_(i-1) - 2 x_i + x_(i+1)|^2,  x_i in its cell, ends held
@@ -36,12 +39,14 @@ from skills.learning.policy import Rollout
 
 TREMOR_S = 0.25  # a Hann window this wide has its zeros at 8, 12, 16 Hz and passes less than 3 % in between
 # Lengths as parts of a cell:
-STEP = 0.25  # between points: 1.25 mm in the paper's cells
-GRAZED = 0.05  # a visit that advances by less is due to tremor, or crosses a corner
+STEP = 0.1  # between points: 0.5 mm in the paper's cells; wider ones round off the small motions of a hand
+GRAZED = 0.02  # a visit that advances by less is due to tremor, or crosses a corner
 BLEND = 1.0
 MOVED = 0.02  # a hand that stays within this distance is at rest
 INSIDE = 0.001  # distance from the cell's faces, so that rounding never puts a point into the neighbouring cell
-STIFFNESS = 10.0  # halves waves that are 11 points long, 14 mm in the paper's cells; preserves longer ones
+STIFFNESS = 1.0  # halves waves that are 6 points long, 3 mm in the paper's cells; preserves longer ones
+# With hysteresis the hand leaves its cells, and their faces would cut corners into the path: waves of 20 points.
+STIFFNESS_CUT = 100.0
 _ROUNDS = 120
 
 
@@ -53,14 +58,22 @@ class Trace:
         path: The demonstration in its grid.
         tip_mm: Points in the demonstration's frame, shape (N, 3).
         waypoints: The waypoint of each point, shape (N,).
+        seconds: The time of each point in the demonstration, shape (N,), ascending.
+        ends_mm: Its first and its last sample, each within its cell, shape (2, 3).
+        end_s: The time of its last sample.
     """
 
     path: GridPath
     tip_mm: Floats
     waypoints: Ints
+    seconds: Floats
+    ends_mm: Floats
+    end_s: float
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "tip_mm", frozen(self.tip_mm, np.float64, (None, 3), "tip_mm"))
+        object.__setattr__(self, "seconds", frozen(self.seconds, np.float64, (len(self.tip_mm),), "seconds"))
+        object.__setattr__(self, "ends_mm", frozen(self.ends_mm, np.float64, (2, 3), "ends_mm"))
         object.__setattr__(self, "waypoints", frozen(self.waypoints, np.int64, (len(self.tip_mm),), "waypoints"))
 
 
@@ -71,14 +84,20 @@ class FittedPath:
     Attributes:
         tip_mm: Points in the demonstration's frame, shape (K, 3).
         visits: The rollout's visit of each point, ascending, shape (K,).
+        clock_s: Times in the demonstration, shape (C,), ascending; the first is when it is joined.
+        places: The index of a point of `tip_mm`, with a fraction, at each of these times, shape (C,), ascending.
     """
 
     tip_mm: Floats
     visits: Ints
+    clock_s: Floats
+    places: Floats
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "tip_mm", frozen(self.tip_mm, np.float64, (None, 3), "tip_mm"))
         object.__setattr__(self, "visits", frozen(self.visits, np.int64, (len(self.tip_mm),), "visits"))
+        object.__setattr__(self, "clock_s", frozen(self.clock_s, np.float64, (None,), "clock_s"))
+        object.__setattr__(self, "places", frozen(self.places, np.float64, (len(self.clock_s),), "places"))
 
 
 def trace(demo: Demo, path: GridPath) -> Trace:
@@ -101,28 +120,34 @@ def trace(demo: Demo, path: GridPath) -> Trace:
     before = np.searchsorted(waypoints, bridged) - 1
     share = (bridged - waypoints[before]) / (waypoints[before + 1] - waypoints[before])
     calm = np.concatenate((calm, calm[before] + share[:, None] * (calm[before + 1] - calm[before])))
+    times = np.concatenate((demo.stamps_s, demo.stamps_s[before] + share * np.diff(demo.stamps_s)[before]))
     waypoints = np.concatenate((waypoints, bridged))
     order = np.argsort(waypoints, kind="stable")
     moving = order[_moving(calm[order], MOVED * path.grid.cell_mm)]
-    return Trace(path, calm[moving], waypoints[moving])
+    half = path.grid.cell_mm * (0.5 - INSIDE)
+    centres = path.tip_mm[[0, -1]]
+    # hysteresis lets a sample belong to a cell from just outside of it
+    ends = demo.tip_mm[[0, -1]].clip(centres - half, centres + half).round(6)
+    return Trace(path, calm[moving], waypoints[moving], times[moving], ends, float(demo.stamps_s[-1]))
 
 
-def fit_to_demo(followed: Rollout, demonstrated: Trace, start_mm: Floats) -> FittedPath:
+def fit_to_demo(followed: Rollout, demonstrated: Trace, start_mm: Floats | None = None) -> FittedPath:
     """Fit a smooth path to the demonstration that a rollout follows, within the rollout's cells.
 
     Args:
         followed: A rollout that reaches the goal.
         demonstrated: The demonstration that its policy was learnt from.
-        start_mm: Start of the path in the demonstration's frame, shape (3,), in the rollout's first cell.
+        start_mm: Start of the path in the demonstration's frame, shape (3,), in the rollout's first cell; None: the
+            demonstration's own, for a rollout that begins in its first cell.
 
     Returns:
-        The path from `start_mm` to the centre of the goal's cell, rounded to a nanometre.
+        The path from the start to the demonstration's last sample, rounded to a nanometre.
     """
     assert followed.finished and np.array_equal(followed.path.states, demonstrated.path.states)
-    guide, visits = _guide(followed, demonstrated, start_mm)
+    guide, visits, clock_s = _guide(followed, demonstrated, start_mm)
     along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(guide, axis=0), axis=1)))
     if along[-1] == 0:
-        return FittedPath(guide[:1], visits[:1])
+        return FittedPath(guide[:1], visits[:1], clock_s[[0, -1]], np.zeros(2))
     cell_mm = followed.path.grid.cell_mm
     at, visits = _touching(*_spread(along, visits, cell_mm), followed.path.grid.cells_of(followed.states))
     wanted = np.stack([np.interp(at, along, axis) for axis in guide.T], axis=1)
@@ -132,9 +157,9 @@ def fit_to_demo(followed: Rollout, demonstrated: Trace, start_mm: Floats) -> Fit
     # The ends are fixed, because start and goal are promised to clients.
     low[0] = high[0] = guide[0]
     low[-1] = high[-1] = guide[-1]
-    tip = _smoothest(wanted, low, high)
+    tip = _smoothest(wanted, low, high, STIFFNESS_CUT if followed.path.hysteresis else STIFFNESS)
     tip[1:-1] = tip[1:-1].round(6)  # to a nanometre, so that every machine computes the same bytes
-    return FittedPath(tip, visits)
+    return FittedPath(tip, visits, clock_s, np.interp(along, at, np.arange(len(at))))
 
 
 def _waypoints(tip_mm: Floats, path: GridPath) -> Ints:
@@ -155,12 +180,12 @@ def _moving(tip_mm: Floats, least_mm: float) -> Ints:
     return np.array(found)
 
 
-def _guide(followed: Rollout, demonstrated: Trace, start_mm: Floats) -> tuple[Floats, Ints]:
-    """Return the points of the guide, (M, 3), and the visit of each, (M,)."""
+def _guide(followed: Rollout, demonstrated: Trace, start_mm: Floats | None) -> tuple[Floats, Ints, Floats]:
+    """Return the points of the guide, (M, 3), the visit of each, (M,), and its time in the demonstration, (M,)."""
     last = len(followed.states) - 1
     joined = last + 1 - _tail(followed)
-    goal = followed.tip_mm[-1]
-    approach = np.concatenate((start_mm[None], followed.tip_mm[1 : joined + 1]))
+    start, goal = demonstrated.ends_mm if start_mm is None else (start_mm, demonstrated.ends_mm[1])
+    approach = np.concatenate((start[None], followed.tip_mm[1 : joined + 1]))
     visits = demonstrated.waypoints - (len(demonstrated.path.states) - 1 - last)
     part = np.flatnonzero((visits >= joined) & (joined < last))  # none where only the goal's cell is left
     part = part[_nearest(demonstrated.tip_mm[part], visits[part] == joined, approach[-1]) :]
@@ -171,7 +196,11 @@ def _guide(followed: Rollout, demonstrated: Trace, start_mm: Floats) -> tuple[Fl
     if len(part) and visits[part[-1]] == last:
         tip = _blended(tip[::-1], goal, over_mm)[::-1]
     of_visit = np.concatenate((np.arange(joined + 1), visits[part], [last]))
-    return np.concatenate((approach, tip, goal[None])), of_visit
+    seconds = demonstrated.seconds[part]
+    # A hand at its own start moves off when the surgeon did; elsewhere the clock begins where the path joins.
+    joins_s = 0.0 if start_mm is None else float(seconds[0]) if len(part) else demonstrated.end_s
+    clock_s = np.concatenate((np.full(joined + 1, joins_s), seconds, [demonstrated.end_s]))
+    return np.concatenate((approach, tip, goal[None])), of_visit, clock_s
 
 
 def _tail(followed: Rollout) -> int:
@@ -236,14 +265,14 @@ def _touching(at: Floats, visits: Ints, cells: Ints) -> tuple[Floats, Ints]:
     )
 
 
-def _smoothest(wanted: Floats, low: Floats, high: Floats) -> Floats:
+def _smoothest(wanted: Floats, low: Floats, high: Floats, stiffness: float) -> Floats:
     """Solve the minimisation above for points, (K, 3), within boxes, by Nesterov's accelerated projected gradient."""
-    rate = 1 / (1 + 16 * STIFFNESS)  # 1 over the largest curvature of the objective; the smallest is 1
+    rate = 1 / (1 + 16 * stiffness)  # 1 over the largest curvature of the objective; the smallest is 1
     push = (1 - np.sqrt(rate)) / (1 + np.sqrt(rate))
     x = ahead = wanted.clip(low, high)
     for _ in range(_ROUNDS):
         step = ahead[1:] - ahead[:-1]
-        bend = STIFFNESS * (step[1:] - step[:-1])
+        bend = stiffness * (step[1:] - step[:-1])
         slope = ahead - wanted
         slope[:-2] += bend
         slope[2:] += bend

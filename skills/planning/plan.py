@@ -7,13 +7,19 @@ One learnt policy serves many passes (Sec. IV, Fig. 7).
 A pass moves the complete grid world so that the policy's *goal* lies at the suture point, turned about it if the point
 has a rotation. In the moved grid the policy is rolled out from the pass's start. The result is a path in the arm's
 frame: through the centres of its cells, as in the paper, or, if the demonstration is given, fitted to the recording
-within the same cells (`skills.planning.path_fit`). Between passes the surgeon inserts and grasps the needle by hand
+within the same cells (`skills.planning.path_fit`), with the surgeon's orientation, jaw and tempo along it
+(`skills.planning.hand`). What was demonstrated at the policy's goal is then done at the suture point: the hand's last
+sample lies there, somewhere in the cell of the goal. Between passes the surgeon inserts and grasps the needle by hand
 (M1, M2).
+
+The orientation turns with the pass. It is held as at the first sample where that is requested, and the plan then states
+its *departure* from the recorded one. A2 ends in the recorded hand-off, the poses of both arms moved with the pass, if
+the demonstration has them, and otherwise as in the paper (`skills.planning.handoff`).
 
 A start outside its grid world is connected to the nearest place inside by a straight transfer, which is ours; from
 there the policy continues. A suture point is the target of the arm's tip, which is its hinge; with a `tip_offset_mm` it
-is the target of the point that far along the jaw's approach, such as the finger tips, with the jaw as it is held during
-A1.
+is the target of the point that far along the jaw's approach, such as the finger tips, with the jaw as it is at the end
+of A1; a given start is meant with the jaw as it is at the start of the demonstration.
 
 The demonstrated pass, as an arm drives it, is checked against the arm's joint limits:
 
@@ -21,7 +27,7 @@ The demonstrated pass, as an arm drives it, is checked against the arm's joint l
 
 A plan at the demonstrated place drives the *fitted path* (`skills.planning.path_fit`), sampled as
 `skills.planning.trajectory` samples A1. Here the joints of every one of those samples are solved in closed form
-(`skills.kinematics`), with the jaw held as it was at the start of the demonstration. If no path can be fitted, the pass
+(`skills.kinematics`), with the jaw as recorded, or pointing straight down. If no path can be fitted, the pass
 goes through the centres of its cells, as in the paper. All of this is ours.
 """
 
@@ -38,13 +44,21 @@ from skills.demonstration.demonstration import Demo
 from skills.errors import BadPlan, BadSpeed, OutsideGrid
 from skills.fields import Count, schema
 from skills.gridworld.grid import GridWorld
-from skills.kinematics import POINTING_DOWN, NearestLimit, matrix_of, nearest_limit, quaternion_of, reachable
+from skills.kinematics import (
+    POINTING_DOWN,
+    NearestLimit,
+    angle_between,
+    matrix_of,
+    nearest_limit,
+    quaternion_of,
+    reachable,
+)
 from skills.learning.policy import Policy, rollout
-from skills.planning.handoff import PsmM, realign
-from skills.planning.motion_laws import followed
-from skills.planning.passes import ways
+from skills.planning.hand import Hand, hand_along, moved
+from skills.planning.handoff import PsmM, needle_tips_mm, realign
+from skills.planning.motion_laws import Pose, followed
+from skills.planning.passes import PassPath, Way, ways
 from skills.planning.path_fit import Trace, fit_to_demo, trace
-from skills.planning.trajectory import PassPath
 
 MAX_PASSES = 200
 RATE_HZ = (100.0, 200.0)  # of the plans that a robot's controller follows
@@ -52,8 +66,12 @@ MAX_OUTSIDE_MM = 50.0  # ours, as wide as the paper's grid: a start further away
 MAX_TIP_OFFSET_MM = 50.0  # ours: finger tips are 10.2 mm from the hinge, and no instrument has them a hand away
 UNTURNED = (0.0, 0.0, 0.0, 1.0)
 NEGLIGIBLE_MM = 1e-9
+# Ours: by so much the needle may stand wrongly in the jaws in the estimate of success (`verification.monte_carlo`).
+CONSTANT_TURN_DEG = 10.0
 
-Orientation = Literal["demonstrated", "assumed tool-down"]
+Orientation = Literal["recorded", "demonstrated", "assumed tool-down"]
+Turning = Literal["recorded", "constant"]
+A2Target = Literal["recorded", "paper"]
 PathKind = Literal["fitted", "cell centres"]
 
 
@@ -79,8 +97,10 @@ class Pass:
         tip_mm: The tip's path to the suture point, from the start or from where it enters the grid world, shape (K, 3).
             Fitted: about four points per cell, each in one of those states, in their order. Otherwise: the beginning,
             if that is not a centre, and the states' centres.
-        rotation: The jaw's [n o a] during A1, shape (3, 3).
+        rotation: The jaw's [n o a] at the start of A1, shape (3, 3); held, unless the hand turns it.
         target_rotation: Target of the turn in A2, shape (3, 3), or None if PSM_M's approach is not known.
+        hand: Orientation, jaw and tempo of A1; None: the jaw held, at an even tempo, as in plans of older versions.
+        taking: The recorded pose in which PSM_M takes the needle; None: that of the paper's A2.
     """
 
     point: SuturePoint
@@ -89,6 +109,8 @@ class Pass:
     tip_mm: Floats
     rotation: Floats
     target_rotation: Floats | None
+    hand: Hand | None = None
+    taking: Pose | None = None
 
     def __post_init__(self) -> None:
         for name, dtype, shape in (
@@ -103,6 +125,21 @@ class Pass:
             object.__setattr__(self, "target_rotation", target)
 
 
+@schema
+@dataclass(frozen=True)
+class Departure:
+    """The difference of a constant orientation from the recorded one.
+
+    `deg` and `needle_tip_mm` are the greatest of the demonstration: the angle, and the distance of the needle's free
+    end from where it was. The others are those of its last sample, the hand-off.
+    """
+
+    deg: float
+    needle_tip_mm: float
+    handoff_deg: float
+    handoff_needle_tip_mm: float
+
+
 @dataclass(frozen=True, eq=False)
 class SuturePlan:
     """Passes in order, with everything that a playback needs.
@@ -111,13 +148,16 @@ class SuturePlan:
         arm: The arm that performs the passes.
         frame: The arm's frame.
         instrument: Number of the instrument.
-        speed_mm_s: Speed of the tip during A1 where the path is straight.
-        orientation: Source of the jaw's rotation: demonstrated, or assumed to point straight down.
+        speed_mm_s: Greatest speed of the tip.
+        orientation: The jaw's rotation in A1: as recorded all along the pass, or constant as in the demonstration's
+            first sample, or assumed to point straight down.
         path: The kind of path: fitted, or through the centres of the cells.
         psm_m: The arm that takes the needle; None if A1 alone is planned.
         passes: The passes in order.
         rate_hz: The one rate at which the plan is sampled.
         tip_offset_mm: Distance of a suture point from the tip, along the jaw's approach.
+        a2: The end of A2: the recorded hand-off, or that of the paper.
+        departure: The difference from the recorded orientation; None if there is none or it was not recorded.
     """
 
     arm: str
@@ -130,6 +170,8 @@ class SuturePlan:
     passes: tuple[Pass, ...]
     rate_hz: float = 200.0
     tip_offset_mm: float = 0.0
+    a2: A2Target = "paper"
+    departure: Departure | None = None
 
     def __post_init__(self) -> None:
         low, high = RATE_HZ
@@ -141,7 +183,10 @@ class SuturePlan:
     @property
     def pass_paths(self) -> tuple[PassPath, ...]:
         """The passes as input for `time_parametrise`."""
-        return tuple(PassPath(one.tip_mm, one.rotation, one.target_rotation, one.start_mm) for one in self.passes)
+        return tuple(
+            PassPath(one.tip_mm, one.rotation, one.target_rotation, one.start_mm, one.hand, one.taking)
+            for one in self.passes
+        )
 
 
 def stack(
@@ -158,26 +203,33 @@ def stack(
     speed_mm_s: float = 20.0,
     rate_hz: float = 200.0,
     tip_offset_mm: float = 0.0,
+    orientation: Turning | None = None,
+    a2: A2Target | None = None,
 ) -> SuturePlan:
     """Stack a policy's grid world at suture points and roll the policy out in each (Fig. 7).
 
     Args:
         policy: The policy to follow; its frame is the arm's.
         points: The suture points, 1 to 200; each is the goal of one pass.
-        demo: The demonstration that the policy was learnt from: passes are fitted to it, and arm, frame, instrument and
-            rotation are its own. None: passes go from cell centre to cell centre, and arm, frame and instrument are
-            given.
+        demo: The demonstration that the policy was learnt from: passes are fitted to it, with its orientation, jaw and
+            tempo, and arm, frame and instrument are its own. None: passes go from cell centre to cell centre at an even
+            tempo, and arm, frame and instrument are given.
         arm: The arm, such as "PSM2"; with a demonstration, none or the same.
         frame: The frame of the policy's grid; with a demonstration, none or the same.
         instrument: The instrument's number; with a demonstration, none or the same.
-        rotation: The jaw's [n o a], shape (3, 3), held during A1; None: the demonstration's first, or straight down
-            where it recorded none.
+        rotation: The jaw's [n o a], shape (3, 3), held during A1; None: the demonstration's, or straight down where it
+            recorded none.
         starts_mm: Start of each pass in the arm's frame; None: the demonstrated start, moved with the grid.
         psm_m: The arm that takes the needle; None: no A2.
-        speed_mm_s: Desired speed of the tip during A1 where the path is straight.
+        speed_mm_s: Greatest speed of the tip: the surgeon's tempo is slowed to it.
         rate_hz: Samples per second, 100 to 200.
-        tip_offset_mm: Distance from the tip (the hinge), along the jaw's approach as it is held during A1, at which
-            suture points and given starts are meant; `JAW_TIP_MM` for the finger tips.
+        tip_offset_mm: Distance from the tip (the hinge), along the jaw's approach, at which suture points (the jaw as
+            at the end of A1) and given starts (as in the demonstration's first sample) are meant; `JAW_TIP_MM` for the
+            finger tips.
+        orientation: "recorded": along the pass as demonstrated; "constant": held as in the first sample. None: recorded
+            where the demonstration has it and no rotation is given.
+        a2: "recorded": A2 ends in the demonstrated poses of both arms; "paper": PSM_A turns across PSM_M's approach.
+            None: recorded where the demonstration's orientation and PSM_M's pose are known.
 
     Returns:
         The plan, with one pass per suture point.
@@ -185,7 +237,7 @@ def stack(
     Raises:
         BadPlan: There are no points or too many, a point is not a `SuturePoint`, the number of starts differs from the
             number of points, the goal is not reached from a start, the demonstration is not the policy's, another arm
-            is given beside it, or the offset is not one of an instrument.
+            is given beside it, the offset is not one of an instrument, or what was not recorded is requested.
         BadSpeed: The rate is not one of a plan.
         OutsideGrid: A start lies more than `MAX_OUTSIDE_MM` outside its pass's grid world.
     """
@@ -201,18 +253,93 @@ def stack(
         _of_demonstration(demo, name, value)
         for name, value in (("arm", arm), ("frame", frame), ("instrument", instrument))
     )
+    turning = _turns(demo, rotation, orientation)
+    handing = _handing(demo, psm_m, a2)
+    known = rotation is not None or (demo is not None and demo.rotation_xyzw is not None)
     if rotation is None and demo is not None:
         rotation = rotation_of(demo.rotation_xyzw)
     jaw = POINTING_DOWN if rotation is None else frozen(rotation, np.float64, (3, 3), "rotation")
-    recorded = None if demo is None else trace(demo, policy.path)
-    seen: Orientation = "assumed tool-down" if rotation is None else "demonstrated"
-    path: PathKind = "cell centres" if recorded is None else "fitted"
-    plan = SuturePlan(arm, frame, instrument, speed_mm_s, seen, path, psm_m, (), rate_hz, tip_offset_mm)
+    recorded = None if demo is None else _Recorded(demo, trace(demo, policy.path), turning)
+    plan = SuturePlan(
+        arm,
+        frame,
+        instrument,
+        speed_mm_s,
+        "recorded" if turning else "demonstrated" if known else "assumed tool-down",
+        "cell centres" if recorded is None else "fitted",
+        psm_m,
+        (),
+        rate_hz,
+        tip_offset_mm,
+        handing,
+        None if turning or demo is None else departure_of(demo, jaw),
+    )
     passes = tuple(
         _pass(policy, recorded, number, point, start, jaw, plan)
         for number, (point, start) in enumerate(zip(points, starts, strict=True))
     )
     return replace(plan, passes=passes)
+
+
+@dataclass(frozen=True, eq=False)
+class _Recorded:
+    """The demonstration of a plan, its trace in the grid, and whether the jaw turns as it did there."""
+
+    demo: Demo
+    trace: Trace
+    turning: bool
+
+    @property
+    def last_rotation(self) -> Floats | None:
+        """The jaw's [n o a] at the recorded hand-off, shape (3, 3)."""
+        return None if self.demo.rotation_xyzw is None else matrix_of(self.demo.rotation_xyzw[-1:])[0]
+
+
+def _turns(demo: Demo | None, rotation: ArrayLike | None, orientation: Turning | None) -> bool:
+    """Return whether the jaw turns as it was recorded.
+
+    Raises:
+        BadPlan: That is requested, and there is no recorded orientation, or another one is given.
+    """
+    there = demo is not None and demo.rotation_xyzw is not None and rotation is None
+    if orientation == "recorded" and not there:
+        raise BadPlan(
+            "The demonstration has no orientation, or another rotation is given, so that none along the pass is known; "
+            "omit the orientation, or ask for a constant one."
+        )
+    return there and orientation != "constant"
+
+
+def _handing(demo: Demo | None, psm_m: PsmM | None, a2: A2Target | None) -> A2Target:
+    """Return the end of A2.
+
+    Raises:
+        BadPlan: The recorded hand-off is requested, and there is none.
+    """
+    there = demo is not None and demo.rotation_xyzw is not None and psm_m is not None and psm_m.taken_mm is not None
+    if a2 == "recorded" and not there:
+        raise BadPlan(
+            "The hand-off was not recorded: that needs the orientation of PSM_A and the pose of PSM_M in the "
+            "demonstration, and no other approach; omit a2, or ask for the paper's."
+        )
+    return a2 or ("recorded" if there else "paper")
+
+
+def departure_of(demo: Demo, rotation: Floats | None = None) -> Departure | None:
+    """Return the difference of a constant orientation from the recorded one; None if none was recorded.
+
+    Args:
+        demo: The demonstration.
+        rotation: The constant [n o a], shape (3, 3); None: that of the first sample.
+    """
+    if demo.rotation_xyzw is None:
+        return None
+    seen = matrix_of(demo.rotation_xyzw)
+    rotation = seen[0] if rotation is None else rotation
+    turn_deg = np.degrees(angle_between(seen, np.broadcast_to(rotation, seen.shape)))
+    # The free end is on either side of the jaws, so the further one counts.
+    apart_mm = np.linalg.norm((seen - rotation) @ needle_tips_mm().T, axis=1).max(axis=1)
+    return Departure(*(float(v) for v in (turn_deg.max(), apart_mm.max(), turn_deg[-1], apart_mm[-1])))
 
 
 def _of_demonstration(demo: Demo | None, name: str, given: str | None) -> str:
@@ -233,33 +360,57 @@ def _of_demonstration(demo: Demo | None, name: str, given: str | None) -> str:
 
 def _pass(
     policy: Policy,
-    recorded: Trace | None,
+    recorded: _Recorded | None,
     number: int,
     point: SuturePoint,
     start_mm: ArrayLike | None,
     jaw: Floats,
     plan: SuturePlan,
 ) -> Pass:
-    grid, goal = policy.path.grid, policy.path.grid.centres_mm(policy.path.goal)
+    grid = policy.path.grid
+    goal = grid.centres_mm(policy.path.goal) if recorded is None else recorded.trace.ends_mm[1]
     turned = matrix_of(np.array([point.rotation_xyzw]))[0]
-    held = turned @ jaw
-    hinge = -plan.tip_offset_mm * held[:, 2]  # offset from a given place to the tip, which is the hinge
-    place = frozen(point.position_mm, np.float64, (3,), "position_mm") + hinge
+    last = recorded.last_rotation if recorded is not None and recorded.turning else None
+    # offsets from a given place to the tip, which is the hinge
+    at_start, at_end = (-plan.tip_offset_mm * (turned @ one)[:, 2] for one in (jaw, jaw if last is None else last))
+    place = frozen(point.position_mm, np.float64, (3,), "position_mm") + at_end
     # `grid`, `goal` and `begin` are in the frame of the learnt grid; `place` and `start` are in the arm's frame.
-    begin = grid.centres_mm(policy.path.start)
+    begin = grid.centres_mm(policy.path.start) if recorded is None else recorded.trace.ends_mm[0]
     start = turned @ (begin - goal) + place
     if start_mm is not None:
-        start = frozen(start_mm, np.float64, (3,), "start") + hinge
+        start = frozen(start_mm, np.float64, (3,), "start") + at_start
         begin = _entered(grid, turned.T @ (start - place) + goal, number)
     followed = rollout(policy, begin)
     if not followed.finished:
         raise BadPlan(f"From its start pass {number} does not reach the goal.", **{"pass": number})
-    path = followed.tip_mm if recorded is None else fit_to_demo(followed, recorded, begin).tip_mm
+    hand, held = None, turned @ jaw
+    if recorded is None:
+        path = followed.tip_mm
+    else:
+        fit = fit_to_demo(followed, recorded.trace, None if start_mm is None else begin)
+        path = fit.tip_mm
+        hand = moved(hand_along(recorded.demo, fit, turning=recorded.turning), turned, goal, place)
+        if hand.rotation_xyzw is not None:
+            held = matrix_of(hand.rotation_xyzw[:1])[0]
     if np.abs(path[0] - begin).max() > NEGLIGIBLE_MM:
         path = np.concatenate((begin[None], path))
-    tip = (path - goal) @ turned.T + place
-    target = None if plan.psm_m is None else realign(held, plan.psm_m.approach).rotation
-    return Pass(point, start, followed.states, tip, held, target)
+    one = Pass(point, start, followed.states, (path - goal) @ turned.T + place, held, None, hand)
+    return _with_a2(one, plan, recorded, goal, turned)
+
+
+def _with_a2(one: Pass, plan: SuturePlan, recorded: _Recorded | None, goal_mm: Floats, turned: Floats) -> Pass:
+    """Add the end of A2 to a pass: the recorded hand-off, moved with the pass, or that of the paper."""
+    psm_m = plan.psm_m
+    if psm_m is None:
+        return one
+    brought = PassPath(one.tip_mm, one.rotation, hand=one.hand).last_rotation
+    if plan.a2 == "paper":
+        return replace(one, target_rotation=realign(brought, psm_m.approach).rotation)
+    assert recorded is not None and recorded.last_rotation is not None
+    assert psm_m.taken_mm is not None and psm_m.taken_xyzw is not None
+    target = brought if recorded.turning else turned @ recorded.last_rotation
+    taken_mm = turned @ (np.array(psm_m.taken_mm) - goal_mm) + one.tip_mm[-1]
+    return replace(one, target_rotation=target, taking=Pose(taken_mm, turned @ matrix_of([psm_m.taken_xyzw])[0]))
 
 
 def _entered(grid: GridWorld, start_mm: Floats, number: int) -> Floats:
@@ -288,6 +439,14 @@ def rotation_of(rotation_xyzw: Floats | None) -> Floats | None:
     return None if rotation_xyzw is None else matrix_of(rotation_xyzw[:1])[0]
 
 
+def turn_deg(one: Pass) -> float:
+    """Return the greatest angle between the jaw's rotation in A1 and that at its start, degrees."""
+    if one.hand is None or one.hand.rotation_xyzw is None:
+        return 0.0
+    turned = matrix_of(one.hand.rotation_xyzw)
+    return float(np.degrees(angle_between(turned, np.broadcast_to(turned[0], turned.shape))).max())
+
+
 def pose_xyzw(rotation: Floats) -> tuple[float, float, float, float]:
     """Return one rotation as a quaternion x, y, z, w.
 
@@ -311,6 +470,7 @@ class DrivenPass:
         nearest_limit: The joint that comes nearest to its limit on the path, or goes furthest beyond it.
         cell_centres_beyond: Number of centres of the path's cells that are beyond the limits: a rollout contains those
             centres, but a plan does not drive them if its path is fitted.
+        orientation: As in `SuturePlan`; "demonstrated" also in older certificates, which held the jaw.
     """
 
     path: PathKind
@@ -319,6 +479,7 @@ class DrivenPass:
     beyond: Count
     nearest_limit: NearestLimit
     cell_centres_beyond: Count
+    orientation: Orientation = "demonstrated"
 
 
 def driven_pass(policy: Policy, demo: Demo) -> DrivenPass:
@@ -337,8 +498,8 @@ def driven_pass(policy: Policy, demo: Demo) -> DrivenPass:
     plan = _at_its_own_place(policy, demo)
     (only,) = plan.passes
     (way,) = ways(plan.pass_paths, None)
-    line, _ = followed(way.line, STEP_MM)
-    nearest, beyond = nearest_limit(line, only.rotation, demo.instrument)
+    line, rotation = _driven(way, only.rotation)
+    nearest, beyond = nearest_limit(line, rotation, demo.instrument)
     return DrivenPass(
         path=plan.path,
         frame=demo.frame,
@@ -346,21 +507,32 @@ def driven_pass(policy: Policy, demo: Demo) -> DrivenPass:
         beyond=beyond,
         nearest_limit=nearest,
         cell_centres_beyond=int(np.count_nonzero(~reachable(policy.path.tip_mm, only.rotation, demo.instrument))),
+        orientation=plan.orientation,
     )
+
+
+def _driven(way: Way, held: Floats) -> tuple[Floats, Floats]:
+    """Return the places of A1, (N, 3) mm, and the jaw's rotation there: (N, 3, 3), or the (3, 3) that is held."""
+    if way.hand is None:
+        return followed(way.line, STEP_MM)[0], held
+    # as densely as a plan at the surgeon's own tempo, also where the jaw turns and the tip rests
+    tip, rotation, _ = way.hand.at(2 + int(max(way.hand.length_mm / STEP_MM, way.hand.duration_s * RATE_HZ[1])))
+    return tip, held if rotation is None else rotation
 
 
 def _at_its_own_place(policy: Policy, demo: Demo) -> SuturePlan:
     """Plan one pass at the demonstrated place, along the fitted path if one can be fitted."""
-    x, y, z = policy.path.tip_mm[-1].tolist()
 
     def pass_along(recorded: Demo | None) -> SuturePlan:
+        goal_mm = policy.path.tip_mm[-1] if recorded is None else trace(recorded, policy.path).ends_mm[1]
+        x, y, z = goal_mm.tolist()
         return stack(
             policy,
             [SuturePoint((x, y, z))],
             arm=demo.arm,
             frame=demo.frame,
             instrument=demo.instrument,
-            rotation=rotation_of(demo.rotation_xyzw),
+            rotation=rotation_of(demo.rotation_xyzw) if recorded is None else None,
             demo=recorded,
         )
 

@@ -9,10 +9,15 @@ passes.
 
 The law of motion is ours; the paper only asks for no jerky movements:
 
-* A1 is a cubic spline through the polyline's points, at rest at both ends and slower in bends. Each point is passed
-  exactly, on a tick. Between points it leaves the straight move by at most 1.25 mm, because moves are divided until it
-  does not (`skills.planning.motion_laws`). Stopping at every point would not leave it at all, but takes longer.
-* Transfers, A2 and all motion of PSM_M are minimum-jerk moves from rest to rest (`skills.planning.motion_laws`).
+* A1 along a recorded hand has the hand's own profile of speeds and turns (`skills.planning.hand`), all of it slowed by
+  one factor, the *tempo*: a part of the surgeon's, so that the tip is nowhere faster than asked. Slower in one place
+  only would be another profile. The tip is near the polyline, as the hand states it.
+* A1 without a hand is a cubic spline through the polyline's points, at rest at both ends and slower in bends. Each
+  point is passed exactly, on a tick. Between points it leaves the straight move by at most 1.25 mm, because moves are
+  divided until it does not (`skills.planning.motion_laws`). Stopping at every point would not leave it at all, but
+  takes longer.
+* Transfers, A2 and all motion of PSM_M are minimum-jerk moves from rest to rest (`skills.planning.motion_laws`). The
+  jaw closes or opens evenly over a transfer, and stays as it is during A2.
 * If a joint of either arm would exceed its speed or acceleration limit, that phase of all passes is slowed until no
   joint does.
 
@@ -23,7 +28,7 @@ the place where one pass ends and the next begins: time passes there, and nothin
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from math import isfinite, radians, sqrt
+from math import ceil, isfinite, radians, sqrt
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -39,7 +44,6 @@ from skills.planning.motion_laws import (
     PHASES,
     TRANSFER,
     Pace,
-    Pose,
     Poses,
     check_length,
     followed,
@@ -73,12 +77,16 @@ class Trajectory:
         joints: Rows of `kinematics.JOINTS`, rad and mm, shape (T, 6).
         pass_index: Number of the pass, from 0, shape (T,).
         phase: `TRANSFER` (to where A1 begins), `A1` or `A2`, shape (T,).
-        speed_mm_s: Speed along A1 where its path is straight, after any slow-down.
+        speed_mm_s: Speed along A1 where its path is straight, or greatest speed of a hand, after any slow-down.
         turn_rad_s: Peak rate of A2 after any slow-down; if PSM_M needs longer to come in, A2 turns slower still.
         speed_ratio: Greatest joint speed, of either arm, as a part of its limit.
         acceleration_ratio: Greatest joint acceleration, of either arm, as a part of its limit.
         deviation_mm: Greatest distance of A1 from its straight moves.
         psm_m: Simultaneous motion of PSM_M; None if its place is not known.
+        tempo: The part of the surgeon's tempo at which A1 follows a recorded hand, at most 1; None without one.
+        jaw_rad: Angle of PSM_A's jaw, shape (T,); None if it was not recorded, and so is constant.
+        taking: The recorded poses in which PSM_M takes the needle, one for each pass, in the PSM base frame; None where
+            they follow from the jaw, as in the paper.
     """
 
     rate_hz: float
@@ -95,6 +103,9 @@ class Trajectory:
     acceleration_ratio: float
     deviation_mm: float
     psm_m: OtherArm | None = None
+    tempo: float | None = None
+    jaw_rad: Floats | None = None
+    taking: Poses | None = None
 
     def __post_init__(self) -> None:
         instrument_of(self.instrument)
@@ -120,6 +131,8 @@ class Trajectory:
             )
         if self.psm_m is not None and len(self.psm_m.joints) != count:
             raise BadPlan(f"PSM_M has {len(self.psm_m.joints)} samples and PSM_A has {count}; give equal numbers.")
+        if self.jaw_rad is not None:
+            object.__setattr__(self, "jaw_rad", frozen(self.jaw_rad, np.float64, (count,), "jaw_rad"))
 
     def __len__(self) -> int:
         """The number of samples."""
@@ -156,8 +169,8 @@ def time_parametrise(
 
     Args:
         passes: The passes in order.
-        speed_mm_s: Speed along A1 where its path is straight, and greatest speed of a transfer and of PSM_M; lower in
-            bends, and lower if the joints' limits require it.
+        speed_mm_s: Speed along A1 where its path is straight, and greatest speed of a recorded hand, of a transfer and
+            of PSM_M; lower in bends, and lower if the joints' limits require it.
         rate_hz: Samples per second.
         instrument: Number of the instrument.
         pause_s: Seconds between passes, for M1 and M2 by hand; rounded to full ticks, at least one.
@@ -170,7 +183,7 @@ def time_parametrise(
         BadSpeed: Speed, rate or pause is NaN, not positive, or over its limit; the motion has too many samples; or no
             speed keeps it within the joints' limits.
         NoMotion: There is no pass, or one in which nothing moves.
-        BadPlan: PSM_M would take the needle in a pass without A2.
+        BadPlan: PSM_M would take the needle in a pass without A2, or only some of the passes follow a recorded hand.
         Unreachable: The first sample that an arm cannot reach; `numbers` has pass, phase, joint, value and limit.
     """
     if not (isfinite(speed_mm_s) and 0 < speed_mm_s <= MAX_SPEED_MM_S):
@@ -179,7 +192,9 @@ def time_parametrise(
     if not (isfinite(pause_s) and 0 <= pause_s <= 3600):
         raise BadSpeed("The pause between passes must be 0 to 3600 s.", pause_s=pause_s)
     routes = ways(passes, psm_m)
-    paces = (Pace(speed_mm_s, PEAK_TURN_RAD_S, rate_hz),) * 3
+    peak_mm_s = _peak_mm_s(routes)
+    tempo = 1.0 if peak_mm_s <= speed_mm_s else speed_mm_s / peak_mm_s
+    paces = (Pace(speed_mm_s, PEAK_TURN_RAD_S, rate_hz, tempo),) * 3
     for _ in range(_ATTEMPTS):
         motion = _solved([_sample(one, paces) for one in routes], instrument, psm_m)
         speed, acceleration = _ratios(motion, rate_hz, instrument)
@@ -191,6 +206,7 @@ def time_parametrise(
         raise BadSpeed("No speed keeps this plan within the joints' limits; move it away from the limits of the wrist.")
     pause = max(1, round(pause_s * rate_hz))  # at least one tick, because stamps must increase
     ticks = motion.ticks
+    handed = routes[0].hand is not None
     return Trajectory(
         rate_hz=rate_hz,
         instrument=instrument,
@@ -200,13 +216,35 @@ def time_parametrise(
         joints=motion.joints,
         pass_index=ticks.pass_index,
         phase=ticks.phase,
-        speed_mm_s=paces[A1].speed_mm_s,
+        speed_mm_s=peak_mm_s * paces[A1].tempo if handed else paces[A1].speed_mm_s,
         turn_rad_s=paces[A2].turn_rad_s,
         speed_ratio=float(speed.max()),
         acceleration_ratio=float(acceleration.max()),
         deviation_mm=motion.deviation_mm,
         psm_m=motion.psm_m,
+        tempo=paces[A1].tempo if handed else None,
+        jaw_rad=motion.jaw_rad,
+        taking=_taking(passes),
     )
+
+
+def _peak_mm_s(routes: Sequence[Way]) -> float:
+    """Return the greatest speed of the recorded hands, 0 if there are none.
+
+    Raises:
+        BadPlan: Only some of the passes have one.
+    """
+    hands = [one.hand for one in routes if one.hand is not None]
+    if hands and len(hands) < len(routes):
+        raise BadPlan("Either all passes of a plan follow a recorded hand, or none does.")
+    return max((hand.peak_mm_s for hand in hands), default=0.0)
+
+
+def _taking(passes: Sequence[PassPath]) -> Poses | None:
+    recorded = [one.taking for one in passes if one.taking is not None]
+    if len(recorded) < len(passes):
+        return None
+    return Poses(np.stack([pose.tip_mm for pose in recorded]), np.stack([pose.rotation for pose in recorded]))
 
 
 def joint_ratios(
@@ -247,11 +285,12 @@ def _check_rate(rate_hz: float) -> None:
 
 @dataclass(frozen=True, eq=False)
 class _Sampled:
-    """One pass in ticks: the poses of each arm, and the number of ticks of each phase."""
+    """One pass in ticks: the poses of each arm, the number of ticks of each phase, and the recorded jaw, if any."""
 
     poses: tuple[Poses, ...]
     counts: tuple[int, int, int]
     deviation_mm: float
+    jaw_rad: Floats | None
 
 
 def _sample(one: Way, paces: Paces) -> _Sampled:
@@ -259,17 +298,34 @@ def _sample(one: Way, paces: Paces) -> _Sampled:
     legs = [move(start, end, paces[TRANSFER]) for start, end in pairwise(one.transfer)]
     parts = [tuple(poses[:-1] for poses in leg) for leg in legs]  # a leg's last pose is the first of the next part
     begin = one.transfer[-1]
-    tip, deviation_mm = followed(one.line, paces[A1].speed_mm_s / paces[A1].rate_hz)
-    along = Poses(tip, np.tile(begin[0].rotation, (len(tip), 1, 1)))
-    parts.append((along, *(held(pose, len(tip)) for pose in begin[1:])))
+    along, deviation_mm, jaw = _brought(one, paces[A1])
+    parts.append((along, *(held(pose, len(along)) for pose in begin[1:])))
     before = sum(len(leg[0]) for leg in parts[:-1])
     turning = 0
     if one.handed is not None:
-        turned = move((Pose(one.line[-1], begin[0].rotation), *begin[1:]), one.handed, paces[A2], least_ticks=1)
+        turned = move(one.brought, one.handed, paces[A2], least_ticks=1)
         parts.append(tuple(poses[1:] for poses in turned))
         turning = len(turned[0]) - 1
     poses = tuple(joined(of_arm) for of_arm in zip(*parts, strict=True))
-    return _Sampled(poses, (before, len(tip), turning), deviation_mm)
+    if jaw is not None:
+        jaw = np.concatenate((np.full(before, jaw[0]), jaw, np.full(turning, jaw[-1])))
+    return _Sampled(poses, (before, len(along), turning), deviation_mm, jaw)
+
+
+def _brought(one: Way, pace: Pace) -> tuple[Poses, float, Floats | None]:
+    """Return the poses of A1, its greatest distance from its straight moves, and the recorded angles of the jaw."""
+    first = one.transfer[-1][0].rotation
+    if one.hand is None:
+        tip, deviation_mm = followed(one.line, pace.speed_mm_s / pace.rate_hz)
+        return Poses(tip, np.tile(first, (len(tip), 1, 1))), deviation_mm, None
+    ticks = ceil(one.hand.duration_s / pace.tempo * pace.rate_hz)
+    check_length(ticks)
+    tip, turned, jaw = one.hand.at(ticks + 1)
+    rotation = np.tile(first, (len(tip), 1, 1)) if turned is None else turned
+    # without round-off, because transfer and A2 begin and end exactly there
+    tip[0], tip[-1] = one.line[0], one.line[-1]
+    rotation[0], rotation[-1] = first, one.brought[0].rotation
+    return Poses(tip, rotation), one.hand.deviation_mm, jaw
 
 
 # ---- all passes ------------------------------------------------------------------------------------------------
@@ -284,6 +340,7 @@ class _Motion:
     joints: Floats
     psm_m: OtherArm | None
     deviation_mm: float
+    jaw_rad: Floats | None
 
 
 def _solved(sampled: Sequence[_Sampled], instrument: str, psm_m: PsmM | None) -> _Motion:
@@ -295,7 +352,19 @@ def _solved(sampled: Sequence[_Sampled], instrument: str, psm_m: PsmM | None) ->
     poses = [joined(of_arm) for of_arm in zip(*(one.poses for one in sampled), strict=True)]
     joints = solve(poses[0], ticks, instrument)
     other = None if psm_m is None or len(poses) == 1 else other_arm(poses[1], ticks, psm_m)
-    return _Motion(poses[0], ticks, joints, other, max(one.deviation_mm for one in sampled))
+    deviation_mm = max(one.deviation_mm for one in sampled)
+    return _Motion(poses[0], ticks, joints, other, deviation_mm, _jaw(sampled))
+
+
+def _jaw(sampled: Sequence[_Sampled]) -> Floats | None:
+    """Concatenate the angles of the jaw; over a transfer it goes evenly from those of the pass before to its own."""
+    angles = [one.jaw_rad for one in sampled if one.jaw_rad is not None]
+    if len(angles) < len(sampled):
+        return None
+    for before, after, one in zip(angles, angles[1:], sampled[1:], strict=False):
+        transfer = one.counts[0]
+        after[:transfer] = np.linspace(before[-1], after[transfer], transfer + 1)[:-1]
+    return np.concatenate(angles)
 
 
 def _ratios(motion: _Motion, rate_hz: float, instrument: str) -> tuple[Floats, Floats]:

@@ -15,6 +15,7 @@ from typing import Any, Literal
 from pydantic import ConfigDict, Field
 
 from skills.fields import Count, Point, Quaternion, Sha256, Slug, schema
+from skills.planning.plan import Departure
 from skills.planning.trajectory import Seam, Transfer
 from skills.schemas import Given, Handedness, Page, PolicyName, SkillLevel
 from skills.schemas.comparison import Atlas, Score
@@ -132,7 +133,8 @@ class Pass(Given):
     start_mm: Point
     states: list[int]
     path_mm: list[Point]
-    jaw_xyzw: Quaternion
+    jaw_xyzw: Quaternion = Field(description="The jaw at the start of A1.")
+    turn_deg: float = Field(default=0.0, description="Greatest angle of the jaw from its start during A1.")
     target_xyzw: Quaternion | None = Field(description="The jaw after A2; null where A1 alone is planned.")
     transfer: Transfer | None
 
@@ -145,6 +147,10 @@ class Timetable(Given):
     duration_s: float
     seconds_by_phase: dict[str, float]
     speed_used_mm_s: float
+    tempo: float | None = Field(
+        default=None, description="The part of the surgeon's tempo in A1, at most 1; null where none is followed."
+    )
+    jaw: str = Field(default="constant", description="recorded along A1, or constant.")
     peak_joint_speed_ratio: float
     peak_joint_acceleration_ratio: float
     deviation_mm: float
@@ -163,7 +169,16 @@ class Plan(Given):
     arm: str
     frame: str
     instrument: str
-    orientation: str = Field(description="demonstrated, or assumed tool-down.")
+    orientation: str = Field(
+        description="recorded: turns as the surgeon's; demonstrated: constant, the demonstration's first; or assumed "
+        "tool-down, which is constant too."
+    )
+    departure: Departure | None = Field(
+        default=None, description="Of a constant orientation from the recorded one; null where there is none."
+    )
+    a2: str | None = Field(
+        default=None, description="recorded: ends in the demonstrated hand-off; or paper. Null without a hand-off."
+    )
     path: str = Field(description="fitted, or cell centres.")
     psm_m: PsmM | None
     realignment: bool

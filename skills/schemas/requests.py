@@ -16,7 +16,16 @@ from skills.gridworld.grid import MAX_HYSTERESIS, GridMode
 from skills.kinematics import INSTRUMENTS, JAW_TIP_MM
 from skills.learning.policy import LEARNERS, MAX_SEED, Learner, learner_of
 from skills.planning.handoff import Enters
-from skills.planning.plan import MAX_OUTSIDE_MM, MAX_PASSES, MAX_TIP_OFFSET_MM, RATE_HZ, SuturePoint
+from skills.planning.plan import (
+    MAX_OUTSIDE_MM,
+    MAX_PASSES,
+    MAX_TIP_OFFSET_MM,
+    RATE_HZ,
+    A2Target,
+    SuturePoint,
+    Turning,
+)
+from skills.planning.trajectory import MAX_SPEED_MM_S
 from skills.schemas import DemoOutcome, Handedness, SkillLevel
 from skills.settings import Role
 
@@ -434,7 +443,21 @@ class PlanIn(Schema):
     arm: Name | None = None
     frame: Name | None = None
     instrument: Name | None = None
-    speed_mm_s: Annotated[Number, Field(gt=0, le=1000)] = 20.0
+    speed_mm_s: Annotated[Number, Field(gt=0, le=1000)] = Field(
+        default=20.0,
+        description="Greatest speed of the tip: the surgeon's tempo is slowed to it, all along the pass alike. At most "
+        f"{MAX_SPEED_MM_S:g}.",
+    )
+    orientation: Turning | None = Field(
+        default=None,
+        description="recorded: the jaw turns as the surgeon's along the pass; constant: it is held as in the "
+        "demonstration's first sample, and the answer states the departure. By default recorded where it was.",
+    )
+    a2: A2Target | None = Field(
+        default=None,
+        description="recorded: A2 ends in the demonstrated hand-off, in the poses of both arms; paper: PSM_A turns "
+        "across PSM_M's approach. By default recorded where both poses were, unless psm_m gives another approach.",
+    )
     rate_hz: Annotated[Number, Field(ge=RATE_HZ[0], le=RATE_HZ[1])] = 200.0
     tip_offset_mm: Annotated[Number, Field(ge=0, le=MAX_TIP_OFFSET_MM)] = Field(
         default=0.0,

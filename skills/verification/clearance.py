@@ -41,9 +41,10 @@ from numpy.typing import ArrayLike
 
 from skills.arrays import Flags, Floats, Ints
 from skills.kinematics import DEFAULT_INSTRUMENT, INSERTION, JAW_TIP_MM, WRIST_MM, forward, instrument_of, matrix_of
-from skills.planning.handoff import HELD_MM, HOLDING_RAD, NEEDLE_RADIUS_MM
+from skills.planning.handoff import HELD_MM, HOLDING_RAD, NEEDLE_FREE_RAD, NEEDLE_RADIUS_MM
 from skills.planning.trajectory import TRANSFER, Trajectory
-from skills.verification.playback import LINKS, PAD_SIZE_MM, LinkPair, pad_scale
+from skills.verification.playback import FINGERS as FINGER_LINKS
+from skills.verification.playback import LINKS, PAD_SIZE_MM, PSM_A, LinkPair, pad_scale
 
 # The reach of the surfaces in `urdf/psm.urdf` from the wrist's pitch axis and from the hinge, mm.
 SHAFT_RADIUS_MM = 4.0
@@ -79,6 +80,13 @@ def travel_mm(joints: Floats, instrument: str) -> Floats:
     return np.stack([shaft, wrists, fingers, fingers], axis=1)
 
 
+def openings(trajectory: Trajectory) -> Floats:
+    """Return the opening of each of PSM_A's fingers, rad, shape (T,): at least that of jaws that hold a needle."""
+    if trajectory.jaw_rad is None:
+        return np.full(len(trajectory), HOLDING_RAD)
+    return np.maximum(trajectory.jaw_rad / 2, HOLDING_RAD)
+
+
 @dataclass(frozen=True, eq=False)
 class Bounds:
     """Lower bounds on the distances of pairs of links at every sample, from distances measured at some samples.
@@ -89,12 +97,15 @@ class Bounds:
         seen_mm: The distances measured there, shape (C, P).
         ways_mm: Greatest distance that each body's links can have moved since the first sample, shape (T, 4); a body
             that is missing here does not move.
+        opened_mm: Greatest distance of PSM_A's fingers from where they were measured, because the jaw is open further,
+            shape (T,); None: as measured.
     """
 
     pairs: tuple[LinkPair, ...]
     looked_at: Ints
     seen_mm: Floats
     ways_mm: Mapping[str, Floats]
+    opened_mm: Floats | None = None
 
     @classmethod
     def of(
@@ -115,14 +126,20 @@ class Bounds:
         return cls(tuple(pairs), looked_at, seen_mm, ways)
 
     def at_least_mm(self, column: int) -> Floats:
-        """Return a lower bound on one pair's distance, shape (T,): exact where it was measured, NaN next to a NaN."""
+        """Return a lower bound on one pair's distance, shape (T,): exact where it was measured, NaN next to a NaN.
+
+        Where the jaw is open further than when it was measured, the bound allows for that.
+        """
         way, looked_at, seen = self._way_mm(column), self.looked_at, self.seen_mm[:, column]
         sample = np.arange(len(way))
         before = np.searchsorted(looked_at, sample, side="right") - 1
         after = np.searchsorted(looked_at, sample, side="left")
         since = seen[before] - (way - way[looked_at[before]])
         until = seen[after] - (way[looked_at[after]] - way)
-        return np.asarray(np.maximum(since, until))
+        least, pair = np.maximum(since, until), self.pairs[column]
+        if self.opened_mm is not None and pair.body == PSM_A and pair.link in FINGER_LINKS:
+            least = least - self.opened_mm
+        return np.asarray(least)
 
     def moved_mm(self) -> float:
         """Return the greatest distance by which any pair can have approached between two measurements."""
@@ -163,13 +180,13 @@ class Links:
         return Links(self.begin_mm @ base.T + base_mm, self.end_mm @ base.T + base_mm)
 
 
-def links_of(joints: ArrayLike, instrument: str = DEFAULT_INSTRUMENT, opening_rad: float = HOLDING_RAD) -> Links:
+def links_of(joints: ArrayLike, instrument: str = DEFAULT_INSTRUMENT, opening_rad: ArrayLike = HOLDING_RAD) -> Links:
     """Return the links of an arm with these joints, in its base frame.
 
     Args:
         joints: Rows of `kinematics.JOINTS`, rad and mm, shape (T, 6). Limits are not checked; NaN stays NaN.
         instrument: Number of the instrument.
-        opening_rad: Opening of each finger.
+        opening_rad: Opening of each finger, of all poses or of each, shape (T,).
     """
     tool = instrument_of(instrument)
     q = np.asarray(joints, dtype=np.float64)
@@ -185,10 +202,12 @@ def links_of(joints: ArrayLike, instrument: str = DEFAULT_INSTRUMENT, opening_ra
     wrist = (q[:, 2:3] - tool.wrist_offset_mm) * shaft
     hinge = wrist + WRIST_MM * x5
     axes = [(wrist - tool.shaft_mm * shaft, wrist), (wrist, hinge)]
+    opening = np.broadcast_to(np.asarray(opening_rad, dtype=np.float64), (len(q),))[:, None]
+    cosine, sine = np.cos(opening), np.sin(opening)
     for side in (1.0, -1.0):
-        outwards = side * np.cos(opening_rad) * o - np.sin(opening_rad) * a
+        outwards = side * cosine * o - sine * a
         begin = hinge + ASIDE_MM * outwards
-        axes.append((begin, begin + FINGER_MM * (np.cos(opening_rad) * a + side * np.sin(opening_rad) * o)))
+        axes.append((begin, begin + FINGER_MM * (cosine * a + side * sine * o)))
     begins, ends = zip(*axes, strict=True)
     return Links(np.stack(begins, axis=1), np.stack(ends, axis=1))
 
@@ -320,7 +339,6 @@ def _in_jaws_of_psm_a(trajectory: Trajectory, at: Ints) -> tuple[Floats, Floats]
     return place, jaws
 
 
-NEEDLE_FREE_RAD = 2 * pi / 3  # of the arc beyond PSM_A's grip: two thirds of a half circle, as in urdf/needle.urdf
 NEEDLE_THICK_MM = 0.66  # the same file
 _HALF_WIDTH_RAD = FINGER_RADIUS_MM / NEEDLE_RADIUS_MM  # of the arc, from the middle of the fingers to their side
 

@@ -42,7 +42,8 @@ from skills.errors import BadInput, BadSettings
 from skills.fields import Count, Figure, Fraction, schema
 from skills.kinematics import CANNULA_MM, INSERTION, forward, instrument_of, joint_margins, matrix_of, solutions_of
 from skills.learning.slip import wilson
-from skills.planning.handoff import HOLDING_RAD, OPEN_RAD, hand_off
+from skills.planning.handoff import OPEN_RAD, hand_off
+from skills.planning.motion_laws import Pose
 from skills.planning.trajectory import A2, Trajectory
 from skills.verification.clearance import (
     FINGERS,
@@ -52,6 +53,7 @@ from skills.verification.clearance import (
     clearance_between,
     clearance_to_pad,
     links_of,
+    openings,
     travel_mm,
 )
 from skills.verification.verdict import Limits
@@ -114,7 +116,7 @@ class Planned:
         instrument: Number of its instrument.
         base: Rotation of its base in PSM_A's base frame, shape (3, 3).
         base_mm: Its remote centre there, shape (3,).
-        opening_rad: Opening of each of its fingers.
+        opening_rad: Opening of each of its fingers, shape (S,).
     """
 
     tip_mm: Floats
@@ -123,12 +125,12 @@ class Planned:
     instrument: str
     base: Floats
     base_mm: Floats
-    opening_rad: float
+    opening_rad: Floats
 
     def at(self, samples: Ints) -> "Planned":
         """Return the arm at some of the samples."""
         tip, rotation, joints = self.tip_mm[samples], self.rotation[samples], self.joints[samples]
-        return replace(self, tip_mm=tip, rotation=rotation, joints=joints)
+        return replace(self, tip_mm=tip, rotation=rotation, joints=joints, opening_rad=self.opening_rad[samples])
 
     def shifted(self, shift_mm: Floats) -> Floats:
         """Solve the joints for the pass shifted by each of N shifts, in PSM_A's base frame: shape (N * S, 6).
@@ -144,8 +146,9 @@ class Planned:
         return np.asarray(solutions[np.arange(len(tip)), nearest])
 
     def links(self, joints: Floats) -> Links:
-        """Return the arm's links in PSM_A's base frame."""
-        return links_of(joints, self.instrument, self.opening_rad).seen_from(self.base, self.base_mm)
+        """Return the arm's links in PSM_A's base frame, for the samples' joints once or for each variation."""
+        openings_rad = np.tile(self.opening_rad, len(joints) // len(self.opening_rad))
+        return links_of(joints, self.instrument, openings_rad).seen_from(self.base, self.base_mm)
 
     def margins(self, joints: Floats) -> Floats:
         """Return each joint's distance from its nearer limit as a part of its range."""
@@ -165,11 +168,13 @@ class PlannedPass:
         arms: PSM_A and, if its place is known, PSM_M.
         phase: Phase of each sample, shape (S,).
         pad_top_mm: Height of the pad's top in the PSM_A base frame.
+        taking: The recorded pose in which PSM_M takes the needle, in that frame; None: that of the paper's A2.
     """
 
     arms: tuple[Planned, ...]
     phase: Bytes
     pad_top_mm: float
+    taking: Pose | None = None
 
     @property
     def handing_over(self) -> Flags:
@@ -189,14 +194,15 @@ def scene_of(trajectory: Trajectory, number: int, pad_top_mm: float, opening_rad
     samples = np.flatnonzero(trajectory.pass_index == number)
     rotation = matrix_of(trajectory.rotation_xyzw[samples])
     tip, joints, instrument = trajectory.tip_mm[samples], trajectory.joints[samples], trajectory.instrument
-    arms = [Planned(tip, rotation, joints, instrument, np.eye(3), np.zeros(3), HOLDING_RAD)]
+    arms = [Planned(tip, rotation, joints, instrument, np.eye(3), np.zeros(3), openings(trajectory)[samples])]
     other = trajectory.psm_m
     if other is not None:
         joints, base = other.joints[samples], matrix_of(other.base_xyzw[None])[0]
-        arms.append(
-            Planned(*forward(joints, other.instrument), joints, other.instrument, base, other.base_mm, opening_rad)
-        )
-    return PlannedPass(tuple(arms), trajectory.phase[samples], pad_top_mm)
+        opened = np.full(len(samples), opening_rad)
+        arms.append(Planned(*forward(joints, other.instrument), joints, other.instrument, base, other.base_mm, opened))
+    recorded = trajectory.taking
+    taking = None if recorded is None else Pose(recorded.tip_mm[number], recorded.rotation[number])
+    return PlannedPass(tuple(arms), trajectory.phase[samples], pad_top_mm, taking)
 
 
 def looked_at(scene: PlannedPass, stretches: int) -> PlannedPass:
@@ -222,7 +228,7 @@ def looked_at(scene: PlannedPass, stretches: int) -> PlannedPass:
     spans = list(zip(begins.tolist(), ends.tolist(), strict=True))
     least = [begin + int(values[begin : end + 1].argmin()) for values in margins for begin, end in spans]
     samples = np.unique(np.concatenate([begins, ends, least]))
-    return PlannedPass(tuple(arm.at(samples) for arm in scene.arms), scene.phase[samples], scene.pad_top_mm)
+    return replace(scene, arms=tuple(arm.at(samples) for arm in scene.arms), phase=scene.phase[samples])
 
 
 def spoiled(scene: PlannedPass, drawn: Drawn, tip_errors_mm: Floats, limits: Limits) -> dict[str, Flags]:
@@ -412,7 +418,7 @@ def doubt(
     Args:
         trajectory: The planned motion, with PSM_M's if its place is known.
         approach_m: PSM_M's approach in the PSM_A base frame, shape (3,); None if it is not known. Not used if the
-            trajectory has PSM_M: then the last pose of that arm counts.
+            trajectory has PSM_M or its recorded pose: then the last pose of that arm counts.
         pad_top_mm: Height of the pad's top in the PSM_A base frame; the pad is assumed to be infinite.
         seed: Seed of the random numbers.
         settings: The errors to draw, and the conditions of a catch.
@@ -475,6 +481,8 @@ def _hand_off(scene: PlannedPass, approach_m: ArrayLike | None) -> HandOff | Non
     if len(scene.arms) == 2:
         other = scene.arms[1]
         return HandOff(tip, jaw, other.base @ other.tip_mm[-1] + other.base_mm, other.base @ other.rotation[-1])
+    if scene.taking is not None:
+        return HandOff(tip, jaw, scene.taking.tip_mm, scene.taking.rotation)
     if approach_m is None:
         return None
     (tip_m,), (jaw_m,) = hand_off(tip[None], jaw[None], approach_m)

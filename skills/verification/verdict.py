@@ -15,7 +15,7 @@ evidence of the hardware's accuracy. PSM_M is in the kinematic pass alone.
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -34,9 +34,10 @@ from skills.kinematics import (
     joint_margins,
     matrix_of,
 )
+from skills.planning.handoff import HOLDING_RAD
 from skills.planning.motion_laws import A2, PHASES, TRANSFER
 from skills.planning.trajectory import Trajectory, joint_ratios
-from skills.verification.clearance import Bounds, needle_to_pad_mm, psm_m_poses
+from skills.verification.clearance import FINGER_REACH_MM, Bounds, needle_to_pad_mm, openings, psm_m_poses
 from skills.verification.playback import CLEARANCE_SEEN_MM, PAD, PSM_A, PSM_M, Playback
 
 
@@ -104,7 +105,10 @@ def figures_of(playback: Playback, trajectory: Trajectory) -> Figures:
         psm_m_fk_mm=psm_m_fk_mm,
         ticks=np.append(1.0, np.diff(trajectory.stamps_s) * trajectory.rate_hz),
         effort=(np.abs(playback.efforts) / np.array(instrument_of(trajectory.instrument).arm.effort)).max(axis=1),
-        apart=Bounds.of(moving, playback.link_pairs, looked_at, playback.clearances_mm),
+        apart=replace(
+            Bounds.of(moving, playback.link_pairs, looked_at, playback.clearances_mm),
+            opened_mm=FINGER_REACH_MM * (openings(trajectory) - HOLDING_RAD),  # the simulator's fingers hold a needle
+        ),
         needle_mm=needle_to_pad_mm(trajectory, looked_at, playback.pad_mm),
     )
 
@@ -450,7 +454,7 @@ def judge(
         trajectory: The trajectory that was played.
         settings: The limits; by default `Limits()`.
         approach_m: PSM_M's approach in the PSM_A base frame, shape (3,), if it is known and PSM_M is not in the scene;
-            if PSM_M is in the scene, its own pose counts.
+            if PSM_M is in the scene, its own pose counts, and otherwise the recorded one of the trajectory.
 
     Returns:
         The verdict and its figures.
@@ -589,6 +593,8 @@ def _approaches(trajectory: Trajectory, approach_m: ArrayLike | None) -> Floats 
     """Return PSM_M's approach at the end of each pass, shape (passes, 3): its own, or else the given one."""
     if trajectory.psm_m is not None:
         return psm_m_poses(trajectory, trajectory.last_samples)[1][:, :, 2]
+    if trajectory.taking is not None:
+        return trajectory.taking.rotation[:, :, 2]
     if approach_m is None:
         return None
     return np.tile(frozen(approach_m, np.float64, (3,), "approach_m"), (trajectory.passes, 1))

@@ -11,6 +11,7 @@ from tests.bench.beyond import learners
 from tests.bench.combining import combining
 from tests.bench.doubt import doubting
 from tests.bench.geometry import geometry
+from tests.bench.hands import hands
 from tests.bench.joining import joining
 from tests.bench.kinematics import kinematics
 from tests.bench.learning import learning
@@ -39,6 +40,7 @@ PARTS = {
     "geometry": geometry,
     "joining": joining,
     "pose-styles": pose_styles,
+    "hands": hands,
     "session": session,
     "tissue": tissue,
 }

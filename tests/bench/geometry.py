@@ -112,7 +112,7 @@ def ours_fitted(demo: Demo) -> Elsewhere:
     def elsewhere(start_mm: np.ndarray, goal_mm: np.ndarray) -> Demo:
         there = moved(demo, start_mm, goal_mm)
         path = discretize(there.tip_mm, choose_grid(there.tip_mm, "fit"))
-        fitted_mm = fit_to_demo(replay(path, path.start), trace(there, path), path.tip_mm[0]).tip_mm
+        fitted_mm = fit_to_demo(replay(path, path.start), trace(there, path)).tip_mm
         stamps_s = np.linspace(0.0, demo.stamps_s[-1], len(fitted_mm))
         return replace(there, stamps_s=stamps_s, tip_mm=fitted_mm - fitted_mm[-1] + goal_mm)
 

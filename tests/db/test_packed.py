@@ -31,7 +31,7 @@ from skills.learning.q_learning import CellQLearning, PhaseQLearning
 from skills.learning.ties import ShortestWay
 from skills.learning.tube import certified_poses
 from skills.planning.handoff import PsmM
-from skills.planning.plan import SuturePoint, stack
+from skills.planning.plan import Departure, SuturePoint, stack
 from skills.verification.playback import Pictures, Playback
 from tests.deep.networks import always
 from tests.library.cases import bag, hand_off
@@ -52,6 +52,13 @@ PLAN = stack(
     rotation=None,
     psm_m=PsmM((-0.94, 0.10, -0.33)),
 )
+HANDED = stack(
+    PHASED,
+    [SuturePoint((5.0, 55.0, -125.0))],
+    demo=DEMO,
+    psm_m=PsmM((-0.94, 0.10, -0.33), taken_mm=(15.0, 55.0, -125.0), taken_xyzw=(0.0, 0.0, 0.0, 1.0)),
+)
+HANDED = replace(HANDED, departure=Departure(60.0, 15.5, 59.0, 15.0))
 PLAYBACK = Playback(
     tip_mm=np.array([[1.0, np.nan, np.inf], [-0.0, 5e-324, 1e308]]),
     rotation_xyzw=np.zeros((2, 4)),
@@ -91,6 +98,7 @@ VALUES = [
     replace(POLICY, network=always((0.5, -0.25, 1e-30))),
     replace(PLAN, psm_m=None),
     PLAN,
+    HANDED,
     replace(PLAN, psm_m=PsmM((1.0, 0.0, 0.0), (160.0, 20.0, 20.0), (0.0, 0.0, 0.0, 1.0), "420006", "start", "a", "b")),
     certify(POLICY)[1],
     certified_poses([DEMO]),
@@ -347,6 +355,12 @@ def test_a_partner_without_a_base_keeps_its_old_digest_and_can_be_read():
     known = replace(partner, base_mm=(1.0, 2.0, 3.0), base_xyzw=(0.0, 0.0, 0.0, 1.0), instrument="400006")
     assert unpack(pack(known)) == known
     assert digest(replace(demo, partner=known)) != digest(demo)
+
+
+def test_a_plan_without_a_hand_is_stored_as_before_there_was_any():
+    assert digest(PLAN) == "42389bfa5e526d2ca015b1e3826613a3660f525483675825cd81dbf98b775d21"
+    assert HANDED.passes[0].taking is not None
+    assert digest(HANDED) != digest(replace(HANDED, departure=None))
 
 
 def test_a_plan_from_before_psm_m_moved_is_refused_as_a_whole():

@@ -123,10 +123,14 @@ def test_a_moving_jaw_is_found():
             return one
         return writer.joint_state(one.topic, one.log_ns, [0.9], ["jaw"], velocities=[0.0])
 
-    with pytest.raises(BadBag, match="jaw is not held"):
+    with pytest.raises(BadBag, match="velocity that does not match"):
         checked(rewritten(change))
-    with pytest.raises(BadBag, match="jaw is not held"):
-        checked(remade(replace(arm(), jaw_rad=1.5)))
+    with pytest.raises(BadBag, match="angle that the instrument cannot have"):
+        checked(remade(replace(arm(), jaw_rad=np.full(len(arm().jaw_rad), 1.5))))
+
+
+def test_a_jaw_that_opens_as_planned_is_accepted():
+    assert checked(remade(replace(arm(), jaw_rad=np.linspace(0.1, 0.4, len(arm().jaw_rad)))))
 
 
 @pytest.mark.parametrize("joint", range(6))
@@ -246,9 +250,8 @@ def test_the_arms_keep_the_same_time():
 
 
 def test_half_a_plan_is_found():
-    half = replace(
-        arm(), **{name: getattr(arm(), name)[81:] for name in ("stamps_ns", "joints", "tip_m", "rotation_xyzw")}
-    )
+    columns = ("stamps_ns", "joints", "tip_m", "rotation_xyzw", "jaw_rad")
+    half = replace(arm(), **{name: getattr(arm(), name)[81:] for name in columns})
     with pytest.raises(BadBag, match="number of samples"):
         checked(remade(half))
 

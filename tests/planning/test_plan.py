@@ -128,12 +128,12 @@ def hand_along(name):
 @given(places_mm, turns_xyzw, st.integers(0, 1000), st.tuples(*[st.floats(-2.4, 2.4)] * 3))
 def test_with_its_demonstration_a_pass_is_the_fitted_path_moved(place_mm, turn_xyzw, start, off_mm):
     policy, grid, demo = learnt(NAME), named_path(NAME).grid, hand_along(NAME)
-    turned, goal_mm = matrix_of([turn_xyzw])[0], policy.path.tip_mm[-1]
+    turned, goal_mm = matrix_of([turn_xyzw])[0], demo.tip_mm[-1]
     here_mm = grid.centres_mm(start % grid.n_states) + off_mm
     start_mm = turned @ (here_mm - goal_mm) + place_mm
     plan = stacked([SuturePoint(place_mm, turn_xyzw)] * 2, starts_mm=[None, start_mm], demo=demo)
-    for one, from_mm in zip(plan.passes, (policy.path.tip_mm[0], here_mm), strict=True):
-        followed = rollout(policy, from_mm)
+    for one, from_mm in zip(plan.passes, (None, here_mm), strict=True):
+        followed = rollout(policy, demo.tip_mm[0] if from_mm is None else from_mm)
         fit = fit_to_demo(followed, trace(demo, policy.path), from_mm)
         assert one.tip_mm == pytest.approx((fit.tip_mm - goal_mm) @ turned.T + place_mm, abs=1e-5)
         assert one.states.tolist() == followed.states.tolist()
@@ -226,8 +226,13 @@ def test_arm_frame_instrument_and_rotation_are_the_demonstrations():
         instrument=demo.instrument,
         rotation=rotation_of(demo.rotation_xyzw),
     )
-    assert digest(short) == digest(long)
-    assert short.orientation == "demonstrated"
+    assert digest(replace(short, orientation="demonstrated", departure=long.departure, passes=())) == digest(
+        replace(long, passes=())
+    )
+    assert [digest(replace(one.hand, rotation_xyzw=None)) for one in short.passes] == [
+        digest(one.hand) for one in long.passes
+    ]
+    assert (short.orientation, long.orientation) == ("recorded", "demonstrated")
     assert (short.arm, short.frame, short.instrument) == (demo.arm, demo.frame, demo.instrument)
 
 

@@ -177,7 +177,11 @@ def _contents(
     settings: Settings,
 ) -> bytes:
     if media_type == BAG:
-        asked = {"tip_error_mm": settings.replay_tip_error_mm, "lower_bound": settings.replay_lower_bound}
+        asked = {
+            "tip_error_mm": settings.replay_tip_error_mm,
+            "lower_bound": settings.replay_lower_bound,
+            "constant_turn_deg": settings.constant_turn_deg,
+        }
         return replay_bag(db, plan, pass_index=pass_index, handoff=handoff, **asked)
     with db.reading() as session:
         motion = motion_of(session, plan)

@@ -302,7 +302,14 @@ def get_policy_version(
     **says(PolicySummary, 404, 409, 410, 412),
 )
 def release(
-    surgeon: Slug, suture: Slug, version: Version, db: Db, request: Request, actor: Actor, if_match: Condition = None
+    surgeon: Slug,
+    suture: Slug,
+    version: Version,
+    db: Db,
+    request: Request,
+    actor: Actor,
+    settings: Configured,
+    if_match: Condition = None,
 ) -> Response:
     """Release a version if it passes the gate; releasing an older version rolls back.
 
@@ -313,7 +320,7 @@ def release(
         policy = policies.find_version(session, surgeon, suture, version)
         if if_match is not None:
             _refuse_overtaken(session, encoded, surgeon, suture, if_match)
-        released = releases.release(session, policy, actor)
+        released = releases.release(session, policy, actor, constant_turn_deg=settings.constant_turn_deg)
         return say(summary_json(released))
 
 
