@@ -26,6 +26,7 @@ PACKAGE = str(Path(skills.__file__).parent)
 COMMON = ("errors", "remedies", "settings", "logs", "arrays", "fields", "packing", "compiled", "kinematics")
 COMMON += ("db/", "client/", "api/app", "jobs/__init__", "library/catalogue.py", "library/keys.py")
 PERIODIC = "forget_erased"  # its calls are part of no request, and a slow walk has them
+STARTING = "confined_reader"  # called once at the start of the service
 
 
 def room(file: str) -> str:
@@ -45,7 +46,7 @@ class Trace:
         if event != "call" or code in self.stations or not code.co_filename.startswith(PACKAGE):
             return
         file = code.co_filename.removeprefix(f"{PACKAGE}/")
-        if "." in code.co_qualname or code.co_name.startswith(("_", "<")) or file.startswith(COMMON):
+        if "." in code.co_qualname or code.co_name.startswith(("_", "<", STARTING)) or file.startswith(COMMON):
             return
         caller = frame.f_back
         while caller is not None and not caller.f_code.co_filename.startswith(PACKAGE):
