@@ -22,6 +22,7 @@ from skills.learning.certificate import coverage
 from skills.learning.policy import Learner, Policy, learn_tabular, next_step
 from skills.learning.q_learning import CellQLearning, PhaseQLearning
 from skills.library import policies
+from skills.library.training import joining_of
 from tests.formats.bags import sample_folder
 from tests.gridworld.paths import WALKS, learnt
 
@@ -50,20 +51,20 @@ def recorded(cell_mm: float, learner: Learner) -> Policy:
 
 def as_npz(policy: Policy) -> io.BytesIO:
     """Return the service's arrays of a policy."""
-    version: Any = SimpleNamespace(sha256="00" * 32)
+    version: Any = SimpleNamespace(sha256="00" * 32, manifest=joining_of(policy))
     return io.BytesIO(policies.arrays_of(version))
 
 
 def as_json(policy: Policy) -> io.StringIO:
     """Return the part of the service's JSON from which a policy runs."""
-    grid = policy.path.grid
-    about = {
+    grid, rule = policy.path.grid, joining_of(policy)
+    about = rule | {
         "grid": {"origin_mm": grid.origin_mm, "cell_mm": grid.cell_mm, "shape": grid.shape},
         "waypoints": policy.path.states.tolist(),
-        "actions": policies.actions_of(policy),
+        policies.table_name(rule, "actions"): policies.actions_of(policy),
     }
     live = policies.live_actions_of(policy)
-    return io.StringIO(json.dumps(about if live is None else about | {"live_actions": live}))
+    return io.StringIO(json.dumps(about | ({} if live is None else {policies.table_name(rule, "live_actions"): live})))
 
 
 def agrees(runner: Any, policy: Policy, states: NDArray[np.int64]) -> None:
@@ -91,10 +92,14 @@ def loaded(monkeypatch: pytest.MonkeyPatch) -> Callable[[Policy, str], Any]:
 
 
 @pytest.mark.parametrize("form", ["json", "live", "npz"])
-@pytest.mark.parametrize("phased", [True, False], ids=["phase", "cell"])
+@pytest.mark.parametrize(
+    "rule",
+    [{}, {"phased": False}, {"join_share": 0.5}, {"join_share": 1.0}],
+    ids=["phase", "cell", "joining half", "joining the start"],
+)
 @pytest.mark.parametrize("name", WALKS)
-def test_the_runner_acts_as_the_service_in_every_state_and_phase(loaded, name, phased, form):
-    policy = learnt(name, phased=phased)
+def test_the_runner_acts_as_the_service_in_every_state_and_phase(loaded, name, rule, form):
+    policy = learnt(name, **rule)
     runner = loaded(policy, form)
     agrees(runner, policy, np.arange(policy.path.grid.n_states))
     outside = policy.path.grid.centres_mm(0) - policy.path.grid.cell_mm
@@ -126,12 +131,20 @@ def test_the_json_of_a_large_policy_has_its_live_actions_alone(loaded):
     live = policies.live_actions_of(policy)
     assert live is not None
     assert sum(len(box["actions"]) for box in live) == domain.n_rows == 64_258
-    assert len(orjson.dumps(live)) == pytest.approx(0.17e6, rel=0.03)
+    assert len(orjson.dumps(live)) == pytest.approx(0.18e6, rel=0.03)
     rows = np.random.default_rng(0).choice(np.flatnonzero(domain.certified), 200)
     agrees(loaded(policy, "json"), policy, np.unique(domain.state_of[rows])[:20])
 
 
+def test_the_runner_stops_at_a_format_that_it_does_not_know(loaded):
+    about = json.loads(as_json(learnt(next(iter(WALKS)), join_share=0.5)).read())
+    with pytest.raises(KeyError):
+        names()["from_json"](io.StringIO(json.dumps(about | {"format": 3})))
+    with pytest.raises(KeyError, match="actions"):
+        names()["from_json"](io.StringIO(json.dumps({**about, "format": 1})))
+
+
 def test_the_runner_is_as_long_as_the_page_says():
     lines = [line for line in RUNNER.splitlines() if line.strip()]
-    assert len(lines) <= 50
-    assert len(lines[lines.index("class Runner:") : lines.index("def from_json(file):")]) <= 32
+    assert len(lines) <= 58
+    assert len(lines[lines.index("class Runner:") : lines.index("def from_json(file):")]) <= 38

@@ -575,12 +575,12 @@ def describe_policy(
             )
         ),
         **({} if wandered is None else {"rollouts": as_json(wandered)}),  # left out on the grid: older digests
-        **_joining(policy),
+        **joining_of(policy),
         **({} if policy.ties is None else {"ties": as_json(policy.ties)}),  # left out as before there was a rule
     }
 
 
-def _joining(policy: Policy) -> dict[str, Any]:
+def joining_of(policy: Policy) -> dict[str, Any]:
     """Return the format and the joining table of a policy; nothing by the rule nearest, which every client knows."""
     domain = policy.domain
     if domain.finishes_unjoined:
