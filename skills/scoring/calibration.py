@@ -10,9 +10,9 @@ The model predicts a rating and a level as sums of a few figures, each with its 
 So a weight is the number of points by which the rating changes when a figure changes by one standard deviation of the
 cohort. A figure outside the range of the calibration is reported, because a sum means nothing there.
 
-The fit is ridge regression for the rating and logistic regression, from scikit-learn, for the level, on standardised
-figures and with one fixed strength each: a cohort of eight surgeons is too small to choose it by. A trial with several
-motions has the same weight as any other, and is judged by their mean.
+The fit is ridge regression for the rating and logistic regression for the level, on standardised figures, both from
+scikit-learn and with one fixed strength each: a cohort of eight surgeons is too small to choose it by. A trial with
+several motions has the same weight as any other, and is judged by their mean.
 
 Trials of one surgeon are alike, so a model is judged on surgeons all of whose trials are left out. Leaving out has a
 bias: without a good trial the mean of the others is lower, so that predictions of nothing but the mean fall as the
@@ -603,7 +603,7 @@ def _spearman(several: Floats, other: Floats) -> Floats:
 def _fitted(cohort: Cohort, inside: Flags, columns: tuple[int, ...] | None, margin: float = 0.0) -> SkillModel:
     """Fit to the trials marked in `inside`, shape (T,)."""
     from sklearn import config_context
-    from sklearn.linear_model import LogisticRegression
+    from sklearn.linear_model import LogisticRegression, Ridge
 
     chosen = list(range(len(MODELLED)) if columns is None else columns)
     taken = inside[cohort.trials]
@@ -613,27 +613,26 @@ def _fitted(cohort: Cohort, inside: Flags, columns: tuple[int, ...] | None, marg
     scale = np.sqrt(np.average((values - centre) ** 2, axis=0, weights=weights))
     scale[~(scale > 1e-9 * np.abs(centre).clip(1e-9))] = 1.0  # it never varied
     standard = ((values - centre) / scale)[:, chosen]
-    ratings = cohort.ratings[trials]
-    mean = float(np.average(ratings, weights=weights))
-    weighted = (standard * weights[:, None]).T
-    ridge = np.linalg.solve(weighted @ standard + RIDGE * np.eye(len(chosen)), weighted @ (ratings - mean))
     levels = cohort.levels[trials]
     known = np.unique(levels)
     offsets, slopes = np.zeros(len(known)), np.zeros((len(known), len(chosen)))
+    logistic = LogisticRegression(C=LOGISTIC, max_iter=1000)
+    with config_context(assume_finite=True, skip_parameter_validation=True):  # `Cohort` has checked the numbers
+        ridge = Ridge(alpha=RIDGE).fit(standard, cohort.ratings[trials], sample_weight=weights)
+        if len(known) > 1:
+            logistic.fit(standard, levels, sample_weight=weights)
     if len(known) > 1:
-        with config_context(assume_finite=True, skip_parameter_validation=True):  # `Cohort` has checked the numbers
-            logistic = LogisticRegression(C=LOGISTIC, max_iter=1000).fit(standard, levels, sample_weight=weights)
         first = len(known) - len(logistic.coef_)  # with two levels scikit-learn gives weights to the second alone
         offsets[first:], slopes[first:] = logistic.intercept_, logistic.coef_
     rating_weights, level_weights = np.zeros(len(MODELLED)), np.zeros((len(known), len(MODELLED)))
-    rating_weights[chosen], level_weights[:, chosen] = ridge, slopes
+    rating_weights[chosen], level_weights[:, chosen] = ridge.coef_, slopes
     return SkillModel(
         figures=MODELLED,
         centre=centre,
         scale=scale,
         lowest=values.min(axis=0),
         highest=values.max(axis=0),
-        rating=mean,
+        rating=float(ridge.intercept_),
         rating_weights=rating_weights,
         rating_margin=margin,
         levels=tuple(LEVELS[level] for level in known),
