@@ -74,7 +74,7 @@ class Settings(BaseSettings):
     replay_lower_bound: float = Field(default=0.95, ge=0, le=1)
     # the release gate requires that every start so near to the demonstrated one, an uncalibrated arm's error, ...
     near_radius_mm: float = Field(default=3.0, gt=0, allow_inf_nan=False)
-    # ... follows this share of the demonstration; recordings and samples: 0.76 or more, see docs/joining.md
+    # ... follows this share of the demonstration; recordings and samples: 0.91 or more, see docs/joining.md
     near_least_share: float = Field(default=0.4, ge=0, le=1)
     # greatest turn of the surgeon's, of a plan to export or a version to release that holds the jaw; beyond it the
     # needle would stand in the jaws as no estimate of success allows for

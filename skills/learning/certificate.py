@@ -57,7 +57,7 @@ class NearLimits:
         radius_mm: A start is near if a position within this distance of the demonstrated start's centre lies in its
             cell. Ours: 3 mm, the tip error of an uncalibrated arm, which may start there when sent to the demonstrated
             start.
-        least_share: Least share of the demonstration that every near start must follow. Ours: 0.4, between the 0.76 or
+        least_share: Least share of the demonstration that every near start must follow. Ours: 0.4, between the 0.91 or
             more of all recordings and samples, and the 0.1 or less of paths that come back beside their start
             (docs/joining.md).
     """

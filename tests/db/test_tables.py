@@ -59,7 +59,7 @@ def full(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
     url = backends.fresh(request.param, tmp_path_factory.mktemp("full"))
     database = Database(url)
     cases.add_surgeon(database)
-    demo, other = (cases.add_demo(database, cases.hand_off((shift, 0.0, 0.0))) for shift in (0.0, 2.5))
+    demo, other = (cases.add_demo(database, cases.hand_off((shift, 0.0, 0.0))) for shift in (0.0, 1.0))
     cases.train(database, demos=[demo.sha256, other.sha256])
     cases.train(database, release=True)
     posed = cases.store(database, cases.upload(cases.bag(), "application/vnd.mcap"))

@@ -102,9 +102,9 @@ def test_an_outcome_is_stored_and_a_repetition_does_not_change_it(database: Data
         with pytest.raises(Conflict, match=r"is stored as a failure \(The needle fell") as refused:
             add(database, **other)
         assert refused.value.remedies == (Remedy(Action.MARK_DEMO, demo=demo.sha256, outcome=other["outcome"]),)
-    unmarked = add(database, 2.5)
+    unmarked = add(database, 1.0)
     with pytest.raises(Conflict, match="stored without an outcome"):
-        add(database, 2.5, outcome="success")
+        add(database, 1.0, outcome="success")
     with database.reading() as session:
         assert session.get_one(Demonstration, unmarked.row).outcome is None
     assert actions(database) == [("mark-failure", "test")]
@@ -113,7 +113,7 @@ def test_an_outcome_is_stored_and_a_repetition_does_not_change_it(database: Data
 
 
 def test_demonstrations_are_listed_by_outcome_with_one_statement(database: Database):
-    rows = {what: add(database, shift).row for shift, what in ((0.0, "unknown"), (2.5, "success"), (5.0, "failure"))}
+    rows = {what: add(database, shift).row for shift, what in ((0.0, "unknown"), (1.0, "success"), (5.0, "failure"))}
     for what, row in rows.items():
         if what != "unknown":
             with database.reading() as session:
@@ -150,7 +150,7 @@ def test_a_mark_is_seen_with_its_surgeon_and_goes_with_its_demonstration(databas
 
 @FAILED
 def test_what_failed_is_learnt_from_only_if_told(database: Database, outcome: str):
-    good, bad = add(database), add(database, 2.5)
+    good, bad = add(database), add(database, 1.0)
     mark(database, bad, outcome)
     assert cases.ask_training(database).request["demos"] == [good.sha256]
     with pytest.raises(Conflict, match=f"is marked {outcome}: The needle fell.") as refused:
@@ -176,7 +176,7 @@ def test_a_training_of_successes_keeps_identity_and_manifest(database: Database)
 
 
 def test_a_policy_of_any_outcome_names_the_outcomes(database: Database):
-    good, bad, unknown = add(database), add(database, 2.5), add(database, 5.0)
+    good, bad, unknown = add(database), add(database, 1.0), add(database, 5.0)
     mark(database, good, "success", None)
     mark(database, bad, "failure")
     demos = [one.sha256 for one in (bad, unknown, good)]
@@ -209,7 +209,7 @@ def test_a_card_states_the_samples_that_were_dropped(database: Database):
     rows = [f"{k * 0.01:.2f},{min(k, 150) * 0.2:.2f},50,-120" for k in range(200)]
     rows[50] = rows[50].replace("0.50,", "0.48,")
     demo = cases.add_demo(database, "\n".join(["t_s,x_mm,y_mm,z_mm", *rows, rows[-1]]).encode(), segment="whole")
-    sound = add(database, 2.5)
+    sound = add(database, 1.0)
     version = cases.train(database, demos=[demo.sha256, sound.sha256], combine=Medoid())
     with database.reading() as session:
         card = card_of(session, find_by_digest(session, version.sha256)).written()
@@ -225,7 +225,7 @@ def test_a_card_states_the_samples_that_were_dropped(database: Database):
 
 @FAILED
 def test_a_mark_withdraws_the_releases_that_rest_on_it(database: Database, outcome):
-    first, demo = add(database), add(database, 2.5)
+    first, demo = add(database), add(database, 1.0)
     cases.train(database, demos=[first.sha256], release=True)
     version = cases.train(database, release=True)
     assert served(database) == [2, 1]
@@ -244,7 +244,7 @@ def test_a_mark_withdraws_the_releases_that_rest_on_it(database: Database, outco
 
 
 def test_a_mark_of_one_of_several_demonstrations_withdraws_the_release(database: Database):
-    first, second, third = add(database), add(database, 2.5), add(database, 5.0)
+    first, second, third = add(database), add(database, 1.0), add(database, 5.0)
     cases.train(database, demos=[first.sha256, second.sha256], combine=Medoid(), release=True)
     cases.train(database, demos=[third.sha256], release=True)
     mark(database, first, "failure")
@@ -298,7 +298,7 @@ def test_a_mark_made_while_a_style_is_learnt(
 
 
 def test_a_batch_learns_from_the_newest_that_did_not_fail(database: Database):
-    good, bad = add(database), add(database, 2.5)
+    good, bad = add(database), add(database, 1.0)
     mark(database, bad, "failure")
     (style,) = styles_of(database, retrain(database))
     assert (style.demonstration_row, style.state) == (good.row, "done")
@@ -319,7 +319,7 @@ def test_a_mark_made_before_a_batch_learns_fails_its_style(database: Database):
 
 
 def test_a_batch_whose_demonstrations_have_all_been_marked_says_so(database: Database):
-    demos = [add(database), add(database, 2.5)]
+    demos = [add(database), add(database, 1.0)]
     cases.train(database, demos=[one.sha256 for one in demos], outcomes="any", release=True)
     job = ask_retraining(database)
     for demo in demos:
@@ -337,7 +337,7 @@ def test_a_batch_whose_demonstrations_have_all_been_marked_says_so(database: Dat
 def test_a_newer_failure_is_not_waited_for(database: Database):
     add(database)
     cases.train(database)
-    bad = add(database, 2.5)
+    bad = add(database, 1.0)
     for waits in (True, False):
         with database.reading() as session:
             (row,) = [styles for surgeon, styles in matrix(session).rows if surgeon.slug == "kestrel"]
@@ -346,7 +346,7 @@ def test_a_newer_failure_is_not_waited_for(database: Database):
 
 
 def test_a_failure_is_compared_only_if_named_and_in_no_percentile(database: Database):
-    good, bad = add(database), add(database, 2.5)
+    good, bad = add(database), add(database, 1.0)
     mark(database, bad, "failure")
     asked = {"surgeon": "kestrel", "suture": cases.SUTURE, "demo": bad.sha256}
     found = score(database, ScoreIn(**asked), read_told)
@@ -379,7 +379,7 @@ def restored(database: Database, folder: Path, *, listed: bool = True) -> Databa
 
 
 def test_a_mark_made_after_the_backup_is_made_again(database: Database, tmp_path: Path):
-    demo, other = add(database), add(database, 2.5)
+    demo, other = add(database), add(database, 1.0)
     mark(database, other, "recovery", "Dr Doe slipped.")
     version = cases.train(database, demos=[demo.sha256], release=True)
     back_up(database, tmp_path / "b.zip")

@@ -60,7 +60,7 @@ def served(database: Database) -> str | None:
 
 def two_releases(database: Database) -> tuple[str, str]:
     """Release a policy of one demonstration and then one of another; return their demonstrations."""
-    demos = [cases.add_demo(database, cases.hand_off((shift, 0.0, 0.0))).sha256 for shift in (0.0, 2.5)]
+    demos = [cases.add_demo(database, cases.hand_off((shift, 0.0, 0.0))).sha256 for shift in (0.0, 1.0)]
     for demo in demos:
         cases.train(database, demos=[demo], release=True)
     return demos[0], demos[1]

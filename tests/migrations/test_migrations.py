@@ -129,7 +129,7 @@ def test_what_the_first_version_stored_is_kept_whole_and_still_guarded(database:
 def test_a_policy_of_several_demos_cannot_be_downgraded_to_one_demo(database: Database):
     database.migrate()
     cases.add_surgeon(database)
-    demos = [cases.add_demo(database, cases.hand_off((shift, 0.0, 0.0))).sha256 for shift in (0.0, 2.5)]
+    demos = [cases.add_demo(database, cases.hand_off((shift, 0.0, 0.0))).sha256 for shift in (0.0, 1.0)]
     cases.train(database, demos=demos)
     with pytest.raises(RuntimeError, match="several demonstrations"):
         go(database, command.downgrade, "0008")
