@@ -306,6 +306,8 @@ def cell(value: Any) -> str:
     """Return a value as the text of a table cell."""
     if value is None:
         return ""
+    if isinstance(value, float):
+        return str(round(value, 6))
     return f"{value:%Y-%m-%d %H:%M:%SZ}" if isinstance(value, datetime) else str(value)
 
 
