@@ -38,7 +38,7 @@ from skills.db.session import Database
 from skills.errors import PreconditionFailed, SkillsError, TooMany, UnknownFormat
 from skills.formats import BYTES
 from skills.library import policies
-from skills.library.integrity import learnt
+from skills.library.integrity import covered, learnt
 from skills.library.jobs import ACTIVE, find_job, find_jobs, job_json
 from skills.library.pose_styles import pose_style_json, poses_of
 from skills.library.recordings import damaged
@@ -210,8 +210,9 @@ def _encode(policy: PolicyVersion, release: Release | None, media_type: str) -> 
     else:
         about = policies.about_policy(policy, release)
         about[policies.table_name(about, "actions")] = policies.actions_of(learnt(policy))
-        live = policies.live_actions_of(learnt(policy))
-        if live is not None:  # left out otherwise: a client of before verifies it
+        # An older version is served as it was, and a smaller one too: a client of before verifies every field.
+        live = None if covered(policy).share is None else policies.live_actions_of(learnt(policy))
+        if live is not None:
             about[policies.table_name(about, "live_actions")] = live
         about["arrays"] = f"/policy-versions/{policy.sha256} with Accept: {NPZ}"
         content = orjson.dumps(about)

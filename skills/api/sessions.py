@@ -14,11 +14,13 @@ sends the reason: a client that does not read cannot hold up a watcher.
 """
 
 import asyncio
+import logging
 from collections import Counter
 from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import date
+from functools import partial
 from time import monotonic
 from typing import Any
 
@@ -44,6 +46,8 @@ from skills.library.pose_styles import next_json, poses_of
 from skills.schemas.requests import PoseIn
 from skills.settings import Settings
 
+log = logging.getLogger("skills.api")
+
 RATE_HZ = 100.0  # nominal; the bucket is refilled faster, so that a clock that runs fast by a quarter is not refused
 BURST, REFILL_HZ = 50.0, 125.0
 MESSAGE_BYTES = 4096  # a pose has about 200
@@ -55,6 +59,7 @@ CLOSE_S = 1.0  # for a client that does not read to take the reason
 AGAIN_S = 10.0
 WITHDRAWN, ERASED, FORBIDDEN, SIGNED_OUT, IDLE, FLOODED, BUSY = 4404, 4410, 4403, 4401, 4408, 4429, 4503
 NO_JSON, NO_TEXT = 1007, 1003  # of RFC 6455
+UNWATCHED = "The service cannot see a withdrawal; open the session again."
 UNREADABLE = "The database cannot be read, so a withdrawal would not be seen; open the session again."
 
 
@@ -152,7 +157,7 @@ class Sessions:
             pinned = await to_thread.run_sync(_pin, self._database.seen_by(caller.only), surgeon, suture)
             task = asyncio.current_task()
             assert task is not None
-            follower = Follower(pinned, socket.scope["ask_again"], task)
+            follower = Follower(pinned, partial(socket.scope["ask_again"], socket.scope), task)
             with self._watched(follower, began_s):
                 await self._hold(socket, follower)
 
@@ -231,6 +236,8 @@ class Sessions:
         if not self._watching:
             self._known_s = began_s
             self._watching = [asyncio.create_task(self._watch_releases()), asyncio.create_task(self._watch_callers())]
+            for one in self._watching:
+                one.add_done_callback(self._watched_no_more)
         try:
             yield
         finally:
@@ -239,6 +246,14 @@ class Sessions:
                 for one in self._watching:
                     one.cancel()
                 self._watching = []
+
+    def _watched_no_more(self, watcher: "asyncio.Task[None]") -> None:
+        """End all sessions if a watcher failed: a withdrawal would not be seen."""
+        if watcher.cancelled() or watcher.exception() is None:
+            return
+        log.error("a watcher of sessions failed", exc_info=watcher.exception())
+        for one in self._open:
+            one.end(BUSY, UNWATCHED)
 
     async def _watch_releases(self) -> None:
         """End sessions whose release must not be followed any more, and those that nobody uses."""

@@ -213,7 +213,8 @@ def live_actions_of(policy: Policy) -> list[dict[str, list[int]]] | None:
 def arrays_of(version: PolicyVersion) -> bytes:
     """Return a policy's arrays as the bytes of an .npz, Q values and confidence on the certified domain only.
 
-    The grid is in it, so that the file alone runs the policy (docs/running.md). If the policy has a network, `network`
+    The grid is in it, so that the file alone runs the policy (docs/running.md), but not in that of a version which was
+    learnt before there were shares: its bytes stay the same. If the policy has a network, `network`
     holds the bytes of its safetensors file. By another joining rule than the nearest waypoint there are `format` and
     `joins`, (n_states,), the phase after starting in a state or moving onto it in phase 0; and `action` is called
     `action_joining`, see `table_name`.
@@ -226,7 +227,9 @@ def arrays_of(version: PolicyVersion) -> bytes:
     if policy.network is not None:
         learnt_too["network"] = np.frombuffer(policy.network.tensors, np.uint8)
     if coverage.share is not None:  # an older version is served as it was
-        learnt_too["share"] = coverage.share
+        grid = policy.path.grid
+        learnt_too |= {"share": coverage.share, "origin_mm": np.array(grid.origin_mm)}
+        learnt_too |= {"cell_mm": np.float64(grid.cell_mm), "shape": np.array(grid.shape, np.int64)}
     if "joining" in manifest:
         learnt_too |= {"format": np.int32(manifest["format"]), "joins": domain.joins.astype(np.int32)}
     np.savez_compressed(
@@ -237,9 +240,6 @@ def arrays_of(version: PolicyVersion) -> bytes:
         **{table_name(manifest, "action"): policy.greedy[kept]},  # type: ignore[arg-type]
         q=policy.q[kept],
         confidence=policy.confidence[kept],
-        origin_mm=np.array(policy.path.grid.origin_mm),
-        cell_mm=np.float64(policy.path.grid.cell_mm),
-        shape=np.array(policy.path.grid.shape, np.int64),
         waypoints=policy.path.states,
         reaches_goal=coverage.reaches,
         joins_nearest=coverage.joins_nearest,

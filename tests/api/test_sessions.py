@@ -22,6 +22,7 @@ from skills.api.sessions import (
     NO_TEXT,
     SIGNED_OUT,
     UNREADABLE,
+    UNWATCHED,
     WITHDRAWN,
 )
 from skills.errors import Busy
@@ -191,6 +192,16 @@ def test_a_new_release_is_told_and_changes_nothing(posed: Service):
         until(lambda: newer() == 2)
     with opened(posed) as socket:
         assert socket.receive_json()["version"] == 2
+
+
+def test_sessions_end_where_their_watcher_fails(posed: Service, monkeypatch: pytest.MonkeyPatch, caplog):
+    def fails(*_: object) -> None:
+        raise TypeError("planted")
+
+    monkeypatch.setattr(sessions, "_look", fails)
+    with opened(posed) as socket:
+        assert closed(socket) == (BUSY, UNWATCHED)
+    assert "a watcher of sessions failed" in caplog.text
 
 
 def test_a_revoked_key_closes_its_session_and_no_other(posed: Service):
