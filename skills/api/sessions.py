@@ -28,6 +28,7 @@ import orjson
 from anyio import to_thread
 from pydantic import ValidationError
 from sqlalchemy.exc import SQLAlchemyError
+from starlette.types import Scope
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from skills.api.authorisation import Caller
@@ -53,7 +54,7 @@ BURST, REFILL_HZ = 50.0, 125.0
 MESSAGE_BYTES = 4096  # a pose has about 200
 MOST = 400  # sessions of this process; 50 at 100 Hz take about a core
 WATCH_S = 0.2  # between two looks for changes of releases
-CALLER_S = 0.5  # between two checks of the callers; a look-up of a key is cached for a second
+CALLER_S = 0.5  # for one check of each caller; a look-up of a key is cached for a second
 UNKNOWN_S = 1.5  # without an answer of the database for so long, a release may have been withdrawn
 CLOSE_S = 1.0  # for a client that does not read to take the reason
 AGAIN_S = 10.0
@@ -81,6 +82,7 @@ class Follower:
 
     pinned: Pinned
     ask_again: Callable[[], Awaitable[Caller]]
+    credentials: Any  # of equal ones the caller is the same
     task: "asyncio.Task[Any]"
     heard_s: float = field(default_factory=monotonic)
     bucket: Bucket = field(default_factory=lambda: Bucket(BURST, REFILL_HZ))
@@ -94,15 +96,16 @@ class Follower:
             self.ended = code, reason
             self.task.cancel()
 
-    async def ask_caller(self) -> None:
-        """End it if its caller may not use it any more."""
+    async def refused(self) -> tuple[int, str] | None:
+        """Return why its caller may not use it any more, or None."""
         try:
             caller = await self.ask_again()
             caller.must_be("reader")
         except Busy:
-            self.end(BUSY, UNREADABLE)
+            return BUSY, UNREADABLE
         except SkillsError:
-            self.end(SIGNED_OUT, "The key is revoked or expired.")
+            return SIGNED_OUT, "The key is revoked or expired."
+        return None
 
     def answer(self, text: str) -> bytes:
         """Return the answer to a message.
@@ -157,7 +160,8 @@ class Sessions:
             pinned = await to_thread.run_sync(_pin, self._database.seen_by(caller.only), surgeon, suture)
             task = asyncio.current_task()
             assert task is not None
-            follower = Follower(pinned, partial(socket.scope["ask_again"], socket.scope), task)
+            ask_again = partial(socket.scope["ask_again"], socket.scope)
+            follower = Follower(pinned, ask_again, _credentials(socket.scope), task)
             with self._watched(follower, began_s):
                 await self._hold(socket, follower)
 
@@ -284,8 +288,23 @@ class Sessions:
     async def _watch_callers(self) -> None:
         """End the sessions of callers who may not use them any more."""
         while True:
-            await asyncio.sleep(CALLER_S)
-            await asyncio.gather(*(one.ask_caller() for one in self._open))
+            callers: dict[Any, list[Follower]] = {}
+            for one in self._open:
+                callers.setdefault(one.credentials, []).append(one)
+            if not callers:
+                await asyncio.sleep(CALLER_S)
+            # One after the other: all at once would hold up the answers of every session.
+            for same in callers.values():
+                await asyncio.sleep(CALLER_S / len(callers))
+                if (why := await same[0].refused()) is not None:
+                    for one in same:
+                        one.end(*why)
+
+
+def _credentials(scope: Scope) -> tuple[Any, ...]:
+    """Return all that a caller is recognised by: the address, and every header but those of the WebSocket itself."""
+    sent = (header for header in scope["headers"] if not header[0].startswith(b"sec-websocket-"))
+    return (scope["client"] or ("",))[0], *sorted(sent)
 
 
 def _pin(database: Database, surgeon: str, suture: str) -> Pinned:
