@@ -49,7 +49,7 @@ def test_the_demo_does_the_main_job_and_exits_with_0(
     assert {surgeon for surgeon, _, _ in styles} == surgeons
     assert all(exact == states for _, exact, states in styles)
     pictures = tmp_path / "build" / "demo"
-    learnt = "333 of 333 states, DTW 0 mm, 54% of the demonstration from a start on average; released."
+    learnt = "333 of 333 states, DTW 0 mm, 57% of the demonstration from a start on average; released."
     assert (learnt if real else "No real recording:") in printed
     assert ("Played back at its own place: No hand-off: feasible in an exact simulation" in printed) == real
     assert len(list(pictures.glob("*-playback.png"))) >= len(styles)
