@@ -49,8 +49,8 @@ def lasting(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
 
 @pytest.fixture
 def service(request: pytest.FixtureRequest, label: str) -> Service:
-    """Return the shared service, or a new one for operations that delete."""
-    shared = not label.startswith("DELETE")
+    """Return the shared service, or a new one for operations that delete, and at night: many requests change more."""
+    shared = not label.startswith("DELETE") and request.node.get_closest_marker("nightly") is None
     found: Service = request.getfixturevalue("lasting" if shared else "trained")
     return found
 
