@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from skills.arrays import Floats, Ints
 from skills.errors import BadSettings
-from skills.gridworld.grid import MOVES, GridPath
+from skills.gridworld.grid import MOVES, GridPath, moves_between
 from skills.gridworld.reward import RewardMap
 
 REACH = 2  # cells; part of the interface: a hand or an arm pushed two cells off its path is still led back
@@ -131,8 +131,7 @@ class Domain:
         """
         phases, cells = np.asarray(phases), np.asarray(cells)
         waypoints = self.path.cells
-        ahead = np.abs(cells - waypoints[phases]).max(axis=-1)
-        behind = np.abs(cells - waypoints[phases - 1]).max(axis=-1)
+        ahead, behind = (moves_between(cells, waypoints[of]) for of in (phases, phases - 1))
         return np.asarray((phases == 0) | (np.minimum(ahead, behind) <= REACH))
 
     def rows_of(self, phases: ArrayLike, cells: ArrayLike) -> Ints:

@@ -72,7 +72,9 @@ class GridWorld:
     def holds(self, cells: ArrayLike) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
         """Return for each cell, (..., 3), whether it is in the grid."""
         cells = np.asarray(cells)
-        return np.asarray(((cells >= 0) & (cells < self.shape)).all(axis=-1))
+        inside = (cells >= 0) & (cells < self.shape)
+        # Not `all`, which takes several times as long over an axis of three.
+        return np.asarray(inside[..., 0] & inside[..., 1] & inside[..., 2])
 
     def states_of(self, cells: ArrayLike) -> Ints:
         """Return the states of cells, (..., 3): the paper's StateToIndex, with bounds checked.
@@ -153,6 +155,18 @@ class GridWorld:
     def centres_of(self, cells: ArrayLike) -> Floats:
         """Return the centres in mm, (..., 3), of cells, (..., 3)."""
         return np.asarray(np.asarray(self.origin_mm) + self.cell_mm * np.asarray(cells), np.float64)
+
+
+def moves_between(cells: Ints, others: Ints) -> Ints:
+    """Return the least number of moves between cells, (...,): the largest difference along an axis.
+
+    Args:
+        cells: Cells, shape (..., 3).
+        others: Other cells, of the same shape, or one cell.
+    """
+    away = np.abs(cells - others)
+    # Not `max`, which takes several times as long over an axis of three.
+    return np.asarray(np.maximum(np.maximum(away[..., 0], away[..., 1]), away[..., 2]))
 
 
 PAPER_GRID = GridWorld(paper.GRID_ORIGIN_MM, paper.CELL_MM, paper.GRID_SHAPE)

@@ -30,7 +30,7 @@ from numpy.typing import ArrayLike
 from skills.arrays import Bytes, Flags, Floats, Ints
 from skills.errors import BadSettings
 from skills.gridworld.domain import Domain, Moves, check_join_share
-from skills.gridworld.grid import MOVES
+from skills.gridworld.grid import MOVES, moves_between
 from skills.gridworld.reward import RewardMap
 from skills.gridworld.scene import STAY, Hazards
 from skills.learning import _kernels
@@ -95,16 +95,15 @@ def exact_values(mdp: Mdp) -> Floats:
 def _moves_to_go(mdp: Mdp) -> tuple[Floats, Floats]:
     """Return d - 1 and A_p of each row above phase 0, both (rows,); 0 in phase 0."""
     domain, levels, gamma = mdp.domain, mdp.reward.levels, mdp.gamma
-    waypoints = domain.path.cells
-    moves, arrivals = np.zeros(domain.n_rows), np.zeros(domain.n_rows)
-    arrival = levels.goal  # A_p, from the last phase down
-    for phase in range(domain.phases - 1, 0, -1):
-        rows = slice(domain.offset[phase], domain.offset[phase + 1])
-        moves[rows] = np.abs(domain.cell_of[rows] - waypoints[phase]).max(axis=1).clip(1) - 1.0
-        arrivals[rows] = arrival
-        behind = max(1, int(np.abs(waypoints[phase - 1] - waypoints[phase]).max()))
-        arrival = levels.visited + gamma * gamma ** (behind - 1.0) * arrival
-    return moves, arrivals
+    waypoints, later = domain.path.cells, slice(domain.offset[1], None)
+    behind = moves_between(waypoints[1:], waypoints[:-1]).clip(1).tolist()
+    arrival = np.zeros(domain.phases)  # A_p
+    arrival[1:] = levels.goal
+    for phase in range(domain.phases - 2, 0, -1):
+        arrival[phase] = levels.visited + gamma * gamma ** (behind[phase] - 1.0) * arrival[phase + 1]
+    moves = np.zeros(domain.n_rows)
+    moves[later] = moves_between(domain.cell_of[later], waypoints[domain.phase_of[later]]).clip(1) - 1.0
+    return moves, arrival[domain.phase_of]
 
 
 def _phase_0_values(mdp: Mdp, values: Floats) -> Floats:

@@ -200,7 +200,7 @@ def _walks(domain: Domain, actions: Ints, moves: Moves, rule: ShortestWay) -> tu
     joins = (moves.row >= 0) & (domain.phase_of[moves.row] != domain.phase_of)
     arrives = ends | ((actions >= 0) & (moves.finishes | moves.advances | joins))
     after = np.append(np.where(arrives | (actions < 0) | (moves.row < 0), none, moves.row), none)
-    step = np.array(_kernels.STEPS)[np.abs(MOVES[actions]).sum(axis=1)]
+    step = np.array(_kernels.STEPS)[np.abs(MOVES).sum(axis=1)][actions]
     length = np.append(np.where(ends, 0, step), 0)
     deepest = depth[domain.state_of]
     deepest = np.append(np.where(ends, deepest, np.maximum(deepest, depth[moves.state])), np.iinfo(np.int64).min)

@@ -391,6 +391,8 @@ def joining_rules(session: Session, surgeons: Collection[int] | None = None) -> 
     Returns:
         The least share, by style: a surgeon's row and a suture type.
     """
+    if surgeons is not None and not surgeons:
+        return {}
     rule = PolicyVersion.manifest["settings"]["join_share"].as_float()
     query = select(Release.surgeon_row, Release.suture, rule).join(
         PolicyVersion, PolicyVersion.row == Release.policy_row

@@ -124,11 +124,21 @@ def trace(demo: Demo, path: GridPath) -> Trace:
     waypoints = np.concatenate((waypoints, bridged))
     order = np.argsort(waypoints, kind="stable")
     moving = order[_moving(calm[order], MOVED * path.grid.cell_mm)]
+    ends = ends_of(demo, path)
+    return Trace(path, calm[moving], waypoints[moving], times[moving], ends, float(demo.stamps_s[-1]))
+
+
+def ends_of(demo: Demo, path: GridPath) -> Floats:
+    """Return the first and the last sample of a demonstration, each within its cell, shape (2, 3).
+
+    Args:
+        demo: The demonstration.
+        path: The path that `discretize` made from it.
+    """
     half = path.grid.cell_mm * (0.5 - INSIDE)
     centres = path.tip_mm[[0, -1]]
     # hysteresis lets a sample belong to a cell from just outside of it
-    ends = demo.tip_mm[[0, -1]].clip(centres - half, centres + half).round(6)
-    return Trace(path, calm[moving], waypoints[moving], times[moving], ends, float(demo.stamps_s[-1]))
+    return demo.tip_mm[[0, -1]].clip(centres - half, centres + half).round(6)
 
 
 def fit_to_demo(followed: Rollout, demonstrated: Trace, start_mm: Floats | None = None) -> FittedPath:

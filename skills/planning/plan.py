@@ -58,7 +58,7 @@ from skills.planning.hand import Hand, hand_along, moved
 from skills.planning.handoff import PsmM, needle_tips_mm, realign
 from skills.planning.motion_laws import Pose, followed
 from skills.planning.passes import PassPath, Way, ways
-from skills.planning.path_fit import Trace, fit_to_demo, trace
+from skills.planning.path_fit import Trace, ends_of, fit_to_demo, trace
 
 MAX_PASSES = 200
 RATE_HZ = (100.0, 200.0)  # of the plans that a robot's controller follows
@@ -524,7 +524,7 @@ def _at_its_own_place(policy: Policy, demo: Demo) -> SuturePlan:
     """Plan one pass at the demonstrated place, along the fitted path if one can be fitted."""
 
     def pass_along(recorded: Demo | None) -> SuturePlan:
-        goal_mm = policy.path.tip_mm[-1] if recorded is None else trace(recorded, policy.path).ends_mm[1]
+        goal_mm = policy.path.tip_mm[-1] if recorded is None else ends_of(recorded, policy.path)[1]
         x, y, z = goal_mm.tolist()
         return stack(
             policy,
