@@ -152,6 +152,8 @@ def test_from_a_bag_folder_to_a_released_policy_and_a_plan(with_worker, tmp_path
     assert (code, "Write nearest, start, or a share from 0 to 1" in said) == (1, True)
     code, said = skills("train", *STYLE, "--join", "start", "--learner", "cell-q-learning")
     assert (code, "cell-q-learning has no phases" in said) == (1, True)
+    code, said = skills("train", *STYLE, "--learner", "cell-q-learning", "--setting", "gamma=0.95")
+    assert (code, "use a gamma below 0.9" in said) == (1, True)
     code, said = skills("rollout", *STYLE, "--start", "-30,25,-140", "--json")
     assert json.loads(said)["finished"]
     exported = tmp_path / "policy.json"

@@ -9,7 +9,7 @@ the shortest way (`skills.learning.ties`); the others, whose values have not set
 
 from dataclasses import asdict, dataclass
 from functools import cached_property
-from math import dist
+from math import dist, inf
 from typing import Any, get_args
 
 import numpy as np
@@ -100,12 +100,12 @@ def check_learnable(reward: RewardMap, learner: Learner, seed: int) -> None:
         seed: The seed.
 
     Raises:
-        BadSettings: The seed is not an integer from 0 to 2^63 - 1, or arriving would not pay (see `_refuse_loops`), or
+        BadSettings: The seed is not an integer from 0 to 2^63 - 1, or arriving would not pay (see `refuse_loops`), or
             the grid is too large for memory.
     """
     if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed <= MAX_SEED:
         raise BadSettings("The seed must be an integer from 0 to 2^63 - 1.")
-    _refuse_loops(reward.levels, learner)
+    refuse_loops(reward.levels, learner)
     refuse_too_large(reward.path, learner)
 
 
@@ -134,10 +134,17 @@ def _without_moving(*, settled: bool) -> Training:
     return Training(steps=0, updates=0, episodes=0, finished=0, out_of_steps=0, out_of_time=0, settled=settled)
 
 
-def _refuse_loops(levels: RewardLevels, learner: Learner) -> None:
-    """Refuse rewards under which going round in circles pays more than arriving.
+def refuse_loops(levels: RewardLevels, learner: Learner) -> None:
+    """Refuse settings with which going round in circles pays more than arriving.
 
     `MaxEntIRL` learns from other rewards, but is certified against these with its gamma.
+
+    Args:
+        levels: The rewards of Algorithm 1.
+        learner: The settings of the learner.
+
+    Raises:
+        BadSettings: A loop pays more; the message has the greatest gamma with which it does not.
     """
     if learner.phased:
         if levels.other != 0:
@@ -145,13 +152,11 @@ def _refuse_loops(levels: RewardLevels, learner: Learner) -> None:
         return  # no waypoint pays twice, so no loop does
     if levels.visited <= 0:
         return  # standing still never pays, and the goal pays more
-    if learner.gamma == 1:
-        raise BadSettings("With gamma 1 the value of standing on a visited cell is infinite; use a gamma below 1.")
-    looping = levels.visited / (1 - learner.gamma)
+    looping = inf if learner.gamma == 1 else levels.visited / (1 - learner.gamma)
     if not levels.goal > looping:
         raise BadSettings(
-            f"Standing on a visited cell is worth {looping:g} in the long run, arriving only {levels.goal:g}: use "
-            f"a goal above {looping:g} or a gamma below {1 - levels.visited / levels.goal:g}.",
+            f"Standing on a visited cell is worth {looping:g} in the long run, arriving only {levels.goal:g}: "
+            f"use a gamma below {1 - levels.visited / levels.goal:g}.",
             gamma=learner.gamma,
         )
 

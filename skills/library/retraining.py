@@ -14,18 +14,16 @@ from sqlalchemy.orm import Session
 from skills.db import rfc3339
 from skills.db.models import Demonstration, PolicyVersion, Surgeon, SutureType
 from skills.db.service_tables import Job, StyleToRetrain
-from skills.deep import require_installed
 from skills.errors import Conflict, NotFound
 from skills.learning.certificate import NearLimits
 from skills.learning.policy import LEARNER_VERSION, describe_learner
-from skills.learning.q_learning import PhaseQLearning
 from skills.library import jobs
 from skills.library.catalogue import find_surgeon, find_suture_type
 from skills.library.demos import newest_demos
 from skills.library.jobs import BATCH, KEPT, PART, Asked, PartRequest, RetrainingRequest, did_nothing, with_rule
 from skills.library.policies import Recipe, joining_rules, recipes_of
 from skills.library.releases import Outcome
-from skills.library.training import GATE_VERSION, POSES_VERSION
+from skills.library.training import GATE_VERSION, POSES_VERSION, learner_to_train
 from skills.packing import canonical, sha256
 from skills.remedies import Action, Remedy
 from skills.schemas.requests import RetrainingIn
@@ -59,9 +57,10 @@ def request_retraining(session: Session, batch: RetrainingIn, actor: str, near: 
     Raises:
         NotFound: The surgeon or the suture type is unknown.
         Conflict: There is no demonstration that may be learnt from.
+        BadSettings: With the learner's settings going round in circles pays more than arriving.
         LearnerNotInstalled: The learner needs a library that is not installed.
     """
-    require_installed(learner := batch.chosen or PhaseQLearning())
+    learner = learner_to_train(batch.chosen)
     who = None if batch.surgeon is None else find_surgeon(session, batch.surgeon)
     what = None if batch.suture is None else find_suture_type(session, batch.suture)
     demos = _newest_demos(session, who, what)

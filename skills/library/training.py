@@ -34,7 +34,7 @@ from skills.demonstration.demonstration import Demo
 from skills.errors import BadInput, BadPlan, Conflict, NotFound, SkillsError
 from skills.fields import as_json
 from skills.gridworld.grid import discretisation_rmse
-from skills.gridworld.reward import RewardMap, sparse_reward
+from skills.gridworld.reward import RewardLevels, RewardMap, sparse_reward
 from skills.kinematics import instrument_of
 from skills.learning.certificate import Certificate, NearLimits, NearStarts, certify, least_gamma, near_starts
 from skills.learning.dynamic_programming import FAINT
@@ -46,6 +46,7 @@ from skills.learning.policy import (
     describe_learner,
     describe_settings,
     learner_of,
+    refuse_loops,
     refuse_too_large,
 )
 from skills.learning.q_learning import PhaseQLearning
@@ -118,10 +119,10 @@ def request_training(session: Session, training: TrainingIn, actor: str, near: N
             outcomes "any"; or the surgeon's consent does not cover training.
         BadInput: A demonstration belongs to another style or is named twice, there are too many, or they cannot be
             combined.
-        BadSettings: Learning would need too much memory.
+        BadSettings: Learning would need too much memory, or going round in circles would pay more than arriving.
         LearnerNotInstalled: The learner needs a library that is not installed.
     """
-    require_installed(learner := training.chosen or PhaseQLearning())
+    learner = learner_to_train(training.chosen)
     who, what = find_surgeon(session, training.surgeon), find_suture_type(session, training.suture)
     require(who, "training")
     any_outcome = training.outcomes == ANY
@@ -155,6 +156,19 @@ def request_training(session: Session, training: TrainingIn, actor: str, near: N
         return Asked(job, True, QUEUED)
     again = training.release and job.state == "succeeded"
     return Asked(job, False, _release_again(session, job, actor) if again else did_nothing(job))
+
+
+def learner_to_train(chosen: Learner | None) -> Learner:
+    """Return the learner of a request, by default phase Q-learning, if it can be used here.
+
+    Raises:
+        BadSettings: With its settings going round in circles pays more than arriving.
+        LearnerNotInstalled: It needs a library that is not installed.
+    """
+    learner = chosen or PhaseQLearning()
+    refuse_loops(RewardLevels(), learner)  # those of every demonstration that is added
+    require_installed(learner)
+    return learner
 
 
 def near_limits(settings: Settings) -> NearLimits:

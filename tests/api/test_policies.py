@@ -10,6 +10,9 @@ import orjson
 import pytest
 
 from skills.client import Client, Problem
+from skills.errors import BadSettings
+from skills.gridworld.reward import sparse_reward
+from skills.learning.policy import learn_tabular, learner_of
 from skills.learning.q_learning import CellQLearning
 from tests import backends
 from tests.api.service import CSV, GOAL_MM, KESTREL, POLICY, Service, assert_problem, copy_of_trained, serving
@@ -306,6 +309,25 @@ def test_a_learner_with_settings_that_cannot_be_meant_is_refused_at_once(still: 
     before = still.counts()
     assert_problem(still.http.post("/trainings", json={**KESTREL, "learner": learner}), 422)
     assert still.counts() == before
+
+
+@pytest.mark.parametrize("asks", ["/trainings", "/retrainings"])
+@pytest.mark.parametrize(
+    "learner",
+    [
+        {"kind": "cell-q-learning", "gamma": 0.95},
+        {"kind": "cell-q-learning", "gamma": 1.0},
+        {"kind": "max-ent-irl", "gamma": 0.9},
+    ],
+    ids=str,
+)
+def test_a_learner_that_could_only_learn_to_loop_is_refused(still: Service, asks: str, learner: dict):
+    before = still.counts()
+    refused = assert_problem(still.http.post(asks, json={**KESTREL, "learner": learner}), 422)
+    assert refused["detail"].endswith("use a gamma below 0.9.")
+    assert still.counts() == before
+    with pytest.raises(BadSettings, match="use a gamma below 0.9"):  # as a training would have failed
+        learn_tabular(sparse_reward(still.client.learnt(**KESTREL).path), learner_of(learner))
 
 
 def test_a_demo_in_a_frame_other_than_the_arms_base_is_not_released(service: Service):
