@@ -15,6 +15,10 @@ of motions that are not in step is smoother than each; afterwards the mean tempo
 
 Orientations are averaged as by Markley et al. (Averaging Quaternions, J. Guid. Control Dyn. 30, 2007): the mean is the
 eigenvector of the largest eigenvalue of the sum of the quaternions' outer products.
+
+Where demonstrations turn the jaw in unlike ways, their mean is further from another one than the shortest turn from
+start to goal. So the orientations are only a share of the way from that turn to the mean: the share that is best for
+each demonstration predicted from the others (`_turn_share`). It is 1 where they agree, and for a single one.
 """
 
 from collections.abc import Sequence
@@ -35,6 +39,11 @@ PHASES = 101  # ours: a hundredth of a hand-off of 5 s is a twentieth of a secon
 WARP_SMOOTHING = 3.0  # ours: standard deviation in phases; the steps of a DTW path are no tempo
 UNIT_TOLERANCE = 1e-3  # of a quaternion's length; three printed decimals pass
 LIKE_FLOOR = 1e-6  # of squared distances between situations; several demonstrations may share one
+SHARES = np.linspace(
+    1.0, 0.0, 21
+)  # of the demonstrations' turn, from which one is chosen; of equally good ones the first
+TRIED = 5  # every fifth phase is enough to choose it
+FAR_RAD = 0.9 * np.pi  # at half a turn from the shortest turn, the side on which the mean lies changes suddenly
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +57,8 @@ class PosePath:
         jaw_rad: Angle of the jaw, shape (N,); None if not every demonstration has it.
         spread_mm: Standard deviation of the demonstrations' positions about the path, shape (N,); 0 for a single one.
         spread_rad: Standard deviation of their orientations about the path, shape (N,).
+        turn_share: Where the orientations are between the shortest turn from start to goal, 0, and the mean of the
+            demonstrations, 1.
     """
 
     tip_mm: Floats
@@ -56,6 +67,7 @@ class PosePath:
     jaw_rad: Floats | None
     spread_mm: Floats
     spread_rad: Floats
+    turn_share: float = 1.0
 
     def __post_init__(self) -> None:
         count = len(self.tip_mm)
@@ -82,6 +94,7 @@ class PoseStyle:
         rotation_xyzw: Orientations, unit quaternions, shape (K, PHASES, 4).
         duration_s: Duration of each demonstration, shape (K,).
         jaw_rad: Angles of the jaw, shape (K, PHASES); None if not every demonstration has it.
+        turn_share: The share of their mean turn in a motion, 0 to 1; the rest is the shortest turn.
     """
 
     frame: str
@@ -89,6 +102,7 @@ class PoseStyle:
     rotation_xyzw: Floats
     duration_s: Floats
     jaw_rad: Floats | None = None
+    turn_share: float = 1.0
 
     def __post_init__(self) -> None:
         count = len(self.tip_mm)
@@ -120,7 +134,7 @@ class PoseStyle:
         ends = np.stack([frozen(start_mm, np.float64, (3,), "start_mm"), frozen(goal_mm, np.float64, (3,), "goal_mm")])
         turns = Rotation.from_quat([unit_quaternion(start_xyzw, "start_xyzw"), unit_quaternion(goal_xyzw, "goal_xyzw")])
         tips = np.stack([laid_tip(tip, ends) for tip in self.tip_mm])
-        rotations = np.stack([laid_rotation(rotation, turns) for rotation in self.rotation_xyzw])
+        rotations = laid_rotations(self.rotation_xyzw, turns)
         weights = self._weights(ends, turns)
         jaws = np.zeros(tips.shape[:2]) if self.jaw_rad is None else self.jaw_rad
         elapsed = np.linspace(0.0, 1.0, PHASES)
@@ -132,6 +146,10 @@ class PoseStyle:
             jaws = np.stack([_at(jaw, warp) for jaw, warp in zip(jaws, warps, strict=True)])
             elapsed = weights @ warps / (PHASES - 1)
         tip_mm, rotation = np.einsum("k,kpi->pi", weights, tips), mean_rotation(rotations, weights)
+        apart = _apart(_shortest(turns, elapsed), rotation)
+        turn_share = self.turn_share if np.linalg.norm(apart, axis=1).max() < FAR_RAD else 1.0
+        if turn_share < 1.0:
+            rotation = (_shortest(turns, elapsed) * Rotation.from_rotvec(turn_share * apart)).as_quat()
         off_mm = np.linalg.norm(tips - tip_mm, axis=2)
         dots = np.abs(np.einsum("kpi,pi->kp", rotations, rotation)).clip(0.0, 1.0)
         spread_mm, spread_rad = (np.sqrt(weights @ apart**2) for apart in (off_mm, 2 * np.arccos(dots)))
@@ -144,6 +162,7 @@ class PoseStyle:
             None if self.jaw_rad is None else _at(weights @ jaws, again),
             _at(spread_mm, again),
             _at(spread_rad, again),
+            turn_share,
         )
 
     def _weights(self, ends: Floats, turns: Rotation) -> Floats:
@@ -224,7 +243,43 @@ def learn_pose_style(demos: Sequence[Demo]) -> PoseStyle:
         np.stack(rotations),
         np.array([demo.stamps_s[-1] for demo in demos]),
         np.stack(jaws) if len(jaws) == len(demos) else None,
+        _turn_share(np.stack(rotations)),
     )
+
+
+def _turn_share(rotation_xyzw: Floats) -> float:
+    """Return the share of the demonstrations' mean turn that is best for one which is not among them.
+
+    Each demonstration is predicted from the others, between its own start and goal, with every one of `SHARES`. The
+    best share has the least mean angle. It is chosen once without the error of each demonstration, and the median of
+    these choices is returned, so that no single demonstration decides.
+
+    Args:
+        rotation_xyzw: The orientations of the demonstrations, unit quaternions, shape (K, PHASES, 4).
+    """
+    shown = rotation_xyzw[:, ::TRIED]
+    if len(shown) == 1:
+        return 1.0
+    errors, even = [], np.full(len(shown) - 1, 1.0 / (len(shown) - 1))
+    phase = np.linspace(0.0, 1.0, shown.shape[1])
+    for left_out, own in enumerate(shown):
+        ends = Rotation.from_quat(own[[0, -1]])
+        shortest = _shortest(ends, phase)
+        mean = mean_rotation(laid_rotations(np.delete(shown, left_out, axis=0), ends), even)
+        wanted, apart = shortest.inv() * Rotation.from_quat(own), _apart(shortest, mean)
+        errors.append([(Rotation.from_rotvec(-one * apart) * wanted).magnitude().mean() for one in SHARES])
+    total = np.sum(errors, axis=0) - errors
+    return float(np.median(SHARES[total.round(9).argmin(axis=1)]))
+
+
+def _shortest(ends: Rotation, shares: Floats) -> Rotation:
+    """Return the shortest turn from one orientation to another, at shares of it, (N,)."""
+    return Slerp([0.0, 1.0], ends)(shares.clip(0.0, 1.0))  # rounding may leave the range
+
+
+def _apart(base: Rotation, rotation_xyzw: Floats) -> Floats:
+    """Return the rotations, as vectors in rad, (N, 3), that lead from a base to orientations, (N, 4)."""
+    return np.asarray((base.inv() * Rotation.from_quat(rotation_xyzw)).as_rotvec())
 
 
 def unit_quaternion(values: ArrayLike, name: str) -> Floats:
@@ -239,24 +294,28 @@ def unit_quaternion(values: ArrayLike, name: str) -> Floats:
     return quaternion
 
 
-def _blend() -> Floats:
-    """Return the share of the goal's correction at each phase, (PHASES,): a smoothstep."""
-    phase = np.linspace(0.0, 1.0, PHASES)
+def _blend(count: int) -> Floats:
+    """Return the share of the goal's correction at each phase, (count,): a smoothstep."""
+    phase = np.linspace(0.0, 1.0, count)
     return np.asarray(phase * phase * (3.0 - 2.0 * phase))
 
 
 def laid_tip(tip_mm: Floats, ends_mm: Floats) -> Floats:
     """Return positions laid between two ends."""
-    share = _blend()[:, None]
+    share = _blend(len(tip_mm))[:, None]
     return np.asarray(tip_mm + (1.0 - share) * (ends_mm[0] - tip_mm[0]) + share * (ends_mm[1] - tip_mm[-1]))
 
 
-def laid_rotation(rotation_xyzw: Floats, ends: Rotation) -> Floats:
-    """Return orientations laid between two ends."""
-    rotations = Rotation.from_quat(rotation_xyzw)
-    first, last = ends[0] * rotations[0].inv(), ends[1] * rotations[-1].inv()
-    over = (last * first.inv()).as_rotvec()
-    return np.asarray((Rotation.from_rotvec(_blend()[:, None] * over) * first * rotations).as_quat())
+def laid_rotations(rotation_xyzw: Floats, ends: Rotation) -> Floats:
+    """Return the orientations of each demonstration, (K, P, 4), laid between two ends."""
+    demos, phases, _ = rotation_xyzw.shape
+    shown = [Rotation.from_quat(rotation_xyzw[:, k]) for k in (0, -1)]
+    first, last = (ends[k] * shown[k].inv() for k in (0, 1))
+    over = (last * first.inv()).as_rotvec()[:, None] * _blend(phases)[:, None]
+    begun = Rotation.from_quat(first.as_quat().repeat(phases, axis=0)) * Rotation.from_quat(
+        rotation_xyzw.reshape(-1, 4)
+    )
+    return np.asarray((Rotation.from_rotvec(over.reshape(-1, 3)) * begun).as_quat()).reshape(demos, phases, 4)
 
 
 def _warp(tip_mm: Floats, mean_mm: Floats) -> Floats:

@@ -25,7 +25,7 @@ at every phase, at the distances at which its branches meet. It does not prove a
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import ceil, isfinite, sqrt
 
 import numpy as np
@@ -210,12 +210,13 @@ class CertifiedPoses:
         return float(self.path.elapsed_s[-1]) / (len(self.path.elapsed_s) - 1)
 
 
-def certified_poses(demos: Sequence[Demo], at: int = 0) -> CertifiedPoses | None:
+def certified_poses(demos: Sequence[Demo], at: int = 0, turn_share: float | None = None) -> CertifiedPoses | None:
     """Learn the poses of a style, and certify the tube around them with the default limits.
 
     Args:
         demos: Demonstrations of one arm in one frame.
         at: The index of the one at whose start and goal pose the motion lies.
+        turn_share: The share of their mean turn in the motion; default: the one that `learn_pose_style` chooses.
 
     Returns:
         The motion, whether its certificate holds or not; None if a demonstration has no orientation.
@@ -228,6 +229,7 @@ def certified_poses(demos: Sequence[Demo], at: int = 0) -> CertifiedPoses | None
     if place is not None and (place.rotation_xyzw is None or any(one.rotation_xyzw is None for one in demos)):
         return None
     style = learn_pose_style(demos)
+    style = style if turn_share is None else replace(style, turn_share=turn_share)
     assert place is not None and place.rotation_xyzw is not None, "checked above, and by `learn_pose_style`"
     path = style.between(place.tip_mm[0], place.rotation_xyzw[0], place.tip_mm[-1], place.rotation_xyzw[-1])
     return CertifiedPoses(place.arm, style.frame, path, certify_tube(path, TubeLimits()), place.partner)

@@ -334,8 +334,12 @@ def _policy(row: PolicyVersion) -> Why:
 
 
 def _poses(row: StoredPoses) -> Why:
-    poses, again = posed(row), poses_of_demonstrations(row.policy)
-    if again is None or not alike(poses.path, again.path) or poses.frame != again.frame:
+    poses = posed(row)
+    for turn_share in (None, 1.0):  # pose styles of before have the whole turn of their demonstrations
+        again = poses_of_demonstrations(row.policy, turn_share)
+        if again is not None and alike(poses.path, again.path) and poses.frame == again.frame:
+            break
+    else:
         yield "it differs from the poses of its version's demonstrations"
 
 

@@ -56,11 +56,16 @@ def _absent(version: PolicyVersion) -> NotFound:
     )
 
 
-def poses_of_demonstrations(version: PolicyVersion) -> CertifiedPoses | None:
-    """Compute the pose style of a policy version from its demonstrations; None if one has no orientation."""
+def poses_of_demonstrations(version: PolicyVersion, turn_share: float | None = None) -> CertifiedPoses | None:
+    """Compute the pose style of a policy version from its demonstrations; None if one has no orientation.
+
+    Args:
+        version: The version.
+        turn_share: The share of the demonstrations' mean turn; default: the one that `learn_pose_style` chooses.
+    """
     demos, combined = version.demonstrations, version.manifest.get("combined")
     at = 0 if combined is None else [one.sha256 for one in demos].index(combined["at"])
-    return certified_poses([one.demo for one in demos], at)
+    return certified_poses([one.demo for one in demos], at, turn_share)
 
 
 def pose_style_json(version: PolicyVersion, poses: CertifiedPoses) -> dict[str, Any]:
@@ -81,6 +86,7 @@ def pose_style_json(version: PolicyVersion, poses: CertifiedPoses) -> dict[str, 
         "elapsed_s": path.elapsed_s.tolist(),
         "spread_mm": path.spread_mm.tolist(),
         "spread_rad": path.spread_rad.tolist(),
+        "turn_share": path.turn_share,
         "tick_s": poses.tick_s,
         "tube": as_json(poses.tube),
         "partner": None if poses.partner is None else as_json(poses.partner),

@@ -44,7 +44,7 @@ GRAZED = 0.02  # a visit that advances by less is due to tremor, or crosses a co
 BLEND = 1.0
 MOVED = 0.02  # a hand that stays within this distance is at rest
 INSIDE = 0.001  # distance from the cell's faces, so that rounding never puts a point into the neighbouring cell
-STIFFNESS = 1.0  # halves waves that are 6 points long, 3 mm in the paper's cells; preserves longer ones
+STIFFNESS = 0.3  # halves waves that are 4 points long, 2 mm in the paper's cells; preserves longer ones
 # With hysteresis the hand leaves its cells, and their faces would cut corners into the path: waves of 20 points.
 STIFFNESS_CUT = 100.0
 _ROUNDS = 120

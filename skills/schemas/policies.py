@@ -436,6 +436,11 @@ class PoseStyle(PolicyName):
     elapsed_s: list[float]
     spread_mm: list[float] = Field(description="Standard deviation of the demonstrations about the path.")
     spread_rad: list[float]
+    turn_share: float = Field(
+        default=1.0,
+        description="Where the orientations are between the shortest turn from start to goal, 0, and the mean of the "
+        "demonstrations, 1; below 1 they turn in unlike ways.",
+    )
     tick_s: float = Field(description="Time between two phases.")
     tube: TubeCertificate
     partner: Partner | None = Field(description="The other arm as it took the needle, where that was recorded.")

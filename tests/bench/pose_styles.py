@@ -28,7 +28,7 @@ from skills.demonstration.demonstration import Demo, cut_demo
 from skills.demonstration.segments import propose_segments
 from skills.formats.jigsaws import read_jigsaws, trials
 from skills.learning.evaluation import dtw
-from skills.learning.pose_style import PHASES, PoseStyle, laid_rotation, laid_tip, learn_pose_style, mean_rotation
+from skills.learning.pose_style import PHASES, PoseStyle, laid_rotations, laid_tip, learn_pose_style, mean_rotation
 from tests.bench.timing import best_s
 
 if TYPE_CHECKING:
@@ -148,7 +148,7 @@ def medoid(shown: list[Poses], middle: Poses, ends: Poses) -> Poses:
 
 def laid(one: Poses, ends: Poses) -> Poses:
     """Return a demonstration laid between start and goal, as in `skills.learning.pose_style`."""
-    return laid_tip(one[0], ends[0][[0, -1]]), laid_rotation(one[1], Rotation.from_quat(ends[1][[0, -1]]))
+    return laid_tip(one[0], ends[0][[0, -1]]), laid_rotations(one[1][None], Rotation.from_quat(ends[1][[0, -1]]))[0]
 
 
 def laid_medoid(shown: list[Poses], middle: Poses, ends: Poses) -> Poses:

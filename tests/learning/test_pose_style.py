@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation, Slerp
 
 from skills.demonstration.demonstration import Demo
 from skills.errors import BadInput, MixedFrames
 from skills.learning.pose_style import PHASES, learn_pose_style, mean_rotation
-from tests.bench.pose_styles import laid_medoid, left_out, line, motions, ours
+from tests.bench.pose_styles import drawn, interval, laid_medoid, left_out, line, motions, ours, surgeons
 
 
 def a_demo(seed: int = 0, *, at_mm: tuple[float, float, float] = (0.0, 0.0, -120.0), samples: int = 240) -> Demo:
@@ -127,6 +127,46 @@ def test_the_jaw_is_left_out_unless_all_have_it() -> None:
     style = learn_pose_style([demo, replace(demo, jaw_rad=None)])
     assert style.jaw_rad is None
     assert style.between(*poses(1), *poses(2)).jaw_rad is None
+
+
+def aside(*detours_rad: tuple[float, float, float]) -> list[Demo]:
+    """Return demonstrations with equal ends that turn aside and back, each by a rotation vector halfway."""
+    demo, there = a_demo(samples=PHASES), np.sin(np.linspace(0.0, np.pi, PHASES))[:, None]
+    assert demo.rotation_xyzw is not None
+    shortest = Slerp([0, 1], Rotation.from_quat(demo.rotation_xyzw[[0, -1]]))(np.linspace(0, 1, PHASES))
+    return [
+        replace(demo, rotation_xyzw=(shortest * Rotation.from_rotvec(there * one)).as_quat()) for one in detours_rad
+    ]
+
+
+def test_the_share_of_two_that_turn_aside_by_one_and_by_half() -> None:
+    # One is predicted from the other best with 1 (twice would be right), and the other way round with a half.
+    style = learn_pose_style(aside((1.0, 0.0, 0.0), (0.5, 0.0, 0.0)))
+    assert style.turn_share == pytest.approx(0.75)
+    assert learn_pose_style(aside((1.0, 0.0, 0.0))).turn_share == 1.0
+    assert learn_pose_style(aside((0.7, 0.0, 0.0), (0.7, 0.0, 0.0), (0.7, 0.0, 0.0))).turn_share == 1.0
+
+
+def test_hands_that_turn_in_unlike_ways_leave_the_shortest_turn() -> None:
+    shown = aside((0.6, 0.0, 0.0), (-0.5, 0.0, 0.1), (0.0, 0.4, 0.0), (0.0, -0.5, -0.2))
+    demo = shown[0]
+    assert demo.rotation_xyzw is not None
+    ends = (demo.tip_mm[0], demo.rotation_xyzw[0], demo.tip_mm[-1], demo.rotation_xyzw[-1])
+    path = learn_pose_style(shown).between(*ends)
+    (straight,) = aside((0.0, 0.0, 0.0))
+    assert straight.rotation_xyzw is not None
+    assert path.turn_share == 0.0
+    assert angle(path.rotation_xyzw, straight.rotation_xyzw) < 1e-7
+    assert path.spread_rad.max() > 0.3  # they are as far from it as before
+
+
+@pytest.mark.nightly
+@pytest.mark.needs("jigsaws")
+def test_a_shortest_turn_is_not_certainly_nearer_to_other_surgeons() -> None:
+    for of in surgeons().values():
+        mine, straight = left_out([one for _, one in of], (ours, line), drawn([user for user, _ in of]))
+        low, _ = interval((mine - straight)[:, 1])
+        assert low < 0.0
 
 
 @pytest.mark.needs("benchmarks")

@@ -1,5 +1,6 @@
 """Pose styles stored with policy versions: made at training, verified, erased, backed up, and refused with a reason."""
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from skills.demonstration.recording import Recording
 from skills.errors import Corrupt, NotFound
 from skills.formats import write_mcap
 from skills.learning.pose_style import PHASES
+from skills.learning.tube import certified_poses
 from skills.library import training
 from skills.library.backup import back_up, restore
 from skills.library.demos import withdraw_demo
@@ -28,12 +30,13 @@ from tests.library.styles import retrain
 MCAP = "application/vnd.mcap"
 
 
-def turning(shift_mm: float = 0.0, *, tip: np.ndarray | None = None) -> bytes:
-    """Return a hand-off of PSM2 that turns by 60 degrees about the shaft on its way."""
+def turning(shift_mm: float = 0.0, *, tip: np.ndarray | None = None, detour_deg: float = 0.0) -> bytes:
+    """Return a hand-off of PSM2 that turns by 60 degrees about the shaft on its way, and aside and back by a detour."""
     tip = cases.points_mm((shift_mm, 0.0, 0.0)) if tip is None else tip
     stamps_ns = cases.START_NS + np.arange(len(tip)) * (10**9 // cases.RATE_HZ)
     spin = Rotation.from_rotvec(np.radians(np.linspace(0.0, 60.0, len(tip)))[:, None] * [0.0, 0.0, 1.0])
-    turned = (Rotation.from_quat([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0]) * spin).as_quat()
+    aside = Rotation.from_rotvec(np.radians(detour_deg) * np.sin(np.linspace(0, np.pi, len(tip)))[:, None] * [1, 0, 0])
+    turned = (Rotation.from_quat([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0]) * spin * aside).as_quat()
     motion = Motion("PSM2", "/PSM2/local/measured_cp", "PSM2_base", stamps_ns, tip, turned)
     return write_mcap(Recording(format="mcap", integrity="full", motions=(motion,)))
 
@@ -78,6 +81,22 @@ def test_several_demonstrations_give_one_pose_style_at_one_place(database: Datab
         (place,) = [one.demo for one in version.demonstrations if one.sha256 == at]
     assert np.abs(poses.path.tip_mm[[0, -1]] - place.tip_mm[[0, -1]]).max() < 1e-9
     assert poses.path.spread_mm.max() > 0.0
+    assert wrong(database) == []
+
+
+@pytest.mark.parametrize("older", [True, False])
+def test_poses_of_before_keep_the_whole_turn_and_verify(
+    database: Database, monkeypatch: pytest.MonkeyPatch, older: bool
+):
+    cases.add_surgeon(database)
+    demos = [add(database, turning(k, detour_deg=aside)) for k, aside in enumerate((15.0, -20.0, 0.5))]
+    with monkeypatch.context() as patched:
+        if older:
+            patched.setattr(training, "certified_poses", partial(certified_poses, turn_share=1.0))
+        version = cases.train(database, demos=[one.sha256 for one in demos])
+    with database.reading() as session:
+        version = session.get_one(PolicyVersion, version.row)
+        assert (poses_of(version).path.turn_share == 1.0) == older
     assert wrong(database) == []
 
 

@@ -11,15 +11,18 @@ import numpy as np
 import pytest
 
 from skills.demonstration.demonstration import Demo
+from skills.demonstration.movement import smoothed_tip
 from skills.errors import BadPlan, Unreachable
-from skills.gridworld.grid import PAPER_GRID, discretize
+from skills.gridworld.grid import PAPER_GRID, choose_grid, discretize
 from skills.gridworld.reward import sparse_reward
 from skills.kinematics import POINTING_DOWN, angle_between, matrix_of, quaternion_of
 from skills.learning.policy import Policy, learn_tabular
 from skills.learning.pose_style import learn_pose_style
 from skills.learning.q_learning import PhaseQLearning
-from skills.planning.hand import Hand, styled
+from skills.learning.slip import replay
+from skills.planning.hand import Hand, hand_along, styled
 from skills.planning.handoff import HELD_MM, NEEDLE_RADIUS_MM, PsmM, needle_tips_mm, turn
+from skills.planning.path_fit import TREMOR_S, fit_to_demo, trace
 from skills.planning.plan import SuturePoint, departure_of, driven_pass, stack
 from skills.planning.trajectory import A1, A2, Trajectory, time_parametrise
 from skills.verification.clearance import openings
@@ -268,6 +271,24 @@ def test_the_estimate_of_success_judges_the_recorded_hand_off():
 
 
 # ---- several demonstrations, and values -------------------------------------------------------------------------
+
+
+@pytest.mark.nightly
+@pytest.mark.needs("recordings")
+@pytest.mark.needs("jigsaws")
+def test_real_hands_are_fitted_as_nearly_and_moved_as_they_were() -> None:
+    from tests.bench import hands  # here, because it takes the longest to import
+
+    demos = dict(hands.hand_offs())
+    assert len(demos) >= 30
+    for name, demo in demos.items():
+        path = discretize(demo.tip_mm, choose_grid(demo.tip_mm))
+        fit = fit_to_demo(replay(path, path.start), trace(demo, path))
+        averaged = smoothed_tip(demo.stamps_s, demo.tip_mm, TREMOR_S)[1]
+        assert hands.rmse_mm(fit.tip_mm, demo.tip_mm) <= hands.rmse_mm(averaged, demo.tip_mm) + 0.05, name
+        hand = hand_along(demo, fit, turning=True)
+        at_time, _ = hands.profile(hand.at(int(hand.duration_s * RATE_HZ) + 2)[0], demo)
+        assert at_time >= 0.9, name
 
 
 def test_several_demonstrations_have_the_hand_of_their_pose_style():
