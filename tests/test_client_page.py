@@ -50,10 +50,11 @@ def test_every_block_of_the_page_runs_in_the_order_of_the_page(url: str, capsys:
         names[one].close()
     printed = capsys.readouterr().out
     for said in (
-        "22 states; 1331 starts reach the goal",
+        "22 states; 0.36",
         "DTW 0.0 mm; 1 pass of",
         "The path follows the reference all along: 0.0 mm from it on average. Not calibrated",
         "['succeeded', 'succeeded', 'succeeded']",
+        "1 100 True",
         "100%\n",
         "succeeded 100%",
         "404 not-found",

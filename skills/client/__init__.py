@@ -14,7 +14,7 @@ from collections.abc import Awaitable, Callable, Sequence
 from datetime import datetime
 from ipaddress import ip_address
 from types import TracebackType
-from typing import Any, Literal, Self
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 import httpx2 as httpx
 
@@ -27,6 +27,7 @@ from skills.client.connection import (
     NotUnderstood,
     Now,
     Problem,
+    SessionClosed,
     UnprotectedKey,
     at,
     call,
@@ -41,6 +42,9 @@ from skills.errors import BadSettings
 from skills.remedies import Action, Remedy
 from skills.schemas.given import Key, NewKey, Ready
 
+if TYPE_CHECKING:
+    from skills.client.sessions import AsyncSession, Session
+
 __all__ = [
     "AsyncClient",
     "Client",
@@ -51,6 +55,7 @@ __all__ = [
     "Problem",
     "Progress",
     "Retrying",
+    "SessionClosed",
     "UnprotectedKey",
 ]
 
@@ -98,6 +103,7 @@ class Keys(Connection):
 
 
 TIMEOUT_S = 60.0  # ours: the service reads a large recording in at most 30 s, and the request may be queued before
+ANSWER_S = 1.0  # ours: an answer takes milliseconds, and an arm must not go on for long without one
 AGAIN = Retrying()
 
 
@@ -185,6 +191,18 @@ class Client(Calls, Now):
         """Close the connections."""
         self.close()
 
+    def session(self, surgeon: str, suture: str, *, timeout_s: float = ANSWER_S) -> "Session":
+        """Return a session of the released pose style, to be entered with `with`; see `skills.client.sessions`.
+
+        Args:
+            surgeon: The surgeon's pseudonym.
+            suture: The suture type.
+            timeout_s: Longest wait for an answer; then the session is closed.
+        """
+        from skills.client.sessions import Session  # here, because of websockets
+
+        return Session(self, surgeon, suture, timeout_s)
+
     def close(self) -> None:
         """Close the connections."""
         self.http.close()
@@ -222,6 +240,12 @@ class AsyncClient(Calls, Later):
     ) -> None:
         """Close the connections."""
         await self.aclose()
+
+    def session(self, surgeon: str, suture: str, *, timeout_s: float = ANSWER_S) -> "AsyncSession":
+        """Return a session of the released pose style, to be entered with `async with`; otherwise as of `Client`."""
+        from skills.client.sessions import AsyncSession
+
+        return AsyncSession(self, surgeon, suture, timeout_s)
 
     async def aclose(self) -> None:
         """Close the connections."""

@@ -117,6 +117,19 @@ class UnprotectedKey(SkillsError):
     """The API key would be sent where others can read it."""
 
 
+class SessionClosed(SkillsError):
+    """A session of a pose style is closed; the arm that follows it must stop.
+
+    Attributes:
+        code: The code with which the service closed it (docs/pose-styles.md), 1006 if the connection was lost, and
+            None if the client closed it.
+    """
+
+    def __init__(self, code: int | None, reason: str) -> None:
+        super().__init__(reason, "Stop the arm; open another session to follow what is released now.", code=code)
+        self.code = code
+
+
 class JobFailed(SkillsError):
     """A job did not succeed; `job` is its last state."""
 

@@ -30,6 +30,8 @@ from skills.schemas.policies import (
     RetrainedStyle,
     Retraining,
     Rollout,
+    SessionOpening,
+    SessionPose,
     Version,
 )
 from skills.schemas.recordings import (
@@ -73,6 +75,8 @@ __all__ = [
     "RewardMap",
     "Rollout",
     "Score",
+    "SessionOpening",
+    "SessionPose",
     "Surgeon",
     "SuturePoints",
     "SutureType",

@@ -417,6 +417,32 @@ class NextPose(PoseAnswer, PolicyName):
     tick_s: float
 
 
+class SessionPose(PoseAnswer):
+    """The next pose of a session."""
+
+    newer_version: int | None = Field(description="Another version that was released since; the session keeps its own.")
+
+
+class SessionLimits(Given):
+    """What a session allows; more closes it."""
+
+    rate_hz: float
+    burst: float = Field(description="Messages at once.")
+    message_bytes: int
+    idle_s: float = Field(description="Without a message for so long it is closed.")
+
+
+class SessionOpening(PolicyName):
+    """The first message of a session: the version that it is pinned to, the tube, and the limits."""
+
+    arm: str
+    frame: str
+    phases: int
+    tick_s: float = Field(description="Time between two phases.")
+    tube: TubeCertificate
+    limits: SessionLimits
+
+
 class PoseStyle(PolicyName):
     """The poses of a hand along one phase, learnt from the demonstrations of a policy version.
 
