@@ -59,7 +59,6 @@ DELAYED_MM = 5.0  # at 100 mm/s the largest delay is this far; with a larger res
 MOST_SAMPLES = 6000  # evenly spread; more samples of one motion do not change the fit
 TRIED_SAMPLES = 1500  # all hypotheses are fitted to so many of them, the best one to all
 FEWEST_SAMPLES = 10
-MOVING_PIECES = 2  # and in so many of these it may have been moving
 STILL_SHARE = 0.05  # of a piece's own extent: a piece that hardly moves fits everything
 BEYOND_RAD, BEYOND_MM = 0.05, 5.0  # a measured joint may be this far beyond the limits with which its arm is driven
 _WILD = 1e6  # rad or mm: no joint's value; the sine of it would be meaningless

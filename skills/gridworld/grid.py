@@ -23,7 +23,6 @@ from skills.fields import Count, Fraction, Point, stored_schema
 from skills.gridworld import paper
 
 MOVES = frozen([(a, b, c) for a in (-1, 0, 1) for b in (-1, 0, 1) for c in (-1, 0, 1)], np.int64, (27, 3), "moves")
-MOVES_NOTE = "action = 9a + 3b + c, with a, b, c in {0, 1, 2} for -1, 0, +1 cell along x, y, z"
 
 FAR_MM = 10.0  # ours: a motion this far from the origin of its frame has no point within a millimetre of it
 MAX_CELLS = 2**24  # ours: a table of rewards of 128 MiB; a larger grid is a mistake of units
