@@ -12,6 +12,7 @@ _CONTENTS = {
     "read_recording": "formats",
     "Demo": "demonstration.demonstration",
     "cut_demo": "demonstration.demonstration",
+    "partner_motion": "demonstration.demonstration",
     "GridWorld": "gridworld.grid",
     "GridPath": "gridworld.grid",
     "PAPER_GRID": "gridworld.grid",

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from skills.arrays import Floats, frozen
-from skills.demonstration.partner import Partner, in_base, partner_at
+from skills.demonstration.partner import Partner, PartnerMotion, in_base, partner_along, partner_at
 from skills.demonstration.recording import (
     BaseFrame,
     Format,
@@ -173,6 +173,29 @@ def cut_demo(
         instrument=recording.instrument_on(motion.arm) or CLASSIC_LARGE_NEEDLE_DRIVER,
         pauses=_pauses(recording, motion.arm, int(stamps_ns[0]), int(stamps_ns[-1])),
         partner=partner,
+    )
+
+
+def partner_motion(recording: Recording, demo: Demo) -> PartnerMotion | None:
+    """Return the motion of the other arm at each stamp of a demonstration, in the demonstration's frame.
+
+    Args:
+        recording: The recording of which the demonstration is a part.
+        demo: The demonstration, as `cut_demo` returned it.
+
+    Returns:
+        The motion of the arm that takes the needle; None if the demonstration has no `partner`, or if the other arm was
+        not recorded all along it.
+    """
+    if demo.partner is None:
+        return None
+    motion = recording.motion_of(arm=demo.arm, topic=demo.topic)
+    seconds, bases = demo.start_s + demo.stamps_s, base_frames(recording)
+    found, base = partner_along(recording, motion, seconds, bases, demo.partner.arm), recording.base_under(motion)
+    return (
+        found
+        if found is None or base is None
+        else PartnerMotion(found.arm, *base.seen_from(found.tip_mm, found.rotation_xyzw))
     )
 
 

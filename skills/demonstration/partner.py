@@ -12,7 +12,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from skills.arrays import Floats, xyz
+from skills.arrays import Floats, frozen, xyz
+from skills.demonstration.movement import same_signs
 from skills.demonstration.recording import BaseFrame, Motion, Recording
 from skills.fields import Point, Quaternion, computed_field, schema
 from skills.kinematics import INSTRUMENTS, matrix_of
@@ -54,6 +55,26 @@ class Partner:
         return x, y, z
 
 
+@dataclass(frozen=True, eq=False)
+class PartnerMotion:
+    """The other arm all along a demonstration or a path, in its frame.
+
+    Attributes:
+        arm: The other arm's name.
+        tip_mm: Positions of its tip at each stamp or phase, shape (T, 3).
+        rotation_xyzw: Its orientations there, unit quaternions, shape (T, 4).
+    """
+
+    arm: str
+    tip_mm: Floats
+    rotation_xyzw: Floats
+
+    def __post_init__(self) -> None:
+        count = len(self.tip_mm)
+        object.__setattr__(self, "tip_mm", frozen(self.tip_mm, np.float64, (count, 3), "tip_mm"))
+        object.__setattr__(self, "rotation_xyzw", frozen(self.rotation_xyzw, np.float64, (count, 4), "rotation_xyzw"))
+
+
 def partner_at(
     recording: Recording, motion: Motion, second: float, bases: Sequence[BaseFrame], arm: str | None = None
 ) -> Partner | None:
@@ -80,12 +101,10 @@ def partner_at(
         there = pose_at(recording, other, second)
         if there is None:
             continue
-        position, rotation = other.tip_mm[there], other.rotation_xyzw[there]
-        if base is not None and other.frame == base.frame:
-            position, rotation = _seen_from(base, position, rotation)
-        # A local pose and another arm's pose share no frame, even if a recorder gave both frames the same name.
-        elif motion.is_local or not motion.frame or other.frame != motion.frame:
+        seen = _in_frame_of(motion, base, other, other.tip_mm[[there]], other.rotation_xyzw[[there]])
+        if seen is None:
             continue
+        (position,), (rotation,) = seen
         apart_mm = float(np.linalg.norm(position - motion.tip_mm[here]))
         if apart_mm <= NEAR_MM:
             base_mm, base_xyzw = (None, None) if base is None else _other_base(base, other.arm, bases)
@@ -93,6 +112,41 @@ def partner_at(
             pose = xyz(position), _xyzw(rotation)
             near.append((apart_mm, Partner(other.arm, round(second, 6), *pose, base_mm, base_xyzw, tool)))
     return min(near, key=lambda one: one[0])[1] if near else None
+
+
+def partner_along(
+    recording: Recording, motion: Motion, seconds: Floats, bases: Sequence[BaseFrame], arm: str
+) -> PartnerMotion | None:
+    """Return the other arm at each time of a demonstration, in the frame of this arm's motion.
+
+    Args:
+        recording: A recording of both arms.
+        motion: The motion of this arm.
+        seconds: Times since the recording's `origin_ns`, increasing, shape (T,).
+        bases: Result of `base_frames` for the recording.
+        arm: Name of the other arm.
+
+    Returns:
+        The other arm's motion; None if its orientation is not known, if its poses cannot be expressed in this arm's
+        frame, or if there is none of them within `APART_S` of each time.
+    """
+    base = _base_of(motion, bases)
+    for other in recording.motions:
+        if other.arm != arm or other.is_local or other.rotation_xyzw is None:
+            continue
+        stamps_s = recording.seconds(other.stamps_ns)
+        after = np.searchsorted(stamps_s, seconds).clip(1, len(stamps_s) - 1) if len(stamps_s) > 1 else 0
+        before_s, after_s = stamps_s[np.maximum(after - 1, 0)], stamps_s[after]
+        near = np.minimum(np.abs(seconds - before_s), np.abs(seconds - after_s)) <= APART_S
+        seen = _in_frame_of(motion, base, other, other.tip_mm, other.rotation_xyzw)
+        if seen is None or not near.all():
+            continue
+        tip_mm, turned = (
+            np.stack([np.interp(seconds, stamps_s, column) for column in columns.T], axis=1)
+            for columns in (seen[0], same_signs(seen[1]))
+        )
+        return PartnerMotion(arm, tip_mm, turned / np.linalg.norm(turned, axis=1, keepdims=True))
+    return None
 
 
 def in_base(partner: Partner, base: BaseFrame, bases: Sequence[BaseFrame]) -> Partner:
@@ -152,6 +206,18 @@ def _instrument_of(recording: Recording, arm: str) -> str | None:
     """Return the instrument of an arm, such as 400006; None if it is not known, or its constants are not."""
     number = recording.instrument_on(arm)
     return number if number in INSTRUMENTS else None
+
+
+def _in_frame_of(
+    motion: Motion, base: BaseFrame | None, other: Motion, position_mm: Floats, rotation_xyzw: Floats
+) -> tuple[Floats, Floats] | None:
+    """Return another arm's poses, (T, 3) and (T, 4), in the frame of a motion; None if they share none."""
+    if base is not None and other.frame == base.frame:
+        return base.seen_from(position_mm, rotation_xyzw)
+    # A local pose and another arm's pose share no frame, even if a recorder gave both frames the same name.
+    if motion.is_local or not motion.frame or other.frame != motion.frame:
+        return None
+    return position_mm, rotation_xyzw
 
 
 def _seen_from(base: BaseFrame, position_mm: Floats, rotation_xyzw: Floats) -> tuple[Floats, Floats]:

@@ -19,6 +19,9 @@ eigenvector of the largest eigenvalue of the sum of the quaternions' outer produ
 Where demonstrations turn the jaw in unlike ways, their mean is further from another one than the shortest turn from
 start to goal. So the orientations are only a share of the way from that turn to the mean: the share that is best for
 each demonstration predicted from the others (`_turn_share`). It is 1 where they agree, and for a single one.
+
+The other arm, PSM_M, is learnt as it moves relative to this arm's pose at the hand-off, where both hold the needle; so
+it moves with the goal, and in step with this arm.
 """
 
 from collections.abc import Sequence
@@ -32,6 +35,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from skills.arrays import Floats, frozen
 from skills.demonstration.demonstration import Demo
 from skills.demonstration.movement import same_signs
+from skills.demonstration.partner import PartnerMotion
 from skills.errors import BadInput, MixedFrames
 from skills.learning.evaluation import dtw
 
@@ -59,6 +63,7 @@ class PosePath:
         spread_rad: Standard deviation of their orientations about the path, shape (N,).
         turn_share: Where the orientations are between the shortest turn from start to goal, 0, and the mean of the
             demonstrations, 1.
+        partner: The other arm at the same phases, in the same frame; None if the style has none.
     """
 
     tip_mm: Floats
@@ -68,6 +73,7 @@ class PosePath:
     spread_mm: Floats
     spread_rad: Floats
     turn_share: float = 1.0
+    partner: PartnerMotion | None = None
 
     def __post_init__(self) -> None:
         count = len(self.tip_mm)
@@ -95,6 +101,8 @@ class PoseStyle:
         duration_s: Duration of each demonstration, shape (K,).
         jaw_rad: Angles of the jaw, shape (K, PHASES); None if not every demonstration has it.
         turn_share: The share of their mean turn in a motion, 0 to 1; the rest is the shortest turn.
+        partners: The other arm at each phase of each demonstration, as seen from this arm's pose at the hand-off; None
+            if it is not learnt.
     """
 
     frame: str
@@ -103,6 +111,7 @@ class PoseStyle:
     duration_s: Floats
     jaw_rad: Floats | None = None
     turn_share: float = 1.0
+    partners: tuple[PartnerMotion, ...] | None = None
 
     def __post_init__(self) -> None:
         count = len(self.tip_mm)
@@ -137,7 +146,7 @@ class PoseStyle:
         rotations = laid_rotations(self.rotation_xyzw, turns)
         weights = self._weights(ends, turns)
         jaws = np.zeros(tips.shape[:2]) if self.jaw_rad is None else self.jaw_rad
-        elapsed = np.linspace(0.0, 1.0, PHASES)
+        elapsed, warps = np.linspace(0.0, 1.0, PHASES), np.tile(np.arange(float(PHASES)), (len(tips), 1))
         if len(tips) > 1:
             mean = np.einsum("k,kpi->pi", weights, tips)
             warps = np.stack([_warp(tip, mean) for tip in tips])
@@ -163,7 +172,20 @@ class PoseStyle:
             _at(spread_mm, again),
             _at(spread_rad, again),
             turn_share,
+            self._partner(ends[1], turns[1], weights, warps, again),
         )
+
+    def _partner(
+        self, goal_mm: Floats, goal: Rotation, weights: Floats, warps: Floats, again: Floats
+    ) -> PartnerMotion | None:
+        """Return the other arm beside a motion: the weighted mean as seen from the goal, in step with this arm."""
+        if self.partners is None:
+            return None
+        tips = np.stack([_at(one.tip_mm, warp) for one, warp in zip(self.partners, warps, strict=True)])
+        turns = np.stack([_turn_at(one.rotation_xyzw, warp) for one, warp in zip(self.partners, warps, strict=True)])
+        seen = Rotation.from_quat(_turn_at(mean_rotation(turns, weights), again))
+        tip_mm = goal_mm + goal.apply(_at(np.einsum("k,kpi->pi", weights, tips), again))
+        return PartnerMotion(self.partners[0].arm, tip_mm, same_signs((goal * seen).as_quat()))
 
     def _weights(self, ends: Floats, turns: Rotation) -> Floats:
         """Return the weight of each demonstration between two poses, (K,), with sum 1.
@@ -203,17 +225,20 @@ class _Situation:
         return float(moved @ moved + turned @ turned)
 
 
-def learn_pose_style(demos: Sequence[Demo]) -> PoseStyle:
+def learn_pose_style(demos: Sequence[Demo], partners: Sequence[PartnerMotion | None] | None = None) -> PoseStyle:
     """Learn a pose style from demonstrations of one surgeon and suture type.
 
     Args:
         demos: At least one, all in one frame and with orientation.
+        partners: The other arm along each demonstration (`skills.demonstration.demonstration.partner_motion`). It is
+            learnt if every demonstration has one, and None leaves it out.
 
     Returns:
         The style.
 
     Raises:
-        BadInput: There is no demonstration, or one has no orientation.
+        BadInput: There is no demonstration, or one has no orientation; or the partners are not those of the
+            demonstrations, or of several arms.
         MixedFrames: They are in different frames.
     """
     if not demos:
@@ -244,7 +269,36 @@ def learn_pose_style(demos: Sequence[Demo]) -> PoseStyle:
         np.array([demo.stamps_s[-1] for demo in demos]),
         np.stack(jaws) if len(jaws) == len(demos) else None,
         _turn_share(np.stack(rotations)),
+        None if partners is None else _partners(demos, partners),
     )
+
+
+def _partners(demos: Sequence[Demo], partners: Sequence[PartnerMotion | None]) -> tuple[PartnerMotion, ...] | None:
+    """Return the other arm at each phase of each demonstration, seen from this arm's last pose; None if one has none.
+
+    Raises:
+        BadInput: They are not along the demonstrations, or of several arms.
+    """
+    known = [one for one in partners if one is not None]
+    if len(partners) != len(demos) or len({one.arm for one in known}) > 1:
+        raise BadInput("Give the other arm's motion of each demonstration, all of one arm, or None where it has none.")
+    if len(known) < len(partners):
+        return None
+    found = []
+    for demo, other in zip(demos, known, strict=True):
+        if len(other.tip_mm) != len(demo.stamps_s):
+            raise BadInput(
+                f"The other arm's motion has {len(other.tip_mm)} samples, and its demonstration {len(demo.stamps_s)}; "
+                "take it from the recording at the demonstration's stamps."
+            )
+        assert demo.rotation_xyzw is not None, "checked by the caller"
+        last = Rotation.from_quat(demo.rotation_xyzw[-1]).inv()
+        at = np.interp(np.linspace(0.0, demo.stamps_s[-1], PHASES), demo.stamps_s, np.arange(len(demo.stamps_s)))
+        turned = Rotation.from_quat(_turn_at(other.rotation_xyzw, at))
+        found.append(
+            PartnerMotion(other.arm, last.apply(_at(other.tip_mm, at) - demo.tip_mm[-1]), (last * turned).as_quat())
+        )
+    return tuple(found)
 
 
 def _turn_share(rotation_xyzw: Floats) -> float:
@@ -267,7 +321,9 @@ def _turn_share(rotation_xyzw: Floats) -> float:
         shortest = _shortest(ends, phase)
         mean = mean_rotation(laid_rotations(np.delete(shown, left_out, axis=0), ends), even)
         wanted, apart = shortest.inv() * Rotation.from_quat(own), _apart(shortest, mean)
-        errors.append([(Rotation.from_rotvec(-one * apart) * wanted).magnitude().mean() for one in SHARES])
+        back = Rotation.from_rotvec((-SHARES[:, None, None] * apart).reshape(-1, 3))
+        off_rad = (back * Rotation.from_quat(np.tile(wanted.as_quat(), (len(SHARES), 1)))).magnitude()
+        errors.append(off_rad.reshape(len(SHARES), -1).mean(axis=1))
     total = np.sum(errors, axis=0) - errors
     return float(np.median(SHARES[total.round(9).argmin(axis=1)]))
 

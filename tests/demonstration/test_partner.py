@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from skills.demonstration.demonstration import cut_demo, propose_segments
-from skills.kinematics import matrix_of
+from skills.demonstration.demonstration import cut_demo, partner_motion, propose_segments
+from skills.kinematics import angle_between, matrix_of
 from tests.demonstration import sessions
 from tests.demonstration.sessions import A, Kind, M, session
 
@@ -65,6 +65,47 @@ def test_in_the_arms_own_frame_it_is_found_through_the_camera(recorded):
     turn, shift = sessions.BASES[M]  # as written, although the recording does not contain them
     np.testing.assert_allclose(demo.partner.position_mm, turn @ other.tip_mm[at] + shift, atol=1e-6)
     np.testing.assert_allclose(demo.partner.approach, turn @ matrix_of(other.rotation_xyzw[[at]])[0][:, 2], atol=1e-9)
+
+
+# ---- its motion -------------------------------------------------------------------------------------------------
+
+
+def test_its_motion_is_the_recorded_one_at_the_stamps_of_this_arm(recorded):
+    value, _ = recorded
+    demo = cut(value, f"/{A}/measured_cp")
+    other, seconds = value.motion_of(topic=f"/{M}/measured_cp"), demo.start_s + demo.stamps_s
+    found = partner_motion(value, demo)
+    assert found.arm == M
+    for axis in range(3):
+        wanted = np.interp(seconds, value.seconds(other.stamps_ns), other.tip_mm[:, axis])
+        np.testing.assert_allclose(found.tip_mm[:, axis], wanted, atol=1e-9)
+    nearest = np.abs(value.seconds(other.stamps_ns)[None] - seconds[:, None]).argmin(axis=1)
+    off = angle_between(matrix_of(found.rotation_xyzw), matrix_of(other.rotation_xyzw[nearest]))
+    assert off.max() < 0.02
+
+
+def test_its_motion_in_this_arms_own_frame_is_found_through_the_camera(recorded):
+    value, _ = recorded
+    demo = cut(value)
+    found, other = partner_motion(value, demo), value.motion_of(topic=f"/{M}/local/measured_cp")
+    turn, shift = sessions.BASES[M]
+    seconds = demo.start_s + demo.stamps_s
+    local = np.stack([np.interp(seconds, value.seconds(other.stamps_ns), axis) for axis in other.tip_mm.T], axis=1)
+    np.testing.assert_allclose(found.tip_mm, local @ turn.T + shift, atol=1e-6)
+    assert np.linalg.norm(found.tip_mm[-1] - demo.partner.position_mm) < 0.5
+
+
+def test_a_motion_that_was_not_recorded_all_along_is_none(recorded):
+    value, _ = recorded
+    demo = cut(value, f"/{A}/measured_cp")
+    assert partner_motion(value, replace(demo, partner=None)) is None
+    other = value.motion_of(topic=f"/{M}/measured_cp")
+    late = value.seconds(other.stamps_ns) > demo.start_s + demo.stamps_s[-1] / 2
+    cut_off = replace(
+        other, stamps_ns=other.stamps_ns[late], tip_mm=other.tip_mm[late], rotation_xyzw=other.rotation_xyzw[late]
+    )
+    motions = tuple(cut_off if m is other else m for m in value.motions)
+    assert partner_motion(replace(value, motions=motions), demo) is None
 
 
 # ---- its base ---------------------------------------------------------------------------------------------------

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 
 from skills.demonstration.demonstration import Demo
+from skills.demonstration.partner import PartnerMotion
 from skills.errors import BadInput, MixedFrames
 from skills.learning.pose_style import PHASES, learn_pose_style, mean_rotation
 from tests.bench.pose_styles import drawn, interval, laid_medoid, left_out, line, motions, ours, surgeons
@@ -158,6 +159,63 @@ def test_hands_that_turn_in_unlike_ways_leave_the_shortest_turn() -> None:
     assert path.turn_share == 0.0
     assert angle(path.rotation_xyzw, straight.rotation_xyzw) < 1e-7
     assert path.spread_rad.max() > 0.3  # they are as far from it as before
+
+
+def beside(demo: Demo, offset_mm: tuple[float, float, float] = (4.0, -9.0, 2.0)) -> PartnerMotion:
+    """Return another arm that follows this one at an offset, turned by a quarter."""
+    assert demo.rotation_xyzw is not None
+    quarter = Rotation.from_rotvec([0.0, 0.0, np.pi / 2])
+    return PartnerMotion("PSM1", demo.tip_mm + offset_mm, (Rotation.from_quat(demo.rotation_xyzw) * quarter).as_quat())
+
+
+def test_the_other_arm_of_one_demonstration_is_as_it_was_recorded() -> None:
+    demo = a_demo(samples=PHASES)
+    assert demo.rotation_xyzw is not None
+    ends = (demo.tip_mm[0], demo.rotation_xyzw[0], demo.tip_mm[-1], demo.rotation_xyzw[-1])
+    other = learn_pose_style([demo], [beside(demo)]).between(*ends).partner
+    assert other is not None and other.arm == "PSM1"
+    assert np.abs(other.tip_mm - beside(demo).tip_mm).max() < 1e-9
+    assert angle(other.rotation_xyzw, beside(demo).rotation_xyzw) < 1e-7
+    assert learn_pose_style([demo]).between(*ends).partner is None
+
+
+def test_the_other_arm_moves_with_the_hand_off() -> None:
+    demo = a_demo()
+    assert demo.rotation_xyzw is not None
+    style = learn_pose_style([demo], [beside(demo)])
+    turn, shift = Rotation.from_rotvec([0.3, -0.2, 0.5]), np.array([7.0, -3.0, 11.0])
+    ends = demo.tip_mm[[0, -1]], Rotation.from_quat(demo.rotation_xyzw[[0, -1]])
+    here, there = (
+        style.between(tip[0], rotation[0].as_quat(), tip[1], rotation[1].as_quat()).partner
+        for tip, rotation in (ends, (turn.apply(ends[0]) + shift, turn * ends[1]))
+    )
+    assert here is not None and there is not None
+    assert np.abs(there.tip_mm - turn.apply(np.array(here.tip_mm)) - shift).max() < 1e-9
+    assert angle(there.rotation_xyzw, (turn * Rotation.from_quat(here.rotation_xyzw)).as_quat()) < 1e-7
+
+
+def test_the_other_arm_stays_in_step_where_tempos_differ() -> None:
+    demo = a_demo(samples=400)
+    later = replace(demo, stamps_s=demo.stamps_s[-1] * (demo.stamps_s / demo.stamps_s[-1]) ** 1.6)
+    assert demo.rotation_xyzw is not None
+    path = learn_pose_style([demo, later], [beside(demo), beside(later)]).between(
+        demo.tip_mm[0], demo.rotation_xyzw[0], demo.tip_mm[-1], demo.rotation_xyzw[-1]
+    )
+    assert path.partner is not None
+    assert np.abs(path.partner.tip_mm - path.tip_mm - (4.0, -9.0, 2.0)).max() < 1e-9
+
+
+def test_other_arms_that_are_not_those_of_the_demonstrations_are_refused() -> None:
+    shown = [a_demo(0), a_demo(1)]
+    others = [beside(one) for one in shown]
+    assert learn_pose_style(shown, [others[0], None]).partners is None
+    with pytest.raises(BadInput, match="of each demonstration"):
+        learn_pose_style(shown, others[:1])
+    with pytest.raises(BadInput, match="of one arm"):
+        learn_pose_style(shown, [others[0], replace(others[1], arm="PSM3")])
+    short = PartnerMotion("PSM1", others[1].tip_mm[:10], others[1].rotation_xyzw[:10])
+    with pytest.raises(BadInput, match="has 10 samples"):
+        learn_pose_style(shown, [others[0], short])
 
 
 @pytest.mark.nightly

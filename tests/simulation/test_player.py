@@ -19,6 +19,8 @@ from skills.verification.playback import PSM_M, Playback
 from skills.verification.verdict import judge
 from tests.bench.playing import stacked
 from tests.planning.motions import hand_off, small_trajectory
+from tests.planning.test_hand import at_home, recorded_psm_m, turning
+from tests.planning.test_transfers import BESIDE
 
 needs_simulator = pytest.mark.needs("simulator")
 TRAJECTORY = small_trajectory(passes=2, rate_hz=60.0)
@@ -91,6 +93,19 @@ def test_psm_m_beside_it_is_at_the_distance_worked_by_hand():
     assert report.failure is not None
     assert report.failure.quantity == "clearance of PSM_A roll_link to PSM_M roll_link"
     assert report.psm_m_fk_error_mm < 1e-4
+
+
+@needs_simulator
+def test_a_recorded_hand_off_is_played_with_both_arms():
+    shown = replace(recorded_psm_m(), base_mm=BESIDE.base_mm, base_xyzw=BESIDE.base_xyzw)
+    both, plan = at_home(psm_m=shown)
+    playback = play(both)
+    report = judge(playback, both)
+    assert report.feasible, report.failure
+    assert plan.a2 == "recorded" and report.psm_m_in_scene
+    assert playback.psm_m_tip_mm[-1] == pytest.approx(shown.taken_mm, abs=1e-3)
+    demo, _ = turning()
+    assert playback.tip_mm[-1] == pytest.approx(demo.tip_mm[-1], abs=1e-3)
 
 
 @needs_simulator
