@@ -98,7 +98,7 @@ def test_psm_m_beside_it_is_at_the_distance_worked_by_hand():
 @needs_simulator
 def test_a_recorded_hand_off_is_played_with_both_arms():
     shown = replace(recorded_psm_m(), base_mm=BESIDE.base_mm, base_xyzw=BESIDE.base_xyzw)
-    both, plan = at_home(psm_m=shown)
+    both, plan = at_home(psm_m=shown, rate_hz=100.0)
     playback = play(both)
     report = judge(playback, both)
     assert report.feasible, report.failure
