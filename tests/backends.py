@@ -16,7 +16,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import pytest
 from sqlalchemy import create_engine, make_url, text
 
 from skills.db.session import Database
@@ -24,8 +23,7 @@ from tests.leftovers import shared
 from tests.needs import need
 from tests.waiting import until
 
-BACKENDS = ("sqlite", "postgresql")
-POSTGRESQL_NIGHTLY = ("sqlite", pytest.param("postgresql", marks=pytest.mark.nightly))  # for slow real processes
+BACKENDS = ("sqlite", "postgresql")  # as parameters of a test: by day `tests.by_day` decides
 
 
 def fresh(backend: str, folder: Path) -> str:

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import settings as hypothesis_settings
 
 from skills.settings import Settings
-from tests import leftovers
+from tests import by_day, leftovers
 from tests.needs import need, required
 
 if TYPE_CHECKING:
@@ -26,8 +26,8 @@ LEFT = pytest.StashKey[list[str]]()
 GARBAGE = 50_000  # objects, some 10 MB
 
 # No deadlines, because on a busy machine an example may take any time. By day every run has the same examples, so it is
-# red only for a change; `make nightly` searches at random.
-hypothesis_settings.register_profile("tests", deadline=None, derandomize=True)
+# red only for a change; `make nightly` searches at random, with 100 examples in the place of 30.
+hypothesis_settings.register_profile("tests", deadline=None, derandomize=True, max_examples=30)
 hypothesis_settings.register_profile("nightly", deadline=None)
 hypothesis_settings.load_profile("tests")
 
@@ -92,12 +92,16 @@ def own_fork_server(shared_fork_server: object, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr("skills.api.app.confined_reader", shared_fork_server)
 
 
+@pytest.hookimpl(tryfirst=True)  # before tests are selected by their marks
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Alternate files that start processes and wait with files that compute; put short ones last.
+    """Mark tests on PostgreSQL that run at night, and order the files.
+
+    Files that start processes and wait alternate with files that compute, and short ones come last.
 
     A file goes to one worker, so that its shared fixtures are made once (`--dist loadfile`). So no more than about half
     of the workers wait, and none is left alone with a long file at the end.
     """
+    by_day.mark(items)
     rank = {item.path: place for item in items for place, name in enumerate(FIRST) if name in item.nodeid}
     files = list(dict.fromkeys(item.path for item in items))
     waiting = sorted((file for file in files if rank.get(file, WAITING) < WAITING), key=lambda file: rank[file])

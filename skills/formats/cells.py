@@ -222,6 +222,11 @@ def read_numbers(
     return quick
 
 
+def load_arrow() -> None:
+    """Import Arrow, which the fast parser uses, before a process is forked for a table."""
+    from pyarrow import compute  # noqa: F401
+
+
 class _NotPlain(Exception):
     """Rows that `_any_numbers` reads or refuses."""
 

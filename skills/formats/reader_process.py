@@ -43,6 +43,7 @@ from skills.demonstration.segments import Segment, press_times, propose_by_arm
 from skills.errors import BadInput, SkillsError, TooLarge, Unanswered, UnknownFormat, UnreadableRecording
 from skills.fields import as_json
 from skills.formats import read_recording, write_mcap
+from skills.formats.cells import load_arrow
 from skills.formats.mcap import _kernels
 from skills.remedies import read_remedies
 from skills.sandbox import ProcessLimits
@@ -327,7 +328,11 @@ def allowed_cpu_s(file: BinaryIO) -> int:
 
 
 def get_ready() -> None:
-    """Read the shortest possible recording, so that every fork inherits the loaded compiled loops."""
+    """Read the shortest possible recording, so that every fork inherits the loaded compiled loops and imports.
+
+    Each fork that reads a table would import `pyarrow` again, which takes 30 times as long as reading a small one.
+    """
+    load_arrow()
     folder = kept_in(_kernels.follow_compiled)
     check_kept(folder)
     stamps_ns, tip_mm = np.array([0, 1]), np.zeros((2, 3))

@@ -212,7 +212,7 @@ def test_a_service_serves_what_it_has_just_released_on_postgresql_too(tmp_path: 
     backends.drop(url)
 
 
-@pytest.mark.parametrize("backend", backends.POSTGRESQL_NIGHTLY)
+@pytest.mark.parametrize("backend", backends.BACKENDS)
 def test_erased_policies_leave_all_processes_memory_without_a_request(backend: str, tmp_path: Path):
     url = backends.fresh(backend, tmp_path)
     learn_two_versions(url)

@@ -34,7 +34,7 @@ SENT_BYTES = 10_000  # of a body before its sender stops
 SPOOLED_BYTES = SPOOL_BYTES + SENT_BYTES  # of every fifth body: more than is buffered in memory
 
 
-@pytest.fixture(scope="module", params=backends.POSTGRESQL_NIGHTLY)
+@pytest.fixture(scope="module", params=backends.BACKENDS)
 def installation(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator["Installation"]:
     folder = tmp_path_factory.mktemp("hostile")
     url = backends.fresh(request.param, folder)

@@ -19,7 +19,7 @@ from tests.e2e.conftest import Service, running
 from tests.waiting import END_S
 
 
-@pytest.fixture(params=backends.POSTGRESQL_NIGHTLY)
+@pytest.fixture(params=backends.BACKENDS)
 def installation(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[Service, Database]]:
     """Yield a service, and its database in this process."""
     url = backends.fresh(request.param, tmp_path)

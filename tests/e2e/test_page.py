@@ -368,7 +368,9 @@ def try_out(tab: Watched, call: str) -> Locator:
 
 
 @pytest.mark.nightly  # a page that takes 5 s of processor time; by day tests/api reads it
-@pytest.mark.parametrize("name", ["desk", "desk-dark", "phone"])
+@pytest.mark.parametrize(
+    "name", ["desk", *(pytest.param(one, marks=pytest.mark.nightly) for one in ("desk-dark", "phone"))]
+)
 def test_a_call_is_tried_out_on_the_page_of_the_calls(browser: Browser, url: str, name: str) -> None:
     with visiting(browser, url, phone="phone" in name, dark="dark" in name) as tab:
         tab.open("/docs")
@@ -381,7 +383,7 @@ def test_a_call_is_tried_out_on_the_page_of_the_calls(browser: Browser, url: str
 
 
 @pytest.mark.nightly  # as above, with a service of its own
-@pytest.mark.parametrize("scheme", ["bearer", "header"])
+@pytest.mark.parametrize("scheme", ["bearer", pytest.param("header", marks=pytest.mark.nightly)])
 def test_a_call_with_a_key_is_tried_out_behind_a_prefix(browser: Browser, tmp_path: Path, scheme: str) -> None:
     serving = running(tmp_path, root_path=PREFIX, workers=0)
     with serving as service, closing(Database(f"sqlite:///{service.database}")) as database:

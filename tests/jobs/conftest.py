@@ -6,16 +6,6 @@ import pytest
 from tests.backends import BACKENDS, blank, drop
 from tests.jobs.house import House
 
-ON_BOTH_BY_DAY = {"test_one_worker"}  # the life of a request; what follows from it runs on PostgreSQL at night
-
-
-@pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    for item in items:
-        here = item.path.parent == Path(__file__).parent and item.path.stem not in ON_BOTH_BY_DAY
-        if here and "house" in getattr(item, "fixturenames", ()) and "postgresql" in item.name:
-            item.add_marker(pytest.mark.nightly)
-
 
 @pytest.fixture(scope="module", params=BACKENDS)
 def house(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[House]:

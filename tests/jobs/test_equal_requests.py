@@ -10,7 +10,7 @@ from sqlalchemy import select
 
 from skills.db.models import PolicyVersion
 from skills.db.service_tables import Event, Job
-from tests.backends import POSTGRESQL_NIGHTLY
+from tests.backends import BACKENDS
 from tests.jobs.house import add_demonstration, site
 from tests.library import cases
 from tests.waiting import END_S, until
@@ -19,8 +19,9 @@ AT_ONCE = 8
 PATIENCE_S = END_S
 
 
-@pytest.mark.parametrize("rounds", [5, pytest.param(50, marks=pytest.mark.nightly)])
-@pytest.mark.parametrize("backend", POSTGRESQL_NIGHTLY)
+@pytest.mark.nightly  # by day eight equal requests of a batch (`test_batches`)
+@pytest.mark.parametrize("rounds", [5, 50])
+@pytest.mark.parametrize("backend", BACKENDS)
 def test_eight_equal_requests_at_once_are_one_job_in_each_round(backend: str, rounds: int, tmp_path: Path):
     with site(backend, tmp_path, workers=1) as place:
         add_demonstration(place.service.url)

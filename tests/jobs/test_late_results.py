@@ -28,7 +28,7 @@ SLOW = CellQLearning(episodes=800_000)  # about a second of learning, so that a 
 PATIENCE_S = END_S
 
 
-@pytest.fixture(params=backends.POSTGRESQL_NIGHTLY)
+@pytest.fixture(params=backends.BACKENDS)
 def records(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Records]:
     url = backends.fresh(request.param, tmp_path)
     records = Records(url)

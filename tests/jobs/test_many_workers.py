@@ -6,12 +6,15 @@ import subprocess
 import sys
 import time
 
+import pytest
+
 from skills.jobs.worker import NICENESS
 from skills.serving import environment
 from tests.jobs.house import ROOT, House
 from tests.waiting import END_S, until
 
 
+@pytest.mark.nightly  # by day a batch has a worker that is killed, and one that is stopped
 def test_killed_and_stopped_workers_are_replaced_and_jobs_have_one_result(empty_house: House):
     house = empty_house
     with house.workers(3) as workers:

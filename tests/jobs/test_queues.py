@@ -47,6 +47,7 @@ def test_pictures_are_drawn_one_after_the_other_and_hold_up_nothing(house: House
     assert drawn == [(word, row) for row in pictures for word in ("begins", "wrote")]
 
 
+@pytest.mark.nightly  # by day `test_batches` kills a worker
 def test_pictures_of_a_worker_that_died_are_drawn_by_another(empty_house: House):
     house = empty_house
     with house.workers(2) as workers:

@@ -106,7 +106,7 @@ def test_a_named_cache_folder_that_is_not_writable_is_refused(folder, monkeypatc
     check_kept(folder)
 
 
-@pytest.mark.parametrize("command", ["serve", "worker"])
+@pytest.mark.parametrize("command", ["serve", pytest.param("worker", marks=pytest.mark.nightly)])
 def test_no_command_starts_with_a_world_writable_machine_code_cache(tmp_path, command):
     open_to_all = tmp_path / "cache"
     open_to_all.mkdir()

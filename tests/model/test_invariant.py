@@ -115,7 +115,7 @@ def test_what_is_served_stored_and_answered_obeys_the_invariant(backend: str):
     run(backend, 0, examples=2, steps=15)
 
 
-@pytest.mark.parametrize("backend", ["sqlite", pytest.param("postgresql", marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("backend", backends.BACKENDS)
 @pytest.mark.parametrize("steps", FOUND.values(), ids=FOUND)
 def test_the_invariant_holds_where_it_once_did_not(backend: str, steps: list[Step]):
     on(backend).play(*steps)

@@ -250,6 +250,7 @@ print(canonical(asdict(judge(play(one), one))).decode())
 """
 
 
+@pytest.mark.nightly  # by day `test_player` compares two processes
 def test_two_processes_report_the_same_bytes():
     said = []
     for seed in ("1", "2"):

@@ -1,0 +1,66 @@
+"""The tests that run on PostgreSQL by day, too.
+
+A test whose parameter names PostgreSQL is marked `nightly`, unless its file or its name is in `ON_BOTH`: there the SQL,
+the locks or the notifications of PostgreSQL decide the result. All others run on SQLite by day and on both at night.
+"""
+
+import pytest
+
+ON_BOTH = {
+    # the tables, transactions and queries themselves
+    *("test_base", "test_changes", "test_query_plans", "test_session", "test_tables"),
+    *("test_library", "test_erasing", "test_watching"),
+    # the life of a job; what follows from it runs on PostgreSQL at night
+    "test_one_worker",
+    "test_what_is_served_stored_and_answered_obeys_the_invariant",
+    # consent
+    "test_the_question_is_answered_alike_in_python_and_in_sql",
+    "test_consent_withdrawn_during_training_stores_and_releases_nothing",
+    "test_in_a_batch_consent_withdrawn_after_its_part_began_is_seen",
+    "test_withdrawn_consent_withdraws_releases_and_renewal_restores_none",
+    "test_withdrawn_consent_withdraws_a_surgeons_combined_and_other_styles",
+    "test_exports_need_export_consent_and_training_needs_training_consent",
+    # releases that other processes are notified of
+    "test_a_release_or_withdrawal_in_one_process_takes_effect_in_another",
+    "test_also_while_the_line_that_tells_of_changes_is_cut",
+    "test_under_load_nothing_is_served_after_its_end_is_acknowledged",
+    "test_a_withdrawal_closes_the_session_with_the_reason",
+    "test_an_erasure_and_the_end_of_consent_close_the_session",
+    "test_a_new_release_is_told_and_changes_nothing",
+    # migrations
+    "test_up_makes_exactly_the_tables_of_the_models",
+    "test_every_revision_goes_down_and_up_on_tables_with_rows_in_them",
+    "test_a_migration_that_fails_half_way_leaves_nothing",
+    "test_two_services_that_start_together_migrate_once",
+    "test_a_release_is_taken_over_and_serves_the_same_bytes",
+    "test_down_and_up_again_keeps_every_row_and_every_answer",
+    # backups that are restored
+    "test_a_demonstration_erased_after_the_backup_leaves_nothing_served",
+    "test_a_deleted_recording_that_is_used_again_does_not_block_a_restore",
+    "test_a_key_that_was_revoked_stays_revoked",
+    "test_the_service_keeps_the_list_up_while_it_runs",
+    # outcomes
+    "test_the_newest_mark_counts_and_every_mark_says_who_and_why",
+    "test_demonstrations_are_listed_by_outcome_with_one_statement",
+    "test_a_mark_withdraws_the_releases_that_rest_on_it",
+    "test_a_mark_made_while_a_style_is_learnt",
+    # cached recordings
+    "test_a_large_content_is_stored_in_chunks",
+    "test_a_recording_that_is_erased_while_it_is_read_is_not_cached",
+    "test_concurrent_first_uses_leave_one_entry",
+    "test_erasing_a_surgeon_keeps_anothers_episode_of_one_dataset",
+    # datasets
+    "test_two_workers_and_a_second_attempt_store_one_dataset",
+    "test_consent_withdrawn_during_the_job_stores_nothing",
+    "test_everybody_who_can_be_seen_consents",
+    "test_erasing_a_surgeon_deletes_the_datasets_with_them",
+    "test_erasing_during_the_job_stores_nothing",
+}
+
+
+def mark(items: list[pytest.Item]) -> None:
+    """Mark the tests on PostgreSQL that run at night only."""
+    for item in items:
+        test, _, parameters = item.name.partition("[")
+        if "postgresql" in parameters and not ON_BOTH & {item.path.stem, test}:
+            item.add_marker(pytest.mark.nightly)
