@@ -10,9 +10,9 @@ from skills.client import Problem
 from skills.library.keys import create_key
 from skills.library.pose_styles import FORMAT
 from tests import backends
-from tests.api.service import KESTREL, MCAP, POLICY, Service, assert_problem, serving
+from tests.api.posed import of_pose_style
+from tests.api.service import KESTREL, POLICY, Service, assert_problem, serving
 from tests.library import cases
-from tests.library.test_pose_styles import turning
 
 POSES, NEXT = f"{POLICY}/pose-style", f"{POLICY}/next"
 
@@ -20,12 +20,8 @@ POSES, NEXT = f"{POLICY}/pose-style", f"{POLICY}/next"
 @pytest.fixture(params=backends.BACKENDS)
 def posed(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Service]:
     """Yield a service in which kestrel's style, with orientation, is released."""
-    url = backends.fresh(request.param, tmp_path)
+    url = of_pose_style(request.param, tmp_path)
     with serving(url) as service:
-        service.client.put_surgeon("kestrel")
-        service.client.add_demo(turning(), media_type=MCAP, **KESTREL)
-        job = service.train(release=True)
-        assert job["result"]["released"], job["result"]
         yield service
     backends.drop(url)
 

@@ -32,9 +32,9 @@ from skills.library.keys import create_key, revoke_key
 from skills.library.policies import find_version
 from skills.library.releases import release
 from tests import backends
-from tests.api.service import KESTREL, MCAP, POLICY, Service, serving
+from tests.api.posed import of_pose_style
+from tests.api.service import KESTREL, POLICY, Service, serving
 from tests.library import cases
-from tests.library.test_pose_styles import turning
 from tests.waiting import END_S, until
 
 SESSION = f"ws://localhost{POLICY}/session"
@@ -49,12 +49,8 @@ def _patient(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(params=backends.BACKENDS)
 def posed(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Service]:
     """Yield a service that serves a pose style, with a second version that is not released."""
-    url = backends.fresh(request.param, tmp_path)
+    url = of_pose_style(request.param, tmp_path)
     with serving(url, key_sessions=2) as service:
-        service.client.put_surgeon("kestrel")
-        service.client.add_demo(turning(), media_type=MCAP, **KESTREL)
-        assert service.train(release=True)["result"]["released"]
-        service.train(seed=2)
         yield service
         until(lambda: service.app.state.sessions.count == 0)
     backends.drop(url)
@@ -238,9 +234,5 @@ def test_who_may_not_open_one_is_refused_before_it_opens(posed: Service):
 
 
 def test_a_session_that_nobody_uses_is_closed(tmp_path: Path):
-    with serving(backends.fresh("sqlite", tmp_path), session_idle_s=0.3) as service:
-        service.client.put_surgeon("kestrel")
-        service.client.add_demo(turning(), media_type=MCAP, **KESTREL)
-        service.train(release=True)
-        with opened(service) as socket:
-            assert closed(socket) == (IDLE, "No message for 0.3 s.")
+    with serving(of_pose_style("sqlite", tmp_path), session_idle_s=0.3) as service, opened(service) as socket:
+        assert closed(socket) == (IDLE, "No message for 0.3 s.")

@@ -13,11 +13,10 @@ import pytest
 from websockets.sync.client import connect
 
 from skills.client import Client
-from tests import backends
-from tests.api.service import KESTREL, MCAP, POLICY, serving
+from tests.api.posed import of_pose_style
+from tests.api.service import KESTREL, POLICY
 from tests.e2e.conftest import Service
 from tests.e2e.test_hostile_clients import sockets_at
-from tests.library.test_pose_styles import turning
 from tests.waiting import END_S, until
 
 SOME = 10
@@ -28,11 +27,7 @@ POSE = b'{"position_mm": [-10, 55, -135], "rotation_xyzw": [0.70710678, 0.707106
 def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
     """Yield a service in a process of its own that serves a pose style, with short timeouts."""
     folder = tmp_path_factory.mktemp("sessions")
-    url = backends.fresh("sqlite", folder)
-    with serving(url) as service:
-        service.client.put_surgeon("kestrel")
-        service.client.add_demo(turning(), media_type=MCAP, **KESTREL)
-        assert service.train(release=True)["result"]["released"]
+    url = of_pose_style("sqlite", folder)
     found = Service(folder, database_url=url, workers=0, heartbeat_s=0.3, session_idle_s=1.0)
     found.start()
     try:
