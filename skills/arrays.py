@@ -1,6 +1,6 @@
 """Arrays of the library's values: validated once, C-ordered, read-only."""
 
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,7 +15,9 @@ Flags = NDArray[np.bool_]
 
 
 def frozen(values: ArrayLike, dtype: Any, shape: tuple[int | None, ...], name: str) -> NDArray[Any]:
-    """Copy values into a read-only C-ordered array of the given type and shape.
+    """Return values as a read-only C-ordered array of the given type and shape, which nobody else can change.
+
+    Values that are such an array already, with memory of its own, are returned as they are; all others are copied.
 
     Args:
         values: The values.
@@ -29,7 +31,7 @@ def frozen(values: ArrayLike, dtype: Any, shape: tuple[int | None, ...], name: s
     Raises:
         BadInput: The shape is another one, or a number is NaN or infinite.
     """
-    array = np.array(values, dtype=dtype, order="C", copy=True)  # a copy, which the caller cannot change later
+    array = values if _is_frozen(values, dtype) else np.array(values, dtype=dtype, order="C", copy=True)
     if array.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, array.shape, strict=True)):
         wanted = " x ".join("any" if n is None else str(n) for n in shape)
         raise BadInput(f"{name} has shape {array.shape}; give {wanted}.", shape=array.shape)
@@ -37,6 +39,13 @@ def frozen(values: ArrayLike, dtype: Any, shape: tuple[int | None, ...], name: s
         raise BadInput(f"{name} contains NaN or infinity; every number must be finite.")
     array.setflags(write=False)
     return array
+
+
+def _is_frozen(values: ArrayLike, dtype: Any) -> TypeGuard[NDArray[Any]]:
+    """Return whether values are an array as `frozen` returns it; a view of another array may change with that."""
+    if type(values) is not np.ndarray or values.dtype != dtype:
+        return False
+    return values.flags.owndata and values.flags.c_contiguous and values.flags.aligned and not values.flags.writeable
 
 
 def xyz(values: Floats) -> Point:

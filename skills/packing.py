@@ -121,8 +121,10 @@ def read(file: IO[bytes], classes: Known) -> Any:
 
 def assemble(archive: Mapping[str, np.ndarray[Any, Any]], classes: Known) -> Any:
     """Return the value whose parts are in an archive."""
-    tree = json.loads(archive["tree"].tobytes())
-    return build(tree, [archive[f"a{i}"] for i in range(len(archive) - 1)], classes)
+    tree, arrays = json.loads(archive["tree"].tobytes()), [archive[f"a{i}"] for i in range(len(archive) - 1)]
+    for array in arrays:
+        array.setflags(write=False)  # so that values need no copy of their own: see `skills.arrays.frozen`
+    return build(tree, arrays, classes)
 
 
 def unfolded_bytes(file: IO[bytes]) -> int:

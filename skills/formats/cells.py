@@ -34,7 +34,7 @@ Decimals = Literal["point", "comma"]
 LINE_CHARACTERS = 16_384  # a row of the widest supported table has 6,000
 COLUMNS = 400  # the widest known recorder writes 180
 ROWS = 5_000_000  # 14 hours at 100 Hz
-BLOCK_BYTES = 4 << 20  # parsed at once
+BLOCK_BYTES = 1 << 20  # parsed at once; what is made of a larger block does not fit into the processor's cache
 END_BYTES, END_ROWS = 1 << 16, 10  # ours: the rows with which the last one is compared
 SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs"}
 NS_PER = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}  # units of time
@@ -51,22 +51,16 @@ _FIRST_ROW = 2  # the header is row 1
 class ParsedNumbers:
     """The numbers of the columns that are used, and exact stamps, shape (T,), where one of them has times.
 
-    Blocks have some rows each, shape (rows, columns), because one array of them all would be one copy more.
+    Each group of columns is an array of its own, shape (T, columns), so that nothing needs to be copied out of others.
     """
 
-    blocks: Sequence[Floats]
+    groups: Sequence[Floats]
     stamps_ns: Ints | None
 
     @property
     def rows(self) -> int:
         """The number of rows T."""
-        return sum(map(len, self.blocks))
-
-    def columns(self, chosen: Sequence[int]) -> Floats:
-        """Return some of the columns by index, shape (T, number of indices)."""
-        first, end = chosen[0], chosen[-1] + 1
-        run = slice(first, end) if list(chosen) == list(range(first, end)) else list(chosen)
-        return np.concatenate([one[:, run] for one in self.blocks])
+        return len(self.groups[0])
 
 
 @contextmanager
@@ -190,7 +184,7 @@ def check_last_number(file: BinaryIO, separator: str, decimal: Decimals) -> None
 def read_numbers(
     text: TextIO,
     names: Sequence[str],
-    used: Sequence[int],
+    groups: Sequence[Sequence[int]],
     separator: str = ",",
     decimal: Decimals = "point",
     time: tuple[int, str] | None = None,
@@ -200,10 +194,10 @@ def read_numbers(
     Args:
         text: Positioned below the header.
         names: The names of all columns, for messages.
-        used: The indices of the columns to read, at least one.
+        groups: The indices of the columns to read, in groups of at least one.
         separator: The character between two cells.
         decimal: The decimal mark.
-        time: The index of the column with times, and its unit: one of `NS_PER`.
+        time: The index of the column with times, a group of its own, and its unit: one of `NS_PER`.
 
     Raises:
         UnreadableRecording: A row of another length, a cell that is not a number, too many rows, or none.
@@ -211,15 +205,15 @@ def read_numbers(
         BadColumns: A time is beyond the year 2096.
     """
     # Typed as `TextIO`, but `open_text` makes it a wrapper of the file.
-    quick = _plain_numbers(text.buffer, len(names), used, separator, decimal, time)
-    if quick is None:
+    numbers = _plain_numbers(text.buffer, len(names), groups, separator, decimal, time)
+    if numbers is None:
         text.seek(0)
         next(_lines(text, 1))  # the header
-        quick = _any_numbers(text, names, used, separator, decimal, time)
-    _check_finite([names[k] for k in used], quick.blocks)
+        numbers = _any_numbers(text, names, groups, separator, decimal, time)
+    _check_finite(names, groups, numbers.groups)
     if time is not None:
-        _check_early(names[time[0]], time[1], quick.columns([list(used).index(time[0])])[:, 0])
-    return quick
+        _check_early(names[time[0]], time[1], numbers.groups[list(groups).index([time[0]])][:, 0])
+    return numbers
 
 
 def load_arrow() -> None:
@@ -232,33 +226,63 @@ class _NotPlain(Exception):
 
 
 def _plain_numbers(
-    file: BinaryIO, columns: int, used: Sequence[int], separator: str, decimal: Decimals, time: tuple[int, str] | None
+    file: BinaryIO,
+    columns: int,
+    groups: Sequence[Sequence[int]],
+    separator: str,
+    decimal: Decimals,
+    time: tuple[int, str] | None,
 ) -> ParsedNumbers | None:
     """Read a table whose rows are plain with Arrow's parser, in a tenth of the time; None for any other table.
 
     Arrow accepts no finite number that Python does not, and then the same one. Its reader of CSV files starts threads,
-    which a reader's process may not; its conversion of texts does not. Arguments are those of `read_numbers`, and the
-    table's file.
+    which a reader's process may not; its conversion of texts does not. The rows are counted first, so that each number
+    is stored once, where it stays: to map new memory takes as long as to parse. Arguments are those of `read_numbers`,
+    and the table's file.
     """
     from pyarrow import ArrowInvalid, compute, float64  # here, because most processes never need it
 
-    blocks, stamps_ns = list[Floats](), list[Ints]()
+    used = sorted({index for group in groups for index in group})
+    place = {column: k for k, column in enumerate(used)}
+    picks = [_as_slice([place[column] for column in group]) for group in groups]
+    most = _most_rows(file, columns + len(used))
+    found, stamps_ns, rows = [np.empty((most, len(group))) for group in groups], list[Ints](), 0
     try:
         for block in _plain_blocks(file, decimal):
-            cells, rows = _cells(block, columns, separator)
-            picked = cells.take((2 * (np.arange(rows)[:, None] * columns + used)).ravel())  # the others are separators
+            split, count = _cells(block, columns, separator)
+            cells = split.take((2 * (np.arange(count)[:, None] * columns + used)).ravel())  # the others are separators
             if b" " in block or (separator != "\t" and b"\t" in block):
-                picked = compute.ascii_trim_whitespace(picked)
-            blocks.append(compute.cast(picked, float64()).to_numpy().reshape(rows, len(used)))
-            if time is not None:
-                stamps_ns.append(_stamps(picked[used.index(time[0]) :: len(used)], NS_PER[time[1]]))
-            if sum(map(len, blocks)) > ROWS:
+                cells = compute.ascii_trim_whitespace(cells)
+            values = compute.cast(cells, float64()).to_numpy().reshape(-1, len(used))
+            before, rows = rows, rows + len(values)
+            if rows > most:
                 return None
+            for array, pick in zip(found, picks, strict=True):
+                array[before:rows] = values[:, pick]
+            if time is not None:
+                stamps_ns.append(_stamps(cells[place[time[0]] :: len(used)], NS_PER[time[1]]))
     except (ArrowInvalid, ValueError, ArithmeticError, _NotPlain):  # the reason is found by `_any_numbers`
         return None
-    if not blocks:
+    if not rows:
         return None
-    return ParsedNumbers(blocks, None if time is None else np.concatenate(stamps_ns))
+    for array in found:
+        array.resize((rows, array.shape[1]), refcheck=False)  # nothing else refers to it
+    return ParsedNumbers(found, None if time is None else np.concatenate(stamps_ns))
+
+
+def _as_slice(indices: list[int]) -> slice | list[int]:
+    """Return indices as a slice, which copies nothing, where they follow one another."""
+    run = slice(indices[0], indices[-1] + 1)
+    return run if indices == list(range(run.start, run.stop)) else indices
+
+
+def _most_rows(file: BinaryIO, least_bytes: int) -> int:
+    """Return a bound on the rows: the number of lines, but no more than their least length and `ROWS` allow."""
+    size, lines = file.seek(0, os.SEEK_END), 1
+    file.seek(0)
+    while block := file.read(BLOCK_BYTES):
+        lines += block.count(b"\n")
+    return min(lines, size // least_bytes + 1, ROWS)
 
 
 def _plain_blocks(file: BinaryIO, decimal: Decimals) -> Iterator[bytes]:
@@ -336,12 +360,13 @@ def _stamps(texts: Any, ns_per_unit: int) -> Ints:
 def _any_numbers(
     text: TextIO,
     names: Sequence[str],
-    used: Sequence[int],
+    groups: Sequence[Sequence[int]],
     separator: str,
     decimal: Decimals,
     time: tuple[int, str] | None,
 ) -> ParsedNumbers:
     """Read the rows one by one; arguments and errors are those of `read_numbers`."""
+    used = [index for group in groups for index in group]
     rows = csv_rows(text, first_line=_FIRST_ROW, separator=separator)
     cells, stamps_ns, count, blank_line = array("d"), array("q"), 0, 0
     for row in rows:
@@ -369,7 +394,11 @@ def _any_numbers(
     if not count:
         raise UnreadableRecording("The table has a header and no rows.")
     values = np.frombuffer(cells).reshape(count, len(used))
-    return ParsedNumbers([values], None if time is None else np.frombuffer(stamps_ns, dtype=np.int64))
+    ends = np.cumsum([len(group) for group in groups])[:-1].tolist()
+    return ParsedNumbers(
+        [np.ascontiguousarray(part) for part in np.split(values, ends, axis=1)],
+        None if time is None else np.frombuffer(stamps_ns, dtype=np.int64),
+    )
 
 
 def is_number(cell: str) -> bool:
@@ -407,15 +436,16 @@ def _no_number(names: Sequence[str], used: Sequence[int], cells: list[str], line
     return UnreadableRecording(f"{where}: not a number; export the table again.", row=line, column=names[k])
 
 
-def _check_finite(names: Sequence[str], blocks: Sequence[Floats]) -> None:
-    before = _FIRST_ROW
-    for values in blocks:
-        finite = np.isfinite(values)
-        if not finite.all():
+def _check_finite(names: Sequence[str], groups: Sequence[Sequence[int]], found: Sequence[Floats]) -> None:
+    wrong = list[tuple[int, int]]()
+    for group, values in zip(groups, found, strict=True):
+        if not (finite := np.isfinite(values)).all():
             row, column = np.argwhere(~finite)[0].tolist()
-            line, name = before + row, names[column]
-            raise NotFinite(f"Row {line}, column {name}: NaN or infinity; cut the row.", row=line, column=name)
-        before += len(values)
+            wrong.append((row + _FIRST_ROW, group[column]))
+    if wrong:
+        line, column = min(wrong)
+        name = names[column]
+        raise NotFinite(f"Row {line}, column {name}: NaN or infinity; cut the row.", row=line, column=name)
 
 
 def _exact_ns(cell: str, ns_per_unit: int) -> int:

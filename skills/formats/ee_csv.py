@@ -44,7 +44,7 @@ from skills.demonstration.recording import (
 )
 from skills.errors import BadColumns, BadSettings, MixedFrames, NoUsableTopic, SkillsError
 from skills.formats.cells import check_whole, header_of, open_text, read_numbers
-from skills.formats.columns import BASE, ColumnSetpoints, base_of, check_joints, check_outside, posed, scaled
+from skills.formats.columns import BASE, ColumnSetpoints, base_of, check_joints, check_outside, posed
 from skills.formats.tables import TableReading, check_steps, check_time, stamps_of
 from skills.kinematics import INSERTION, JOINTS
 from skills.remedies import Action, Remedy
@@ -63,6 +63,8 @@ _PARTS = {"js": _JOINTS, "jaw": ("jaw",), "jaw_sp": ("jaw",)}  # of any other ki
 _SETPOINTS = {"sp": "/{}/setpoint_cp", "jaw_sp": "/{}/jaw/setpoint_js"}
 _KIND = "ee_csv"
 
+Parts = tuple[Floats, ...]  # the numbers of a group in mm and rad, an array for each of `_Group.parts`
+
 
 @dataclass(frozen=True)
 class _Group:
@@ -71,6 +73,11 @@ class _Group:
     arm: str
     kind: str
     columns: tuple[int, ...]
+
+    @property
+    def parts(self) -> list[tuple[int, ...]]:
+        """The columns in the arrays as which values need them: positions apart from quaternions."""
+        return [self.columns] if self.kind in _PARTS else [self.columns[:3], self.columns[3:]]
 
     @property
     def topic(self) -> str:
@@ -124,20 +131,31 @@ def read_ee_csv(file: BinaryIO, said: TableReading) -> Recording:
 
 def _read(
     file: BinaryIO, groups: Sequence[_Group], time: int | None, said: TableReading
-) -> tuple[Ints, dict[tuple[str, str], Floats]]:
-    """Return the stamps, shape (T,), and the numbers of each arm and kind, shape (T, K)."""
+) -> tuple[Ints, dict[tuple[str, str], Parts]]:
+    """Return the stamps, shape (T,), and the numbers of each arm and kind."""
     file.seek(0)
     with open_text(file) as text:
         names, separator = header_of(text)
-        used = sorted({k for group in groups for k in group.columns} | ({time} if time is not None else set()))
+        used = [*([[time]] if time is not None else []), *(part for one in groups for part in one.parts)]
         numbers = read_numbers(text, names, used, separator, said.decimal, None if time is None else (time, "ns"))
-    place = {column: k for k, column in enumerate(used)}
+    found = iter(numbers.groups)
     if time is not None:
-        _check_whole(numbers.columns([place[time]]))
+        _check_whole(next(found))
         assert numbers.stamps_ns is not None
         check_steps(TIME, "ns", numbers.stamps_ns)
-    stamps_ns = stamps_of(numbers.stamps_ns, numbers.rows, said)
-    return stamps_ns, {(one.arm, one.kind): numbers.columns([place[k] for k in one.columns]) for one in groups}
+    stamps_ns, read = stamps_of(numbers.stamps_ns, numbers.rows, said), dict[tuple[str, str], Parts]()
+    for one in groups:
+        parts = tuple(next(found) for _ in one.parts)
+        with np.errstate(over="ignore"):  # infinite ones are refused by the recording's values
+            if one.kind == "js":
+                parts[0][:, INSERTION] *= 1000.0  # the recorders write metres
+            elif one.kind not in _PARTS:
+                parts[0][:] *= 1000.0
+        for part in parts:
+            part.setflags(write=False)  # so that the recording's values need no copy
+        read[one.arm, one.kind] = parts
+    stamps_ns.setflags(write=False)
+    return stamps_ns, read
 
 
 def _groups(names: Sequence[str]) -> tuple[list[_Group], dict[str, str]]:
@@ -210,7 +228,7 @@ def _check_whole(times: Floats) -> None:
 
 
 def _recording(
-    parts: dict[tuple[str, str], Floats],
+    parts: Mapping[tuple[str, str], Parts],
     stamps_ns: Ints,
     said: TableReading,
     columns: tuple[Column, ...],
@@ -220,10 +238,10 @@ def _recording(
     joints: list[Joints] = []
     jaws: list[tuple[str, Signal]] = []
     left_out: list[tuple[str, str]] = list(faults.items())
-    posing = [arm for arm, kind in parts if kind == "pose" and parts[arm, kind].any()]
+    posing = [arm for arm, kind in parts if kind == "pose" and any(part.any() for part in parts[arm, kind])]
     for (arm, kind), values in parts.items():
         if kind == "js":
-            positions = _in_mm(values)
+            (positions,) = values
             topic = f"/{arm}/measured_js"
             check_joints(topic, positions)
             joints.append(recorded_joints(arm, topic, stamps_ns, positions))
@@ -232,12 +250,10 @@ def _recording(
                 posed_motion = _motion(arm, topic, base_of(arm, said.frame), stamps_ns, tip_mm, rotation)
                 motions.append(replace(posed_motion, from_joints=True))
         elif kind == "jaw":
-            jaws.append((arm, recorded_signal(stamps_ns, values[:, 0], f"/{arm}/jaw/measured_js")))
+            jaws.append((arm, recorded_signal(stamps_ns, values[0][:, 0], f"/{arm}/jaw/measured_js")))
         elif kind == "pose" and arm in posing:
             frame = _frame(arm, posing, said)
-            motions.append(
-                _motion(arm, f"/{arm}/measured_cp", frame, stamps_ns, scaled(values[:, :3], 1000.0), values[:, 3:])
-            )
+            motions.append(_motion(arm, f"/{arm}/measured_cp", frame, stamps_ns, *values))
         elif kind == "pose":
             left_out.append((f"/{arm}/measured_cp", "All its numbers are 0: the arm was not recorded."))
     for (arm, kind), values in parts.items():
@@ -270,17 +286,18 @@ def _recording(
     )
 
 
-def _setpoints(parts: Mapping[tuple[str, str], Floats], stamps_ns: Ints, motions: Sequence[Motion]) -> ColumnSetpoints:
+def _setpoints(parts: Mapping[tuple[str, str], Parts], stamps_ns: Ints, motions: Sequence[Motion]) -> ColumnSetpoints:
     setpoints = ColumnSetpoints()
     for (arm, kind), values in parts.items():
         measured = next((one for one in motions if one.topic == f"/{arm}/measured_cp"), None)
         topic = _SETPOINTS.get(kind, "").format(arm)
         if kind == "jaw_sp":
-            setpoints.add_jaw(arm, topic, stamps_ns, values[:, 0])
+            setpoints.add_jaw(arm, topic, stamps_ns, values[0][:, 0])
         elif kind == "sp" and measured is None:
             setpoints.left_out.append((topic, "The arm has no measured pose beside it."))
         elif kind == "sp" and measured is not None:
-            setpoints.add_tip(topic, stamps_ns, scaled(values[:, :3], 1000.0), values[:, 3:], measured)
+            tip_mm, rotation = values
+            setpoints.add_tip(topic, stamps_ns, tip_mm, rotation, measured)
     return setpoints
 
 
@@ -288,12 +305,6 @@ def _motion(arm: str, topic: str, frame: str, stamps_ns: Ints, tip_mm: Floats, r
     return recorded_motion(
         arm=arm, topic=topic, frame=frame, stamps_ns=stamps_ns, tip_mm=tip_mm, rotation_xyzw=rotation_xyzw
     )
-
-
-def _in_mm(joints: Floats) -> Floats:
-    positions = joints.copy()
-    positions[:, INSERTION] = scaled(positions[:, INSERTION], 1000.0)  # the recorders write metres
-    return positions
 
 
 def _frame(arm: str, arms: Sequence[str], said: TableReading) -> str:
@@ -316,11 +327,11 @@ def _frame(arm: str, arms: Sequence[str], said: TableReading) -> str:
     return said.frame
 
 
-def _local(arm: str, stamps_ns: Ints, values: Floats, motion: Motion | None) -> tuple[Motion | None, str]:
+def _local(arm: str, stamps_ns: Ints, values: Parts, motion: Motion | None) -> tuple[Motion | None, str]:
     """Return the motion in the arm's base, or the reason why `rcm_pose` is not one."""
     topic = f"/{arm}/local/measured_cp"
     try:
-        local = _motion(arm, topic, f"{arm}_base", stamps_ns, scaled(values[:, :3], 1000.0), values[:, 3:])
+        local = _motion(arm, topic, f"{arm}_base", stamps_ns, *values)
     except SkillsError as error:  # no demonstration depends on it, where the arm has another pose
         return None, str(error)
     if np.ptp(local.tip_mm, axis=0).max() < WIDE_MM:

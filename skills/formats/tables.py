@@ -208,7 +208,7 @@ def read_table(file: BinaryIO, reading: TableReading | None = None) -> Recording
         numbers = read_numbers(
             text,
             names,
-            [use.index for use in uses.values()],
+            [[use.index] for use in uses.values()],
             separator,
             said.decimal,
             None if time is None else (time.index, time.unit),
@@ -219,8 +219,8 @@ def read_table(file: BinaryIO, reading: TableReading | None = None) -> Recording
     if time is not None and time.unit != "s":
         check_steps(names[time.index], time.unit, stamps_ns)
     columns = {
-        name: scaled(numbers.columns([k])[:, 0], QUANTITIES[name][use.unit])
-        for k, (name, use) in enumerate(uses.items())
+        name: scaled(found[:, 0], QUANTITIES[name][use.unit])
+        for found, (name, use) in zip(numbers.groups, uses.items(), strict=True)
     }
     recording = _recording(_Table(columns, stamps_ns), said, _listed(names, uses))
     return recording if is_ended else replace(recording, notes=(NOT_ENDED,))

@@ -30,15 +30,15 @@ ROWS = st.lists(st.lists(NUMBERS | TEXTS, min_size=3, max_size=3), min_size=1, m
 
 def both(text, used=(0, 1, 2), decimal="point", time=None):
     """Return what the quick and the thorough parser say: values and stamps, or None and the refusal."""
-    said = []
+    said, groups = [], [[k] for k in used]
     for quickly in (True, False):
         with open_text(io.BytesIO(text.encode())) as opened:
             names, separator = header_of(opened)
             try:
                 if quickly:
-                    numbers = cells._plain_numbers(opened.buffer, len(names), used, separator, decimal, time)
+                    numbers = cells._plain_numbers(opened.buffer, len(names), groups, separator, decimal, time)
                 else:
-                    numbers = cells._any_numbers(opened, names, used, separator, decimal, time)
+                    numbers = cells._any_numbers(opened, names, groups, separator, decimal, time)
             except SkillsError as refused:
                 numbers = type(refused)
         said.append(numbers)
@@ -46,7 +46,7 @@ def both(text, used=(0, 1, 2), decimal="point", time=None):
 
 
 def whole(numbers):
-    return np.concatenate(numbers.blocks)
+    return np.concatenate(numbers.groups, axis=1)
 
 
 def assert_equal(one, other):
@@ -119,7 +119,7 @@ def test_the_quick_parser_starts_no_threads():
         "import io, os, pyarrow\n"
         "from skills.formats.cells import _plain_numbers\n"
         "before = len(os.listdir('/proc/self/task'))\n"
-        "read = _plain_numbers(io.BytesIO(b't,x\\n' + 1000 * b'1.5, 2.5\\n'), 2, (0, 1), ',', 'point', (0, 's'))\n"
+        "read = _plain_numbers(io.BytesIO(b't,x\\n' + 1000 * b'1.5, 2.5\\n'), 2, ([0], [1]), ',', 'point', (0, 's'))\n"
         "assert read.rows == 1000\n"
         "print(len(os.listdir('/proc/self/task')) - before)\n"
     )

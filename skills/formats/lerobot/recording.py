@@ -109,6 +109,7 @@ def read_episode(files: Files, root: str, frame: str | None = None) -> Recording
         commanded = {}
     _check_one_episode(dataset, table)
     stamps_ns, clock = _stamps_ns(dataset, table)
+    stamps_ns.setflags(write=False)  # so that all streams share it
     values = _values(table, meanings)
     tools = _tools(dataset, table)
     joints = {
