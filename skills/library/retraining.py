@@ -40,8 +40,9 @@ def request_retraining(session: Session, batch: RetrainingIn, actor: str, near: 
     the same way. Unless the request names a learner, a style keeps the joining rule of the policy that it serves.
 
     The styles are chosen now; they and all defaults are the job's identity. With `only_stale` a style is left out if
-    its newest version was learnt from that demonstration, with these settings and this learner, and was not refused by
-    an older release gate; if no style remains, the job has succeeded at once.
+    its newest version was learnt from that demonstration, with these settings and this learner, was not refused by an
+    older release gate, and was checked with the same limits at the near starts; if no style remains, the job has
+    succeeded at once.
 
     If an equal batch with `release` is done, and some of its styles now serve another version than when it ended, the
     new job consists of these styles: they are learnt again, which gives the same versions, and released by the same
@@ -180,14 +181,16 @@ def _reasons(
 ) -> dict[int, list[str]]:
     """Return, by demonstration, why its style's newest version is stale; an empty list if it is up to date.
 
-    It is up to date if it was learnt from this demonstration with these settings and this learner, and not refused by
-    an older gate.
+    It is up to date if it was learnt from this demonstration with these settings and this learner, not refused by an
+    older gate, and checked with the same limits at the near starts. A version from before there were such limits passed
+    the gate of its time, and is up to date.
     """
     of = PolicyVersion
     last = select(func.max(of.version).label("version"), of.surgeon_row, of.suture).group_by(of.surgeon_row, of.suture)
     newest = last.where(*_styles(of, surgeon, suture)).subquery()
     said = [of.manifest[name] for name in ("demos", "learner", "settings", "seed", "learner_version")]
-    gate = of.releasable, of.manifest["grid_certificate"]["gate"]
+    gate = of.releasable, of.manifest["grid_certificate"]["gate"], of.manifest["grid_certificate"]["near"]
+    limits = asdict(NearLimits(**asked.get("near", {})))
     query = select(of.surgeon_row, of.suture, *said, *gate).join(
         newest,
         (of.surgeon_row == newest.c.surgeon_row) & (of.suture == newest.c.suture) & (of.version == newest.c.version),
@@ -199,7 +202,7 @@ def _reasons(
         if version is None:
             reasons[demo.row] = ["never trained"]
             continue
-        rests_on, *how, learner_version, releasable, gate = version
+        rests_on, *how, learner_version, releasable, gate, near = version
         learner = with_rule(asked["learner"], rules.get((demo.surgeon_row, demo.suture)))
         settings = {name: value for name, value in learner.items() if name != "kind"}
         found = {
@@ -207,6 +210,7 @@ def _reasons(
             "other settings": how != [learner["kind"], settings, asked["seed"]],
             "a newer learner": learner_version != asked["learner_version"],
             "refused by an older gate": not releasable and gate != asked["gate"],
+            "other limits at the near starts": near is not None and not limits.items() <= near.items(),
         }
         reasons[demo.row] = [reason for reason, holds in found.items() if holds]
     return reasons

@@ -307,7 +307,7 @@ class RetrainingIn(Schema):
     only_stale: StrictBool = Field(
         default=False,
         description="Leaves out every style whose newest version is what this would make of it: learnt from its newest "
-        "demonstration, with these settings, by this version of the learner.",
+        "demonstration, with these settings, by this version of the learner, under this gate's limits.",
     )
     learner: LearnerIn | None = None
     release: StrictBool = Field(

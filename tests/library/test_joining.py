@@ -15,8 +15,9 @@ from skills.learning.policy import Policy, learn_tabular
 from skills.learning.q_learning import CellQLearning, PhaseQLearning
 from skills.library import releases
 from skills.library.integrity import learnt, shares
+from skills.library.retraining import request_retraining
 from skills.library.training import near_limits, refusals, request_training
-from skills.schemas.requests import TrainingIn
+from skills.schemas.requests import RetrainingIn, TrainingIn
 from skills.settings import Settings
 from tests.library import cases
 from tests.library.styles import ask_retraining, parts_of, styles_of
@@ -68,6 +69,17 @@ def test_the_gates_limit_is_a_setting_and_part_of_a_trainings_identity(database)
     assert job.row != same.row, "an equal training under another limit is another job"
     result = cases.work(database, job).result
     assert (result["policy_version"], result["releasable"]) == (refused.version + 1, True)
+
+
+def test_a_batch_of_stale_styles_takes_those_checked_with_other_near_limits(database):
+    cases.add_surgeon(database)
+    cases.add_demo(database, loop())
+    cases.train(database)
+    asked = RetrainingIn(surgeon="kestrel", only_stale=True)
+    for near, stale in ((NearLimits(), []), (NearLimits(3.0, 0.0), [["other limits at the near starts"]])):
+        with database.writing() as session:
+            job = request_retraining(session, asked, "test", near)[0]
+        assert [style.stale for style in styles_of(database, job)] == stale
 
 
 def test_the_default_of_the_settings_is_that_of_the_gate():
