@@ -235,7 +235,7 @@ def add_demo(database: Database, recording_sha256: str, cut: DemoIn, actor: str,
     with database.reading() as session:
         find_surgeon(session, cut.surgeon)
         find_suture_type(session, cut.suture)
-    made = make_demo(stored_recording(database, recording_sha256, read), cut)
+    made = make_demo(stored_recording(database, recording_sha256, read, intact=True), cut)
     with database.writing() as session:
         return _store_demo(session, find_recording(session, recording_sha256), made, cut, actor)
 

@@ -16,6 +16,7 @@ import hashlib
 import io
 import logging
 import tempfile
+from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import partial
@@ -273,7 +274,9 @@ def find_recording(session: Session, recording_sha256: str) -> StoredRecording:
     return find_by_digest(session, StoredRecording, recording_sha256, "recording", Remedy(Action.ADD_RECORDING))
 
 
-def stored_recording(database: Database, recording_sha256: str, tell: Teller = read_told) -> Told:
+def stored_recording(
+    database: Database, recording_sha256: str, tell: Teller = read_told, *, intact: bool = False
+) -> Told:
     """Return what is read of a stored recording: from the cache, or else decoded again, and cached.
 
     No transaction is open while it is decoded.
@@ -282,10 +285,11 @@ def stored_recording(database: Database, recording_sha256: str, tell: Teller = r
         database: The database, restricted to the rows that the caller may see.
         recording_sha256: The SHA-256 of its bytes.
         tell: The reader, possibly in another process.
+        intact: Verify the digest of the bytes also where they are not decoded, for a row that will rest on them.
 
     Raises:
         NotFound: There is no such recording.
-        Corrupt: Its bytes do not match their digest.
+        Corrupt: Its bytes were read, and do not match their digest.
         BadRecording: This version does not read it, or not within the limits of the reader.
     """
     with tempfile.TemporaryFile() as file:
@@ -293,6 +297,8 @@ def stored_recording(database: Database, recording_sha256: str, tell: Teller = r
             stored = find_recording(session, recording_sha256)
             kept = cached_content(session, stored)
             if kept is not None:
+                if intact:
+                    deque(recording_bytes(session, stored), maxlen=0)
                 return kept
             file.writelines(recording_bytes(session, stored))
         told = tell(file, **stored.reading)

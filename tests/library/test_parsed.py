@@ -12,10 +12,10 @@ import pytest
 from sqlalchemy import delete, func, select, text, update
 from sqlalchemy.orm import Session
 
-from skills.db.models import ParsedChunk, ParsedRecording, StoredRecording
+from skills.db.models import ParsedChunk, ParsedRecording, RecordingChunk, StoredRecording
 from skills.db.row_visibility import Only
 from skills.db.session import Database
-from skills.errors import Busy, NotFound
+from skills.errors import Busy, Corrupt, NotFound
 from skills.formats import media_type_of
 from skills.formats.lerobot.cut import cut_episode, episodes_of, find_dataset
 from skills.formats.reader_process import Told, read_told, tell
@@ -184,6 +184,18 @@ def test_a_damaged_entry_is_logged_and_found_by_verify(database: Database, caplo
         "parsed_recordings 1"
     ]
     assert sha256 not in caplog.text
+
+
+def test_nothing_is_cut_from_a_recording_whose_bytes_are_damaged(database: Database):
+    """Its content is cached, but a demonstration of it could not be exported, verified or read by a later version."""
+    sha256 = add(database)
+    cases.add_surgeon(database)
+    on_table = "" if database.engine.dialect.name == "sqlite" else " ON recording_chunks"
+    with database.writing() as session:
+        session.execute(text(f"DROP TRIGGER recording_chunks_append_only{on_table}"))
+        session.execute(update(RecordingChunk).values(data=TABLE.replace(b"1", b"2", 1)))
+    with pytest.raises(Corrupt, match="restore it from a backup"):
+        add_demo(database, sha256, CUT, "test", never)
 
 
 def test_an_entry_of_another_recording_is_not_used(database: Database):
