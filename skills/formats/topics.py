@@ -5,8 +5,9 @@ of measurement in the header. The topics follow the CRTK conventions (dVRK docum
 may be below any namespace, as in `/CRTK/psm2/measured_cp`.
 
 Only measured motions are learnt from. Setpoints of a PSM's tip and jaw are read beside them, because a dataset may have
-them as its actions; they are never motions. Other commands (`servo_cp`, `move_cp` and the like) are not used, nor are
-poses of other things (`T_b_w`, the base of an arm in a simulator's world).
+them as its actions; they are never motions. Setpoints of joints (`setpoint_js`) are not read: known recorders take
+`setpoint_cp` beside them, and as poses they would need the instrument. Other commands (`servo_cp`, `move_cp` and the
+like) are not used, nor are poses of other things (`T_b_w`, the base of an arm in a simulator's world).
 """
 
 import re
