@@ -81,6 +81,8 @@ class Settings(BaseSettings):
     constant_turn_deg: float = Field(default=10.0, ge=0, le=180)
     workers: int = Field(default_factory=_cores, ge=0, le=64)  # worker processes; 0: workers run elsewhere
     lease_s: float = Field(default=2.0, gt=0)  # a worker without a heartbeat for longer is considered dead
+    keep_jobs_days: float = Field(default=365.0, ge=1, le=36_500)  # jobs after their end; events stay
+    keep_pictures_days: float = Field(default=365.0, ge=1, le=36_500)  # films and plots; they can be drawn again
     job_attempts: int = Field(default=3, ge=1)
     hosts: str = ""  # further host names of this service, separated by commas
     tls_cert: Path | None = None

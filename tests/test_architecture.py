@@ -156,7 +156,7 @@ def test_only_the_api_knows_status_codes():
     assert "status_code" not in "".join(file.read_text() for file in DOMAIN)
 
 
-OPENS = {"reading", "writing", "connect", "begin", "_readers", "_writers"}  # of databases, engines and makers
+OPENS = {"reading", "writing", "connect", "begin", "_sessions"}  # of databases, engines and makers
 WAITS = (ast.Yield, ast.YieldFrom, ast.Await, ast.AsyncFor, ast.AsyncWith)
 FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda, ast.ClassDef)
 MAY_YIELD_A_SESSION = {

@@ -47,6 +47,7 @@ from skills.library.keys import (
     note_use,
     signed_in,
 )
+from skills.library.locks import SIGN_INS
 from skills.remedies import Action, Remedy
 from skills.settings import Settings
 
@@ -207,7 +208,7 @@ class Access:
         """Run a change of sign-ins in a transaction, in a thread; call `forget` after one that ends a sign-in."""
 
         def write() -> T:
-            with self._database.writing() as session:
+            with self._database.writing([SIGN_INS]) as session:
                 return change(session)
 
         return await to_thread.run_sync(write)

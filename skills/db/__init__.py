@@ -66,6 +66,7 @@ class Base(DeclarativeBase):
 RowId = Annotated[
     int, mapped_column(BigInteger().with_variant(Integer, "sqlite"), primary_key=True, autoincrement=True)
 ]
+Number = Annotated[int, mapped_column(BigInteger().with_variant(Integer, "sqlite"))]  # a row, without a foreign key
 Sha256 = String(64)
 Slug = String(64)
 

@@ -24,12 +24,13 @@ from sqlalchemy import (
     and_,
     func,
     select,
+    text,
 )
 from sqlalchemy.ext.hybrid import hybrid_property
 from sqlalchemy.orm import Mapped, column_property, mapped_column, relationship
 
 from skills.comparison.distances import Measured
-from skills.db import Base, RowId, Sha256, Slug, now
+from skills.db import Base, Number, RowId, Sha256, Slug, now
 from skills.db.packed import Packed, stored
 from skills.demonstration.demonstration import Demo, Partner, Pause
 from skills.gridworld.grid import GridPath, GridWorld
@@ -151,13 +152,22 @@ class RecordingSurgeon(Base):
 
 
 class RecordingChunk(Base):
-    """A chunk of 1 MiB of a recording."""
+    """A chunk of 1 MiB of a recording; it is stored before the row of the recording, and deleted after it."""
 
     __tablename__ = "recording_chunks"
 
-    recording: Mapped[int] = mapped_column(ForeignKey("recordings.row"), primary_key=True)
+    recording: Mapped[Number] = mapped_column(primary_key=True, autoincrement=False)
     number: Mapped[int] = mapped_column(primary_key=True)
     data: Mapped[bytes] = mapped_column(LargeBinary)
+
+
+class LooseChunks(Base):
+    """Chunks without a recording, to be deleted when due: of an upload under way, or of a deleted recording."""
+
+    __tablename__ = "loose_chunks"
+
+    recording_row: Mapped[Number] = mapped_column(primary_key=True, autoincrement=False)
+    due_at: Mapped[datetime]
 
 
 class ParsedRecording(Base):
@@ -205,6 +215,7 @@ class DemonstrationOutcome(Base):
     __table_args__ = (
         CheckConstraint("outcome IN ('success', 'recovery', 'failure')", name="outcome"),
         Index("ix_demonstration_outcomes_newest", "demonstration_row", "row"),
+        Index("ix_demonstration_outcomes_outcome", "outcome", "demonstration_row"),
     )
 
 
@@ -251,6 +262,12 @@ class Demonstration(Base):
         Index("ix_demonstrations_style", "surgeon_row", "suture", "row"),
         Index("ix_demonstrations_surgeon", "surgeon_row", "row"),
         Index("ix_demonstrations_suture", "suture", "row"),
+        Index(
+            "ix_demonstrations_withdrawn",
+            "row",
+            sqlite_where=text("withdrawn_at IS NOT NULL"),
+            postgresql_where=text("withdrawn_at IS NOT NULL"),
+        ),
     )
 
     @property
@@ -425,7 +442,7 @@ class StoredPictures(Base):
     row: Mapped[RowId]
     playback_row: Mapped[int] = mapped_column(ForeignKey("playbacks.row"), unique=True)
     drawn: Mapped[Pictures] = mapped_column(Packed(Pictures), deferred=True)
-    created_at: Mapped[datetime] = mapped_column(default=now)
+    created_at: Mapped[datetime] = mapped_column(default=now, index=True)
 
 
 class StoredCalibration(Base):

@@ -23,7 +23,7 @@ from sqlalchemy import (
 )
 from sqlalchemy.orm import Mapped, Session, mapped_column, relationship
 
-from skills.db import Base, RowId, Sha256, now
+from skills.db import Base, Number, RowId, Sha256, now
 from skills.db.models import Demonstration, PolicyVersion, Surgeon
 from skills.packing import canonical, sha256
 
@@ -34,8 +34,10 @@ class Job(Base):
     """A request for work.
 
     `identity` is the digest of its resolved inputs: there is at most one active or succeeded job of an identity.
-    `attempt` is the number of the current attempt; its workflow is named "<row>-<attempt>". `told_at` is the time at
-    which the attempt was enqueued in the engine.
+    `plan` is the digest of the plan that a playback or pictures belong to. `attempt` is the number of the current
+    attempt; its workflow is named "<row>-<attempt>". `told_at` is the time at which the attempt was enqueued in the
+    engine; of a batch, the time since which all its styles have rows. The surgeon is no foreign key: an erased
+    surgeon's jobs are deleted in steps, after the surgeon.
     """
 
     __tablename__ = "jobs"
@@ -50,7 +52,8 @@ class Job(Base):
     result: Mapped[dict[str, Any] | None]
     error: Mapped[str | None] = mapped_column(String(LONGEST_REASON))
     attempt: Mapped[int] = mapped_column(default=1)
-    surgeon_row: Mapped[int | None] = mapped_column(ForeignKey("surgeons.row"), index=True)
+    surgeon_row: Mapped[Number | None] = mapped_column(index=True)
+    plan: Mapped[str | None] = mapped_column(Sha256)
     asked_by: Mapped[str] = mapped_column(default="local")
     told_at: Mapped[datetime | None]
     created_at: Mapped[datetime] = mapped_column(default=now)
@@ -62,7 +65,15 @@ class Job(Base):
         CheckConstraint("progress >= 0 AND progress <= 1", name="progress"),
         Index("ix_jobs_identity", "identity", "row"),
         Index("ix_jobs_state", "state", "row"),
-        Index("ix_jobs_kind", "kind", "state"),  # for the counts at every metrics scrape
+        Index("ix_jobs_kind_row", "kind", "row"),
+        Index("ix_jobs_kind_state", "kind", "state", "row"),  # also for the counts at every metrics scrape
+        Index("ix_jobs_plan", "plan", "kind", "row"),
+        Index(  # partial, for the retention: the others have not ended
+            "ix_jobs_ended",
+            "ended_at",
+            sqlite_where=text("ended_at IS NOT NULL"),
+            postgresql_where=text("ended_at IS NOT NULL"),
+        ),
         Index(  # partial, so that failed and cancelled jobs can be requested again
             "uq_jobs_identity_live",
             "identity",
@@ -71,6 +82,14 @@ class Job(Base):
             postgresql_where=text("state IN ('queued', 'running', 'succeeded')"),
         ),
     )
+
+
+class ErasedSurgeon(Base):
+    """A surgeon who was erased, and whose ended jobs are not deleted yet: until then they are hidden."""
+
+    __tablename__ = "erased_surgeons"
+
+    surgeon_row: Mapped[Number] = mapped_column(primary_key=True, autoincrement=False)
 
 
 class StyleToRetrain(Base):

@@ -1,9 +1,16 @@
 """Sessions on the database, its disk, and the revision of its tables: a SQLite file or PostgreSQL, by URL.
 
 `reading()` and `writing()` yield a session that is one transaction; `writing()` commits if its block ends without an
-exception. A writing transaction takes the single write lock at its beginning (BEGIN IMMEDIATE; an advisory lock on
-PostgreSQL), so that concurrent writers wait for each other instead of failing midway or overwriting each other's
-changes; a reading one sees one consistent state from beginning to end.
+exception. A reading one sees one consistent state from beginning to end.
+
+A writing transaction takes all its locks at its beginning, so that concurrent writers wait for each other instead of
+failing midway or overwriting each other's changes. On SQLite that is the file's single write lock (BEGIN IMMEDIATE). On
+PostgreSQL there are locks of two granularities, as Gray et al. ("Granularity of locks in a shared data base", VLDB
+1975) describe them: `writing()` locks the whole database, alone; `writing(names)` shares the database with others of
+its kind, and locks the named things, in an order that is the same for all. So two transactions wait for each other if
+they name the same thing, or if one of them names nothing; and none of them can deadlock with another over these locks.
+A transaction that names things may only rely on what is under these names (`skills.library.locks`), and must be short,
+because one that locks everything waits for it, and later ones wait for that.
 
 Nothing is retried here except connecting, before any statement was sent. A caller that loses the database during a
 transaction gets `Busy`, and does not know whether its changes were committed. It may repeat the request: uploads, jobs
@@ -19,18 +26,19 @@ start does, does not need it. A migration is in a file named after its revision,
 ordered by number.
 """
 
+import hashlib
 import logging
 import os
 import sqlite3
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from copy import copy
 from functools import cache
 from importlib import resources
 from pathlib import Path
 from time import monotonic, sleep
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any, Literal, NoReturn
 
 from sqlalchemy import URL, Connection, Dialect, Engine, create_engine, event, inspect, text
 from sqlalchemy.engine import ExceptionContext, make_url
@@ -47,7 +55,7 @@ if TYPE_CHECKING:
     from alembic.config import Config
 
 BUSY_TIMEOUT_MS = 10_000
-WRITE_LOCK = 0x5C111  # ours: the number of the advisory lock, an arbitrary unused one
+WRITE_LOCK = 0x5C111  # ours: the number of the advisory lock of everything, an arbitrary unused one
 WAL_LIMIT_BYTES = 64 << 20  # without a limit the write-ahead log stays as large as the largest upload
 KEPT_OPEN, AT_ONCE = 10, 40  # connections; 40 threads handle requests (Starlette's default), and each needs one
 RESTART_S = 3.0  # timeout for a server that refuses connections, as while restarting; most are back within 1 s
@@ -103,19 +111,25 @@ class Database:
         """
         self.url = url
         self.engine = _open(url, patience_ms or BUSY_TIMEOUT_MS)
-        self._readers = sessionmaker(self.engine, expire_on_commit=False)
-        self._writers = sessionmaker(self.engine.execution_options(writes=True), expire_on_commit=False)
+        self._sessions = sessionmaker(self.engine, expire_on_commit=False)
 
     @contextmanager
     def reading(self) -> Iterator[Session]:
         """Open a session that reads one consistent state."""
-        with self._in_words(), self._readers() as session:
+        with self._in_words(), self._sessions() as session:
             yield session
 
     @contextmanager
-    def writing(self) -> Iterator[Session]:
-        """Open a session whose block is one transaction, committed if it ends without an exception."""
-        with self._in_words(), self._writers.begin() as session:
+    def writing(self, names: Iterable[str] | None = None) -> Iterator[Session]:
+        """Open a session whose block is one transaction, committed if it ends without an exception.
+
+        Args:
+            names: What it changes or relies on, see `skills.library.locks`: transactions with a common name run one
+                after the other. None: everything. No names: changes that are decided by a single statement each.
+        """
+        locks = True if names is None else tuple(sorted({_number(name) for name in names}))
+        bind = self.engine.execution_options(writes=locks)
+        with self._in_words(), self._sessions(bind=bind) as session, session.begin():
             yield session
 
     def seen_by(self, only: Only | None) -> "Database":
@@ -123,9 +137,7 @@ class Database:
         if only is None:
             return self
         narrowed = copy(self)
-        narrowed._readers = sessionmaker(self.engine, expire_on_commit=False, info={ONLY: only})
-        writes = self.engine.execution_options(writes=True)
-        narrowed._writers = sessionmaker(writes, expire_on_commit=False, info={ONLY: only})
+        narrowed._sessions = sessionmaker(self.engine, expire_on_commit=False, info={ONLY: only})
         return narrowed
 
     def migrate(self) -> None:
@@ -267,7 +279,7 @@ def _open(url: str, patience_ms: int) -> Engine:
 
     @event.listens_for(engine, "begin")
     def _begin(connection: Connection) -> None:
-        connection.exec_driver_sql("BEGIN IMMEDIATE" if connection.get_execution_options().get("writes") else "BEGIN")
+        connection.exec_driver_sql("BEGIN IMMEDIATE" if "writes" in connection.get_execution_options() else "BEGIN")
 
     return engine
 
@@ -369,12 +381,30 @@ def _open_postgresql(url: URL, patience_ms: int) -> Engine:
 
     @event.listens_for(engine, "begin")
     def _begin(connection: Connection) -> None:
-        if connection.get_execution_options().get("writes"):
-            connection.exec_driver_sql(f"SELECT pg_advisory_xact_lock({WRITE_LOCK})")
-        else:
+        locks = connection.get_execution_options().get("writes")
+        if locks is None:
             connection.exec_driver_sql("SET TRANSACTION ISOLATION LEVEL REPEATABLE READ")
+        else:
+            connection.exec_driver_sql(_taking(locks))
 
     return engine
+
+
+def _taking(locks: Literal[True] | tuple[int, ...]) -> str:
+    """Return the statements, sent together, that take the locks of a writing transaction, the one of everything first.
+
+    The transaction is of the level READ COMMITTED, so its later statements see all that was committed before it got
+    its last lock.
+    """
+    if locks is True:
+        return f"SELECT pg_advisory_xact_lock({WRITE_LOCK})"
+    each = [f"SELECT pg_advisory_xact_lock({number})" for number in locks]
+    return "; ".join([f"SELECT pg_advisory_xact_lock_shared({WRITE_LOCK})", *each])
+
+
+def _number(name: str) -> int:
+    """Return the number of the lock of a name: 63 bits of its digest, never one of a lock of another use."""
+    return int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "big") >> 1 | 1 << 62
 
 
 # ---- the disk --------------------------------------------------------------------------------------------------------

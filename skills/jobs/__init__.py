@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING
 from sqlalchemy.engine import make_url
 
 from skills.db.session import make_private, write_ahead
-from skills.library.jobs import PART
+from skills.library.jobs import EXPORT, PART, PICTURES
 from skills.settings import Settings
 
 if TYPE_CHECKING:
@@ -101,7 +101,7 @@ def prepare(settings: Settings) -> None:
 
 def queue_of(kind: str) -> str:
     """Return the name of the queue for jobs of a kind."""
-    return {PART: BATCHES, "pictures": ASIDE, "dataset": ASIDE}.get(kind, JOBS)
+    return {PART: BATCHES, PICTURES: ASIDE, EXPORT: ASIDE}.get(kind, JOBS)
 
 
 def tell(client: "DBOSClient", row: int, attempt: int, kind: str) -> None:

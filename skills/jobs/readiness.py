@@ -92,7 +92,7 @@ def _refuse_missing(url: str, what: str) -> None:
 
 def _try_database(database: Database) -> None:
     try:
-        with database.writing() as session:  # a write transaction, so that a lock or a read-only file is found
+        with database.writing(()) as session:  # a write transaction, so that a lock or a read-only file is found
             revision = revision_of(session.connection())
             if revision == revisions()[0]:
                 session.execute(select(SutureType.slug).limit(1))
@@ -109,7 +109,7 @@ def _try_database(database: Database) -> None:
 def _try_engine(settings: Settings) -> None:
     _refuse_missing(settings.engine_url, "The job engine's database")
     try:
-        with closing(Database(settings.engine_url, patience_ms=PATIENCE_MS)) as engine, engine.writing() as session:
+        with closing(Database(settings.engine_url, patience_ms=PATIENCE_MS)) as engine, engine.writing(()) as session:
             table = "workflow_status" if session.connection().dialect.name == "sqlite" else "dbos.workflow_status"
             session.execute(text(f"SELECT 1 FROM {table} LIMIT 1"))  # noqa: S608 - one of two names of ours
     except (SkillsError, SQLAlchemyError) as error:

@@ -18,6 +18,7 @@ import time
 import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from itertools import cycle
 from threading import Event, Thread
 from types import FrameType
@@ -31,6 +32,7 @@ from skills.db.session import Database, refuse_other_tables
 from skills.errors import SkillsError
 from skills.jobs import BATCHES, JOBS, POLLING_S, QUEUES, configuration, connect
 from skills.jobs.workflows import Leases, Perform, Watch, Work, register
+from skills.library.sweep import sweep
 from skills.logs import job_id, told
 from skills.settings import Settings
 
@@ -82,6 +84,7 @@ def _look(database: Database, row: int) -> tuple[str, str, str]:
 
 
 ROUND_S = 0.5
+SWEEPING_S = 0.2  # in a round, which must stay much shorter than a lease
 MISSED_ROUNDS = 20  # in a row; while the database is unavailable the engine's retry pauses grow up to 90 s
 DRAIN_S = 8  # jobs that run longer are aborted and run again elsewhere; container runtimes kill after 10 s
 NICENESS = 10
@@ -111,7 +114,10 @@ def run_worker(settings: Settings, *, parent: int | None = None, perform: Perfor
         refuse_other_tables(session.connection())
     client = connect(settings)
     work = Work(database, settings, perform)
-    watch = Watch(database, client, executor, Leases(settings.lease_s), DBOS._recover_pending_workflows, work.doing)
+    sweeping = partial(sweep, database, settings, SWEEPING_S)
+    watch = Watch(
+        database, client, executor, Leases(settings.lease_s), DBOS._recover_pending_workflows, work.doing, sweeping
+    )
     try:
         watch.beat()  # registered before it can hold any job, so that others can take over
         with _engine(work, executor, watch):

@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from datetime import timedelta
 
 from dbos import DBOS, DBOSClient, WorkflowStatus
 from sqlalchemy import delete, func, select, update
@@ -23,7 +24,8 @@ from skills.db.service_tables import LONGEST_REASON, Executor, Job
 from skills.db.session import Database
 from skills.errors import Busy, SkillsError
 from skills.jobs import JOBS, QUEUES, STEPS, WORKFLOW, drop, tell, workflow_id
-from skills.library.jobs import ACTIVE, BATCH, PART, end_part
+from skills.library import locks
+from skills.library.jobs import ACTIVE, BATCH, PART, UNSYNCHRONISED, end_part, names_of
 from skills.settings import Settings
 
 FIRST_PAUSE_S = 0.2
@@ -95,7 +97,7 @@ def start(database: Database, row: int, attempt: int) -> bool:
         Whether this attempt is still current; False where the job has ended or has a newer attempt.
     """
     changes = {"state": "running", "started_at": func.coalesce(Job.started_at, now())}
-    with database.writing() as session:
+    with database.writing([locks.job(row)]) as session:
         mine = (Job.row == row, Job.attempt == attempt, Job.state.in_(ACTIVE))
         return session.execute(update(Job).where(*mine).values(**changes).returning(Job.row)).first() is not None
 
@@ -108,7 +110,9 @@ def fail(database: Database, row: int, attempt: int, reason: str, state: str = "
     """
     reason = reason[:LONGEST_REASON]
     changes = {"state": state, "error": reason, "ended_at": now()}
-    with database.writing() as session:
+    with database.reading() as session:
+        named = names_of(session, row)
+    with database.writing(named) as session:
         mine = (Job.row == row, Job.attempt == attempt, Job.state.in_(ACTIVE))
         ended = session.execute(update(Job).where(*mine).values(**changes).returning(Job.kind, Job.request)).first()
         if ended is not None and ended.kind == PART:
@@ -188,6 +192,8 @@ class Leases:
 
 AT_ONCE = 100  # jobs compared in a round: a round must stay much shorter than a lease
 FORGOTTEN_AFTER_LEASES = 30
+SWEEP_S = 60.0  # between two sweeps, if nothing was left by the first
+ENGINE_DAYS = 7  # ours: the engine's rows of ended workflows are kept as long, for whoever looks into a failure
 ENGINE_ATTEMPTS = 10  # of one job: an engine that has failed that often will fail again
 
 # Statuses of a workflow that ended without a result in our row, with the state and the reason for the row.
@@ -231,6 +237,7 @@ class Watch:
         leases: Leases,
         recover: Callable[[list[str]], object],
         doing: Collection[str] = frozenset(),
+        sweep: Callable[[], bool] = lambda: True,
     ) -> None:
         """Create the watch of one executor.
 
@@ -242,6 +249,7 @@ class Watch:
             recover: Callback that returns the pending workflows of dead executors to their queue, provided that they
                 are still pending and still assigned to those executors.
             doing: Ids of the workflows that this worker is running; a live view, not a copy.
+            sweep: Deletes what nobody needs any more in our database for a moment; returns whether nothing is left.
         """
         self._database = database
         self._client = client
@@ -249,11 +257,13 @@ class Watch:
         self._leases = leases
         self._recover = recover
         self._doing = doing
+        self._sweep = sweep
+        self._swept_s: float | None = None
         self._unheard = Leases(leases.lease_s, leases.clock)
 
     def beat(self) -> None:
         """Write a heartbeat."""
-        with self._database.writing() as session:
+        with self._database.writing(()) as session:
             mine = update(Executor).where(Executor.id == self._executor).values(beat_at=now()).returning(Executor.id)
             if session.execute(mine).first() is None:  # the first heartbeat, or others have deleted our row
                 session.add(Executor(id=self._executor))
@@ -274,10 +284,14 @@ class Watch:
             elif workflow.status in ENGINE_FAILED:
                 self._begin_again(job)
         self._remember_told([job.row for job in live if not job.told])
+        if self._swept_s is None or time.monotonic() - self._swept_s > SWEEP_S:
+            self._forget_ended()
+            if self._sweep():
+                self._swept_s = time.monotonic()
 
     def leave(self) -> None:
         """Remove this worker from the table of executors."""
-        with self._database.writing() as session:
+        with self._database.writing(()) as session:
             session.execute(delete(Executor).where(Executor.id == self._executor))
 
     def at_work(self, *queues: str) -> bool:
@@ -303,6 +317,15 @@ class Watch:
         for executor in others.keys() - holders:
             if silent_s[executor] > FORGOTTEN_AFTER_LEASES * self._leases.lease_s:
                 self._forget(executor, beats[executor])
+
+    def _forget_ended(self) -> None:
+        """Delete some of the engine's rows of workflows that ended long ago; the outcomes are in our rows."""
+        before = (now() - timedelta(days=ENGINE_DAYS)).isoformat()
+        ended = self._client.list_workflows(
+            status=["SUCCESS", *ENDINGS, "ERROR"], end_time=before, limit=AT_ONCE, load_input=False, load_output=False
+        )
+        if ended:
+            self._client.delete_workflows([one.workflow_id for one in ended])
 
     def _give_back(self, mine: set[str]) -> None:
         """Return workflows to the queue that are assigned to this worker but have not been started for a full lease.
@@ -337,7 +360,7 @@ class Watch:
             self._recover(sorted(ours))
 
     def _forget(self, executor: str, beat_at: object) -> None:
-        with self._database.writing() as session:
+        with self._database.writing(()) as session:
             session.execute(delete(Executor).where(Executor.id == executor, Executor.beat_at == beat_at))
 
     def _live(self) -> list[Live]:
@@ -370,7 +393,7 @@ class Watch:
         """
         row, attempt = map(int, workflow.split("-"))
         again = {"state": "queued", "attempt": attempt + 1, "told_at": None}
-        with self._database.writing() as session:
+        with self._database.writing([locks.job(row)]) as session:
             mine = (Job.row == row, Job.attempt == attempt, Job.state.in_(ACTIVE))
             session.execute(update(Job).where(*mine).values(**again))
         drop(self._client, row, attempt)
@@ -388,5 +411,8 @@ class Watch:
 
     def _remember_told(self, rows: Sequence[int]) -> None:
         if rows:
-            with self._database.writing() as session:
-                session.execute(update(Job).where(Job.row.in_(rows), Job.told_at.is_(None)).values(told_at=now()))
+            # Rows that another transaction changes now are left for the next round: waiting for several rows in an
+            # order of its own could deadlock.
+            untold = select(Job.row).where(Job.row.in_(rows), Job.told_at.is_(None)).with_for_update(skip_locked=True)
+            with self._database.writing(()) as session:
+                session.execute(update(Job).where(Job.row.in_(untold)).values(told_at=now()), **UNSYNCHRONISED)

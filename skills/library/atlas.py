@@ -51,6 +51,7 @@ from skills.db.row_visibility import EVERYBODYS
 from skills.db.session import Database
 from skills.demonstration.demonstration import Demo
 from skills.errors import BadInput, BadPath, Busy, Conflict, NotFound
+from skills.library import locks
 from skills.library.catalogue import find_suture_type
 from skills.library.consent import may, require
 from skills.library.demos import find_demo
@@ -261,7 +262,7 @@ def _keep(database: Database, measured: Mapping[int, Measured]) -> None:
     if not packed:
         return
     named = sorted({*measured}.union(*(one.others.tolist() for one in measured.values())))
-    with database.writing() as session:
+    with database.writing([locks.DISTANCES]) as session:
         for some in in_parts(named):  # also of surgeons that this caller may not see
             there = select(func.count()).select_from(Demonstration).where(Demonstration.row.in_(some))
             if session.scalar(there, execution_options=EVERYBODYS) != len(some):

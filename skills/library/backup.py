@@ -33,9 +33,10 @@ from skills.errors import Conflict, Corrupt
 from skills.library.catalogue import put_surgeon, salted
 from skills.library.demos import MARKS, mark_demo, withdraw_demo
 from skills.library.erasure import delete_recording, erase_demo, erase_surgeon
-from skills.library.jobs import ACTIVE
+from skills.library.jobs import ACTIVE, BATCH
 from skills.library.keys import revoke_key
 from skills.library.releases import withdraw_policies
+from skills.library.sweep import sweep_erased
 from skills.packing import canonical, sha256
 from skills.schemas import DemoOutcome
 
@@ -196,8 +197,9 @@ def restore(database: Database, source: Path, erasures: Erasures = NOTHING, told
             archive.load(file, manifest, session.connection(), told)
             told("erasures")
             restored = _end_again(session, manifest, erasures)
-            session.execute(update(Job).where(Job.state.in_(ACTIVE)).values(told_at=None))
+            session.execute(update(Job).where(Job.state.in_(ACTIVE), Job.kind != BATCH).values(told_at=None))
             record_event(session, "local", "restore", "installation", manifest.created_at)
+    sweep_erased(database)
     database.forget()
     return restored
 
@@ -233,9 +235,11 @@ def keep_up_erasures(database: Database, target: Path, known: int = 0) -> int:
     """
     query = select(func.max(Event.row)).where(Event.row > known, tuple_(Event.action, Event.object_kind).in_(LISTED))
     with database.reading() as session:
+        if session.scalar(query) is None:
+            return known
+    with database.writing() as session:  # alone: events of earlier rows may still be uncommitted, none is after this
         newest = session.scalar(query)
-    if newest is None:
-        return known
+    assert newest is not None, "events are never deleted"
     keep_erasures(database, target)
     return newest
 

@@ -4,9 +4,9 @@ A style that cannot be learnt fails with its reason, and the others continue. If
 continues its part at the first style without a result; styles that were already started are then trained last, one by
 one, because one of them may have killed the worker.
 
-Slow styles are committed alone. Quick styles are committed a few together, and stored with common statements: on SQLite
-a commit waits for the disk while it holds the only write lock, so with a commit for each style several workers would
-leave no room for other writers.
+Slow styles are committed alone. Quick styles are committed a few together, and stored with common statements: a commit
+waits for the disk while it holds its locks (on SQLite the only one of all writers), so with a commit for each style
+several workers would leave no room for others.
 """
 
 import logging
@@ -30,7 +30,7 @@ from skills.db.session import Database
 from skills.errors import Busy, Conflict, SkillsError
 from skills.fields import as_json
 from skills.learning.policy import Policy
-from skills.library import integrity, jobs, releases
+from skills.library import integrity, jobs, locks, releases
 from skills.library.consent import refusal
 from skills.library.demos import newest_demos
 from skills.library.jobs import KEPT, PartRequest, RetrainingRequest, Store, TrainingRequest, with_rule
@@ -180,7 +180,7 @@ def _train_all(database: Database, batch: _Batch) -> None:
     broken: dict[int, Exception] = {}
     while waiting := [style for style in _waiting(database, batch.part) if style.row not in broken]:
         groups = _groups(waiting)
-        with database.writing() as session:
+        with database.writing([locks.job(batch.row)]) as session:
             _begin(session, batch, groups[0])
         for group, then in zip_longest(groups, groups[1:], fillvalue=()):
             try:
@@ -267,9 +267,10 @@ def _commit(
     database: Database, batch: _Batch, ended: Sequence[tuple[_Style, Learnt | SkillsError]], then: _Group
 ) -> bool:
     """End styles, each with its own result, and mark the next group as started; return whether all were queued."""
-    with database.reading() as session:  # measured before the write lock is taken, which others wait for
+    with database.reading() as session:  # measured before the locks are taken, which others wait for
         measured = _measured(session, [learnt for _, learnt in ended if isinstance(learnt, Learnt)])
-    with database.writing() as session:
+    surgeons = {locks.surgeon(style.lesson.surgeon.slug) for style, _ in ended}
+    with database.writing([locks.job(batch.row), *surgeons]) as session:
         queued = set(session.scalars(QUEUED, {"styles": [style.row for style, _ in ended]}))
         wanted = [(style, learnt) for style, learnt in ended if style.row in queued]
         if wanted:

@@ -1,9 +1,9 @@
 """Consent: whether a surgeon's data may be used for training, export or an atlas.
 
 Every use is decided by `may` (or by `refusal` and `require`, which also give the reason), inside the transaction that
-stores or returns the data: on SQLite a writing transaction holds the write lock from its beginning, on PostgreSQL an
-advisory lock, so the consent that it reads is current. `covered` is the same rule in SQL, for lists; a test compares
-the two.
+stores or returns the data. A transaction that stores holds the name of the surgeon from its beginning
+(`skills.library.locks`), so the consent that it reads is current. `covered` is the same rule in SQL, for lists; a test
+compares the two.
 
 A consent holds to the end of its last day, in UTC. If none is recorded, the study's protocol decides, and every use is
 allowed.

@@ -61,14 +61,13 @@ from skills.library import consent, jobs
 from skills.library.catalogue import find_surgeon, find_suture_type
 from skills.library.demos import find_demo
 from skills.library.integrity import find_by_digest
-from skills.library.jobs import UNSYNCHRONISED, DatasetRequest, Store
+from skills.library.jobs import EXPORT, UNSYNCHRONISED, DatasetRequest, Store
 from skills.library.recordings import CHUNK_BYTES, Teller, confined_reader, stored_recording
 from skills.packing import canonical, sha256
 from skills.remedies import Action, Remedy
 from skills.schemas.requests import DatasetIn
 from skills.settings import Settings
 
-KIND = "dataset"
 MOST = 20_000  # demonstrations of a dataset, ours: their rows are in memory at once
 TOLD_STEPS = 100  # progress is stored about so often, each time in a transaction
 
@@ -130,7 +129,7 @@ def request_dataset(session: Session, asked: DatasetIn, actor: str) -> tuple[Job
         "episodes": len({one.recording_row for one in chosen}) if asked.whole else len(chosen),
         "demos_sha256": sha256(canonical([[one.sha256, splits[one.row]] for one in chosen])),
     }
-    job, new = jobs.ask(session, KIND, request, None, actor)
+    job, new = jobs.ask(session, EXPORT, request, None, actor)
     if new:
         exported = [
             {"job_row": job.row, "demonstration_row": one.row, "split": splits[one.row], "whole": asked.whole}
@@ -353,7 +352,7 @@ def export_dataset(database: Database, request: DatasetRequest, settings: Settin
         BadRecording: A recording cannot be written as an episode; the message names its demonstration.
     """
     with database.reading() as session:
-        job = jobs.find_live(session, KIND, request)
+        job = jobs.find_live(session, EXPORT, request)
         if job is None:
             raise Conflict("The export was cancelled.")
         require_exportable(session, job)
@@ -370,7 +369,7 @@ def export_dataset(database: Database, request: DatasetRequest, settings: Settin
         split_by=request["split"],
         export=export,
     )
-    tell = jobs.telling(database, KIND, request)
+    tell = jobs.telling(database, EXPORT, request)
     with ExitStack() as opened:
         file = opened.enter_context(TemporaryFile())
         read = confined_reader(settings)
@@ -393,7 +392,7 @@ def export_dataset(database: Database, request: DatasetRequest, settings: Settin
         while data := file.read(CHUNK_BYTES):
             session.execute(insert(DatasetChunk), {"dataset_row": dataset.row, "number": number, "data": data})
             number += 1
-        record_events(session, actor, "export", KIND, [(made.sha256, surgeon) for surgeon in surgeons])
+        record_events(session, actor, "export", EXPORT, [(made.sha256, surgeon) for surgeon in surgeons])
         return {
             "dataset": made.sha256,
             "size_bytes": made.size_bytes,
@@ -538,7 +537,7 @@ def dataset_chunk(database: Database, dataset_sha256: str, number: int) -> bytes
 def delete_dataset(session: Session, dataset_sha256: str, actor: str) -> None:
     """Delete a dataset with its job, so that it can be requested again."""
     dataset = find_dataset(session, dataset_sha256)
-    record_event(session, actor, "erase", KIND, dataset.sha256)
+    record_event(session, actor, "erase", EXPORT, dataset.sha256)
     drop_exports(session, [dataset.job_row])
 
 

@@ -6,10 +6,10 @@ recording, DemoIn --make_demo--> Made --upload_demo, add_demo--> Added
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
-from sqlalchemy import select
+from sqlalchemy import Table, select
 from sqlalchemy.orm import Session
 
 from skills.db import now, rfc3339
@@ -35,10 +35,20 @@ from skills.fields import as_json
 from skills.formats.reader_process import MOST, Told, read_told
 from skills.gridworld.grid import PAPER_GRID, GridPath, choose_grid, describe_path, discretize
 from skills.gridworld.reward import RewardMap, sparse_reward
-from skills.library import consent
+from skills.library import consent, locks
 from skills.library.catalogue import find_surgeon, find_suture_type
 from skills.library.integrity import demo_identity, find_by_digest
-from skills.library.recordings import Teller, Upload, entry_of, find_recording, keep, stored_recording, tell_upload
+from skills.library.recordings import (
+    Teller,
+    Upload,
+    cache_large,
+    entry_of,
+    find_recording,
+    keep,
+    send_ahead,
+    stored_recording,
+    tell_upload,
+)
 from skills.library.releases import withdraw_failed, withdraw_resting_on
 from skills.packing import canonical
 from skills.remedies import Action, Remedy
@@ -225,9 +235,12 @@ def upload_demo(database: Database, upload: Upload, cut: DemoIn, actor: str, rea
         find_suture_type(session, cut.suture)
     told = tell_upload(upload, read)
     made, entry = make_demo(told, cut), entry_of(upload, told)
-    with database.writing() as session:
-        stored, _ = keep(session, upload, told, entry, actor)
-        return _store_demo(session, stored, made, cut, actor)
+    ahead = send_ahead(database, upload)
+    with database.writing([locks.recording(upload.sha256), locks.surgeon(cut.surgeon)]) as session:
+        stored, _ = keep(session, upload, told, entry, actor, ahead)
+        added = _store_demo(session, stored, made, cut, actor)
+    cache_large(database, stored, entry)
+    return added
 
 
 def add_demo(database: Database, recording_sha256: str, cut: DemoIn, actor: str, read: Teller = read_told) -> Added:
@@ -235,8 +248,9 @@ def add_demo(database: Database, recording_sha256: str, cut: DemoIn, actor: str,
     with database.reading() as session:
         find_surgeon(session, cut.surgeon)
         find_suture_type(session, cut.suture)
+        recording_sha256 = find_recording(session, recording_sha256).sha256  # in full: the argument may be a prefix
     made = make_demo(stored_recording(database, recording_sha256, read, intact=True), cut)
-    with database.writing() as session:
+    with database.writing([locks.recording(recording_sha256), locks.surgeon(cut.surgeon)]) as session:
         return _store_demo(session, find_recording(session, recording_sha256), made, cut, actor)
 
 
@@ -384,6 +398,9 @@ def list_demos(
         query = query.where(Demonstration.withdrawn_at.is_(None) if active else Demonstration.withdrawn_at.is_not(None))
     if outcome is not None:
         query = query.where(Demonstration.outcome == (None if outcome == "unknown" else outcome))
+        if outcome != "unknown":  # found by the marks, which are few, and not by asking every demonstration for its own
+            marks = cast(Table, DemonstrationOutcome.__table__).c
+            query = query.where(Demonstration.row.in_(select(marks.demonstration_row).where(marks.outcome == outcome)))
     return session.scalars(query).all()
 
 

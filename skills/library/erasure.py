@@ -4,6 +4,9 @@ Recordings are deleted with their surgeon or demonstration, unless a demonstrati
 bytes or they were uploaded as another surgeon's too. A recording that was uploaded without a surgeon and never cut is
 not known to be anybody's: erasing a surgeon does not reach it, and its uploader deletes it. Events remain; those of an
 erased surgeon name a random subject that no longer belongs to anybody.
+
+One transaction erases all that can be seen. Of many jobs and of large recordings it deletes what refers to them, and
+`skills.library.sweep` deletes the rest in steps, after the commit.
 """
 
 import secrets
@@ -12,12 +15,13 @@ from collections.abc import Sequence
 from sqlalchemy import ColumnElement, Select, delete, func, select
 from sqlalchemy.orm import Session
 
-from skills.db import in_parts
+from skills.db import in_parts, now
 from skills.db.changes import announce
 from skills.db.models import (
     Demonstration,
     DemonstrationOutcome,
     Erasure,
+    LooseChunks,
     MeasuredShape,
     Plan,
     PolicyDemonstration,
@@ -41,8 +45,9 @@ from skills.library.datasets import drop_exports, exports_of, exports_of_whole
 from skills.library.demos import find_demo
 from skills.library.jobs import ACTIVE as NOT_ENDED
 from skills.library.jobs import UNSYNCHRONISED, forget_styles
-from skills.library.recordings import find_recording
+from skills.library.recordings import AT_ONCE_BYTES, find_recording
 from skills.library.releases import withdraw_resting_on
+from skills.library.sweep import delete_jobs
 from skills.remedies import Action, Remedy
 
 ACTIVE = Job.state.in_(NOT_ENDED)
@@ -60,8 +65,10 @@ def erase_surgeon(session: Session, slug: str, actor: str) -> Dropped:
     of_surgeon = Demonstration.surgeon_row == surgeon.row
     dropped = [(row, at) for row, at in session.execute(select(Job.row, Job.attempt).where(theirs, ACTIVE))]
     dropped += _drop_exports(session, of_surgeon, surgeon)
-    forget_styles(session, select(Demonstration.row).where(of_surgeon), select(Job.row).where(theirs))
-    session.execute(delete(Job).where(theirs), **UNSYNCHRONISED)
+    # Of this surgeon's batches too, whose styles are all of these demonstrations.
+    forget_styles(session, select(Demonstration.row).where(of_surgeon), None)
+    session.execute(delete(Job).where(theirs, ACTIVE), **UNSYNCHRONISED)
+    delete_jobs(session, surgeon.row)
     named = session.scalars(select(RecordingSurgeon.recording_row).where(RecordingSurgeon.surgeon_row == surgeon.row))
     _erase(session, of_surgeon, surgeon, {*named})
     record_event(session, actor, "erase", "surgeon", surgeon.subject, surgeon)
@@ -194,6 +201,13 @@ def _erase(session: Session, which: ColumnElement[bool], surgeon: Surgeon, recor
 
 
 def _delete_recordings(session: Session, rows: Sequence[int]) -> None:
-    """Delete recordings with their bytes; the records of their uploads and surgeons are deleted with them."""
-    session.execute(delete(RecordingChunk).where(RecordingChunk.recording.in_(rows)), **UNSYNCHRONISED)
+    """Delete recordings with their bytes; the records of their uploads and surgeons are deleted with them.
+
+    The bytes of many or large ones are left to the sweep.
+    """
+    size = select(func.coalesce(func.sum(StoredRecording.size_bytes), 0)).where(StoredRecording.row.in_(rows))
+    if (session.scalar(size.execution_options(**EVERYBODYS)) or 0) <= AT_ONCE_BYTES:
+        session.execute(delete(RecordingChunk).where(RecordingChunk.recording.in_(rows)), **UNSYNCHRONISED)
+    else:
+        session.add_all(LooseChunks(recording_row=row, due_at=now()) for row in rows)
     session.execute(delete(StoredRecording).where(StoredRecording.row.in_(rows)), **UNSYNCHRONISED)

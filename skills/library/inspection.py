@@ -21,6 +21,7 @@ from sqlalchemy.orm import Mapper, Session, defer, object_session
 from skills.db import Base
 from skills.db.models import (
     Demonstration,
+    LooseChunks,
     ParsedChunk,
     ParsedRecording,
     Plan,
@@ -32,9 +33,10 @@ from skills.db.models import (
     StoredPoses,
     StoredRecording,
     StoredRewardMap,
+    Surgeon,
 )
 from skills.db.packed import Packed, digest
-from skills.db.service_tables import DatasetChunk, Job, StoredDataset
+from skills.db.service_tables import DatasetChunk, ErasedSurgeon, Job, StoredDataset
 from skills.db.session import Database, revision_of, revisions
 from skills.errors import Busy, Corrupt, SkillsError
 from skills.formats.reader_process import READER_VERSION, read_told
@@ -129,6 +131,15 @@ def _references(session: Session, checked: Checked) -> None:
             checked.count += session.scalar(select(func.count()).select_from(table).where(child.is_not(None))) or 0
             for row in session.execute(select(*table.primary_key).where(*orphan).limit(NAMED)):
                 checked.wrong.append((_name(table, row), f"its {child.name} has no row in {parent.table.name}"))
+    # Without a foreign key, because they are deleted after the row to which they belong.
+    for column, owner, late in (
+        (RecordingChunk.recording, StoredRecording, LooseChunks.recording_row),
+        (Job.surgeon_row, Surgeon, ErasedSurgeon.surgeon_row),
+    ):
+        table = Base.metadata.tables[column.class_.__tablename__]
+        left = (column.is_not(None), ~exists().where(owner.row == column), ~exists().where(late == column))
+        for row in session.execute(select(*table.primary_key).where(*left).limit(NAMED)):
+            checked.wrong.append((_name(table, row), f"its {column.key} has no row in {owner.__tablename__}"))
 
 
 # ---- rows --------------------------------------------------------------------------------------------------------

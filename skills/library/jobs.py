@@ -14,22 +14,24 @@ even if several workers train it. The batch ends in the same transaction as its 
 
 import secrets
 from collections.abc import Callable, Collection, Mapping, Sequence
-from typing import Any, NamedTuple, NotRequired, TypedDict
+from typing import Any, NamedTuple, NotRequired, TypedDict, cast
 
-from sqlalchemy import ColumnElement, Select, delete, exists, func, select, update
+from sqlalchemy import ColumnElement, Select, Table, delete, exists, func, select, update
 from sqlalchemy.orm import Session
 
 from skills.db import now, rfc3339
 from skills.db.models import Demonstration, PolicyVersion, Release, Surgeon
 from skills.db.row_visibility import EVERYBODYS
-from skills.db.service_tables import Job, StyleToRetrain, record_event
+from skills.db.service_tables import ErasedSurgeon, Job, StyleToRetrain, record_event
 from skills.db.session import Database
 from skills.errors import Conflict, NotFound, TooMany
+from skills.library import locks
 from skills.library.releases import Outcome, is_served
 from skills.packing import canonical, sha256
 from skills.remedies import Action, Remedy
 
 BATCH, PART = "retraining", "retraining-part"
+EXPORT, PICTURES = "dataset", "pictures"
 ACTIVE = ("queued", "running")
 Store = Callable[[Session, str], dict[str, Any]]  # stores a result in a transaction, on behalf of this actor
 # For statements that change many rows: no object of the session has to follow, so none is searched for.
@@ -111,10 +113,12 @@ def settle(session: Session, batch: int) -> None:
     counted = count(session, batch)
     if counted["queued"]:
         return
+    # A batch to whose styles others are still added has not ended.
+    complete = Job.told_at.is_not(None)
     state = "failed" if counted["failed"] else "cancelled" if counted["cancelled"] else "succeeded"
     ended = {"state": state, "progress": 1.0, "result": counted, "error": _why(counted), "ended_at": now()}
     # Only the transaction that changes the state records the event.
-    mine = (Job.row == batch, Job.state.in_(ACTIVE))
+    mine = (Job.row == batch, Job.state.in_(ACTIVE), complete)
     job = session.scalar(update(Job).where(*mine).values(**ended).returning(Job.id))
     if job is not None:
         record_event(session, "worker", "finish", f"job-{BATCH}", job)
@@ -250,6 +254,7 @@ def ask(
         kind=kind,
         identity=identity_of(kind, request),
         request={**request},
+        plan=request.get("plan"),
         surgeon_row=surgeon.row if surgeon else None,
         asked_by=actor,
     )
@@ -271,7 +276,7 @@ def telling(database: Database, kind: str, request: Mapping[str, object]) -> Cal
     mine = (Job.identity == identity_of(kind, request), Job.state == "running")
 
     def tell(share: float) -> None:
-        with database.writing() as session:
+        with database.writing(()) as session:
             running = update(Job).where(*mine).values(progress=share).returning(Job.row)
             if session.execute(running).first() is None:
                 raise Conflict("The job was cancelled while it ran.")
@@ -304,6 +309,14 @@ def identity_of(kind: str, request: Mapping[str, object]) -> str:
     return sha256(canonical([kind, request]))
 
 
+def shown() -> list[ColumnElement[bool]]:
+    """Return the conditions on the jobs that users see: no parts of batches, and no jobs of erased surgeons."""
+    erased = cast(Table, ErasedSurgeon.__table__).c.surgeon_row
+    # A scalar and not `exists`, which PostgreSQL may turn into a join, for which it reads and sorts all jobs.
+    of_job = select(erased).where(erased == Job.surgeon_row).correlate(Job).scalar_subquery()
+    return [Job.kind != PART, of_job.is_(None)]
+
+
 def newest(session: Session, kind: str, request: Mapping[str, object]) -> Job | None:
     """Return the newest job with exactly this request, in any state."""
     mine = select(Job).where(Job.identity == identity_of(kind, request))
@@ -312,7 +325,7 @@ def newest(session: Session, kind: str, request: Mapping[str, object]) -> Job | 
 
 def find_job(session: Session, job_id: str) -> Job:
     """Return a job by its id."""
-    job = session.scalar(select(Job).where(Job.id == job_id, Job.kind != PART))
+    job = session.scalar(select(Job).where(Job.id == job_id, *shown()))
     if job is None:
         raise NotFound("There is no job with this id.", Remedy(Action.LIST_JOBS))
     return job
@@ -320,14 +333,14 @@ def find_job(session: Session, job_id: str) -> Job:
 
 def find_jobs(session: Session, job_ids: Collection[str]) -> Sequence[Job]:
     """Return jobs by their ids, with one query; unknown ids are left out."""
-    return session.scalars(select(Job).where(Job.id.in_(job_ids), Job.kind != PART)).all()
+    return session.scalars(select(Job).where(Job.id.in_(job_ids), *shown())).all()
 
 
 def list_jobs(
     session: Session, limit: int, before: int | None, state: str | None, kind: str | None = None
 ) -> Sequence[Job]:
     """List jobs, the newest first: all, or those in one state or of one kind."""
-    query = select(Job).where(Job.kind != PART).order_by(Job.row.desc()).limit(limit)
+    query = select(Job).where(*shown()).order_by(Job.row.desc()).limit(limit)
     if before is not None:
         query = query.where(Job.row < before)
     if state is not None:
@@ -337,8 +350,24 @@ def list_jobs(
     return session.scalars(query).all()
 
 
+def names_of(session: Session, row: int) -> list[str] | None:
+    """Return the names under which the end of a job is stored (`skills.library.locks`): its own, its batch's, its
+    surgeon's; None for an export, which asks for the consent of many surgeons.
+    """
+    query = select(Job.kind, Job.request, Surgeon.slug).outerjoin(Surgeon, Surgeon.row == Job.surgeon_row)
+    found = session.execute(query.where(Job.row == row)).first()
+    if found is None:
+        return [locks.job(row)]
+    if found.kind == EXPORT:
+        return None
+    of_batch = [locks.job(found.request["retraining"])] if found.kind == PART else []
+    return [locks.job(row), *of_batch, *([] if found.slug is None else [locks.surgeon(found.slug)])]
+
+
 def cancel(session: Session, job_id: str, actor: str) -> Job:
     """Cancel a job that is queued or running: its result will not be stored.
+
+    The caller's transaction holds the name of the job.
 
     Raises:
         Conflict: It has ended.

@@ -18,7 +18,7 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import ColumnElement, case, func, select, text
+from sqlalchemy import ColumnElement, Select, case, exists, func, select, text
 from sqlalchemy.orm import Session
 
 from skills.db import now
@@ -221,6 +221,7 @@ State = Literal["released", "trained", "stored", "empty"]
 STATES: tuple[State, ...] = ("released", "trained", "stored", "empty")
 MOST = 50  # rows of a list on a page
 MOST_VERSIONS = 200
+MOST_COUNTED = 1000  # of a kind, for the figures of the first page
 
 _Row = tuple[int, str]  # a style: the surgeon's row and the suture type's slug
 
@@ -284,7 +285,7 @@ def matrix(
     if skill is not None:
         query = query.where(Surgeon.skill_level == skill)
     if state in ("released", "trained", "stored"):
-        query = query.where(Surgeon.row.in_(_having(state)))
+        query = query.where(_having(state))
     surgeons = session.scalars(query.order_by(Surgeon.slug).limit(limit)).all()
     found = _styles(session, [one.row for one in surgeons])
     used = {suture for (_, suture), style in found.items() if state in (None, style.state)}
@@ -302,24 +303,28 @@ def _said(suture: SutureType) -> str:
     return " ".join([suture.slug, suture.name, suture.family, *suture.also_called]).lower()
 
 
-def _having(state: State) -> Any:
-    """Return a query of the surgeons with a style in this state or beyond it."""
+def _having(state: State) -> ColumnElement[bool]:
+    """Return a condition on `Surgeon`: with a style in this state or beyond it, asked surgeon by surgeon."""
     if state == "released":
-        return select(Release.surgeon_row).where(is_served())
-    if state == "trained":
-        return select(PolicyVersion.surgeon_row)
-    return select(Demonstration.surgeon_row).where(Demonstration.withdrawn_at.is_(None))
+        found = exists().where(Release.surgeon_row == Surgeon.row, is_served())
+    elif state == "trained":
+        found = exists().where(PolicyVersion.surgeon_row == Surgeon.row)
+    else:
+        found = exists().where(Demonstration.surgeon_row == Surgeon.row, Demonstration.withdrawn_at.is_(None))
+    return found.correlate(Surgeon)
 
 
 def _counts(session: Session) -> dict[str, int]:
     active = Demonstration.withdrawn_at.is_(None)
-    queries = {
-        "surgeons": select(func.count()).select_from(Surgeon),
-        "suture types": select(func.count()).select_from(SutureType),
-        "demonstrations": select(func.count()).select_from(Demonstration).where(active),
-        "released styles": select(func.count()).select_from(Release).where(is_served()),
+    queries: dict[str, Select[Any]] = {
+        "surgeons": select(Surgeon.row),
+        "suture types": select(SutureType.slug),
+        "demonstrations": select(Demonstration.row).where(active),
+        "released styles": select(Release.row).where(is_served()),
     }
-    return {name: session.scalar(query) or 0 for name, query in queries.items()}
+    # Counted no further than this, so that the page takes as long in a large installation as in a small one.
+    few = {name: query.limit(MOST_COUNTED).subquery() for name, query in queries.items()}
+    return {name: session.scalar(select(func.count()).select_from(rows)) or 0 for name, rows in few.items()}
 
 
 def _styles(session: Session, surgeons: Sequence[int], suture: str | None = None) -> dict[_Row, Style]:
@@ -482,11 +487,11 @@ def playbacks_of(session: Session, plan: Plan) -> list[Played]:
 
 def _played(session: Session, playback: StoredPlayback) -> Played:
     drawn = session.scalar(select(StoredPictures.row).where(StoredPictures.playback_row == playback.row))
-    job = None if drawn else newest_job(session, playbacks.KIND, playback=playback.sha256)
+    job = None if drawn else playbacks.job_of_pictures(session, playback)
     return Played(playback, drawn is not None, job)
 
 
-def newest_job(session: Session, kind: str, **asked: str) -> Job | None:
-    """Return the newest job of a kind whose request has these values."""
-    mine = [Job.kind == kind, *(Job.request[name].as_string() == value for name, value in asked.items())]
-    return session.scalar(select(Job).where(*mine).order_by(Job.row.desc()).limit(1))
+def newest_job(session: Session, kind: str, plan: str) -> Job | None:
+    """Return the newest job of a kind for a plan, or for a playback of it."""
+    mine = select(Job).where(Job.plan == plan, Job.kind == kind)
+    return session.scalar(mine.order_by(Job.row.desc()).limit(1))

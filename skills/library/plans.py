@@ -22,7 +22,7 @@ from skills.formats.suture_points import PARSE, SuturePoints, suture_points
 from skills.gridworld.grid import refuse_metres
 from skills.kinematics import DEFAULT_INSTRUMENT
 from skills.learning.policy import Policy
-from skills.library import policies
+from skills.library import locks, policies
 from skills.library.integrity import find_by_digest, learnt, plan_identity, planned
 from skills.library.policies import combined_of, learnt_from
 from skills.library.recordings import Reader, Upload, read_upload
@@ -90,7 +90,7 @@ def plan_sutures(database: Database, request: PlanIn, actor: str) -> tuple[Plan,
     trajectory = trajectory_of(plan)
     identity = plan_identity(sha, plan)
     about = describe_plan(plan, trajectory)
-    with database.writing() as session:
+    with database.writing([locks.surgeon(request.surgeon)]) as session:
         # Consent may have ended while the plan was computed.
         policy = policies.followable(policies.find_by_digest(session, sha))
         # An equal plan has the same digest, so a repeated request returns the stored row.

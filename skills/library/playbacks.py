@@ -29,7 +29,7 @@ from skills.db.session import Database
 from skills.errors import BadPlan, Conflict, NotDrawnYet
 from skills.library import jobs, releases
 from skills.library.integrity import find_by_digest, planned
-from skills.library.jobs import PicturesRequest, PlaybackRequest
+from skills.library.jobs import PICTURES, PicturesRequest, PlaybackRequest
 from skills.library.plans import find_plan, hands_over, plan_in_words, psm_m_moves, trajectory_of
 from skills.packing import canonical, sha256
 from skills.planning.trajectory import Trajectory
@@ -229,12 +229,9 @@ def _finite(data: Any) -> Any:
     return data
 
 
-KIND = "pictures"
-
-
 def request_pictures(session: Session, playback: StoredPlayback, actor: str) -> tuple[Job, bool]:
     """Queue the pictures of a stored playback; return the job, and whether it is new."""
-    return jobs.ask(session, KIND, _wanted(playback), playback.plan.policy.surgeon, actor)
+    return jobs.ask(session, PICTURES, _wanted(playback), playback.plan.policy.surgeon, actor)
 
 
 def draw_pictures(
@@ -263,7 +260,7 @@ def draw_pictures(
         # A retry of the job must not store the pictures twice.
         if session.scalar(of_playback) is None:
             session.add(StoredPictures(playback_row=playback.row, drawn=drawn))
-            record_event(session, actor, "draw", KIND, playback.sha256, playback.plan.policy.surgeon)
+            record_event(session, actor, "draw", PICTURES, playback.sha256, playback.plan.policy.surgeon)
         return {"playback": playback.sha256}
 
     return store
@@ -277,8 +274,13 @@ def find_pictures(session: Session, playback: StoredPlayback) -> Pictures:
     """
     stored = session.scalar(select(StoredPictures).where(StoredPictures.playback_row == playback.row))
     if stored is None:
-        raise _not_drawn(playback, jobs.newest(session, KIND, _wanted(playback)))
+        raise _not_drawn(playback, job_of_pictures(session, playback))
     return stored.drawn
+
+
+def job_of_pictures(session: Session, playback: StoredPlayback) -> Job | None:
+    """Return the newest job that draws the pictures of a playback, or failed to."""
+    return jobs.newest(session, PICTURES, _wanted(playback))
 
 
 def _not_drawn(playback: StoredPlayback, job: Job | None) -> NotDrawnYet:

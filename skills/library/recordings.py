@@ -19,16 +19,18 @@ import tempfile
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, fields, is_dataclass, replace
+from datetime import timedelta
 from functools import partial
 from typing import Any, BinaryIO
 
 import numpy as np
-from sqlalchemy import delete, select
+from sqlalchemy import delete, select, text, update
 from sqlalchemy.orm import Session
 
 from skills import packing
-from skills.db import rfc3339
+from skills.db import now, rfc3339
 from skills.db.models import (
+    LooseChunks,
     ParsedChunk,
     ParsedRecording,
     RecordingChunk,
@@ -45,6 +47,7 @@ from skills.errors import BadInput, Busy, Conflict, Corrupt, UnknownFormat, Unre
 from skills.fields import as_json
 from skills.formats import MEDIA_TYPES, media_type_of, read_recording
 from skills.formats.reader_process import KNOWN, READER_VERSION, ConfinedReader, Told, read_told
+from skills.library import locks
 from skills.library.catalogue import find_surgeon
 from skills.library.integrity import find_by_digest
 from skills.packing import canonical
@@ -58,13 +61,15 @@ Teller = Callable[..., Told]  # `read_told`, or a callable that runs it in anoth
 BAGS = ("mcap", "rosbag1", "rosbag2")  # formats with checksums; text files have none
 
 CHUNK_BYTES = 1 << 20
+# Ours: that many bytes are stored in one transaction, for which others wait: on SQLite some 40 ms.
+AT_ONCE_BYTES = 4 * CHUNK_BYTES
+DUE_S = 3600.0  # ours: an upload under way stores its next piece within seconds
+UNFINISHED = 0  # version of an entry whose chunks are not all stored
 # Ours: a larger entry is not kept, so that uploads which compress well cannot fill the disk. Entries of bags, tables
 # and JIGSAWS take 0.1 to 1.1 times the bytes of their files, those of parquet files in single precision 1.6 times.
 MOST_SHARE = 4
 LEAST_BYTES = 256 << 10  # ours: the limit for the smallest files, whose names weigh more than their numbers
 TOLERANCE = 1e-6  # ours, in mm, rad and s: another build of numpy may round differently
-
-log = logging.getLogger(__name__)
 
 log = logging.getLogger(__name__)
 
@@ -160,11 +165,14 @@ def store_recording(
             find_surgeon(session, surgeon)
     told = tell_upload(upload, read)
     entry = entry_of(upload, told)
-    with database.writing() as session:
-        stored, new = keep(session, upload, told, entry, actor)
+    names = [] if surgeon is None else [locks.surgeon(surgeon)]
+    ahead = send_ahead(database, upload)
+    with database.writing([locks.recording(upload.sha256), *names]) as session:
+        stored, new = keep(session, upload, told, entry, actor, ahead)
         if surgeon is not None:
             session.merge(RecordingSurgeon(recording_row=stored.row, surgeon_row=find_surgeon(session, surgeon).row))
-        return stored, new
+    cache_large(database, stored, entry)
+    return stored, new
 
 
 def preview(upload: Upload, read: Teller = read_told) -> dict[str, Any]:
@@ -205,7 +213,74 @@ def entry_of(upload: Upload, told: Told) -> Entry | None:
     return packed_content(upload.sha256, upload.size_bytes, upload.reading, told)
 
 
-def keep(session: Session, upload: Upload, told: Told, entry: Entry | None, actor: str) -> tuple[StoredRecording, bool]:
+def send_ahead(database: Database, upload: Upload) -> int | None:
+    """Store the chunks of a large upload before its row, in several short transactions, for which others can wait.
+
+    They belong to nobody until `keep` stores the row; if it does not, they are deleted when they are due
+    (`skills.library.sweep`).
+
+    Returns:
+        The number of the row to be stored; None if `keep` stores the chunks with the row, because they are few or the
+        bytes are stored already.
+
+    Raises:
+        Busy: It took longer than `DUE_S`.
+    """
+    if upload.size_bytes <= AT_ONCE_BYTES:
+        return None
+    same = select(StoredRecording.row).where(StoredRecording.sha256 == upload.sha256)
+    with database.reading() as session:
+        if session.scalar(same.execution_options(**EVERYBODYS)) is not None:
+            return None
+    with database.writing(()) as session:
+        row = _reserve(session)
+        session.add(LooseChunks(recording_row=row, due_at=now() + timedelta(seconds=DUE_S)))
+    upload.file.seek(0)
+    number = 0
+    while piece := upload.file.read(AT_ONCE_BYTES):
+        with database.writing(()) as session:
+            _still_loose(session, row)
+            number = _add_chunks(session, row, number, piece)
+    return row
+
+
+def _reserve(session: Session) -> int:
+    """Return a number that no recording has, had or will get from the database."""
+    if session.get_bind().dialect.name == "postgresql":
+        return int(session.scalars(text("SELECT nextval(pg_get_serial_sequence('recordings', 'row'))")).one())
+    further = "UPDATE sqlite_sequence SET seq = seq + 1 WHERE name = 'recordings' RETURNING seq"
+    row = session.scalar(text(further))
+    if row is None:  # nothing was ever stored
+        session.execute(text("INSERT INTO sqlite_sequence (name, seq) VALUES ('recordings', 0)"))
+        row = session.scalar(text(further))
+    assert row is not None
+    return int(row)
+
+
+def _still_loose(session: Session, row: int) -> None:
+    """Let the chunks of an upload under way be due later.
+
+    Raises:
+        Busy: They were due, and are being deleted.
+    """
+    later = update(LooseChunks).where(LooseChunks.recording_row == row, LooseChunks.due_at > now())
+    found = later.values(due_at=now() + timedelta(seconds=DUE_S)).returning(LooseChunks.recording_row)
+    if session.execute(found).first() is None:
+        raise Busy("The recording took too long to be stored; send it again.")
+
+
+def _add_chunks(session: Session, row: int, number: int, data: bytes) -> int:
+    """Add chunks to a recording; return the number of the next one."""
+    for start in range(0, len(data), CHUNK_BYTES):
+        session.add(RecordingChunk(recording=row, number=number, data=data[start : start + CHUNK_BYTES]))
+        session.flush()
+        number += 1
+    return number
+
+
+def keep(
+    session: Session, upload: Upload, told: Told, entry: Entry | None, actor: str, ahead: int | None = None
+) -> tuple[StoredRecording, bool]:
     """Write a recording in the caller's transaction, once; return the row, and whether it is new to the actor.
 
     Bytes that only others have uploaded are reported as new, so that a digest does not reveal their uploads.
@@ -214,15 +289,19 @@ def keep(session: Session, upload: Upload, told: Told, entry: Entry | None, acto
         session: The caller's transaction.
         upload: The recording's bytes.
         told: What was read of them.
-        entry: The same, from `entry_of`.
+        entry: The same, from `entry_of`; a large one is left to `cache_large`.
         actor: The owner of the caller's key.
+        ahead: The number of its row, from `send_ahead`.
 
     Raises:
         Conflict: The bytes are already stored with other reading parameters.
     """
     same = select(StoredRecording).where(StoredRecording.sha256 == upload.sha256)
     stored = session.scalar(same.execution_options(**EVERYBODYS))
+    entry = None if entry is not None and len(entry.data) > AT_ONCE_BYTES else entry
     if stored is not None:
+        if ahead is not None:  # another upload of the same bytes was faster
+            session.execute(update(LooseChunks).where(LooseChunks.recording_row == ahead).values(due_at=now()))
         if stored.reading != upload.reading:
             if session.get(RecordingUpload, (stored.row, actor)) is None:  # do not reveal another user's parameters
                 raise Conflict(
@@ -236,7 +315,11 @@ def keep(session: Session, upload: Upload, told: Told, entry: Entry | None, acto
         if entry is not None and not is_cached(session, stored):
             put_entry(session, stored.row, entry)
         return stored, _brought_by(session, stored, actor)
+    if ahead is not None:
+        _still_loose(session, ahead)
+        session.execute(delete(LooseChunks).where(LooseChunks.recording_row == ahead))
     stored = StoredRecording(
+        row=ahead,
         sha256=upload.sha256,
         size_bytes=upload.size_bytes,
         media_type=upload.media_type,
@@ -247,13 +330,12 @@ def keep(session: Session, upload: Upload, told: Told, entry: Entry | None, acto
     )
     session.add(stored)
     session.flush()
-    upload.file.seek(0)
-    number = 0
-    # Chunk by chunk, so that memory stays bounded whatever the size of the recording.
-    while data := upload.file.read(CHUNK_BYTES):
-        session.add(RecordingChunk(recording=stored.row, number=number, data=data))
-        session.flush()
-        number += 1
+    if ahead is None:
+        upload.file.seek(0)
+        number = 0
+        # Piece by piece, so that memory stays bounded whatever the size of the recording.
+        while data := upload.file.read(AT_ONCE_BYTES):
+            number = _add_chunks(session, stored.row, number, data)
     if entry is not None:
         put_entry(session, stored.row, entry)
     return stored, _brought_by(session, stored, actor)
@@ -311,12 +393,56 @@ def _remember(database: Database, stored: StoredRecording, told: Told) -> None:
     entry = packed_content(stored.sha256, stored.size_bytes, stored.reading, told)
     if entry is None:
         return
+    if len(entry.data) > AT_ONCE_BYTES:
+        cache_large(database, stored, entry)
+        return
     try:
-        with database.writing() as session:
+        with database.writing([locks.recording(stored.sha256)]) as session:
             if session.get(StoredRecording, stored.row) is not None:
                 put_entry(session, stored.row, entry)
     except Busy as error:  # the caller has the recording; the next use decodes it again
         log.info("recordings %d: it was read, but could not be cached (%s).", stored.row, type(error).__name__)
+
+
+def cache_large(database: Database, stored: StoredRecording, entry: Entry | None) -> None:
+    """Cache a large content of a stored recording in several short transactions; its row gets its version in the last.
+
+    Nothing is done for a small content, which `keep` stores, or if the recording is erased meanwhile. Two callers may
+    write the same content at once: each adds the chunks that are missing.
+    """
+    if entry is None or len(entry.data) <= AT_ONCE_BYTES:
+        return
+    names = [locks.recording(stored.sha256)]
+    mine = (ParsedRecording.recording_row == stored.row, ParsedRecording.sha256 == entry.sha256)
+    try:
+        with database.writing(names) as session:
+            if session.get(StoredRecording, stored.row) is None or is_cached(session, stored):
+                return
+            if session.scalar(select(ParsedRecording.recording_row).where(*mine)) is None:
+                session.execute(delete(ParsedRecording).where(ParsedRecording.recording_row == stored.row))
+                unfinished = {"version": UNFINISHED, "reading": entry.reading, "sha256": entry.sha256}
+                session.add(ParsedRecording(recording_row=stored.row, **unfinished))
+        for start in range(0, len(entry.data), AT_ONCE_BYTES):
+            with database.writing(names) as session:
+                if session.scalar(select(ParsedRecording.recording_row).where(*mine)) is None:
+                    return
+                _add_missing(session, stored.row, entry, start)
+        with database.writing(names) as session:
+            session.execute(update(ParsedRecording).where(*mine).values(version=READER_VERSION))
+    except Busy as error:
+        log.info("recordings %d: it was read, but could not be cached (%s).", stored.row, type(error).__name__)
+
+
+def _add_missing(session: Session, recording_row: int, entry: Entry, start: int) -> None:
+    """Add the chunks of an entry from one byte on, `AT_ONCE_BYTES` of them, that are not stored yet."""
+    first, of = start // CHUNK_BYTES, ParsedChunk
+    known = select(of.number).where(of.recording_row == recording_row, of.number >= first)
+    there = set(session.scalars(known))
+    for number in range(first, first + AT_ONCE_BYTES // CHUNK_BYTES):
+        piece = bytes(entry.data[number * CHUNK_BYTES : (number + 1) * CHUNK_BYTES])
+        if piece and number not in there:
+            session.add(ParsedChunk(recording_row=recording_row, number=number, data=piece))
+            session.flush()
 
 
 def recording_bytes(session: Session, stored: StoredRecording) -> Iterator[bytes]:

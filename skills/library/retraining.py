@@ -8,16 +8,17 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from sqlalchemy import ColumnElement, func, insert, select
+from sqlalchemy import ColumnElement, func, insert, select, update
 from sqlalchemy.orm import Session
 
-from skills.db import rfc3339
+from skills.db import now, rfc3339
 from skills.db.models import Demonstration, PolicyVersion, Surgeon, SutureType
 from skills.db.service_tables import Job, StyleToRetrain
+from skills.db.session import Database
 from skills.errors import Conflict, NotFound
 from skills.learning.certificate import NearLimits
 from skills.learning.policy import LEARNER_VERSION, describe_learner
-from skills.library import jobs
+from skills.library import jobs, locks
 from skills.library.catalogue import find_surgeon, find_suture_type
 from skills.library.demos import newest_demos
 from skills.library.jobs import BATCH, KEPT, PART, Asked, PartRequest, RetrainingRequest, did_nothing, with_rule
@@ -29,10 +30,11 @@ from skills.remedies import Action, Remedy
 from skills.schemas.requests import RetrainingIn
 
 MOST_IN_A_PART = 50  # styles: the engine's overhead for a part, some 30 ms, is then spread over a second of work
+STYLES_AT_ONCE = 500  # rows that one transaction adds: others wait for it, on SQLite all writers
 FEWEST_PARTS = 16  # if there are so many styles: workers share a batch part by part
 
 
-def request_retraining(session: Session, batch: RetrainingIn, actor: str, near: NearLimits | None = None) -> Asked:
+def request_retraining(database: Database, batch: RetrainingIn, actor: str, near: NearLimits | None = None) -> Asked:
     """Queue a batch that trains styles again, each from its newest demonstration that may be learnt from.
 
     One that is marked recovery or failure is left out, even if the style serves a version trained from any outcome. A
@@ -48,8 +50,11 @@ def request_retraining(session: Session, batch: RetrainingIn, actor: str, near: 
     new job consists of these styles: they are learnt again, which gives the same versions, and released by the same
     rules.
 
+    The styles are chosen by reading alone, and added to the job in several short transactions: workers may begin with
+    the first ones before the last ones are added.
+
     Args:
-        session: The caller's transaction.
+        database: The database, restricted to the rows that the caller may see.
         batch: The request. Without `surgeon` or `suture` styles of all of them are trained, and without `learner` phase
             Q-learning with its defaults learns.
         actor: The owner of the caller's key.
@@ -57,9 +62,45 @@ def request_retraining(session: Session, batch: RetrainingIn, actor: str, near: 
 
     Raises:
         NotFound: The surgeon or the suture type is unknown.
-        Conflict: There is no demonstration that may be learnt from.
+        Conflict: There is no demonstration that may be learnt from, or the surgeon was erased meanwhile.
         BadSettings: With the learner's settings going round in circles pays more than arriving.
         LearnerNotInstalled: The learner needs a library that is not installed.
+    """
+    with database.reading() as session:
+        request, styles = choose_styles(session, batch, near)
+    names = [] if batch.surgeon is None else [locks.surgeon(batch.surgeon)]
+    with database.writing([locks.BATCHES, *names]) as session:
+        who = None if batch.surgeon is None else find_surgeon(session, batch.surgeon)
+        job, new = jobs.ask(session, BATCH, request, who, actor)
+        if not new:
+            return Asked(job, False, _did_nothing(session, job))
+    # Rows are inserted only for a new job; an equal one has its own.
+    size = max(1, min(MOST_IN_A_PART, -(-len(styles) // FEWEST_PARTS)))
+    at_once = STYLES_AT_ONCE // size * size
+    for first in range(0, len(styles), at_once):
+        with database.writing([locks.job(job.row)]) as session:
+            if session.scalar(select(Job.row).where(Job.row == job.row, Job.state.in_(jobs.ACTIVE))) is None:
+                break  # cancelled or erased meanwhile
+            _divide(session, job, styles[first : first + at_once], size)
+    with database.writing([locks.job(job.row)]) as session:
+        session.execute(update(Job).where(Job.row == job.row).values(told_at=now()), **jobs.UNSYNCHRONISED)
+        jobs.settle(session, job.row)  # a batch without styles, or whose styles are all done, ends here
+        told = session.get(Job, job.row)
+    if told is None:
+        raise Conflict("The surgeon was erased while the batch was requested.")
+    if not styles:
+        return Asked(told, True, "Nothing: no style needs training.")
+    counted = f"{len(styles)} {'style' if len(styles) == 1 else 'styles'}"
+    why = " that serve another version than when an equal batch ended" if "after" in request else ""
+    return Asked(told, True, f"A new job is queued, of {counted}{why}.")
+
+
+def choose_styles(
+    session: Session, batch: RetrainingIn, near: NearLimits | None = None
+) -> tuple[RetrainingRequest, list[dict[str, Any]]]:
+    """Return the request of a batch's job, and for each of its styles the demonstration and why it is stale.
+
+    The arguments and errors are those of `request_retraining`.
     """
     learner = learner_to_train(batch.chosen)
     who = None if batch.surgeon is None else find_surgeon(session, batch.surgeon)
@@ -88,18 +129,7 @@ def request_retraining(session: Session, batch: RetrainingIn, actor: str, near: 
     stale = _reasons(session, demos, asked, rules, who, what)
     chosen = [demo for demo in demos if stale[demo.row] or not batch.only_stale]
     request, unsettled = _unsettled(session, asked, chosen, rules)
-    job, new = jobs.ask(session, BATCH, request, who, actor)
-    if not new:
-        return Asked(job, False, _did_nothing(session, job))
-    # Rows are inserted only for a new job; an equal one has its own.
-    _divide(session, job, [{"demonstration_row": demo.row, "stale": stale[demo.row]} for demo in unsettled])
-    jobs.settle(session, job.row)  # a batch without styles ends here
-    session.refresh(job)
-    if job.state == "succeeded":
-        return Asked(job, True, "Nothing: no style needs training.")
-    styles = f"{len(unsettled)} {'style' if len(unsettled) == 1 else 'styles'}"
-    why = " that serve another version than when an equal batch ended" if "after" in request else ""
-    return Asked(job, True, f"A new job is queued, of {styles}{why}.")
+    return request, [{"demonstration_row": demo.row, "stale": stale[demo.row]} for demo in unsettled]
 
 
 def _unsettled(
@@ -216,14 +246,16 @@ def _reasons(
     return reasons
 
 
-def _divide(session: Session, job: Job, styles: Sequence[dict[str, Any]]) -> None:
-    """Insert a row for every style, and divide the styles into parts of about the same size."""
-    size = max(1, min(MOST_IN_A_PART, -(-len(styles) // FEWEST_PARTS)))
-    for first in range(0, len(styles), size):
+def _divide(session: Session, job: Job, styles: Sequence[dict[str, Any]], size: int) -> None:
+    """Insert a row for each of some styles, and divide them into parts; a demonstration that was erased is left out."""
+    rows = [style["demonstration_row"] for style in styles]
+    there = set(session.scalars(select(Demonstration.row).where(Demonstration.row.in_(rows))))
+    left = [style for style in styles if style["demonstration_row"] in there]
+    for first in range(0, len(left), size):
         part = Job(
-            id=secrets.token_hex(8),
+            id=(name := secrets.token_hex(8)),
             kind=PART,
-            identity=jobs.identity_of(PART, {"retraining": job.id, "first": first}),
+            identity=jobs.identity_of(PART, {"retraining": job.id, "part": name}),
             request={},
             surgeon_row=job.surgeon_row,
             asked_by=job.asked_by,
@@ -232,13 +264,13 @@ def _divide(session: Session, job: Job, styles: Sequence[dict[str, Any]]) -> Non
         session.flush()
         request: PartRequest = {"retraining": job.row, "part": part.row}
         part.request, part.identity = {**request}, jobs.identity_of(PART, request)
-        rows = [{"job_row": job.row, "part_row": part.row, **style} for style in styles[first : first + size]]
-        session.execute(insert(StyleToRetrain), rows)
+        of_part = [{"job_row": job.row, "part_row": part.row, **style} for style in left[first : first + size]]
+        session.execute(insert(StyleToRetrain), of_part)
 
 
 def find_retraining(session: Session, job_id: str) -> Job:
     """Return a batch by its job's id."""
-    job = session.scalar(select(Job).where(Job.id == job_id, Job.kind == BATCH))
+    job = session.scalar(select(Job).where(Job.id == job_id, Job.kind == BATCH, *jobs.shown()))
     if job is None:
         raise NotFound("There is no retraining with this job id.", Remedy(Action.LIST_JOBS))
     return job

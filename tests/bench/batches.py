@@ -210,8 +210,8 @@ def ours(full: Path, workers: int, styles: int, *, consent: bool = True) -> Took
 
 def asked(database: Database, engine: Engine, **what: object) -> int:
     """Request a batch as the service does."""
-    with database.writing() as session:
-        job, *_ = request_retraining(session, RetrainingIn(**what), "bench")
+    job, *_ = request_retraining(database, RetrainingIn(**what), "bench")
+    with database.reading() as session:
         told = to_tell(session, job)
     for row, attempt in told:
         engine.tell(row, attempt, PART)

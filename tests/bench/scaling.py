@@ -22,7 +22,7 @@ from skills.jobs.workflows import Leases, Watch
 from skills.library import catalogue, demos, jobs, policies
 from skills.library.jobs import BATCH
 from skills.library.overview import condition_of
-from skills.library.retraining import list_styles, request_retraining
+from skills.library.retraining import choose_styles, list_styles
 from skills.library.training import request_training
 from skills.schemas.requests import RetrainingIn, TrainingIn
 from tests import backends
@@ -164,8 +164,8 @@ CALLS: dict[str, Call] = {
     "a training asked for": lambda s, style: request_training(
         s, TrainingIn(surgeon=style[0], suture=style[1]), "bench"
     ),
-    "a surgeon's stale styles asked for": lambda s, style: request_retraining(
-        s, RetrainingIn(surgeon=style[0], only_stale=True), "bench"
+    "a surgeon's stale styles asked for": lambda s, style: choose_styles(
+        s, RetrainingIn(surgeon=style[0], only_stale=True)
     ),
     "jobs, the first page": lambda s, _: jobs.list_jobs(s, PAGE, None, None),
     "jobs that succeeded": lambda s, _: jobs.list_jobs(s, PAGE, None, "succeeded"),

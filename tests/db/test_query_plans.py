@@ -13,7 +13,7 @@ from sqlalchemy.orm import Session
 from skills.db.session import Database
 from skills.jobs.workflows import Leases, Watch
 from skills.library import batch_work, catalogue, demos, jobs, policies, retraining, training
-from skills.library.overview import condition_of
+from skills.library.overview import condition_of, newest_job
 from skills.schemas.requests import RetrainingIn, TrainingIn
 from tests import backends
 from tests.library import hospital
@@ -66,14 +66,16 @@ HOT: dict[str, Callable[[Session], object]] = {
     "a version": lambda s: policies.find_version(s, *STYLE, 1),
     "a version by its digest": lambda s: policies.find_by_digest(s, policies.policy_of(s, *STYLE).policy.sha256),
     "a training": lambda s: training.request_training(s, TrainingIn(surgeon=STYLE[0], suture=STYLE[1]), "test"),
-    "a surgeon's stale styles": lambda s: retraining.request_retraining(
-        s, RetrainingIn(surgeon=STYLE[0], only_stale=True), "test"
-    ),
+    "a surgeon's stale styles": lambda s: retraining.choose_styles(s, RetrainingIn(surgeon=STYLE[0], only_stale=True)),
     "where what was learnt stands": lambda s: s.execute(training.STANDING, {"demonstrations": [1, 2, 3]}).all(),
     "what is known already": lambda s: s.execute(training.KNOWN, {"digests": ["0" * 64, "1" * 64]}).all(),
     "what some styles serve": lambda s: s.execute(batch_work.SERVED, {"demonstrations": [1, 2, 3]}).all(),
     "jobs": lambda s: jobs.list_jobs(s, 10, 50, None),
     "jobs of a state": lambda s: jobs.list_jobs(s, 10, 50, "failed"),
+    "jobs of a kind": lambda s: jobs.list_jobs(s, 10, 50, None, "playback"),
+    "jobs of a kind and a state": lambda s: jobs.list_jobs(s, 10, 50, "failed", "playback"),
+    "the newest job for a plan": lambda s: newest_job(s, "playback", "0" * 64),
+    "withdrawn demonstrations": lambda s: demos.list_demos(s, 10, 50, None, None, active=False),
     "the newest of equal jobs": lambda s: jobs.newest(s, "pictures", {}),
     "a batch's styles": lambda s: retraining.list_styles(s, batch(s), 10, 20, None),
     "a batch's styles of a state": lambda s: retraining.list_styles(s, batch(s), 10, 20, "failed"),

@@ -49,7 +49,7 @@ GONE_WITH_ITS_RECORDING = {"recording_uploads", "recording_surgeons", "parsed_re
 WITHDRAWABLE = ("demonstrations", "releases")
 FREE = {
     "surgeons", "suture_types", "jobs", "retraining_styles", "executors", "keys", "key_surgeons", "sign_ins",
-    "measured_shapes",
+    "measured_shapes", "loose_chunks", "erased_surgeons",
 }  # fmt: skip
 
 

@@ -48,10 +48,9 @@ def made_once(database: Database) -> tuple[Made, str]:
 
 
 def ask_retraining(database: Database, **asked: object) -> Job:
-    with database.writing() as session:
-        if "learner" in asked:
-            asked["learner"] = describe_learner(asked["learner"])
-        return request_retraining(session, RetrainingIn(**asked), "test")[0]
+    if "learner" in asked:
+        asked["learner"] = describe_learner(asked["learner"])
+    return request_retraining(database, RetrainingIn(**asked), "test")[0]
 
 
 def parts_of(database: Database, job: Job) -> list[Job]:

@@ -1,7 +1,7 @@
 """The use cases on both back ends: concurrent requests give one result, and withdrawn inputs none."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
@@ -66,8 +66,8 @@ def test_a_recording_is_looked_at_before_the_transaction_that_stores_it(
     writing, look = Database.writing, segments._look
 
     @contextmanager
-    def watched(self: Database) -> Iterator[Session]:
-        with writing(self) as session:
+    def watched(self: Database, names: Iterable[str] | None = None) -> Iterator[Session]:
+        with writing(self, names) as session:
             begun.append(1)
             try:
                 yield session

@@ -1,7 +1,7 @@
 """The cache of parsed recordings: never another value than that of the bytes, and never a reason to fail."""
 
 import io
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
@@ -271,7 +271,7 @@ def test_a_recording_is_read_although_it_cannot_be_cached(database: Database, mo
     forget(database)
 
     @contextmanager
-    def busy(self: Database) -> Iterator[Session]:
+    def busy(self: Database, names: Iterable[str] | None = None) -> Iterator[Session]:
         raise Busy("The database is busy.")
         yield
 

@@ -6,7 +6,7 @@ them. `settled` makes the databases that the installations begin with.
 
 import shutil
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from datetime import date, datetime
 from functools import cache
@@ -50,9 +50,9 @@ class Interruptible(Database):
         self.pause()
         return super().reading()
 
-    def writing(self) -> AbstractContextManager[Session]:
+    def writing(self, names: Iterable[str] | None = None) -> AbstractContextManager[Session]:
         self.pause()
-        return super().writing()
+        return super().writing(names)
 
 
 class Deaf:

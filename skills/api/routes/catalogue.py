@@ -8,9 +8,10 @@ from skills.api.authorisation import needs
 from skills.api.dependencies import Actor, Db, Jobs, Limit, RowCursor, Slug, SlugCursor, Strict
 from skills.api.openapi import ends, gives, gives_page, makes, router_of, says
 from skills.api.responses import Condition, Giving, refuse_changed, say, stored
-from skills.library import catalogue, erasure
+from skills.library import catalogue, erasure, locks
 from skills.library.catalogue import surgeon_json, suture_json
 from skills.library.keys import about_key, create_key, list_keys, revoke_key
+from skills.library.sweep import sweep_erased
 from skills.schemas import SkillLevel
 from skills.schemas.given import Key, NewKey, Page, Surgeon, SutureType
 from skills.schemas.requests import KEY, LINE, KeyIn, SurgeonIn, SutureTypeIn
@@ -26,7 +27,7 @@ def put_surgeon(
     surgeon: Slug, body: SurgeonIn, db: Db, actor: Actor, if_match: Condition = None, if_none_match: Condition = None
 ) -> Response:
     """Create or replace a surgeon under a pseudonym; fields that are left out are cleared."""
-    with db.writing() as session:
+    with db.writing([locks.surgeon(surgeon)]) as session:
         if if_match or if_none_match:
             known = catalogue.known_surgeon(session, surgeon)
             refuse_changed(known and surgeon_json(known), if_match, if_none_match)
@@ -63,6 +64,7 @@ def erase_surgeon(surgeon: Slug, db: Db, jobs: Jobs, actor: Actor, if_match: Con
         if if_match:
             refuse_changed(surgeon_json(catalogue.find_surgeon(session, surgeon)), if_match)
         dropped = erasure.erase_surgeon(session, surgeon, actor)
+    sweep_erased(db)
     db.forget()  # erased data must not stay in SQLite's write-ahead log
     # after the commit, because one transaction cannot span our database and the engine's
     for row, attempt in dropped:

@@ -32,11 +32,12 @@ from skills.api.routes.policies import Accept
 from skills.db.models import StoredRewardMap
 from skills.errors import BadInput, Conflict, NotFound
 from skills.formats import BYTES, MEDIA_TYPES
-from skills.library import demos, erasure, recordings, scores
+from skills.library import demos, erasure, locks, recordings, scores
 from skills.library.atlas import CONFOUNDED, DISTANCE, MOST, SESSIONS, atlas_of, atlases
 from skills.library.catalogue import find_suture_type
 from skills.library.demos import demo_json, path_json, reward_map_json
 from skills.library.recordings import recording_json
+from skills.library.sweep import sweep_erased
 from skills.schemas import OutcomeAsked
 from skills.schemas.given import Atlas, Demonstration, DemoPath, Page, Recording, RecordingPreview, RewardMap, Score
 from skills.schemas.requests import COUNT, DIGEST, SLUG, DemoIn, OutcomeIn, ScoreIn, SlugField, TableIn
@@ -106,8 +107,11 @@ def get_recording(recording: Digest, db: Db, give: Giving) -> Response:
 @router.delete("/recordings/{recording}", dependencies=[needs("uploader")], **ends(404, 409))
 def delete_recording(recording: Digest, db: Db, caller: Asking) -> None:
     """Delete a recording without demonstrations permanently; allowed to its uploader and to admins."""
-    with db.writing() as session:
+    with db.reading() as session:
+        recording = recordings.find_recording(session, recording).sha256  # in full: the argument may be a prefix
+    with db.writing([locks.recording(recording)]) as session:
         erasure.delete_recording(session, recording, caller.name, anybodys=caller.role == "admin")
+    sweep_erased(db)
     db.forget()
 
 
@@ -214,7 +218,9 @@ def mark_demo(
 
     Releases of versions that were trained with outcomes "any" stay.
     """
-    with db.writing() as session:
+    with db.reading() as session:
+        surgeon = demos.find_demo(session, demo).surgeon.slug
+    with db.writing([locks.surgeon(surgeon)]) as session:
         if if_match:
             refuse_changed(demo_json(demos.find_demo(session, demo)), if_match)
         return give(demo_json(demos.mark_demo(session, demo, body.outcome, body.reason, actor)))
@@ -226,13 +232,16 @@ def withdraw_demo(
 ) -> None:
     """Withdraw a demonstration and the releases that rest on it; with `erase`, delete it and its derived data."""
     dropped: erasure.Dropped = []
-    with db.writing() as session:
+    with db.reading() as session:
+        surgeon = demos.find_demo(session, demo).surgeon.slug
+    with db.writing(None if erase else [locks.surgeon(surgeon)]) as session:
         if if_match:
             refuse_changed(demo_json(demos.find_demo(session, demo)), if_match)
         demos.withdraw_demo(session, demo, actor)
         if erase:
             dropped = erasure.erase_demo(session, demo, actor)
     if erase:
+        sweep_erased(db)
         db.forget()
     # after the commit, because one transaction cannot span our database and the engine's
     for row, attempt in dropped:

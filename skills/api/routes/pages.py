@@ -93,7 +93,7 @@ def show_catalogue(
     with db.reading() as session:
         found = overview.matrix(session, q, state or None, skill or None, cursor)
         asked = {"q": q, "state": state, "skill": skill}
-        return render(request, "catalogue.html", caller, found=found, asked=asked)
+        return render(request, "catalogue.html", caller, found=found, asked=asked, most_counted=overview.MOST_COUNTED)
 
 
 @router.get("/pages/styles/{surgeon}/{suture}", dependencies=[needs("reader")])

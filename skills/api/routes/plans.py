@@ -24,7 +24,7 @@ from skills.db.session import Database
 from skills.errors import UnknownFormat
 from skills.formats import BYTES
 from skills.formats.replay_bag import rows_of_pass
-from skills.library import plans, playbacks
+from skills.library import locks, plans, playbacks
 from skills.library.jobs import QUEUED, did_nothing
 from skills.library.plans import find_suture_points, motion_of, plan_json, trajectory_of
 from skills.library.playbacks import find_playback, playback_json
@@ -58,7 +58,9 @@ def get_plan(plan: Digest, db: Db, give: Giving) -> Response:
 @router.post("/playbacks", dependencies=[needs("trainer"), room_for_a_job], **starts_job(404))
 def play(body: PlaybackIn, db: Db, jobs: Jobs, actor: Actor, settings: Configured) -> Response:
     """Request the playback of a plan in the simulator."""
-    with db.writing() as session:
+    with db.reading() as session:
+        surgeon = plans.find_plan(session, body.plan).policy.surgeon.slug
+    with db.writing([locks.surgeon(surgeon)]) as session:
         job, new = playbacks.request_playback(session, body.plan, actor, settings)
         answer = accepted(session, job, QUEUED if new else did_nothing(job))
     # after the commit; if the engine cannot be notified now, a worker finds the job's row later
@@ -256,7 +258,9 @@ def draw_pictures(playback: Digest, db: Db, actor: Actor) -> Response:
 
     The engine is not notified, because nobody waits for pictures: a worker finds the job in the queue by itself.
     """
-    with db.writing() as session:
+    with db.reading() as session:
+        surgeon = find_playback(session, playback).plan.policy.surgeon.slug
+    with db.writing([locks.surgeon(surgeon)]) as session:
         job, new = playbacks.request_pictures(session, find_playback(session, playback), actor)
         return accepted(session, job, QUEUED if new else did_nothing(job))
 

@@ -48,7 +48,7 @@ from skills.db.session import Database
 from skills.errors import PreconditionFailed
 from skills.learning.policy import next_step
 from skills.library import jobs as asked
-from skills.library import policies, releases
+from skills.library import locks, policies, releases
 from skills.library.cards import Card, card_of
 from skills.library.catalogue import find_surgeon, find_suture_type
 from skills.library.integrity import learnt
@@ -93,7 +93,7 @@ def train(body: TrainingIn, db: Db, jobs: Jobs, actor: Actor, caller: Asking, se
     the gate. `did` states the effect of the request; `result.released` and `served` state what is served now.
     """
     refuse_release(caller, body.release)
-    with db.writing() as session:
+    with db.writing([locks.surgeon(body.surgeon)]) as session:
         job, new, did = request_training(session, body, actor, near_limits(settings))
         answer = accepted(session, job, did)
     # after the commit; if the engine cannot be notified now, a worker finds the job's row later
@@ -136,7 +136,9 @@ async def watch_job(job: JobId, db: Db, caller: Asking, request: Request) -> Str
 @job_router.delete("/jobs/{job}", dependencies=[needs("trainer")], **says(Job, 404, 409))
 def cancel_job(job: JobId, db: Db, jobs: Jobs, actor: Actor) -> Response:
     """Cancel a job that has not ended."""
-    with db.writing() as session:
+    with db.reading() as session:
+        row = asked.find_job(session, job).row
+    with db.writing([locks.job(row)]) as session:
         cancelled = asked.cancel(session, job, actor)
         told = to_tell(session, cancelled)
         said = job_json(cancelled, outcomes_of(session, [cancelled])[cancelled.row])
@@ -162,8 +164,8 @@ def retrain(body: RetrainingIn, db: Db, jobs: Jobs, actor: Actor, caller: Asking
     ended; the new job covers only these. `did` states the effect of the request.
     """
     refuse_release(caller, body.release)
-    with db.writing() as session:
-        job, new, did = request_retraining(session, body, actor, near_limits(settings))
+    job, new, did = request_retraining(db, body, actor, near_limits(settings))
+    with db.reading() as session:
         told = to_tell(session, job) if new else []
         answer = accepted(session, job, did)
     for row, attempt in told:
@@ -316,7 +318,7 @@ def release(
     `If-Match` takes the ETag of the JSON that is served now, so that a concurrent release is not overwritten unnoticed.
     """
     encoded: Encoded = request.app.state.encoded
-    with db.writing() as session:
+    with db.writing([locks.surgeon(surgeon)]) as session:
         policy = policies.find_version(session, surgeon, suture, version)
         if if_match is not None:
             _refuse_overtaken(session, encoded, surgeon, suture, if_match)
@@ -331,7 +333,7 @@ def withdraw(surgeon: Slug, suture: Slug, db: Db, request: Request, actor: Actor
     `If-Match` takes the ETag of the JSON that is served now.
     """
     encoded: Encoded = request.app.state.encoded
-    with db.writing() as session:
+    with db.writing([locks.surgeon(surgeon)]) as session:
         if if_match is not None:
             _refuse_overtaken(session, encoded, surgeon, suture, if_match)
         who, what = find_surgeon(session, surgeon), find_suture_type(session, suture)

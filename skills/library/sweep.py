@@ -1,0 +1,160 @@
+"""The sweep: rows that nobody can see any more, or that are older than their retention, deleted in short transactions.
+
+Each step deletes at most `JOBS_AT_ONCE` jobs or `AT_ONCE_BYTES` of chunks, because others wait for it. A step that is
+interrupted is repeated, so any process may sweep: whoever has erased something, before it answers; and the workers,
+once a minute.
+"""
+
+from datetime import timedelta
+from math import inf
+from time import monotonic
+from typing import Any, cast
+
+from sqlalchemy import Select, Table, delete, exists, or_, select, update
+from sqlalchemy.orm import Session
+
+from skills.db import now
+from skills.db.models import LooseChunks, Plan, RecordingChunk, StoredPictures, StoredPlayback
+from skills.db.row_visibility import EVERYBODYS
+from skills.db.service_tables import ErasedSurgeon, Job, StyleToRetrain
+from skills.db.session import Database
+from skills.library import locks
+from skills.library.jobs import ACTIVE, BATCH, EXPORT, PICTURES, UNSYNCHRONISED, cancel_parts, identity_of
+from skills.library.recordings import AT_ONCE_BYTES, CHUNK_BYTES
+from skills.settings import Settings
+
+JOBS_AT_ONCE = 300
+PICTURES_AT_ONCE = 10
+UNDIVIDED_S = 600.0  # ours: the styles of a batch are added within seconds, or its request was interrupted
+INTERRUPTED = "The service stopped before all styles of the batch were added; request it again."
+
+
+def sweep_erased(database: Database) -> None:
+    """Delete all that is left of erased surgeons, deleted recordings and interrupted uploads."""
+    while _sweep_chunks(database) or _sweep_jobs(database):
+        pass
+
+
+def sweep(database: Database, settings: Settings, at_most_s: float = inf) -> bool:
+    """Delete what is left of erasures, and what is older than its retention; fail batches that were interrupted.
+
+    Args:
+        database: The database, without restriction.
+        settings: The retentions.
+        at_most_s: Stop after the step during which this time has passed.
+
+    Returns:
+        Whether nothing is left to delete.
+    """
+    began_s = monotonic()
+    _fail_undivided(database)
+    pictures, ended = timedelta(days=settings.keep_pictures_days), timedelta(days=settings.keep_jobs_days)
+    while (
+        _sweep_chunks(database)
+        or _sweep_jobs(database)
+        or _sweep_pictures(database, pictures)
+        or _sweep_ended(database, ended)
+    ):
+        if monotonic() - began_s > at_most_s:
+            return False
+    return True
+
+
+def delete_jobs(session: Session, surgeon_row: int) -> None:
+    """Delete the jobs of an erased surgeon that have ended; more than a few are hidden, and left to the sweep."""
+    session.add(ErasedSurgeon(surgeon_row=surgeon_row))
+    session.flush()
+    _delete_jobs_of(session, surgeon_row)
+
+
+def _sweep_chunks(database: Database) -> bool:
+    """Delete some chunks that are due; return whether there were any."""
+    at_once = AT_ONCE_BYTES // CHUNK_BYTES
+    with database.writing([locks.SWEEP]) as session:
+        row = session.scalar(select(LooseChunks.recording_row).where(LooseChunks.due_at <= now()).limit(1))
+        if row is None:
+            return False
+        of = RecordingChunk
+        some = select(of.number).where(of.recording == row).order_by(of.number).limit(at_once)
+        numbers = session.scalars(some, execution_options=EVERYBODYS).all()
+        session.execute(delete(of).where(of.recording == row, of.number.in_(numbers)), **UNSYNCHRONISED)
+        if len(numbers) < at_once:
+            session.execute(delete(LooseChunks).where(LooseChunks.recording_row == row), **UNSYNCHRONISED)
+        return True
+
+
+def _sweep_jobs(database: Database) -> bool:
+    """Delete some jobs of an erased surgeon; return whether there were any."""
+    with database.writing([locks.SWEEP]) as session:
+        surgeon_row = session.scalar(select(ErasedSurgeon.surgeon_row).limit(1))
+        if surgeon_row is not None:
+            _delete_jobs_of(session, surgeon_row)
+        return surgeon_row is not None
+
+
+def _delete_jobs_of(session: Session, surgeon_row: int) -> None:
+    jobs = cast(Table, Job.__table__)  # the bare table: whoever erases need not be allowed to see all that is left
+    some = select(jobs.c.row).where(jobs.c.surgeon_row == surgeon_row).limit(JOBS_AT_ONCE)
+    deleted = session.execute(delete(jobs).where(jobs.c.row.in_(some)).returning(jobs.c.row)).all()
+    if len(deleted) < JOBS_AT_ONCE:
+        session.execute(delete(ErasedSurgeon).where(ErasedSurgeon.surgeon_row == surgeon_row), **UNSYNCHRONISED)
+
+
+def _fail_undivided(database: Database) -> None:
+    """Fail the batches to which nobody adds styles any more."""
+    long_ago = now() - timedelta(seconds=UNDIVIDED_S)
+    waiting = (Job.kind == BATCH, Job.state.in_(ACTIVE), Job.told_at.is_(None), Job.created_at < long_ago)
+    with database.reading() as session:
+        rows = session.scalars(select(Job.row).where(*waiting)).all()
+    for row in rows:
+        with database.writing([locks.job(row)]) as session:
+            failed = {"state": "failed", "error": INTERRUPTED, "ended_at": now()}
+            mine = update(Job).where(Job.row == row, *waiting).values(**failed).returning(Job.row)
+            if session.execute(mine).first() is not None:
+                cancel_parts(session, row)
+
+
+def _sweep_pictures(database: Database, age: timedelta) -> bool:
+    """Delete some older pictures, with the jobs that drew them, so that they can be requested again."""
+    of = StoredPictures
+    old = select(of.row, StoredPlayback.sha256, Plan.sha256).join(StoredPlayback, StoredPlayback.row == of.playback_row)
+    old = old.join(Plan, Plan.row == StoredPlayback.plan_row).where(of.created_at < now() - age)
+    if not _are_there(database, old):
+        return False
+    with database.writing() as session:
+        found = session.execute(old.order_by(of.created_at).limit(PICTURES_AT_ONCE)).all()
+        requests = [identity_of(PICTURES, {"plan": plan, "playback": playback}) for _, playback, plan in found]
+        drew = (Job.identity.in_(requests), Job.state.not_in(ACTIVE))
+        session.execute(delete(Job).where(*drew), **UNSYNCHRONISED)
+        session.execute(delete(of).where(of.row.in_([row for row, *_ in found])), **UNSYNCHRONISED)
+    return True
+
+
+def _sweep_ended(database: Database, age: timedelta) -> bool:
+    """Delete some jobs that ended longer ago; return whether there were any.
+
+    A batch is deleted after its styles and parts. An export stays as long as its dataset.
+    """
+    of = StyleToRetrain
+    ended = select(Job.row).where(Job.ended_at < now() - age, Job.state.not_in(ACTIVE), Job.kind != EXPORT)
+    styles = exists().where(or_(of.part_row == Job.row, of.job_row == Job.row)).correlate(Job)
+    alone, batches = ended.where(~styles), ended.where(Job.kind == BATCH, styles)
+    if not _are_there(database, ended):
+        return False
+    with database.writing() as session:
+        rows = session.scalars(alone.order_by(Job.ended_at).limit(JOBS_AT_ONCE)).all()
+        if rows:
+            session.execute(delete(Job).where(Job.row.in_(rows)), **UNSYNCHRONISED)
+            return True
+        batch = session.scalar(batches.limit(1))
+        if batch is None:
+            return False  # parts of a batch that has not ended so long ago
+        mine = select(of.row).where(of.job_row == batch).limit(JOBS_AT_ONCE)
+        session.execute(delete(of).where(of.row.in_(session.scalars(mine).all())), **UNSYNCHRONISED)
+        return True
+
+
+def _are_there(database: Database, rows: Select[*tuple[Any, ...]]) -> bool:
+    """Ask without any lock, because mostly there are none."""
+    with database.reading() as session:
+        return session.execute(rows.limit(1)).first() is not None

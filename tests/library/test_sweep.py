@@ -1,0 +1,294 @@
+"""Uploads in pieces, erasures in steps, retentions, and batches whose styles are added in steps."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import timedelta
+from typing import Any
+
+import pytest
+from sqlalchemy import func, select, text, update
+from sqlalchemy.orm import Session
+
+from skills.db import now
+from skills.db.models import LooseChunks, ParsedChunk, ParsedRecording, RecordingChunk, StoredRecording
+from skills.db.service_tables import ErasedSurgeon, Event, Job, StyleToRetrain
+from skills.db.session import Database
+from skills.errors import Busy, NotFound
+from skills.library import recordings, retraining, sweep
+from skills.library.erasure import delete_recording, erase_surgeon
+from skills.library.inspection import inspect_installation
+from skills.library.jobs import find_job, identity_of, list_jobs
+from skills.library.recordings import find_recording, recording_bytes, store_recording, stored_recording
+from skills.library.sweep import sweep_erased
+from skills.settings import Settings
+from tests.library import cases
+from tests.library.styles import ask_retraining, look, parts_of
+
+KIB = 1 << 10
+
+
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pieces of 1 KiB, so that a recording of 3 kB has several, and three jobs in a step."""
+    for room in (recordings, sweep):
+        monkeypatch.setattr(room, "CHUNK_BYTES", KIB)
+        monkeypatch.setattr(room, "AT_ONCE_BYTES", KIB)
+    monkeypatch.setattr("skills.library.erasure.AT_ONCE_BYTES", KIB)
+    monkeypatch.setattr(sweep, "JOBS_AT_ONCE", 3)
+
+
+def count(database: Database, table: type) -> int:
+    with database.reading() as session:
+        return session.scalar(select(func.count()).select_from(table)) or 0
+
+
+def settings_of(database: Database, **days: float) -> Settings:
+    return Settings(database_url=database.url, **days)
+
+
+@contextmanager
+def failing_at(monkeypatch: pytest.MonkeyPatch, number: int) -> Iterator[list[int]]:
+    """Let the writing transaction of this number, from 1, fail at its beginning, as if the process were killed."""
+    begun: list[int] = []
+    writing = Database.writing
+
+    @contextmanager
+    def counted(self: Database, names: Any = None) -> Iterator[Session]:
+        begun.append(1)
+        if len(begun) == number:
+            raise KeyboardInterrupt
+        with writing(self, names) as session:
+            yield session
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Database, "writing", counted)
+        yield begun
+
+
+def test_a_large_recording_is_stored_in_pieces_and_read_whole(database: Database, small: None):
+    data = cases.hand_off()
+    stored, new = store_recording(database, cases.upload(data), "test")
+    assert new
+    with database.reading() as session:
+        chunks = session.scalar(select(func.count()).where(RecordingChunk.recording == stored.row))
+        assert chunks == -(-len(data) // KIB) > 2
+        assert b"".join(recording_bytes(session, find_recording(session, stored.sha256))) == data
+    assert count(database, LooseChunks) == 0
+    assert count(database, ParsedChunk) > 1
+    again, new = store_recording(database, cases.upload(data), "test")
+    assert (again.row, new) == (stored.row, False)
+
+
+def test_an_upload_that_dies_anywhere_leaves_nothing_to_see_and_is_swept(
+    database: Database, small: None, monkeypatch: pytest.MonkeyPatch
+):
+    data = cases.hand_off()
+    before_row = -(-len(data) // KIB) + 2  # the reservation, the pieces, and the transaction that makes it visible
+    for number in range(1, before_row + 1):
+        with failing_at(monkeypatch, number), pytest.raises(KeyboardInterrupt):
+            store_recording(database, cases.upload(data), "test")
+        assert count(database, StoredRecording) == 0
+    left = count(database, RecordingChunk)
+    sweep_erased(database)
+    assert count(database, RecordingChunk) == left > 0, "an upload under way is left alone"
+    assert not [one for one in inspect_installation(database) if one.wrong]
+    with database.writing() as session:
+        session.execute(update(LooseChunks).values(due_at=now()))
+    sweep_erased(database)
+    assert (count(database, RecordingChunk), count(database, LooseChunks)) == (0, 0)
+    store_recording(database, cases.upload(data), "test")
+    assert count(database, StoredRecording) == 1
+
+
+def test_pieces_that_were_swept_are_not_continued(database: Database, small: None, monkeypatch: pytest.MonkeyPatch):
+    data = cases.hand_off()
+    upload = cases.upload(data)
+    add, swept = recordings._add_chunks, []
+
+    def late(session: Session, row: int, number: int, piece: bytes) -> int:
+        if not swept:
+            swept.append(1)
+            session.execute(update(LooseChunks).values(due_at=now() - timedelta(seconds=1)))
+        return add(session, row, number, piece)
+
+    monkeypatch.setattr(recordings, "_add_chunks", late)
+    with pytest.raises(Busy, match="send it again"):
+        store_recording(database, upload, "test")
+    assert count(database, StoredRecording) == 0
+
+
+def test_a_content_half_cached_is_not_used_and_is_completed(
+    database: Database, small: None, monkeypatch: pytest.MonkeyPatch
+):
+    stored, _ = store_recording(database, cases.upload(cases.hand_off()), "test")
+    told = stored_recording(database, stored.sha256)
+    with database.writing() as session:
+        session.execute(update(ParsedRecording).values(version=recordings.UNFINISHED))
+        session.execute(text("DELETE FROM parsed_chunks WHERE number = 1"))
+    chunks = count(database, ParsedChunk)
+    assert recordings.alike(stored_recording(database, stored.sha256), told)
+    assert count(database, ParsedChunk) == chunks + 1
+    with database.reading() as session:
+        assert recordings.cached_content(session, find_recording(session, stored.sha256)) is not None
+
+
+def test_a_deleted_recording_is_gone_at_once_and_swept_later(database: Database, small: None):
+    stored, _ = store_recording(database, cases.upload(cases.hand_off()), "test")
+    with database.writing() as session:
+        delete_recording(session, stored.sha256, "test", anybodys=True)
+    with database.reading() as session, pytest.raises(NotFound):
+        find_recording(session, stored.sha256)
+    assert count(database, RecordingChunk) > 0
+    again, _ = store_recording(database, cases.upload(cases.hand_off()), "test")  # with chunks of its own
+    sweep_erased(database)
+    with database.reading() as session:
+        assert b"".join(recording_bytes(session, again)) == cases.hand_off()
+        assert session.scalars(select(RecordingChunk.recording).distinct()).all() == [again.row]
+
+
+def add_jobs(database: Database, number: int, **about: Any) -> None:
+    with database.reading() as session:
+        first = session.scalars(select(Job)).first()
+    with database.writing() as session:
+        session.add_all(
+            Job(
+                **{"id": f"{n:016x}", "kind": "training", "state": "succeeded", "ended_at": now()}
+                | {"request": request, "identity": identity_of("training", request), "surgeon_row": first.surgeon_row}
+                | about
+            )
+            for n in range(number)
+            for request in [first.request | {"seed": 100 + n}]
+        )
+
+
+def test_an_erased_surgeons_jobs_are_gone_at_once_and_swept_later(
+    database: Database, small: None, monkeypatch: pytest.MonkeyPatch
+):
+    cases.add_demo(database)
+    cases.train(database, release=True)
+    add_jobs(database, 10)
+    with database.writing() as session:
+        erase_surgeon(session, "kestrel", "test")
+    assert (count(database, Job), count(database, ErasedSurgeon)) == (8, 1)
+    with database.reading() as session:
+        assert list(list_jobs(session, 50, None, None)) == []
+        with pytest.raises(NotFound):
+            find_job(session, f"{9:016x}")
+    assert not [one for one in inspect_installation(database) if one.wrong]
+    with failing_at(monkeypatch, 3), pytest.raises(KeyboardInterrupt):  # killed in the middle
+        sweep_erased(database)
+    sweep_erased(database)
+    assert (count(database, Job), count(database, ErasedSurgeon)) == (0, 0)
+
+
+def test_ended_jobs_are_deleted_after_their_retention_with_their_batch(database: Database, small: None):
+    cases.add_demo(database)
+    job = ask_retraining(database)
+    for part in parts_of(database, job):
+        cases.work(database, part)
+    young = cases.train(database, seed=9)
+    add_jobs(database, 7, ended_at=now() - timedelta(days=30))
+    days = settings_of(database, keep_jobs_days=20)
+    assert sweep.sweep(database, days)
+    assert count(database, StyleToRetrain) == 1, "the batch is young"
+    events = count(database, Event)
+    with database.writing() as session:
+        session.execute(text("UPDATE jobs SET ended_at = created_at"))
+        old = now() - timedelta(days=30)
+        session.execute(update(Job).where(Job.kind != "training").values(ended_at=old))
+    assert sweep.sweep(database, days)
+    with database.reading() as session:
+        (left,) = session.scalars(select(Job)).all()
+    assert left.result["sha256"] == young.sha256
+    assert (count(database, StyleToRetrain), count(database, Event)) == (0, events)
+
+
+def test_a_sweep_ends_in_time_and_says_that_something_is_left(database: Database, small: None):
+    cases.add_demo(database)
+    cases.train(database)
+    add_jobs(database, 7, ended_at=now() - timedelta(days=30))
+    days = settings_of(database, keep_jobs_days=20)
+    assert not sweep.sweep(database, days, at_most_s=0.0)
+    assert count(database, Job) == 5
+    assert sweep.sweep(database, days)
+    assert count(database, Job) == 1
+
+
+def test_a_batch_does_not_end_before_all_its_styles_are_added(database: Database, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(retraining, "STYLES_AT_ONCE", 1)
+    cases.add_surgeon(database, "osprey")
+    for slug in ("kestrel", "osprey"):
+        cases.add_demo(database, surgeon=slug)
+    divide = retraining._divide
+
+    def and_work(session: Session, job: Job, *styles: Any) -> None:
+        divide(session, job, *styles)
+        session.commit()
+        for part in parts_of(database, job):
+            if part.state == "queued":
+                cases.work(database, part)
+        assert look(database, job).state == "running"
+
+    monkeypatch.setattr(retraining, "_divide", and_work)
+    assert ask_retraining(database).state == "succeeded"
+
+
+def test_a_batch_whose_request_was_interrupted_fails_and_can_be_repeated(
+    database: Database, monkeypatch: pytest.MonkeyPatch
+):
+    cases.add_demo(database)
+    with failing_at(monkeypatch, 3), pytest.raises(KeyboardInterrupt):  # the one that completes it
+        ask_retraining(database)
+    sweep.sweep(database, settings_of(database))
+    with database.reading() as session:
+        (job,) = session.scalars(select(Job).where(Job.kind == "retraining")).all()
+    assert job.state == "queued", "its request may still be at work"
+    with database.writing() as session:
+        session.execute(update(Job).values(created_at=now() - timedelta(hours=1)))
+    sweep.sweep(database, settings_of(database))
+    failed = look(database, job)
+    assert (failed.state, failed.error) == ("failed", sweep.INTERRUPTED)
+    assert [part.state for part in parts_of(database, job)] == ["cancelled"]
+    again = ask_retraining(database)
+    assert again.row != job.row
+
+
+def test_a_batch_cancelled_while_styles_are_added_gets_no_more(database: Database, monkeypatch: pytest.MonkeyPatch):
+    from skills.library.jobs import cancel
+
+    monkeypatch.setattr(retraining, "STYLES_AT_ONCE", 1)
+    cases.add_surgeon(database, "osprey")
+    for slug in ("kestrel", "osprey"):
+        cases.add_demo(database, surgeon=slug)
+    divide = retraining._divide
+
+    def and_cancel(session: Session, job: Job, *styles: Any) -> None:
+        divide(session, job, *styles)
+        cancel(session, job.id, "test")
+
+    monkeypatch.setattr(retraining, "_divide", and_cancel)
+    job = ask_retraining(database)
+    assert (job.state, count(database, StyleToRetrain)) == ("cancelled", 1)
+
+
+def test_a_small_upload_needs_one_transaction(database: Database, monkeypatch: pytest.MonkeyPatch):
+    with failing_at(monkeypatch, 99) as begun:
+        store_recording(database, cases.upload(cases.hand_off()), "test")
+    assert len(begun) == 1
+
+
+def test_bytes_sent_twice_at_once_are_kept_once(database: Database, small: None):
+    data = cases.hand_off()
+    first, second = cases.upload(data), cases.upload(data)
+    told = recordings.tell_upload(first)
+    ahead = [recordings.send_ahead(database, one) for one in (first, second)]
+    assert None not in ahead and len(set(ahead)) == 2
+    kept = []
+    for upload, row in zip((first, second), ahead, strict=True):
+        with database.writing() as session:
+            kept.append(recordings.keep(session, upload, told, None, "test", row)[0].row)
+    assert kept == [ahead[0], ahead[0]]
+    sweep_erased(database)
+    with database.reading() as session:
+        assert session.scalars(select(RecordingChunk.recording).distinct()).all() == [ahead[0]]
+        assert b"".join(recording_bytes(session, find_recording(session, first.sha256))) == data
