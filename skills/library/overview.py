@@ -19,7 +19,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy import ColumnElement, Select, case, exists, func, select, text
-from sqlalchemy.orm import Session
+from sqlalchemy.orm import Session, selectinload
 
 from skills.db import now
 from skills.db.models import (
@@ -430,6 +430,9 @@ def released_styles(session: Session, limit: int = 1000) -> Sequence[Release]:
     """List the served releases by surgeon and suture type, for a selection in a form."""
     found = select(Release).where(is_served()).join(Surgeon, Surgeon.row == Release.surgeon_row)
     by_name = found.order_by(Surgeon.slug, Release.suture)
+    # With all versions at once, and without their manifests, which one of them alone needs.
+    by = PolicyVersion
+    by_name = by_name.options(selectinload(Release.policy).load_only(by.version, by.surgeon_row, by.suture))
     return session.scalars(by_name.limit(limit)).all()
 
 

@@ -15,6 +15,7 @@ from tests.bench.hands import hands
 from tests.bench.joining import joining
 from tests.bench.kinematics import kinematics
 from tests.bench.learning import learning
+from tests.bench.million import million
 from tests.bench.playing import playing
 from tests.bench.pose_styles import pose_styles
 from tests.bench.reading import reading
@@ -23,6 +24,7 @@ from tests.bench.serving import serving
 from tests.bench.session import session
 from tests.bench.ties import ties
 from tests.bench.tissue import tissue
+from tests.bench.writers import writers
 
 PARTS = {
     "reading": reading,
@@ -34,6 +36,8 @@ PARTS = {
     "doubt": doubting,
     "batches": batches,
     "scaling": scaling,
+    "million": million,
+    "writers": writers,
     "serving": serving,
     "atlas": atlas,
     "combining": combining,

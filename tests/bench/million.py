@@ -88,7 +88,10 @@ def fill(database: Database, surgeons: int) -> None:
     styles, jobs = surgeons * STYLES_EACH, surgeons * JOBS_EACH
     surgeon = "(SELECT s.row FROM surgeons s WHERE s.slug = '{}')"
     first, busy = surgeon.format("kestrel"), surgeon.format(BUSY)
-    suture = "(SELECT slug FROM suture_types ORDER BY slug LIMIT 1 OFFSET (n - 1) % 5)"
+    with database.reading() as session:
+        sutures = session.scalars(text("SELECT slug FROM suture_types ORDER BY slug LIMIT 5")).all()
+    cases_ = " ".join(f"WHEN {k} THEN '{slug}'" for k, slug in enumerate(sutures))
+    suture = f"CASE (n - 1) % 5 {cases_} END"
     of_style = {"surgeon_row": f"{first} + (n - 1) / {STYLES_EACH} + 1", "suture": suture}
     number = HEX[database.engine.dialect.name]
     slug = {"postgresql": "lpad(n::text, 5, '0')", "sqlite": "printf('%05d', n)"}[database.engine.dialect.name]
