@@ -24,7 +24,7 @@ from sqlalchemy import (
 from sqlalchemy.orm import Mapped, Session, mapped_column, relationship
 
 from skills.db import Base, Number, RowId, Sha256, now
-from skills.db.models import Demonstration, PolicyVersion, Surgeon
+from skills.db.models import Demonstration, PolicyVersion, RecordingChunk, StoredRecording, Surgeon
 from skills.packing import canonical, sha256
 
 LONGEST_REASON = 2000  # characters
@@ -229,6 +229,11 @@ class Event(Base):
     object_kind: Mapped[str]
     object_id: Mapped[str]
     subject: Mapped[str | None] = mapped_column(String(32), index=True)
+
+
+# Without a foreign key, but in the order in which they are backed up and restored: older schemas have the keys.
+for _late, _first in ((Job, Surgeon), (RecordingChunk, StoredRecording)):
+    cast(Table, _late.__table__).add_is_dependent_on(cast(Table, _first.__table__))
 
 
 # ---- the audit log -------------------------------------------------------------------------------------------------
