@@ -9,7 +9,7 @@ import pytest
 ON_BOTH = {
     # the tables, transactions and queries themselves
     *("test_base", "test_changes", "test_query_plans", "test_session", "test_tables"),
-    *("test_library", "test_erasing", "test_watching"),
+    *("test_library", "test_erasing", "test_sweep", "test_watching"),
     # the life of a job; what follows from it runs on PostgreSQL at night
     "test_one_worker",
     "test_what_is_served_stored_and_answered_obeys_the_invariant",
