@@ -51,7 +51,8 @@ def upgrade() -> None:
     connection = op.get_bind()
     asked = "json_extract(request, '$.plan')" if connection.dialect.name == "sqlite" else "request ->> 'plan'"
     connection.execute(sa.text(f"UPDATE jobs SET plan = {asked} WHERE kind IN ('playback', 'pictures')"))  # noqa: S608
-    connection.execute(sa.text("UPDATE jobs SET told_at = created_at WHERE kind = 'retraining' AND told_at IS NULL"))
+    active = "kind = 'retraining' AND state IN ('queued', 'running')"  # all their styles have rows
+    connection.execute(sa.text(f"UPDATE jobs SET told_at = created_at WHERE {active}"))  # noqa: S608
     op.drop_index("ix_jobs_kind", "jobs")
     for name, (table, columns, where) in INDEXES.items():
         op.create_index(name, table, columns, sqlite_where=where, postgresql_where=where)
