@@ -84,10 +84,15 @@ def environment() -> dict[str, str]:
     """Return a minimal environment for a subprocess.
 
     It has the paths of modules, libraries and compiled loops, and one thread for each numerical library; no secrets.
+    One heap for all threads: glibc reserves 64 MiB for each further one, which a fork could use above its limit.
     """
     kept = {name: os.environ[name] for name in _KEPT if name in os.environ}
     threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-    return kept | threads | {"PYTHONPATH": os.pathsep.join(path or os.getcwd() for path in sys.path)}
+    return (
+        kept
+        | threads
+        | {"MALLOC_ARENA_MAX": "1", "PYTHONPATH": os.pathsep.join(path or os.getcwd() for path in sys.path)}
+    )
 
 
 # ---- outside the process ---------------------------------------------------------------------------------------

@@ -77,8 +77,7 @@ def test_a_batch_of_stale_styles_takes_those_checked_with_other_near_limits(data
     cases.train(database)
     asked = RetrainingIn(surgeon="kestrel", only_stale=True)
     for near, stale in ((NearLimits(), []), (NearLimits(3.0, 0.0), [["other limits at the near starts"]])):
-        with database.writing() as session:
-            job = request_retraining(session, asked, "test", near)[0]
+        job = request_retraining(database, asked, "test", near)[0]
         assert [style.stale for style in styles_of(database, job)] == stale
 
 

@@ -25,7 +25,7 @@ def _exact(asked: dict[str, Any]) -> dict[str, Any]:
     return {
         "tip_mm": asked["tip_mm"],
         "rotation_xyzw": asked["rotation_xyzw"],
-        "joints": asked["joints"],
+        "joints": asked["joints"].copy(),
         "tracking_mm": np.zeros(count),
         "efforts": np.zeros((count, 6)),
         "contact_n": np.zeros(count),
