@@ -76,6 +76,9 @@ class Settings(BaseSettings):
     near_radius_mm: float = Field(default=3.0, gt=0, allow_inf_nan=False)
     # ... follows this share of the demonstration; recordings and samples: 0.91 or more, see docs/joining.md
     near_least_share: float = Field(default=0.4, ge=0, le=1)
+    # ... and, in a scene, finishes with at least this probability, and touches with at most this one (docs/scenes.md)
+    scene_least_finishing: float = Field(default=0.9, ge=0, le=1)
+    scene_most_touching: float = Field(default=0.05, ge=0, le=1)
     # greatest turn of the surgeon's, of a plan to export or a version to release that holds the jaw; beyond it the
     # needle would stand in the jaws as no estimate of success allows for
     constant_turn_deg: float = Field(default=10.0, ge=0, le=180)

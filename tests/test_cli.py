@@ -24,6 +24,7 @@ from skills.db.session import Database
 from skills.formats import read_recording, write_mcap
 from skills.formats.lerobot.cut import find_dataset
 from skills.formats.lerobot.writer import AboutDataset, ExportedEpisode, dataset_files
+from skills.gridworld.scene import Scene
 from skills.learning.policy import LEARNERS
 from skills.library.catalogue import put_surgeon
 from skills.seeds.recordings import sample_recordings
@@ -154,6 +155,13 @@ def test_from_a_bag_folder_to_a_released_policy_and_a_plan(with_worker, tmp_path
     assert (code, "cell-q-learning has no phases" in said) == (1, True)
     code, said = skills("train", *STYLE, "--learner", "cell-q-learning", "--setting", "gamma=0.95")
     assert (code, "use a gamma below 0.9" in said) == (1, True)
+    (tmp_path / "scene.json").write_text(json.dumps(Scene(added["frame"], margin_mm=0.5).as_json()))
+    in_scene = ("--scene", str(tmp_path / "scene.json"), "--learner", "value-iteration", "--setting", "gamma=0.95")
+    code, said = skills("train", *STYLE, *in_scene, "--scene-cost", "touch=50", "--json")
+    asked = json.loads(said)["request"]["surroundings"]
+    assert (code, asked["costs"]["touch"], asked["scene"]["margin_mm"]) == (0, 50, 0.5)
+    code, said = skills("train", *STYLE, "--scene", str(bag / "recording.mcap"))
+    assert (code, "cannot be read as JSON" in said) == (1, True)
     code, said = skills("rollout", *STYLE, "--start", "-30,25,-140", "--json")
     assert json.loads(said)["finished"]
     exported = tmp_path / "policy.json"

@@ -53,6 +53,9 @@ Rule = Annotated[
         help="Where a start joins the demonstration: nearest; start; or a share such as 0.5, so much of it is followed."
     ),
 ]
+SceneFile = Annotated[
+    Path | None, typer.Option("--scene", help="JSON file of what must not be touched, as `Scene.as_json` writes it.")
+]
 JOINING = {"nearest": 0.0, "start": 1.0}
 DEFAULT_LEARNER = "phase-q-learning"
 PHASED = (DEFAULT_LEARNER, "value-iteration")  # the learners that have a joining rule; a test compares them with all
@@ -79,6 +82,10 @@ def train(
         str | None,
         typer.Option(help="Direction in which depth increases, as X,Y,Z, in a frame other than the base of the arm."),
     ] = None,
+    scene: SceneFile = None,
+    scene_cost: Annotated[
+        list[str] | None, typer.Option(help="Cost of the scene, as name=number; repeatable. Example: touch=100.")
+    ] = None,
     release: Annotated[bool, typer.Option(help="Release the version if it passes the gate.")] = False,
     seed: int = 0,
     learner: Kind = None,
@@ -102,6 +109,8 @@ def train(
             release=release,
             outcomes=outcomes,
             depth_along=None if depth_along is None else triple(depth_along),
+            scene=None if scene is None else read_scene(scene),
+            scene_costs=_settings("--scene-cost", scene_cost) if scene_cost else None,
         )
         job = finished(client, asked)
     result = result_of(job)
@@ -166,14 +175,34 @@ def _learner(kind: str | None, settings: list[str], join: str | None) -> dict[st
                 f"The learner {kind} has no phases, so no joining rule.", f"Name one of {', '.join(PHASED)}."
             )
         learner["join_share"] = _join_share(join)
+    return learner | _settings("--setting", settings)
+
+
+def _settings(option: str, settings: list[str]) -> dict[str, Any]:
+    """Return the settings of an option by name."""
+    found = {}
     for setting in settings:
         name, _, value = setting.partition("=")
         try:
             # as JSON, so that numbers, lists and booleans have their type
-            learner[name] = json.loads(value)
+            found[name] = json.loads(value)
         except ValueError:
-            raise BadInput(f"{setting!r} is not a setting.", "Write it as name=number, such as steps=100000") from None
-    return learner
+            example = "steps=100000" if option == "--setting" else "touch=100"
+            raise BadInput(f"{setting!r} is not a setting.", f"Write it as name=number, such as {example}") from None
+    return found
+
+
+def read_scene(path: Path) -> Any:
+    """Return the JSON of a scene's file.
+
+    Raises:
+        BadInput: It cannot be read, or is not JSON.
+    """
+    try:
+        return json.loads(path.read_bytes())
+    except (OSError, ValueError) as error:
+        why = f"The scene {path} cannot be read as JSON: {error}."
+        raise BadInput(why, "Write it with `Scene.as_json` (docs/scenes.md).") from None
 
 
 def _join_share(join: str) -> float:

@@ -79,6 +79,8 @@ class Jobs(Connection):
         release: bool = False,
         outcomes: Literal["success", "any"] = "success",
         depth_along: Sequence[float] | None = None,
+        scene: Mapping[str, Any] | None = None,
+        scene_costs: Mapping[str, float] | None = None,
     ) -> Job:
         """Request the training of a style; an equal request returns the same job.
 
@@ -99,11 +101,14 @@ class Jobs(Connection):
             outcomes: "any" learns also from demonstrations that are marked recovery or failure.
             depth_along: The direction in which depth increases, of a demonstration in another frame than its arm's
                 base; of equally short ways the policy takes the shallower one.
+            scene: What must not be touched, as `Scene.as_json` writes it; the learner's `slip` counts in it.
+            scene_costs: Costs of the scene by name; default: those of `skills.gridworld.scene.SceneCosts`.
         """
         asked = {"surgeon": surgeon, "suture": suture, "seed": seed, "release": release}
         how = None if combine is None else {"kind": combine}
         of = None if outcomes == "success" else outcomes  # left out, so that an older service accepts the rest
         asked |= given({"demos": demos, "combine": how, "learner": learner, "outcomes": of, "depth_along": depth_along})
+        asked |= given({"scene": scene, "scene_costs": scene_costs})
         return await self._ask(Job, "POST", at("trainings"), asked, harmless=not release)
 
     @call
@@ -444,6 +449,7 @@ def _policy(about: dict[str, Any], arrays: bytes, demo: dict[str, Any]) -> "Lear
     from skills.gridworld.domain import Domain
     from skills.gridworld.grid import GridPath, GridWorld
     from skills.gridworld.reward import RewardLevels
+    from skills.gridworld.scene import Surroundings
     from skills.learning.networks import Network
     from skills.learning.policy import Policy as LearntPolicy
     from skills.learning.policy import learner_of
@@ -462,4 +468,5 @@ def _policy(about: dict[str, Any], arrays: bytes, demo: dict[str, Any]) -> "Lear
         network = Network(sent["network"].tobytes()) if "network" in sent else None
     levels, training = RewardLevels(**about["reward_levels"]), Training(**about["training"])
     ties = ShortestWay(**about["ties"]) if about.get("ties") else None
-    return LearntPolicy(path, levels, learner, about["seed"], training, q, network, ties)
+    there = Surroundings.of_json(about["scene"]) if about.get("scene") else None
+    return LearntPolicy(path, levels, learner, about["seed"], training, q, network, ties, there)

@@ -35,6 +35,7 @@ from skills.db.packed import Packed, stored
 from skills.demonstration.demonstration import Demo, Partner, Pause
 from skills.gridworld.grid import GridPath, GridWorld
 from skills.gridworld.reward import RewardLevels, RewardMap
+from skills.gridworld.scene import Box, Capsule, Scene, SceneCosts, Surroundings, Tissue
 from skills.learning.certificate import Coverage
 from skills.learning.dynamic_programming import ValueIteration
 from skills.learning.networks import Network
@@ -53,10 +54,12 @@ from skills.verification.playback import Pictures, Playback
 stored(GridWorld, GridPath, RewardLevels, *LEARNERS.values(), Training, Network, ShortestWay)
 stored(SuturePoint, Pass, Pause, Partner, PsmM, Hand, Pose, Departure)
 stored(PosePath, TubeLimits, TubeCertificate)
+stored(Surroundings, Scene, SceneCosts, Box, Capsule, Tissue)
 # Left out of the serialised value while they hold their default, so that the digests of older values stay the same.
 added_later(GridPath, "hysteresis")
 added_later(Policy, "network")
 added_later(Policy, "ties")
+added_later(Policy, "surroundings")
 added_later(Demo, "pauses")
 added_later(Demo, "partner")
 added_later(Partner, "base_mm")
@@ -70,6 +73,8 @@ added_later(PhaseQLearning, "join_share")
 added_later(ValueIteration, "join_share")
 added_later(Coverage, "share")
 few_numbers(Coverage, "share")  # one for each waypoint
+added_later(Coverage, "finishing")
+added_later(Coverage, "touching")
 added_later(Pass, "hand")
 added_later(Pass, "taking")
 added_later(PsmM, "taken_mm")

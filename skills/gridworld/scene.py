@@ -2,6 +2,8 @@
 
     Scene, GridPath --hazards_of--> Hazards: the moves that touch, and the cost of entering each cell
 
+A policy keeps the scene that it was learnt in, with its costs, as `Surroundings`.
+
 A *scene* has keep-out boxes, capsules (the links of another arm) and tissue, in the frame of the demonstration, in mm.
 Each is grown by `margin_mm`. A *cell* is forbidden if its centre touches something, because centres are what a policy
 commands; a *move* touches if the straight line between the two centres does, so no move passes through a thin box. The
@@ -18,16 +20,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from skills.arrays import Flags, Floats
+from skills.arrays import Flags, Floats, Ints
 from skills.errors import BadSettings
-from skills.fields import Point
-from skills.gridworld.grid import MOVES, GridPath
+from skills.fields import Point, schema
+from skills.gridworld.grid import MOVES, GridPath, GridWorld
 
 STAY = 13  # the action that stays: (0, 0, 0), the middle one of the moves
 SAMPLES_A_STEP = 4  # a move is compared with tissue at points at most a quarter of the map's step apart
+MOST_BODIES = 64  # ours, boxes or capsules: two arms have twenty links, and each body is compared with every move
+MOST_HEIGHTS = 10_000  # ours, of a height map: 100 mm by 100 mm at 1 mm, some 200 kB of JSON
+LEAST_STEP_MM = 0.1  # ours, of a height map: a move of 5 mm is compared with tissue at 4 points a step
 SQUARE = 1e-9  # greatest cosine of the angle between two directions that count as perpendicular
 
 
+@schema
 @dataclass(frozen=True)
 class Box:
     """A box that must not be entered, along the axes of the frame, from its lowest to its highest corner in mm."""
@@ -41,6 +47,7 @@ class Box:
             raise BadSettings("low_mm of a box must be below high_mm along each axis.", box=astuple(self))
 
 
+@schema
 @dataclass(frozen=True)
 class Capsule:
     """A cylinder with round ends, such as a link of the other arm: its axis from a to b, and its radius, in mm."""
@@ -55,6 +62,7 @@ class Capsule:
             raise BadSettings("radius_mm of a capsule must be positive.", radius_mm=self.radius_mm)
 
 
+@schema
 @dataclass(frozen=True)
 class Tissue:
     """A surface that must not be entered: heights above a plane, bilinear between the points of a regular map.
@@ -77,8 +85,16 @@ class Tissue:
     def __post_init__(self) -> None:
         object.__setattr__(self, "heights_mm", tuple(tuple(map(float, row)) for row in self.heights_mm))
         _check_finite("Tissue", self.at_mm, self.normal, self.along, (self.step_mm,), *self.heights_mm)
-        if not self.step_mm > 0 or not self.heights_mm or len({len(row) for row in self.heights_mm} | {0}) != 2:
-            raise BadSettings("A height map needs a positive step_mm, and rows of one number or more, equally long.")
+        if not self.heights_mm or len({len(row) for row in self.heights_mm} | {0}) != 2:
+            raise BadSettings("A height map needs rows of one number or more, equally long.")
+        if not self.step_mm >= LEAST_STEP_MM:
+            raise BadSettings(f"step_mm of a height map must be {LEAST_STEP_MM:g} or more.", step_mm=self.step_mm)
+        if (count := len(self.heights_mm) * len(self.heights_mm[0])) > MOST_HEIGHTS:
+            raise BadSettings(
+                f"A height map may have {MOST_HEIGHTS} heights, this one has {count}; use a larger step_mm, or the "
+                "part of the tissue that is near the path.",
+                heights=count,
+            )
         normal, along = np.array(self.normal), np.array(self.along)
         lengths = np.linalg.norm(normal) * np.linalg.norm(along)
         if not (lengths > 0 and abs(normal @ along) <= SQUARE * lengths):
@@ -104,6 +120,7 @@ class Tissue:
         return np.asarray(apart @ normal - ((1 - u) * near + u * far))
 
 
+@schema
 @dataclass(frozen=True)
 class Scene:
     """What an arm must not touch.
@@ -127,6 +144,11 @@ class Scene:
             raise BadSettings("A scene needs the name of its frame.")
         if not (isfinite(self.margin_mm) and self.margin_mm >= 0):
             raise BadSettings("margin_mm of a scene must be 0 or more.", margin_mm=self.margin_mm)
+        if len(self.boxes) + len(self.capsules) > MOST_BODIES:
+            raise BadSettings(
+                f"A scene may have {MOST_BODIES} boxes and capsules, this one has "
+                f"{len(self.boxes) + len(self.capsules)}; leave out those that are far from the path."
+            )
 
     def as_json(self) -> dict[str, Any]:
         """Return the scene as plain JSON, of which `skills.packing` computes a digest."""
@@ -191,6 +213,7 @@ class Scene:
         return touched
 
 
+@schema
 @dataclass(frozen=True)
 class SceneCosts:
     """Costs in addition to the rewards of Algorithm 1; the paper has none.
@@ -214,6 +237,27 @@ class SceneCosts:
             raise BadSettings("Costs must be finite and 0 or more; `touch` and `close_mm` positive.", costs=costs)
 
 
+@dataclass(frozen=True)
+class Surroundings:
+    """A scene, and the costs with which a policy is learnt in it."""
+
+    scene: Scene
+    costs: SceneCosts = SceneCosts()
+
+    def as_json(self) -> dict[str, Any]:
+        """Return both as plain JSON."""
+        return {"scene": self.scene.as_json(), "costs": _lists(asdict(self.costs))}
+
+    @classmethod
+    def of_json(cls, described: Mapping[str, Any]) -> "Surroundings":
+        """Return both from their JSON.
+
+        Raises:
+            BadSettings: As for `Scene.of_json`; or a cost is out of range.
+        """
+        return cls(Scene.of_json(described["scene"]), SceneCosts(**described["costs"]))
+
+
 @dataclass(frozen=True, eq=False)
 class Hazards:
     """A scene on a grid.
@@ -221,12 +265,17 @@ class Hazards:
     Attributes:
         touches: Whether the move by each action from each state touches, (n_states, 27); off the grid it stays.
         cost: Cost of entering each state, (n_states,).
-        touch: Cost of touching.
+        surroundings: The scene, and its costs.
     """
 
     touches: Flags
     cost: Floats
-    touch: float
+    surroundings: Surroundings
+
+    @property
+    def touch(self) -> float:
+        """The cost of touching."""
+        return self.surroundings.costs.touch
 
     @property
     def forbidden(self) -> Flags:
@@ -249,17 +298,33 @@ def hazards_of(scene: Scene, path: GridPath, frame: str, costs: SceneCosts | Non
     Raises:
         BadSettings: The scene is in another frame; or the demonstration itself touches it, and cannot be followed.
     """
+    refuse_unfit(scene, path, frame)
+    costs, grid = costs or SceneCosts(), path.grid
+    states = np.arange(grid.n_states)
+    centres = grid.centres_mm(states)
+    touches = np.stack([touching(scene, grid, states, np.full(len(states), a)) for a in range(len(MOVES))], axis=1)
+    cost = costs.close * (1 - scene.clearance_mm(centres) / costs.close_mm).clip(0)
+    if scene.tissue is not None:
+        below_mm = scene.tissue.above_mm(path.tip_mm).min() - scene.tissue.above_mm(centres)
+        cost = cost + costs.deeper_per_mm * below_mm.clip(0)
+    return Hazards(touches, np.asarray(cost), Surroundings(scene, costs))
+
+
+def refuse_unfit(scene: Scene, path: GridPath, frame: str) -> None:
+    """Refuse a scene in which a demonstration cannot be followed.
+
+    Args:
+        scene: The scene.
+        path: The demonstrated path.
+        frame: The frame of the path.
+
+    Raises:
+        BadSettings: The scene is in another frame, or the demonstration itself touches it.
+    """
     if scene.frame != frame:
         raise BadSettings(
             f"The scene is in the frame '{scene.frame}', the demonstration in '{frame}'; give the scene in that frame."
         )
-    costs, grid = costs or SceneCosts(), path.grid
-    cells = grid.cells_of(np.arange(grid.n_states))
-    centres = grid.centres_of(cells)
-    touches = np.zeros((grid.n_states, len(MOVES)), bool)
-    for action, move in enumerate(MOVES):
-        after = np.where(grid.holds(cells + move)[:, None], cells + move, cells)
-        touches[:, action] = scene.touches(centres, grid.centres_of(after))
     bad = np.flatnonzero(scene.touches(path.tip_mm[:-1], path.tip_mm[1:]))
     if len(bad):
         x, y, z = path.tip_mm[bad[0]]
@@ -268,11 +333,14 @@ def hazards_of(scene: Scene, path: GridPath, frame: str, costs: SceneCosts | Non
             f"({x:.1f}, {y:.1f}, {z:.1f}) mm; check the scene's frame and margin, or record the hand-off further away.",
             moves=len(bad),
         )
-    cost = costs.close * (1 - scene.clearance_mm(centres) / costs.close_mm).clip(0)
-    if scene.tissue is not None:
-        below_mm = scene.tissue.above_mm(path.tip_mm).min() - scene.tissue.above_mm(centres)
-        cost = cost + costs.deeper_per_mm * below_mm.clip(0)
-    return Hazards(touches, np.asarray(cost), costs.touch)
+
+
+def touching(scene: Scene, grid: GridWorld, states: Ints, actions: Ints) -> Flags:
+    """Return for each state and action, both (N,), whether the move touches a scene, (N,); off the grid it stays."""
+    cells = grid.cells_of(states)
+    after = cells + MOVES[actions]
+    after = np.where(grid.holds(after)[:, None], after, cells)
+    return scene.touches(grid.centres_of(cells), grid.centres_of(after))
 
 
 def _check_finite(name: str, *rows: tuple[float, ...]) -> None:
@@ -283,7 +351,9 @@ def _check_finite(name: str, *rows: tuple[float, ...]) -> None:
 def _lists(value: Any) -> Any:
     if isinstance(value, dict):
         return {name: _lists(part) for name, part in value.items()}
-    return [_lists(part) for part in value] if isinstance(value, list | tuple) else value
+    if isinstance(value, list | tuple):
+        return [_lists(part) for part in value]
+    return float(value) if isinstance(value, int) else value  # so that 5 and 5.0 have the same digest
 
 
 def _tuples(described: Mapping[str, Any]) -> dict[str, Any]:

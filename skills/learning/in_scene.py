@@ -10,8 +10,8 @@ Gamma must be near 1 here. With 0.1 the reward of finishing, ten moves away, is 
 outweighs it: the best policy then stays away from the path. With 0.95 it follows the path from its beginning, because a
 policy that joins later visits less of it.
 
-A `Policy` does not contain its scene. `skills.learning.certificate.certify` checks it in the empty world, and finds its
-detours suboptimal, so it cannot be released as a style. Scenes are not stored, served or planned with yet.
+A `Policy` keeps its scene, and never commands a move that touches it (`Policy.greedy`): where the best move would, and
+in forbidden cells, it stops. `skills.learning.certificate.certify` checks it in that scene too.
 """
 
 from dataclasses import dataclass, replace
@@ -20,19 +20,17 @@ import numpy as np
 
 from skills.arrays import Floats, frozen
 from skills.errors import BadSettings
+from skills.fields import Count, schema
 from skills.gridworld.domain import Domain
 from skills.gridworld.grid import MOVES
 from skills.gridworld.reward import RewardMap
 from skills.gridworld.scene import Hazards
-from skills.learning.certificate import mdp_of
+from skills.learning.certificate import mdp_of, optimal_in_scene
 from skills.learning.dynamic_programming import MAX_SWEEPS, Mdp, ValueIteration, exact_q
-from skills.learning.policy import Policy, check_learnable
+from skills.learning.policy import Learner, Policy, check_learnable
 from skills.learning.q_learning import PhaseQLearning, Training, learn_q
 from skills.learning.slip import start_all
-from skills.learning.ties import TIE
 
-NOISE = 1e-12  # of the cost of touching: values that nearly cancel are exact to less
-FAINTEST = 100  # times that noise: a smaller value is not compared
 SETTLED_ODDS = 1e-13  # a probability that changes by less has settled
 
 
@@ -55,12 +53,13 @@ class SceneOdds:
             object.__setattr__(self, name, frozen(getattr(self, name), np.float64, (None,), name))
 
 
+@schema
 @dataclass(frozen=True)
 class SceneCertificate:
     """The result of checking every greedy action against exact values in a scene, and of every start.
 
     Attributes:
-        checked: Number of states (phase and cell) that were checked: those of the certified domain that are allowed.
+        checked: Number of states (phase and cell) that were checked: those of the certified domain where it moves on.
         suboptimal: Number of them whose greedy action is worse than the best one.
         starts: Number of allowed cells.
         least_finishing: Smallest probability of finishing, over these starts.
@@ -69,9 +68,9 @@ class SceneCertificate:
         mean_touching: Its mean.
     """
 
-    checked: int
-    suboptimal: int
-    starts: int
+    checked: Count
+    suboptimal: Count
+    starts: Count
     least_finishing: float
     mean_finishing: float
     most_touching: float
@@ -97,20 +96,33 @@ def learn_in_scene(
         seed: Seed of all random numbers, 0 to 2^63 - 1.
 
     Returns:
-        The policy, without its scene.
+        The policy, with its scene.
 
     Raises:
         BadSettings: As for `skills.learning.policy.learn_values`.
     """
-    check_learnable(reward, learner, seed)
+    check_learnable(reward, learner, seed, in_scene=True)
     if isinstance(learner, PhaseQLearning):
         q, training = learn_q(reward, learner, seed, hazards)
-        return Policy(reward.path, reward.levels, learner, seed, training, q)
+        return Policy(reward.path, reward.levels, learner, seed, training, q, surroundings=hazards.surroundings)
     q = exact_q(
         Mdp(Domain(reward.path, learner.phased, learner.join_share), reward, learner.gamma, learner.slip, hazards)
     )
     training = Training(steps=0, updates=0, episodes=0, finished=0, out_of_steps=0, out_of_time=0, settled=True)
-    return Policy(reward.path, reward.levels, learner, seed, training, q)
+    return Policy(reward.path, reward.levels, learner, seed, training, q, surroundings=hazards.surroundings)
+
+
+def scene_learner(learner: Learner) -> PhaseQLearning | ValueIteration:
+    """Return a learner that learns in a scene.
+
+    Raises:
+        BadSettings: It does not: it has no phases, or a network.
+    """
+    if isinstance(learner, PhaseQLearning | ValueIteration):
+        return learner
+    raise BadSettings(
+        f"The learner '{learner.kind}' does not learn in a scene; use {PhaseQLearning.kind} or {ValueIteration.kind}."
+    )
 
 
 def certify_in_scene(policy: Policy, hazards: Hazards) -> tuple[SceneCertificate, SceneOdds]:
@@ -127,18 +139,8 @@ def certify_in_scene(policy: Policy, hazards: Hazards) -> tuple[SceneCertificate
         BadSettings: Exact values do not settle, or some are too small to be compared, because gamma is too small.
     """
     mdp, domain = replace(mdp_of(policy), hazards=hazards), policy.domain
-    live = domain.certified & ~domain.terminal & ~hazards.forbidden[domain.state_of]
-    q = exact_q(mdp)
-    best, achieved = q.max(axis=1), q[np.arange(len(q)), policy.greedy.astype(np.int64).clip(0)]
-    noise = NOISE * hazards.touch
-    small = live & (best != 0) & ~(np.abs(best) > FAINTEST * noise)
-    if small.any():
-        raise BadSettings(
-            f"With gamma {mdp.gamma:g} the values of {np.count_nonzero(small)} states are too small to be compared "
-            "with the cost of touching; use a gamma nearer to 1.",
-            gamma=mdp.gamma,
-        )
-    optimal = achieved >= best - TIE * np.abs(best) - noise  # written so that NaN fails
+    live = domain.certified & ~domain.terminal & ~hazards.forbidden[domain.state_of] & (policy.greedy >= 0)
+    optimal = optimal_in_scene(mdp, policy.greedy, live)
     odds = odds_in_scene(policy, hazards, mdp.slip)
     starts = ~hazards.forbidden
     certificate = SceneCertificate(

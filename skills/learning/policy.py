@@ -21,6 +21,7 @@ from skills.gridworld import paper
 from skills.gridworld.domain import FINISHED, OUTSIDE, Domain, Moves
 from skills.gridworld.grid import GridPath, refuse_metres
 from skills.gridworld.reward import RewardLevels, RewardMap
+from skills.gridworld.scene import Hazards, Surroundings, hazards_of, touching
 from skills.learning.dynamic_programming import ValueIteration, iterate_values
 from skills.learning.max_ent_irl import MaxEntIRL, learn_from_recovered
 from skills.learning.networks import DDPG, DQN, TRPO, Network
@@ -91,13 +92,14 @@ def learn_values(reward: RewardMap, learner: Tabular, seed: int) -> tuple[Floats
     return learn_q(reward, learner, seed)
 
 
-def check_learnable(reward: RewardMap, learner: Learner, seed: int) -> None:
+def check_learnable(reward: RewardMap, learner: Learner, seed: int, *, in_scene: bool = False) -> None:
     """Refuse settings with which no learning should be started.
 
     Args:
         reward: The reward map of the demonstrated path.
         learner: The settings of the learner.
         seed: The seed.
+        in_scene: Whether it is learnt in a scene, which needs as much memory as slips do.
 
     Raises:
         BadSettings: The seed is not an integer from 0 to 2^63 - 1, or arriving would not pay (see `refuse_loops`), or
@@ -106,20 +108,22 @@ def check_learnable(reward: RewardMap, learner: Learner, seed: int) -> None:
     if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed <= MAX_SEED:
         raise BadSettings("The seed must be an integer from 0 to 2^63 - 1.")
     refuse_loops(reward.levels, learner)
-    refuse_too_large(reward.path, learner)
+    refuse_too_large(reward.path, learner, in_scene=in_scene)
 
 
-def refuse_too_large(path: GridPath, learner: Learner) -> None:
+def refuse_too_large(path: GridPath, learner: Learner, *, in_scene: bool = False) -> None:
     """Refuse a path whose policy would need too much memory, before any is allocated.
 
     Args:
         path: The demonstrated path.
         learner: The settings of the learner.
+        in_scene: Whether it is learnt in a scene.
 
     Raises:
         BadSettings: It would need more than `MAX_BYTES`.
     """
-    needed = Domain(path, learner.phased).n_rows * (BYTES_A_SLIPPING_ROW if learner.slip > 0 else BYTES_A_ROW)
+    each = BYTES_A_SLIPPING_ROW if learner.slip > 0 or in_scene else BYTES_A_ROW
+    needed = Domain(path, learner.phased).n_rows * each
     if needed > MAX_BYTES:
         raise BadSettings(
             f"Learning {len(path.states)} waypoints in a grid of {path.grid.n_states} cells needs about "
@@ -177,6 +181,7 @@ class Policy:
         q: Q values, shape (rows, 27).
         network: The network of a network learner, from which the Q values were computed at each cell's centre; or None.
         ties: The rule among equally good actions; None: the lowest index, the first one with the largest Q value.
+        surroundings: The scene that it was learnt in, in the frame of the path, and its costs; None: nothing is there.
     """
 
     path: GridPath
@@ -187,8 +192,11 @@ class Policy:
     q: Floats
     network: Network | None = None
     ties: ShortestWay | None = None
+    surroundings: Surroundings | None = None
 
     def __post_init__(self) -> None:
+        if self.surroundings is not None and not self.learner.phased:
+            raise BadSettings("Only in the phase state a policy is learnt in a scene; leave `surroundings` out.")
         if self.ties is not None and not self.learner.phased:
             raise BadSettings("Only in the phase state a way ends where it joins the path; leave `ties` out.")
         object.__setattr__(self, "q", frozen(self.q, np.float64, (self.domain.n_rows, paper.N_ACTIONS), "q"))
@@ -200,10 +208,18 @@ class Policy:
 
     @cached_property
     def greedy(self) -> Bytes:
-        """The action of each row, (rows,): 0 to 26, `FINISHED` or `OUTSIDE`."""
+        """The action of each row, (rows,): 0 to 26, `FINISHED` or `OUTSIDE`.
+
+        In a scene it is `OUTSIDE` also in forbidden cells and where the best move touches: a client stops there, also
+        one that knows no scenes.
+        """
         actions = self.q.argmax(axis=1) if self.ties is None else choose(self.domain, self.q, self.ties)
         actions[self.domain.terminal] = FINISHED
         actions[~self.domain.certified] = OUTSIDE
+        if self.surroundings is not None:
+            rows = np.flatnonzero(actions >= 0)
+            states, made = self.domain.state_of[rows], actions[rows].astype(np.int64)
+            actions[rows[touching(self.surroundings.scene, self.path.grid, states, made)]] = OUTSIDE
         return frozen(actions, np.int8, (self.domain.n_rows,), "greedy")
 
     @cached_property
@@ -212,6 +228,14 @@ class Policy:
         second, first = np.partition(self.q, -2, axis=1)[:, -2:].T
         sure = np.where(first > 0, 1 - second / np.where(first > 0, first, 1.0), 0.0)
         return frozen(sure, np.float64, (self.domain.n_rows,), "confidence")
+
+    @cached_property
+    def hazards(self) -> Hazards | None:
+        """The scene on its grid; None if nothing is there."""
+        if self.surroundings is None:
+            return None
+        scene, costs = self.surroundings.scene, self.surroundings.costs
+        return hazards_of(scene, self.path, scene.frame, costs)
 
     @cached_property
     def moves(self) -> Moves:

@@ -33,8 +33,8 @@ from skills.learning.policy import Policy
 from skills.library import integrity, jobs, locks, releases
 from skills.library.consent import refusal
 from skills.library.demos import newest_demos
-from skills.library.jobs import KEPT, PartRequest, RetrainingRequest, Store, TrainingRequest, with_rule
-from skills.library.policies import Recipe, joining_rules, recipes_of, refuse_unlike
+from skills.library.jobs import PartRequest, RetrainingRequest, Store, TrainingRequest
+from skills.library.policies import LearntIn, Recipe, joining_rules, learner_kept, recipes_of, refuse_unlike, scenes_of
 from skills.library.releases import fit_of, not_worse, shown_mm, taught, way_of
 from skills.library.training import Learnt, Lesson, Stored, combined_lesson, learn_style, lessons, store_styles
 from skills.schemas.policies import FitOnTheSame, PolicyFigures, StoredComparison
@@ -110,7 +110,7 @@ class _Style:
     """A queued style of a part: its lesson, and the number of times that it was started.
 
     With a recipe, the style serves a policy of several demonstrations, and is learnt from as many, combined in the same
-    way. With a rule, it serves a policy with that joining rule.
+    way. With a rule, it serves a policy with that joining rule; with `there`, one that was learnt in that scene.
     """
 
     row: int
@@ -118,6 +118,7 @@ class _Style:
     lesson: Lesson
     recipe: Recipe | None
     rule: float | None = None
+    there: LearntIn | None = None
 
 
 _Group = Sequence[_Style]  # started in one transaction, trained one after another
@@ -140,7 +141,7 @@ class _Batch:
             "surgeon": lesson.surgeon.slug,
             "suture": lesson.suture,
             "demos": [*demos],
-            "learner": with_rule(shared["learner"], style.rule if shared.get("joins") == KEPT else None),
+            "learner": learner_kept(shared, style.rule, style.there),
             "learner_version": shared["learner_version"],
             "seed": shared["seed"],
             "release": shared["release"],
@@ -151,6 +152,10 @@ class _Batch:
             request["poses"] = shared["poses"]
         if "near" in shared:
             request["near"] = shared["near"]
+        if style.there is not None:
+            request["surroundings"] = style.there.surroundings
+            if "odds" in shared:
+                request["odds"] = shared["odds"]
         if how is not None:
             request["combine"] = {"kind": how.kind}
         return request
@@ -206,11 +211,12 @@ def _waiting(database: Database, part: int) -> list[_Style]:
         read = {lesson.row: lesson for lesson in lessons(session, [demonstration for demonstration, *_ in rows])}
         surgeons = {lesson.surgeon.row for lesson in read.values()}
         recipes, rules = recipes_of(session, surgeons), joining_rules(session, surgeons)
+        scenes = scenes_of(session, surgeons)
     styles = []
     for demonstration, row, tries in rows:
         lesson = read[demonstration]
         name = lesson.surgeon.row, lesson.suture
-        styles.append(_Style(row, tries, lesson, recipes.get(name), rules.get(name)))
+        styles.append(_Style(row, tries, lesson, recipes.get(name), rules.get(name), scenes.get(name)))
     return styles
 
 

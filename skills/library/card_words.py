@@ -253,6 +253,44 @@ def coverage(counts: StartCounts, starts: int, mean_share: float, median_share: 
     )
 
 
+def bodies(scene: dict[str, Any]) -> str:
+    """Return the parts of a scene in words, from its JSON."""
+    boxes, capsules = len(scene["boxes"]), len(scene["capsules"])
+    parts = [f"{boxes} {'box' if boxes == 1 else 'boxes'}"] if boxes else []
+    parts += [f"{capsules} {'capsule' if capsules == 1 else 'capsules'}"] if capsules else []
+    parts += ["tissue"] if scene["tissue"] is not None else []
+    return ", ".join(parts) or "nothing"
+
+
+def in_scene(scene: dict[str, Any], slip: float) -> str:
+    """Return the sentences on the scene that a policy was learnt in, and on its odds there.
+
+    Args:
+        scene: The JSON of `schemas.policies.PolicyScene`.
+        slip: The slip that it was learnt with.
+    """
+    near, all_starts = scene["near"], scene["certificate"]
+    return (
+        f"It was learnt in a scene ({bodies(scene['scene'])}; SHA-256 {scene['sha256'][:12]}) with a slip of "
+        f"{slip:.0%}. There a pass finishes with a probability of at least {near['finishing']:.1%} and touches with at "
+        f"most {near['touching']:.1%} from the {near['starts']} allowed starts near the demonstrated one; over all "
+        f"{all_starts['starts']} allowed starts with {all_starts['mean_finishing']:.1%} and "
+        f"{all_starts['mean_touching']:.1%} on average, {all_starts['least_finishing']:.1%} and "
+        f"{all_starts['most_touching']:.1%} at worst."
+    )
+
+
+def not_checked(scene: dict[str, Any] | None) -> list[str]:
+    """Return the properties that were not checked, of a policy learnt in a scene or in none (None)."""
+    if scene is None:
+        return NOT_CHECKED
+    return [
+        "Thread, needle and the arm's body: in the scene the tip alone was checked, between the centres of cells.",
+        "Any other scene: with the tissue elsewhere, or the pass at another place, the odds do not hold.",
+        *NOT_CHECKED[1:],
+    ]
+
+
 def domain(phases: int) -> str:
     """Return the sentences on the certified domain of a policy."""
     if phases == 1:

@@ -297,13 +297,15 @@ def _coverage(version: PolicyVersion, coverage: Coverage) -> CardCoverage:
     share = shares(version)
     mean, median = float(share.mean()), float(np.median(share))
     alone = int(np.count_nonzero(coverage.reaches & (share == 0)))
+    scene, settings = version.manifest.get("scene"), version.manifest["settings"]
+    there = [] if scene is None else [words.in_scene(scene, settings["slip"])]
     followed = {"mean_share": mean, "median_share": median, "starts_goal_alone": alone}
     return CardCoverage(
         **version.manifest["coverage"] | followed,  # an older version has none in its manifest
         **vars(counts),
         shares=StartShares(**{name: count / grid.n_states for name, count in vars(counts).items()}),
         layers=layers,
-        in_words=words.coverage(counts, grid.n_states, mean, median, alone),
+        in_words=" ".join([words.coverage(counts, grid.n_states, mean, median, alone), *there]),
     )
 
 
@@ -313,7 +315,7 @@ def _limits(version: PolicyVersion, demo: Demo) -> CardLimits:
         joint_limits=words.joint_limits(version.manifest, demo.rotation_xyzw is not None),
         tip_accuracy=words.tip_accuracy(),
         tip_error_mm=TipErrors(calibrated=CALIBRATED_MM, not_calibrated=UNCALIBRATED_MM),
-        not_checked=words.NOT_CHECKED,
+        not_checked=words.not_checked(version.manifest.get("scene")),
     )
 
 

@@ -170,6 +170,8 @@ class TrainingRequest(TypedDict):
     combine: NotRequired[dict[str, str]]  # of several demonstrations
     outcomes: NotRequired[str]  # "any": of any outcome; otherwise left out
     depth_along: NotRequired[list[float]]  # in a frame that is not the base of the arm
+    surroundings: NotRequired[dict[str, Any]]  # the scene and its costs
+    odds: NotRequired[dict[str, float]]  # of the gate in a scene, where it is not the default
 
 
 class RetrainingRequest(TypedDict):
@@ -183,6 +185,7 @@ class RetrainingRequest(TypedDict):
     gate: NotRequired[int]
     poses: NotRequired[int]
     near: NotRequired[dict[str, float]]
+    odds: NotRequired[dict[str, float]]
     joins: NotRequired[str]  # `KEPT`; left out where the request names a learner, and in older batches
     seed: int
     release: bool

@@ -28,6 +28,7 @@ from skills.library import consent, integrity, releases
 from skills.library.catalogue import find_surgeon, find_suture_type
 from skills.library.demos import find_demo, newest_demos
 from skills.library.integrity import covered, learnt
+from skills.library.jobs import KEPT, RetrainingRequest, with_rule
 from skills.library.releases import is_served
 from skills.remedies import Action, Remedy
 from skills.schemas import policies as described
@@ -217,7 +218,8 @@ def arrays_of(version: PolicyVersion) -> bytes:
     learnt before there were shares: its bytes stay the same. If the policy has a network, `network`
     holds the bytes of its safetensors file. By another joining rule than the nearest waypoint there are `format` and
     `joins`, (n_states,), the phase after starting in a state or moving onto it in phase 0; and `action` is called
-    `action_joining`, see `table_name`.
+    `action_joining`, see `table_name`. If it was learnt in a scene, `finishing` and `touching`, (n_states,), are the
+    odds of each start.
     """
     policy, coverage, manifest = learnt(version), covered(version), version.manifest
     domain = policy.domain
@@ -230,6 +232,8 @@ def arrays_of(version: PolicyVersion) -> bytes:
         grid = policy.path.grid
         learnt_too |= {"share": coverage.share, "origin_mm": np.array(grid.origin_mm)}
         learnt_too |= {"cell_mm": np.float64(grid.cell_mm), "shape": np.array(grid.shape, np.int64)}
+    if coverage.finishing is not None and coverage.touching is not None:
+        learnt_too |= {"finishing": coverage.finishing, "touching": coverage.touching}
     if "joining" in manifest:
         learnt_too |= {"format": np.int32(manifest["format"]), "joins": domain.joins.astype(np.int32)}
     np.savez_compressed(
@@ -258,7 +262,8 @@ def about_rollout(policy: PolicyVersion, start_mm: Sequence[float]) -> Rollout:
     """
     following = learnt(policy)
     followed = rollout(following, np.asarray(start_mm, float))
-    tip = followed.tip_mm
+    tip, odds = followed.tip_mm, covered(policy) if "scene" in policy.manifest else None
+    start = int(followed.states[0])
     return Rollout(
         version=policy.version,
         sha256=policy.sha256,
@@ -268,6 +273,8 @@ def about_rollout(policy: PolicyVersion, start_mm: Sequence[float]) -> Rollout:
         path_mm=tip.tolist(),
         finished=followed.finished,
         dtw_total_mm=dtw(tip, following.path.tip_mm).total_mm,
+        finishing=None if odds is None or odds.finishing is None else float(odds.finishing[start]),
+        touching=None if odds is None or odds.touching is None else float(odds.touching[start]),
     )
 
 
@@ -401,6 +408,54 @@ def joining_rules(session: Session, surgeons: Collection[int] | None = None) -> 
     if surgeons is not None:
         query = query.where(Release.surgeon_row.in_(surgeons))
     return {(who, suture): share for who, suture, share in session.execute(query)}
+
+
+@dataclass(frozen=True)
+class LearntIn:
+    """The scene that a served policy was learnt in, its digest, and the learner, as JSON."""
+
+    sha256: str
+    surroundings: dict[str, Any]
+    learner: dict[str, Any]
+
+
+def scenes_of(session: Session, surgeons: Collection[int] | None = None) -> dict[tuple[int, str], LearntIn]:
+    """Return the scenes of the styles that serve a policy learnt in one.
+
+    Args:
+        session: The caller's transaction.
+        surgeons: The rows of surgeons; None: all.
+
+    Returns:
+        By style: a surgeon's row and a suture type.
+    """
+    query = select(Release.surgeon_row, Release.suture, PolicyVersion.manifest).join(
+        PolicyVersion, PolicyVersion.row == Release.policy_row
+    )
+    query = query.where(is_served(), PolicyVersion.manifest["scene"]["sha256"].as_string().is_not(None))
+    if surgeons is not None:
+        query = query.where(Release.surgeon_row.in_(surgeons))
+    return {
+        (who, suture): LearntIn(
+            about["scene"]["sha256"],
+            {name: about["scene"][name] for name in ("scene", "costs")},
+            {"kind": about["learner"], **about["settings"]},
+        )
+        for who, suture, about in session.execute(query)
+    }
+
+
+def learner_kept(asked: RetrainingRequest, rule: float | None, there: LearntIn | None) -> dict[str, Any]:
+    """Return the JSON of the learner by which a batch learns a style.
+
+    Args:
+        asked: The batch. If it names no learner, a style keeps what the following say.
+        rule: The joining rule of the policy that the style serves; None: the nearest waypoint.
+        there: The scene that this policy was learnt in; None: none.
+    """
+    if asked.get("joins") != KEPT:
+        return asked["learner"]
+    return with_rule(asked["learner"], rule) if there is None else there.learner
 
 
 def refuse_unlike(demonstrations: Sequence[Demonstration]) -> None:

@@ -16,13 +16,13 @@ from skills.db.models import Demonstration, PolicyVersion, Surgeon, SutureType
 from skills.db.service_tables import Job, StyleToRetrain
 from skills.db.session import Database
 from skills.errors import Conflict, NotFound
-from skills.learning.certificate import NearLimits
+from skills.learning.certificate import NearLimits, OddsLimits
 from skills.learning.policy import LEARNER_VERSION, describe_learner
 from skills.library import jobs, locks
 from skills.library.catalogue import find_surgeon, find_suture_type
 from skills.library.demos import newest_demos
-from skills.library.jobs import BATCH, KEPT, PART, Asked, PartRequest, RetrainingRequest, did_nothing, with_rule
-from skills.library.policies import Recipe, joining_rules, recipes_of
+from skills.library.jobs import BATCH, KEPT, PART, Asked, PartRequest, RetrainingRequest, did_nothing
+from skills.library.policies import LearntIn, Recipe, joining_rules, learner_kept, recipes_of, scenes_of
 from skills.library.releases import Outcome
 from skills.library.training import GATE_VERSION, POSES_VERSION, learner_to_train
 from skills.packing import canonical, sha256
@@ -34,12 +34,20 @@ STYLES_AT_ONCE = 500  # rows that one transaction adds: others wait for it, on S
 FEWEST_PARTS = 16  # if there are so many styles: workers share a batch part by part
 
 
-def request_retraining(database: Database, batch: RetrainingIn, actor: str, near: NearLimits | None = None) -> Asked:
+def request_retraining(
+    database: Database,
+    batch: RetrainingIn,
+    actor: str,
+    near: NearLimits | None = None,
+    odds: OddsLimits | None = None,
+) -> Asked:
     """Queue a batch that trains styles again, each from its newest demonstration that may be learnt from.
 
     One that is marked recovery or failure is left out, even if the style serves a version trained from any outcome. A
     style that serves a policy of several demonstrations is learnt from the same number of its newest ones, combined in
-    the same way. Unless the request names a learner, a style keeps the joining rule of the policy that it serves.
+    the same way. Unless the request names a learner, a style keeps the joining rule of the policy that it serves. A
+    style that serves a policy learnt in a scene is learnt in the same scene, and unless the request names a learner, by
+    the same one.
 
     The styles are chosen now; they and all defaults are the job's identity. With `only_stale` a style is left out if
     its newest version was learnt from that demonstration, with these settings and this learner, was not refused by an
@@ -59,6 +67,7 @@ def request_retraining(database: Database, batch: RetrainingIn, actor: str, near
             Q-learning with its defaults learns.
         actor: The owner of the caller's key.
         near: The gate's limit at the starts near the demonstrated one; None for its defaults.
+        odds: The gate's limits in a scene; None for their defaults.
 
     Raises:
         NotFound: The surgeon or the suture type is unknown.
@@ -67,7 +76,7 @@ def request_retraining(database: Database, batch: RetrainingIn, actor: str, near
         LearnerNotInstalled: The learner needs a library that is not installed.
     """
     with database.reading() as session:
-        request, styles = choose_styles(session, batch, near)
+        request, styles = choose_styles(session, batch, near, odds)
     names = [] if batch.surgeon is None else [locks.surgeon(batch.surgeon)]
     with database.writing([locks.BATCHES, *names]) as session:
         who = None if batch.surgeon is None else find_surgeon(session, batch.surgeon)
@@ -96,7 +105,7 @@ def request_retraining(database: Database, batch: RetrainingIn, actor: str, near
 
 
 def choose_styles(
-    session: Session, batch: RetrainingIn, near: NearLimits | None = None
+    session: Session, batch: RetrainingIn, near: NearLimits | None = None, odds: OddsLimits | None = None
 ) -> tuple[RetrainingRequest, list[dict[str, Any]]]:
     """Return the request of a batch's job, and for each of its styles the demonstration and why it is stale.
 
@@ -123,17 +132,20 @@ def choose_styles(
     }
     if near is not None and near != NearLimits():
         asked["near"] = asdict(near)
+    if odds is not None and odds != OddsLimits():
+        asked["odds"] = asdict(odds)
     if batch.chosen is None:
         asked["joins"] = KEPT
-    rules = {} if batch.chosen is not None else joining_rules(session, {demo.surgeon_row for demo in demos})
-    stale = _reasons(session, demos, asked, rules, who, what)
+    surgeons = {demo.surgeon_row for demo in demos}
+    kept = _Kept({} if batch.chosen is not None else joining_rules(session, surgeons), scenes_of(session, surgeons))
+    stale = _reasons(session, demos, asked, kept, who, what)
     chosen = [demo for demo in demos if stale[demo.row] or not batch.only_stale]
-    request, unsettled = _unsettled(session, asked, chosen, rules)
+    request, unsettled = _unsettled(session, asked, chosen, kept)
     return request, [{"demonstration_row": demo.row, "stale": stale[demo.row]} for demo in unsettled]
 
 
 def _unsettled(
-    session: Session, asked: RetrainingRequest, chosen: Sequence["_Newest"], rules: dict[tuple[int, str], float]
+    session: Session, asked: RetrainingRequest, chosen: Sequence["_Newest"], kept: "_Kept"
 ) -> tuple[RetrainingRequest, Sequence["_Newest"]]:
     """Return the request to make, and its styles; if an equal batch is done, only the styles that it would now release.
 
@@ -141,7 +153,7 @@ def _unsettled(
     """
     recipes = recipes_of(session, None if asked["surgeon"] is None else {demo.surgeon_row for demo in chosen})
     while True:
-        digest = sha256(canonical([_made_of(session, demo, recipes, rules) for demo in chosen]))
+        digest = sha256(canonical([_made_of(session, demo, recipes, kept) for demo in chosen]))
         request: RetrainingRequest = {**asked, "styles": len(chosen), "demos_sha256": digest}
         known = jobs.find_live(session, BATCH, request)
         if known is None or known.state != "succeeded" or not asked["release"]:
@@ -157,15 +169,24 @@ def _made_of(
     session: Session,
     demo: "_Newest",
     recipes: dict[tuple[int, str], Recipe],
-    rules: dict[tuple[int, str], float],
+    kept: "_Kept",
 ) -> str | list[Any]:
-    """Return the digest of a style's newest demonstration, or the combination, digests and joining rule of others."""
+    """Return the digest of a style's newest demonstration, or the combination, digests, rule and scene of others."""
     style = demo.surgeon_row, demo.suture
-    recipe, rule = recipes.get(style), [rules[style]] if style in rules else []
+    recipe, rule = recipes.get(style), [kept.rules[style]] if style in kept.rules else []
+    there = [sha256(canonical(kept.scenes[style].surroundings))] if style in kept.scenes else []
     if recipe is None:
-        return [demo.sha256, *rule] if rule else demo.sha256
+        return [demo.sha256, *rule, *there] if rule or there else demo.sha256
     newest = newest_demos(session, demo.surgeon_row, demo.suture, recipe.demos)
-    return [recipe.how.kind, *(one.sha256 for one in newest), *rule]
+    return [recipe.how.kind, *(one.sha256 for one in newest), *rule, *there]
+
+
+@dataclass(frozen=True)
+class _Kept:
+    """The properties of served policies that a batch keeps: joining rules and scenes, by style."""
+
+    rules: dict[tuple[int, str], float]
+    scenes: dict[tuple[int, str], LearntIn]
 
 
 def _did_nothing(session: Session, job: Job) -> str:
@@ -205,7 +226,7 @@ def _reasons(
     session: Session,
     demos: Sequence[_Newest],
     asked: RetrainingRequest,
-    rules: dict[tuple[int, str], float],
+    kept: "_Kept",
     surgeon: Surgeon | None,
     suture: SutureType | None,
 ) -> dict[int, list[str]]:
@@ -219,8 +240,9 @@ def _reasons(
     last = select(func.max(of.version).label("version"), of.surgeon_row, of.suture).group_by(of.surgeon_row, of.suture)
     newest = last.where(*_styles(of, surgeon, suture)).subquery()
     said = [of.manifest[name] for name in ("demos", "learner", "settings", "seed", "learner_version")]
+    said += [of.manifest["scene"]["sha256"].as_string(), of.manifest["scene"]["near"]]
     gate = of.releasable, of.manifest["grid_certificate"]["gate"], of.manifest["grid_certificate"]["near"]
-    limits = asdict(NearLimits(**asked.get("near", {})))
+    limits, chances = asdict(NearLimits(**asked.get("near", {}))), asdict(OddsLimits(**asked.get("odds", {})))
     query = select(of.surgeon_row, of.suture, *said, *gate).join(
         newest,
         (of.surgeon_row == newest.c.surgeon_row) & (of.suture == newest.c.suture) & (of.version == newest.c.version),
@@ -232,15 +254,19 @@ def _reasons(
         if version is None:
             reasons[demo.row] = ["never trained"]
             continue
-        rests_on, *how, learner_version, releasable, gate, near = version
-        learner = with_rule(asked["learner"], rules.get((demo.surgeon_row, demo.suture)))
+        rests_on, *how, learner_version, scene, odds, releasable, gate, near = version
+        style = demo.surgeon_row, demo.suture
+        there = kept.scenes.get(style)
+        learner = learner_kept(asked, kept.rules.get(style), there)
         settings = {name: value for name, value in learner.items() if name != "kind"}
         found = {
             "a newer demonstration": demo.sha256 not in rests_on,
+            "another scene": scene != (there and there.sha256),
             "other settings": how != [learner["kind"], settings, asked["seed"]],
             "a newer learner": learner_version != asked["learner_version"],
             "refused by an older gate": not releasable and gate != asked["gate"],
-            "other limits at the near starts": near is not None and not limits.items() <= near.items(),
+            "other limits at the near starts": (near is not None and not limits.items() <= near.items())
+            or (odds is not None and not chances.items() <= odds.items()),
         }
         reasons[demo.row] = [reason for reason, holds in found.items() if holds]
     return reasons

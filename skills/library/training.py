@@ -35,10 +35,22 @@ from skills.errors import BadInput, BadPlan, Conflict, NotFound, SkillsError
 from skills.fields import as_json
 from skills.gridworld.grid import discretisation_rmse
 from skills.gridworld.reward import RewardLevels, RewardMap, sparse_reward
+from skills.gridworld.scene import Scene, Surroundings, hazards_of, refuse_unfit
 from skills.kinematics import instrument_of
-from skills.learning.certificate import Certificate, NearLimits, NearStarts, certify, least_gamma, near_starts
+from skills.learning.certificate import (
+    Certificate,
+    NearLimits,
+    NearOdds,
+    NearStarts,
+    OddsLimits,
+    certify,
+    least_gamma,
+    near_odds,
+    near_starts,
+)
 from skills.learning.dynamic_programming import FAINT
 from skills.learning.evaluation import check_in_space, measure
+from skills.learning.in_scene import SceneCertificate, certify_in_scene, learn_in_scene, scene_learner
 from skills.learning.policy import (
     LEARNER_VERSION,
     Learner,
@@ -99,7 +111,13 @@ CERTIFICATE_NOTE = (
 )
 
 
-def request_training(session: Session, training: TrainingIn, actor: str, near: NearLimits | None = None) -> Asked:
+def request_training(
+    session: Session,
+    training: TrainingIn,
+    actor: str,
+    near: NearLimits | None = None,
+    odds: OddsLimits | None = None,
+) -> Asked:
     """Queue the training of a style, with all defaults resolved.
 
     Several demonstrations are combined, independently of the order in which they are named. If an equal training with
@@ -112,14 +130,16 @@ def request_training(session: Session, training: TrainingIn, actor: str, near: N
             without `combine` `BEST`, and without `learner` phase Q-learning with its defaults.
         actor: The owner of the caller's key.
         near: The gate's limit at the starts near the demonstrated one; None for its defaults.
+        odds: The gate's limits in a scene; None for their defaults.
 
     Raises:
         NotFound: The surgeon, the suture type or a demonstration is unknown.
         Conflict: There is no active demonstration; one is marked recovery or failure, and the request does not have
             outcomes "any"; or the surgeon's consent does not cover training.
         BadInput: A demonstration belongs to another style or is named twice, there are too many, or they cannot be
-            combined.
-        BadSettings: Learning would need too much memory, or going round in circles would pay more than arriving.
+            combined; or costs of a scene are given without it.
+        BadSettings: Learning would need too much memory, or going round in circles would pay more than arriving; or the
+            scene is in another frame or is touched by the demonstration, or the learner does not learn in a scene.
         LearnerNotInstalled: The learner needs a library that is not installed.
     """
     learner = learner_to_train(training.chosen)
@@ -128,7 +148,7 @@ def request_training(session: Session, training: TrainingIn, actor: str, near: N
     any_outcome = training.outcomes == ANY
     chosen = choose_demos(session, who, what.slug, training.demos, any_outcome=any_outcome)
     # Before the job is queued, so that the caller sees the error at once.
-    refuse_too_large(chosen[-1].path, learner)
+    refuse_too_large(chosen[-1].path, learner, in_scene=training.scene is not None)
     request: TrainingRequest = {
         "surgeon": who.slug,
         "suture": what.slug,
@@ -151,6 +171,15 @@ def request_training(session: Session, training: TrainingIn, actor: str, near: N
     if training.depth_along is not None:
         _refuse_depth_along(training.depth_along, learner, chosen[-1].frame)
         request["depth_along"] = list(training.depth_along)
+    if (surroundings := training.surroundings) is not None:
+        scene_learner(learner)
+        for demo in chosen:
+            refuse_unfit(surroundings.scene, demo.path, demo.frame)
+        request["surroundings"] = surroundings.as_json()
+        if odds is not None and odds != OddsLimits():
+            request["odds"] = asdict(odds)
+    elif training.scene_costs is not None:
+        raise BadInput("scene_costs are costs of a scene; give the scene too, or omit them.")
     job, new = jobs.ask(session, "training", request, who, actor)
     if new:
         return Asked(job, True, QUEUED)
@@ -174,6 +203,11 @@ def learner_to_train(chosen: Learner | None) -> Learner:
 def near_limits(settings: Settings) -> NearLimits:
     """Return the gate's limit at the starts near the demonstrated one, as an installation sets it."""
     return NearLimits(settings.near_radius_mm, settings.near_least_share)
+
+
+def odds_limits(settings: Settings) -> OddsLimits:
+    """Return the gate's limits in a scene, as an installation sets them."""
+    return OddsLimits(settings.scene_least_finishing, settings.scene_most_touching)
 
 
 def _refuse_depth_along(depth_along: Sequence[float], learner: Learner, frame: str) -> None:
@@ -327,9 +361,15 @@ def learn_style(lesson: Lesson, request: TrainingRequest, settings: Settings, te
     """
     require(lesson.surgeon, "training")  # fails early; the check that counts is repeated in the transaction that stores
     demo, reward = unpack_as(Demo, lesson.demo), unpack_as(RewardMap, lesson.reward)
+    learner = learner_of(request["learner"])
+    if "surroundings" in request:
+        given = Surroundings.of_json(request["surroundings"])
+        hazards = hazards_of(given.scene, reward.path, demo.frame, given.costs)
+        policy = learn_in_scene(reward, scene_learner(learner), hazards, request["seed"])
+        return certified(lesson, request, demo, policy)
     policy = learn_policy(
         reward,
-        learner_of(request["learner"]),
+        learner,
         request["seed"],
         ties=rule_in(demo.frame, request.get("depth_along")),
         tell=tell,
@@ -342,13 +382,21 @@ def learn_style(lesson: Lesson, request: TrainingRequest, settings: Settings, te
 def certified(lesson: Lesson, request: TrainingRequest, demo: Demo, policy: Policy) -> Learnt:
     """Certify and measure a policy that was learnt from a demonstration, and pack all of it."""
     certificate, covered = certify(policy)
+    in_scene = None
+    if policy.hazards is not None:
+        in_scene, odds = certify_in_scene(policy, policy.hazards)
+        covered = replace(covered, finishing=odds.finishes, touching=odds.touches)
     poses = certified_poses([unpack_as(Demo, one) for one in lesson.shown] or [demo], lesson.at)
     numbers, coverage = seal(policy), seal(covered)
     driven, undriven = _driven(policy, demo)
     assert covered.share is not None, "a new certificate has the shares"
-    near = near_starts(policy, covered.share, NearLimits(**request.get("near", {})))
-    refused_because = [*refusals(policy, certificate, near), *undriven]
+    limits = NearLimits(**request.get("near", {}))
+    near = near_starts(policy, covered.share, limits)
+    chances = None if in_scene is None else near_odds(policy, covered, limits, OddsLimits(**request.get("odds", {})))
+    refused_because = [*refusals(policy, certificate, near, chances), *undriven]
     manifest = describe_policy(policy, certificate, near, coverage.digest, demo, request, refused_because, driven)
+    if policy.surroundings is not None and in_scene is not None and chances is not None:
+        manifest["scene"] = describe_scene(policy.surroundings, in_scene, chances)
     if lesson.combined is not None:  # left out for one demonstration, so that older digests stay the same
         manifest["combined"] = lesson.combined
     if request.get("outcomes") == ANY:  # left out otherwise: then none of them is marked recovery or failure
@@ -453,8 +501,14 @@ def _version(learnt: Learnt, version: int) -> dict[str, Any]:
     }
 
 
-def refusals(policy: Policy, certificate: Certificate, near: NearStarts) -> list[str]:
-    """Return the reasons on the grid against a release; the comparisons are written so that NaN fails."""
+def refusals(policy: Policy, certificate: Certificate, near: NearStarts, odds: NearOdds | None = None) -> list[str]:
+    """Return the reasons on the grid against a release; the comparisons are written so that NaN fails.
+
+    In a scene the odds count in place of optimal actions and of starts that reach the goal: sampled values are not
+    exact beside rare and costly touches, and cells in tissue reach nothing.
+    """
+    if odds is not None:
+        return [*_unlikely(odds), *_not_the_style(policy, certificate, near)]
     reasons = []
     if not certificate.every_action_optimal:
         reasons.append(f"{certificate.suboptimal} of {certificate.checked} greedy actions are not optimal")
@@ -473,6 +527,23 @@ def refusals(policy: Policy, certificate: Certificate, near: NearStarts) -> list
             f"{certificate.off_rule} of {certificate.checked} greedy actions are not the ones that the rule among "
             "equally good actions selects"
         )
+    return reasons + _not_the_style(policy, certificate, near)
+
+
+def _unlikely(odds: NearOdds) -> list[str]:
+    """Return the reason why the odds in a scene are against a release, if they are."""
+    if odds.within:
+        return []
+    return [
+        f"of {odds.starts} starts near the demonstrated one, one finishes with a probability of {odds.finishing:.1%}, "
+        f"and one touches the scene with {odds.touching:.1%}; the gate requires at least {odds.least_finishing:.0%} "
+        f"and at most {odds.most_touching:.0%}"
+    ]
+
+
+def _not_the_style(policy: Policy, certificate: Certificate, near: NearStarts) -> list[str]:
+    """Return the reasons why a policy does not follow the demonstration from its start or near it."""
+    reasons = []
     if policy.learner.phased and not certificate.demonstration_reproduced:
         reasons.append("the rollout from the demonstrated start is not the demonstration")
     if policy.learner.phased and not near.within:
@@ -592,6 +663,19 @@ def describe_policy(
         **joining_of(policy),
         **({} if policy.ties is None else {"ties": as_json(policy.ties)}),  # left out as before there was a rule
     }
+
+
+def describe_scene(surroundings: Surroundings, in_scene: SceneCertificate, near: NearOdds) -> dict[str, Any]:
+    """Return the JSON of the scene that a policy was learnt in, with its odds (`schemas.policies.PolicyScene`)."""
+    return {"sha256": scene_digest(surroundings.scene), **surroundings.as_json()} | {
+        "certificate": as_json(in_scene),
+        "near": as_json(near),
+    }
+
+
+def scene_digest(scene: Scene) -> str:
+    """Return the SHA-256 of a scene, over its JSON."""
+    return sha256(canonical(scene.as_json()))
 
 
 def joining_of(policy: Policy) -> dict[str, Any]:

@@ -13,8 +13,10 @@ from pydantic import Field
 from skills.demonstration.partner import Partner
 from skills.fields import Count, Fraction, Point, Quaternion, Sha256, Slug, schema, stored_schema
 from skills.gridworld.reward import RewardLevels
-from skills.learning.certificate import NearStarts
+from skills.gridworld.scene import Scene, SceneCosts
+from skills.learning.certificate import NearOdds, NearStarts
 from skills.learning.evaluation import Metrics, SpaceRollouts
+from skills.learning.in_scene import SceneCertificate
 from skills.learning.q_learning import Training
 from skills.learning.ties import ShortestWay
 from skills.learning.tube_certificate import TubeCertificate
@@ -238,6 +240,27 @@ class Joining:
 
 @schema
 @dataclass(frozen=True)
+class PolicyScene:
+    """The scene that a policy was learnt in, and its odds there, with the slip of its learner (docs/scenes.md).
+
+    Attributes:
+        sha256: Digest of the scene.
+        scene: The scene, in the frame of the policy.
+        costs: The costs in addition to the rewards.
+        certificate: The comparison with exact values in the scene, and the odds over all allowed starts; those of each
+            start are among the arrays.
+        near: The odds of the starts near the demonstrated one, and the gate's limits.
+    """
+
+    sha256: Sha256
+    scene: Scene
+    costs: SceneCosts
+    certificate: SceneCertificate
+    near: NearOdds
+
+
+@schema
+@dataclass(frozen=True)
 class Combined:
     """The combination of a policy's demonstrations into the one path that it follows (docs/combining.md).
 
@@ -314,6 +337,10 @@ class Policy(PolicyName):
     moves onto it in phase 0, is then in the phase beside it; any other start is in phase 0, and any other move in phase
     0 stays in it, also one onto a waypoint or the goal. There is no `actions`, which clients that know no `joining`
     would follow wrongly; the same table is `actions_joining`. A client stops at a format that it does not know.
+
+    With `scene`, -2 stands also in cells that are forbidden there, and where the best move would touch; a client stops
+    as outside the certified domain. The straight lines between the centres of the cells were checked, not smoothed
+    ones, and the odds are those of a client that stops.
     """
 
     surgeon: Slug
@@ -349,6 +376,9 @@ class Policy(PolicyName):
         description="The rule among equally good actions; null or absent: the lowest index. The actions follow it: "
         "take them, and not the first largest of the Q values in the arrays.",
     )
+    scene: PolicyScene | None = Field(
+        default=None, description="What must not be touched, where it was learnt so; absent: nothing was known of it."
+    )
     created_at: datetime
     released_at: datetime | None
     released_by: str | None
@@ -378,6 +408,10 @@ class Rollout(PolicyName):
     path_mm: list[Point]
     finished: bool
     dtw_total_mm: float
+    finishing: Fraction | None = Field(
+        default=None, description="Of a policy learnt in a scene: the probability that a pass from here finishes."
+    )
+    touching: Fraction | None = Field(default=None, description="Likewise: the probability that it touches the scene.")
 
 
 class NextStep(PolicyName):

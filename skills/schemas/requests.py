@@ -13,6 +13,7 @@ from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, StrictBool, St
 
 from skills.comparison.combining import COMBININGS, Combining
 from skills.gridworld.grid import MAX_HYSTERESIS, GridMode
+from skills.gridworld.scene import MOST_BODIES, MOST_HEIGHTS, Scene, SceneCosts, Surroundings
 from skills.kinematics import INSTRUMENTS, JAW_TIP_MM
 from skills.learning.policy import LEARNERS, MAX_SEED, Learner, learner_of
 from skills.planning.handoff import Enters
@@ -241,15 +242,67 @@ class StatedIn(TableIn):
 READING = {"column", "unit", "decimal", "table_arm", "instrument"}
 
 
+def _settings(of: type[Learner] | type[SceneCosts], **more: Any) -> Any:
+    """Return a schema with the numbers of a settings class; the class itself checks their values."""
+    settings: dict[str, Any] = {f.name: (Whole if f.type is int else Number, f.default) for f in fields(of)}
+    return create_model(of.__name__, __base__=Schema, __doc__=of.__doc__, **settings, **more)
+
+
 def _learner(learner: type[Learner]) -> Any:
-    """Return a schema with the settings of a learner; the learner itself checks their values."""
-    settings: dict[str, Any] = {f.name: (Whole if f.type is int else Number, f.default) for f in fields(learner)}
-    # The discriminator of `LearnerIn`, without a default.
-    settings["kind"] = (Literal[learner.kind], ...)
-    return create_model(learner.__name__, __base__=Schema, __doc__=learner.__doc__, **settings)
+    # `kind` is the discriminator of `LearnerIn`, without a default.
+    return _settings(learner, kind=(Literal[learner.kind], ...))
 
 
 LearnerIn: Any = Annotated[reduce(or_, map(_learner, LEARNERS.values())), Field(discriminator="kind")]
+
+
+SceneCostsIn: Any = _settings(SceneCosts)
+
+
+class BoxIn(Schema):
+    """A box that must not be entered, along the axes of the frame."""
+
+    low_mm: Point
+    high_mm: Point
+
+
+class CapsuleIn(Schema):
+    """A cylinder with round ends, such as a link of the other arm."""
+
+    a_mm: Point
+    b_mm: Point
+    radius_mm: Annotated[Number, Field(gt=0, le=10_000)]
+
+
+class TissueIn(Schema):
+    """Heights above a plane, bilinear between the points of a regular map; [[0]] is the plane itself (docs/scenes.md).
+
+    `normal` points out of the tissue, `along` is the direction of the map's rows.
+    """
+
+    at_mm: Point
+    normal: Point
+    along: Point
+    step_mm: Annotated[Number, Field(gt=0, le=10_000)] = 1.0
+    heights_mm: Annotated[
+        list[Annotated[list[Coordinate], Field(min_length=1, max_length=MOST_HEIGHTS)]],
+        Field(min_length=1, max_length=MOST_HEIGHTS),
+    ] = [[0.0]]
+
+
+class SceneIn(Schema):
+    """What must not be touched, in the frame of the demonstration, as `Scene.as_json` writes it (docs/scenes.md)."""
+
+    frame: Annotated[str, Field(pattern=FRAME)]
+    boxes: Annotated[list[BoxIn], Field(max_length=MOST_BODIES)] = []
+    capsules: Annotated[list[CapsuleIn], Field(max_length=MOST_BODIES)] = []
+    tissue: TissueIn | None = None
+    margin_mm: Annotated[Number, Field(ge=0, le=10_000)] = 0.0
+
+    @property
+    def value(self) -> Scene:
+        """The scene as a value of the domain."""
+        return Scene.of_json(self.model_dump())
 
 
 class CombineIn(Schema):
@@ -285,11 +338,27 @@ class TrainingIn(Schema):
         description="Direction in which depth increases, of a demonstration whose frame is not the base of its arm: of "
         "equally short ways the policy takes the shallower one. In a base frame depth is the distance from the origin.",
     )
+    scene: SceneIn | None = Field(
+        default=None,
+        description="What must not be touched; phase-q-learning and value-iteration learn in it, with their `slip`. "
+        "Use a gamma near 1, such as 0.95.",
+    )
+    scene_costs: SceneCostsIn | None = Field(
+        default=None, description="Costs of the scene, in addition to the rewards of Algorithm 1."
+    )
 
     @property
     def chosen(self) -> Learner | None:
         """The learner as a value of the domain."""
         return None if self.learner is None else learner_of(self.learner.model_dump())
+
+    @property
+    def surroundings(self) -> Surroundings | None:
+        """The scene and its costs as values of the domain."""
+        if self.scene is None:
+            return None
+        costs = SceneCosts() if self.scene_costs is None else SceneCosts(**self.scene_costs.model_dump())
+        return Surroundings(self.scene.value, costs)
 
     @property
     def combining(self) -> Combining | None:

@@ -22,6 +22,7 @@ from skills.errors import Corrupt
 from skills.formats import read_recording
 from skills.gridworld.grid import PAPER_GRID, GridWorld, discretize
 from skills.gridworld.reward import RewardLevels, RewardMap, sparse_reward
+from skills.gridworld.scene import Box, Capsule, Scene, Surroundings, Tissue
 from skills.learning.certificate import certify
 from skills.learning.dynamic_programming import ValueIteration
 from skills.learning.max_ent_irl import MaxEntIRL
@@ -76,6 +77,13 @@ PLAYBACK = Playback(
     files={"psm.urdf": "0" * 64},
     seconds_per_step=0.1 + 0.2,
 )
+SCENE = Scene(
+    "base",
+    (Box((0.0, 0.1, -1e300), (0.3, 0.2, 5e-324)),),
+    (Capsule((0.0, 0.0, 0.1), (1.0, 0.0, 0.0), 0.1),),
+    Tissue((0.0, 0.0, -5.0), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0), 2.5, ((0.0, -0.0), (0.1, 0.2))),
+    0.5,
+)
 VALUES = [
     DEMO,
     replace(DEMO, rotation_xyzw=None),
@@ -95,6 +103,7 @@ VALUES = [
     TRPO(),
     replace(PHASED, ties=None),
     replace(PHASED, ties=ShortestWay(depth_along=(0.0, 0.1, -1.0))),
+    replace(PHASED, ties=None, surroundings=Surroundings(SCENE)),
     replace(POLICY, network=always((0.5, -0.25, 1e-30))),
     replace(PLAN, psm_m=None),
     PLAN,

@@ -57,7 +57,7 @@ from skills.library.policies import summary_json, version_json
 from skills.library.pose_styles import about_next, poses_of
 from skills.library.releases import outcomes_of, outcomes_of_styles
 from skills.library.retraining import find_retraining, list_styles, request_retraining, retrained_json
-from skills.library.training import near_limits, request_training
+from skills.library.training import near_limits, odds_limits, request_training
 from skills.schemas.given import (
     Job,
     NextPose,
@@ -94,7 +94,7 @@ def train(body: TrainingIn, db: Db, jobs: Jobs, actor: Actor, caller: Asking, se
     """
     refuse_release(caller, body.release)
     with db.writing([locks.surgeon(body.surgeon)]) as session:
-        job, new, did = request_training(session, body, actor, near_limits(settings))
+        job, new, did = request_training(session, body, actor, near_limits(settings), odds_limits(settings))
         answer = accepted(session, job, did)
     # after the commit; if the engine cannot be notified now, a worker finds the job's row later
     if new:
@@ -164,7 +164,7 @@ def retrain(body: RetrainingIn, db: Db, jobs: Jobs, actor: Actor, caller: Asking
     ended; the new job covers only these. `did` states the effect of the request.
     """
     refuse_release(caller, body.release)
-    job, new, did = request_retraining(db, body, actor, near_limits(settings))
+    job, new, did = request_retraining(db, body, actor, near_limits(settings), odds_limits(settings))
     with db.reading() as session:
         told = to_tell(session, job) if new else []
         answer = accepted(session, job, did)
