@@ -448,6 +448,10 @@ def plan(
         Literal["recorded", "paper"] | None,
         typer.Option(help="The end of A2: recorded, the demonstrated hand-off, or paper. Recorded where it was."),
     ] = None,
+    obstacles: Annotated[
+        Path | None,
+        typer.Option(help="JSON file of tissue and obstacles for the verdict, as --scene of train; else the policy's."),
+    ] = None,
     rate_hz: Annotated[float, typer.Option(help="Samples per second, 100 to 200.")] = 200.0,
     approach: Annotated[str | None, typer.Option(help="PSM_M's approach direction, as x,y,z.")] = None,
     base: Annotated[
@@ -494,6 +498,7 @@ def plan(
             handoff="none" if no_handoff else None,
             orientation=orientation,
             a2=a2,
+            scene=None if obstacles is None else read_scene(obstacles),
         )
     show(made, as_json, ("id", "arm", "frame", "orientation", "trajectory.duration_s"))
     if not as_json:

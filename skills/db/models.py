@@ -81,6 +81,7 @@ added_later(PsmM, "taken_mm")
 added_later(PsmM, "taken_xyzw")
 added_later(SuturePlan, "a2")
 added_later(SuturePlan, "departure")
+added_later(SuturePlan, "scene")
 few_numbers(Policy, "q")  # some 130 different values in 200,000 places: stored as a palette
 
 

@@ -30,6 +30,7 @@ SAMPLES_A_STEP = 4  # a move is compared with tissue at points at most a quarter
 MOST_BODIES = 64  # ours, boxes or capsules: two arms have twenty links, and each body is compared with every move
 MOST_HEIGHTS = 10_000  # ours, of a height map: 100 mm by 100 mm at 1 mm, some 200 kB of JSON
 LEAST_STEP_MM = 0.1  # ours, of a height map: a move of 5 mm is compared with tissue at 4 points a step
+LINE_STEP_MM = 0.25  # ours: a distance from a height map is at most half of this too small, for that reason
 SQUARE = 1e-9  # greatest cosine of the angle between two directions that count as perpendicular
 
 
@@ -46,6 +47,31 @@ class Box:
         if not all(low < high for low, high in zip(self.low_mm, self.high_mm, strict=True)):
             raise BadSettings("low_mm of a box must be below high_mm along each axis.", box=astuple(self))
 
+    def from_lines_mm(self, a_mm: Floats, b_mm: Floats) -> Floats:
+        """Return the distances of straight lines between points, (..., 3), from the box, (...,); 0 where they touch.
+
+        The square of the distance along a line is a parabola between the places where the line crosses the planes of
+        the faces, so each piece has its least distance at its vertex or at an end.
+        """
+        low, high, way = np.array(self.low_mm), np.array(self.high_mm), b_mm - a_mm
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            crossings = np.concatenate([(low - a_mm) / way, (high - a_mm) / way], axis=-1)
+        crossings = np.nan_to_num(crossings, nan=0.0, posinf=1.0, neginf=0.0).clip(0, 1)
+        ends = np.zeros_like(crossings[..., :1])
+        shares = np.sort(np.concatenate([ends, crossings, ends + 1], axis=-1), axis=-1)
+        nearest = np.full(way.shape[:-1], np.inf)
+        for piece in range(shares.shape[-1] - 1):
+            first, last = shares[..., piece, None], shares[..., piece + 1, None]
+            middle = a_mm + (first + last) / 2 * way
+            beside = (middle < low) | (middle > high)
+            face = np.where(middle < low, low, high)
+            slope = np.where(beside, way * way, 0.0).sum(axis=-1, keepdims=True)
+            rise = np.where(beside, way * (face - a_mm), 0.0).sum(axis=-1, keepdims=True)
+            at = a_mm + np.clip(rise / np.where(slope > 0, slope, 1.0), first, last) * way
+            apart = np.linalg.norm(np.maximum(np.maximum(low - at, at - high), 0.0), axis=-1)
+            nearest = np.minimum(nearest, apart)  # NaN stays NaN
+        return np.asarray(nearest)
+
 
 @schema
 @dataclass(frozen=True)
@@ -60,6 +86,13 @@ class Capsule:
         _check_finite("A capsule", self.a_mm, self.b_mm, (self.radius_mm,))
         if not self.radius_mm > 0:
             raise BadSettings("radius_mm of a capsule must be positive.", radius_mm=self.radius_mm)
+
+    def from_lines_mm(self, a_mm: Floats, b_mm: Floats) -> Floats:
+        """Return the distances of straight lines between points, (..., 3), from the capsule, (...,); < 0 inside."""
+        apart = _between_segments_mm(a_mm, b_mm, np.array(self.a_mm), np.array(self.b_mm))
+        # where a coordinate is NaN, the nearest ends may be finite
+        known = np.isfinite(a_mm).all(axis=-1) & np.isfinite(b_mm).all(axis=-1)
+        return np.asarray(np.where(known, apart - self.radius_mm, np.nan))
 
 
 @schema
@@ -118,6 +151,43 @@ class Tissue:
         near = (1 - v) * heights[row, column] + v * heights[row, next_column]
         far = (1 - v) * heights[next_row, column] + v * heights[next_row, next_column]
         return np.asarray(apart @ normal - ((1 - u) * near + u * far))
+
+    @property
+    def flat(self) -> bool:
+        """Whether it is a plane."""
+        return len(self.heights_mm) == len(self.heights_mm[0]) == 1
+
+    def from_lines_mm(self, a_mm: Floats, b_mm: Floats, within_mm: float) -> Floats:
+        """Return lower bounds on the distances of straight lines between points, (..., 3), from the tissue, (...,).
+
+        Of a plane the distances are exact. Of a height map with slopes of at most L, a point that is h above the
+        surface is at least h / sqrt(1 + L^2) away from it; lines are compared at points at most `LINE_STEP_MM` apart,
+        and half of that is subtracted. Inside they are negative.
+
+        Args:
+            a_mm: Beginnings of the lines.
+            b_mm: Their ends.
+            within_mm: Distances from a height map beyond this one are returned as this one.
+        """
+        if self.flat:
+            return np.asarray(np.minimum(self.above_mm(a_mm), self.above_mm(b_mm)))
+        heights, normal = np.array(self.heights_mm), np.array(self.normal) / np.linalg.norm(self.normal)
+        slopes = [np.abs(np.diff(heights, axis=axis)).max(initial=0.0) / self.step_mm for axis in (0, 1)]
+        steep = float(np.sqrt(1 + slopes[0] ** 2 + slopes[1] ** 2))
+        # Only the part of a line that is not far above the highest point of the tissue can be near it.
+        top, up_a, up_b = heights.max() + within_mm * steep, *((end - self.at_mm) @ normal for end in (a_mm, b_mm))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            crossing = np.clip((top - up_a) / (up_b - up_a), 0, 1)
+        first, last = np.where(up_a > top, crossing, 0.0), np.where(up_b > top, crossing, 1.0)
+        near = ~((up_a > top) & (up_b > top))  # NaN counts as near, and stays NaN
+        way = b_mm - a_mm
+        longest = float(np.nanmax((last - first) * np.linalg.norm(way, axis=-1) * near, initial=0.0))
+        pieces = 1 + int(longest / LINE_STEP_MM)
+        least = np.full(up_a.shape, np.inf)
+        for share in np.linspace(0.0, 1.0, pieces + 1):
+            least = np.minimum(least, self.above_mm(a_mm + (first + share * (last - first))[..., None] * way))
+        apart = np.where(least > 0, least / steep, least) - longest / pieces / 2
+        return np.asarray(np.minimum(np.where(near, apart, within_mm), within_mm))
 
 
 @schema
@@ -206,8 +276,7 @@ class Scene:
             touched |= apart <= capsule.radius_mm + self.margin_mm
         if self.tissue is not None:
             longest = float(np.linalg.norm(b - a, axis=-1).max(initial=0.0))
-            flat = len(self.tissue.heights_mm) == len(self.tissue.heights_mm[0]) == 1
-            samples = 2 if flat else 2 + int(SAMPLES_A_STEP * longest / self.tissue.step_mm)
+            samples = 2 if self.tissue.flat else 2 + int(SAMPLES_A_STEP * longest / self.tissue.step_mm)
             for share in np.linspace(0.0, 1.0, samples):
                 touched |= self.tissue.above_mm((1 - share) * a + share * b) <= self.margin_mm
         return touched
@@ -367,7 +436,7 @@ def _tuple(value: Any) -> Any:
 def _between(places: Floats, n: int) -> tuple[np.ndarray[Any, Any], Floats]:
     """Return the index of the map's point at or before each place, and the share of the way to the next one."""
     inside = places.clip(0, n - 1)
-    index = np.floor(inside).astype(np.int64)
+    index = np.floor(np.nan_to_num(inside)).astype(np.int64)  # the share of NaN stays NaN
     return index, inside - index
 
 

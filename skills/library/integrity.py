@@ -23,6 +23,7 @@ from skills.db.service_tables import StoredDataset
 from skills.demonstration.demonstration import Demo
 from skills.errors import AmbiguousDigest, Corrupt, NotFound
 from skills.gridworld.grid import GridPath
+from skills.gridworld.scene import Scene
 from skills.learning.certificate import Coverage, finishes, shares_of
 from skills.learning.policy import Policy
 from skills.learning.tube import CertifiedPoses
@@ -189,6 +190,17 @@ def policy_identity_of(manifest: dict[str, Any], numbers: str) -> str:
 def poses_identity_of(policy_sha256: str, poses: str) -> str:
     """Return a pose style's digest from that of the policy version to which it belongs, and that of its value."""
     return sha256(canonical([policy_sha256, poses]))
+
+
+def learnt_in(version: PolicyVersion) -> Scene | None:
+    """Return the scene that a version was learnt in; None for none."""
+    surroundings = learnt(version).surroundings
+    return None if surroundings is None else surroundings.scene
+
+
+def scene_digest(scene: Scene) -> str:
+    """Return a scene's digest: over its JSON."""
+    return sha256(canonical(scene.as_json()))
 
 
 def plan_identity(policy_sha256: str, plan: SuturePlan) -> str:

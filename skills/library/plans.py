@@ -4,7 +4,7 @@ PlanIn --plan_sutures--> Plan, stored
 recording of a simulated scene --find_suture_points--> SuturePoints, not stored
 """
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from typing import Any
 
@@ -20,10 +20,11 @@ from skills.demonstration.partner import Partner
 from skills.errors import BadPlan, BadSpeed, NoApproach, NoHandOff
 from skills.formats.suture_points import PARSE, SuturePoints, suture_points
 from skills.gridworld.grid import refuse_metres
+from skills.gridworld.scene import Scene
 from skills.kinematics import DEFAULT_INSTRUMENT
 from skills.learning.policy import Policy
 from skills.library import locks, policies
-from skills.library.integrity import find_by_digest, learnt, plan_identity, planned
+from skills.library.integrity import find_by_digest, learnt, plan_identity, planned, scene_digest
 from skills.library.policies import combined_of, learnt_from
 from skills.library.recordings import Reader, Upload, read_upload
 from skills.planning.hand import styled
@@ -87,9 +88,11 @@ def plan_sutures(database: Database, request: PlanIn, actor: str) -> tuple[Plan,
         orientation=request.orientation,
         a2=request.a2,
     )
+    learnt_in = None if followed.surroundings is None else followed.surroundings.scene
+    plan = replace(plan, scene=learnt_in if request.scene is None else request.scene.value)
     trajectory = trajectory_of(plan)
     identity = plan_identity(sha, plan)
-    about = describe_plan(plan, trajectory)
+    about = describe_plan(plan, trajectory, learnt_in)
     with database.writing([locks.surgeon(request.surgeon)]) as session:
         # Consent may have ended while the plan was computed.
         policy = policies.followable(policies.find_by_digest(session, sha))
@@ -200,8 +203,8 @@ def trajectory_of(plan: SuturePlan) -> Trajectory:
     )
 
 
-def describe_plan(plan: SuturePlan, trajectory: Trajectory) -> dict[str, Any]:
-    """Return the JSON of a plan without its digests."""
+def describe_plan(plan: SuturePlan, trajectory: Trajectory, learnt_in: Scene | None) -> dict[str, Any]:
+    """Return the JSON of a plan without its digests; `learnt_in` is the scene of its policy."""
     moved = transfers(trajectory)
     return {
         "arm": plan.arm,
@@ -213,6 +216,7 @@ def describe_plan(plan: SuturePlan, trajectory: Trajectory) -> dict[str, Any]:
         "path": plan.path,
         "psm_m": None if plan.psm_m is None else _describe_psm_m(plan.psm_m),
         "realignment": plan.psm_m is not None,
+        "scene": None if plan.scene is None else _describe_scene(plan.scene, learnt_in),
         "speed_mm_s": plan.speed_mm_s,
         "tip_offset_mm": plan.tip_offset_mm,
         "passes": [
@@ -246,6 +250,35 @@ def describe_plan(plan: SuturePlan, trajectory: Trajectory) -> dict[str, Any]:
     }
 
 
+def _describe_scene(scene: Scene, learnt_in: Scene | None) -> dict[str, Any]:
+    return {
+        "sha256": scene_digest(scene),
+        "learnt_sha256": None if learnt_in is None else scene_digest(learnt_in),
+        "differs": [] if learnt_in is None else differences(scene, learnt_in),
+        "scene": scene.as_json(),
+    }
+
+
+def differences(scene: Scene, learnt_in: Scene) -> list[str]:
+    """Return the differences of a scene from the one that a policy was learnt in, in words.
+
+    Boxes and capsules are compared as sets, so another order is no difference.
+    """
+    found = []
+    for one, other, where in (
+        (learnt_in, scene, "of the learnt scene is not in this one"),
+        (scene, learnt_in, "is not in the learnt scene"),
+    ):
+        found += [f"box {k} {where}" for k, box in enumerate(one.boxes) if box not in other.boxes]
+        found += [f"capsule {k} {where}" for k, capsule in enumerate(one.capsules) if capsule not in other.capsules]
+    if scene.tissue != learnt_in.tissue:
+        was, now = learnt_in.tissue is not None, scene.tissue is not None
+        found.append(f"the tissue {'is another one' if was and now else 'is missing' if was else 'is new'}")
+    if scene.margin_mm != learnt_in.margin_mm:
+        found.append(f"the margin is {scene.margin_mm:g} mm and not {learnt_in.margin_mm:g} mm")
+    return found
+
+
 def _describe_psm_m(psm_m: PsmM) -> dict[str, Any]:
     return {
         "approach": list(psm_m.approach),
@@ -264,7 +297,18 @@ def hands_over(about: dict[str, Any]) -> bool:
 
 def plan_in_words(about: dict[str, Any]) -> str:
     """Return the sentences on the motions of a described plan, and on those that it leaves out."""
-    return " ".join([_moves_in_words(about), *_hand_in_words(about)])
+    return " ".join([_moves_in_words(about), *_hand_in_words(about), _scene_in_words(about.get("scene"))])
+
+
+def _scene_in_words(scene: dict[str, Any] | None) -> str:
+    """Return the sentences on the scene of a described plan, also of an older one, which has none."""
+    if scene is None:
+        return "No scene was stated, so nothing is checked against tissue; the simulator's pad lies below every motion."
+    if scene["learnt_sha256"] is None:
+        return "It is checked against the stated scene, of which its policy knows nothing."
+    if not scene["differs"]:
+        return "It is checked against the scene of its policy, whose odds hold at the demonstrated place alone."
+    return f"Its scene is not the one that its policy was learnt in: {', '.join(scene['differs'])}."
 
 
 def _hand_in_words(about: dict[str, Any]) -> list[str]:

@@ -37,7 +37,8 @@ from skills.remedies import Action, Remedy
 from skills.settings import Settings
 from skills.verification.monte_carlo import DoubtSettings, doubt
 from skills.verification.playback import Pictures
-from skills.verification.verdict import judge
+from skills.verification.scene_clearance import SceneClearance, clearance_of
+from skills.verification.verdict import SCENE, Failure, judge
 
 Level = Literal["good", "caution", "bad"]
 MORE_OFTEN_NOT = 0.5  # a plan whose upper bound is below this fails more often than it succeeds
@@ -142,12 +143,14 @@ def check_playback(
     trajectory = trajectory_of(plan)
     measured = play(trajectory, timeout_s=settings.playback_timeout_s, memory_bytes=settings.playback_memory_bytes)
     approach_m = None if plan.psm_m is None else plan.psm_m.approach
-    verdict = judge(measured, trajectory, approach_m=approach_m)
+    beside = None if plan.scene is None else clearance_of(trajectory, plan.scene)
+    verdict = judge(measured, trajectory, approach_m=approach_m, beside=beside)
     varied = DoubtSettings(tip_errors_mm=tuple(request["tip_errors_mm"]))
     doubted = doubt(trajectory, approach_m=approach_m, pad_top_mm=float(measured.pad_mm[2]), settings=varied)
     report = _finite(asdict(verdict)) | {
         "doubt": _finite(asdict(doubted)),
-        "failure_in_words": None if verdict.failure is None else str(verdict.failure),
+        "failure_in_words": failure_in_words(verdict.failure, beside),
+        "scene": None if beside is None else _finite(asdict(beside.report)),
         "plan": request["plan"],
         "trajectory": trajectory_digest(trajectory),
         "policy": policy,
@@ -170,6 +173,13 @@ def check_playback(
         return {"playback": known.sha256, "feasible": known.feasible}
 
     return store
+
+
+def failure_in_words(failure: Failure | None, beside: SceneClearance | None) -> str | None:
+    """Return a verdict's failure as a sentence; one beside a scene also names the nearest parts."""
+    if failure is None or beside is None or failure.quantity != SCENE or not beside.report.nearest:
+        return None if failure is None else str(failure)
+    return f"{failure} Nearest: {beside.report.nearest[0]}."
 
 
 def find_playback(session: Session, playback_sha256: str) -> StoredPlayback:

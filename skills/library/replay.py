@@ -31,7 +31,7 @@ from skills.formats.verify import PLAN, POLICY, README, VERDICT
 from skills.learning.evaluation import TIE_BREAK, dtw
 from skills.library import consent, policies, releases
 from skills.library.demos import find_demo
-from skills.library.integrity import learnt, planned
+from skills.library.integrity import learnt, learnt_in, planned
 from skills.library.plans import describe_plan, find_plan, plan_in_words, trajectory_of
 from skills.library.playbacks import trajectory_digest
 from skills.library.policies import learnt_from
@@ -278,7 +278,7 @@ def _plan(plan: Plan, trajectory: Trajectory) -> dict[str, Any]:
         "surgeon": policy.surgeon.slug,
         "suture": policy.suture,
         "policy": {"version": policy.version, "sha256": policy.sha256},
-        **(about := describe_plan(planned(plan), trajectory)),
+        **(about := describe_plan(planned(plan), trajectory, learnt_in(policy))),
         "in_words": plan_in_words(about),
     }
 

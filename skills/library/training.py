@@ -35,7 +35,7 @@ from skills.errors import BadInput, BadPlan, Conflict, NotFound, SkillsError
 from skills.fields import as_json
 from skills.gridworld.grid import discretisation_rmse
 from skills.gridworld.reward import RewardLevels, RewardMap, sparse_reward
-from skills.gridworld.scene import Scene, Surroundings, hazards_of, refuse_unfit
+from skills.gridworld.scene import Surroundings, hazards_of, refuse_unfit
 from skills.kinematics import instrument_of
 from skills.learning.certificate import (
     Certificate,
@@ -68,7 +68,7 @@ from skills.library import jobs, releases
 from skills.library.catalogue import find_surgeon, find_suture_type
 from skills.library.consent import refusal, require
 from skills.library.demos import find_demo
-from skills.library.integrity import policy_identity_of, poses_identity_of
+from skills.library.integrity import policy_identity_of, poses_identity_of, scene_digest
 from skills.library.jobs import QUEUED, Asked, Store, TrainingRequest, did_nothing
 from skills.library.policies import BEST, choose_demos, combining_of, describe_combined, find_by_digest
 from skills.packing import canonical, sha256
@@ -671,11 +671,6 @@ def describe_scene(surroundings: Surroundings, in_scene: SceneCertificate, near:
         "certificate": as_json(in_scene),
         "near": as_json(near),
     }
-
-
-def scene_digest(scene: Scene) -> str:
-    """Return the SHA-256 of a scene, over its JSON."""
-    return sha256(canonical(scene.as_json()))
 
 
 def joining_of(policy: Policy) -> dict[str, Any]:

@@ -44,6 +44,7 @@ from skills.demonstration.demonstration import Demo
 from skills.errors import BadPlan, BadSpeed, OutsideGrid
 from skills.fields import Count, schema
 from skills.gridworld.grid import GridWorld
+from skills.gridworld.scene import Scene
 from skills.kinematics import (
     POINTING_DOWN,
     NearestLimit,
@@ -158,6 +159,7 @@ class SuturePlan:
         tip_offset_mm: Distance of a suture point from the tip, along the jaw's approach.
         a2: The end of A2: the recorded hand-off, or that of the paper.
         departure: The difference from the recorded orientation; None if there is none or it was not recorded.
+        scene: Tissue and obstacles in the arm's frame, which do not move with the passes; None: not stated.
     """
 
     arm: str
@@ -172,8 +174,14 @@ class SuturePlan:
     tip_offset_mm: float = 0.0
     a2: A2Target = "paper"
     departure: Departure | None = None
+    scene: Scene | None = None
 
     def __post_init__(self) -> None:
+        if self.scene is not None and self.scene.frame != self.frame:
+            raise BadPlan(
+                f"The scene is in the frame '{self.scene.frame}', the plan in '{self.frame}'; give the scene in that "
+                "frame."
+            )
         low, high = RATE_HZ
         if not low <= self.rate_hz <= high:
             raise BadSpeed(f"A plan must be sampled at {low:g} to {high:g} Hz.", rate_hz=self.rate_hz)

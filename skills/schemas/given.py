@@ -14,7 +14,8 @@ from typing import Any, Literal
 
 from pydantic import ConfigDict, Field
 
-from skills.fields import Count, Point, Quaternion, Sha256, Slug, schema
+from skills.fields import Count, Point, Quaternion, Sha256, Slug, stored_schema
+from skills.gridworld.scene import Scene
 from skills.planning.plan import Departure
 from skills.planning.trajectory import Seam, Transfer
 from skills.schemas import Given, Handedness, Page, PolicyName, SkillLevel
@@ -44,6 +45,7 @@ from skills.schemas.recordings import (
     SuturePoints,
 )
 from skills.verification.monte_carlo import Doubt, Probability
+from skills.verification.scene_clearance import SceneReport
 from skills.verification.verdict import PlaybackReport
 
 __all__ = [
@@ -89,7 +91,7 @@ __all__ = [
 # ---- plans, their motion, and the verdict on it --------------------------------------------------------------------
 
 
-@schema
+@stored_schema
 @dataclass(frozen=True)
 class Verdict(PlaybackReport):
     """The verdict and its figures; peak ratios and margins are PSM_A's, `arms` has all joints.
@@ -101,6 +103,7 @@ class Verdict(PlaybackReport):
         trajectory: Digest of the stamps and joints that were checked.
         policy: The policy version that the plan follows.
         frame: Frame of the plan.
+        scene: Distances from the plan's scene; null: it has none, so nothing was compared with tissue.
     """
 
     failure_in_words: str | None
@@ -109,6 +112,7 @@ class Verdict(PlaybackReport):
     trajectory: Sha256
     policy: PolicyName
     frame: str
+    scene: SceneReport | None = None
 
 
 class Sources(Given):
@@ -162,6 +166,15 @@ class Timetable(Given):
     seams: list[Seam]
 
 
+class PlanScene(Given):
+    """The scene of a plan, in the frame of the arm; it does not move with the passes."""
+
+    sha256: Sha256
+    learnt_sha256: Sha256 | None = Field(description="Of the scene that the policy was learnt in; null: in none.")
+    differs: list[str] = Field(description="The differences from that scene, in words; empty if there are none.")
+    scene: Scene
+
+
 class Plan(Given):
     """Grid worlds stacked at suture points."""
 
@@ -186,6 +199,9 @@ class Plan(Given):
     path: str = Field(description="fitted, or cell centres.")
     psm_m: PsmM | None
     realignment: bool
+    scene: PlanScene | None = Field(
+        default=None, description="Tissue and obstacles; null: none was stated, and nothing is compared with them."
+    )
     speed_mm_s: float
     tip_offset_mm: float
     passes: list[Pass]

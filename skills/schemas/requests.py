@@ -536,6 +536,11 @@ class PlanIn(Schema):
     psm_m: PsmMIn | None = Field(
         default=None, description="Left out, it is taken from the demonstration where that has PSM_M's pose."
     )
+    scene: SceneIn | None = Field(
+        default=None,
+        description="Tissue and obstacles in the frame of the arm, against which the verdict compares the motion. Left "
+        "out, it is the scene that the policy was learnt in.",
+    )
     realignment: StrictBool = Field(
         default=True, description="false plans A1 alone, without A2's turn; handoff 'none' is the way to say so now."
     )

@@ -39,6 +39,9 @@ from skills.planning.motion_laws import A2, PHASES, TRANSFER
 from skills.planning.trajectory import Trajectory, joint_ratios
 from skills.verification.clearance import FINGER_REACH_MM, Bounds, needle_to_pad_mm, openings, psm_m_poses
 from skills.verification.playback import CLEARANCE_SEEN_MM, PAD, PSM_A, PSM_M, Playback
+from skills.verification.scene_clearance import SceneClearance
+
+SCENE = "clearance of the scene"  # the quantity of a failure beside tissue or an obstacle
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,7 +214,13 @@ class _Gate:
         return None if passes.all() else int(np.argmin(passes))
 
 
-def first_failure(figures: Figures, playback: Playback, trajectory: Trajectory, limits: Limits) -> Failure | None:
+def first_failure(
+    figures: Figures,
+    playback: Playback,
+    trajectory: Trajectory,
+    limits: Limits,
+    beside: SceneClearance | None = None,
+) -> Failure | None:
     """Return the earliest sample at which a gate is broken; of several gates broken there, the first listed.
 
     Args:
@@ -219,11 +228,14 @@ def first_failure(figures: Figures, playback: Playback, trajectory: Trajectory, 
         playback: The measurements.
         trajectory: The trajectory that was played.
         limits: The limits of the gates.
+        beside: The motion's distances from a scene; None: they are no gate.
 
     Returns:
         The failure, or None if every sample passes every gate.
     """
-    gates = _gates(figures, playback, trajectory, limits)
+    gates = [*_gates(figures, playback, trajectory, limits)]
+    if beside is not None:
+        gates.append(_Gate(SCENE, "mm", beside.at_least_mm, beside.report.limit_mm, at_least=True))
     broken = [(sample, gate) for gate in gates if (sample := gate.broken()) is not None]
     if not broken:
         return None
@@ -446,6 +458,7 @@ def judge(
     settings: Limits | None = None,
     *,
     approach_m: ArrayLike | None = None,
+    beside: SceneClearance | None = None,
 ) -> PlaybackReport:
     """Compare the measurements with the intended motion and with the limits.
 
@@ -455,6 +468,8 @@ def judge(
         settings: The limits; by default `Limits()`.
         approach_m: PSM_M's approach in the PSM_A base frame, shape (3,), if it is known and PSM_M is not in the scene;
             if PSM_M is in the scene, its own pose counts, and otherwise the recorded one of the trajectory.
+        beside: The trajectory's distances from tissue and obstacles, as `clearance_of` computes them; None: nothing is
+            compared with them. The simulator's pad lies below the motion wherever that goes, so it is no tissue.
 
     Returns:
         The verdict and its figures.
@@ -465,7 +480,7 @@ def judge(
     _check_same(playback, trajectory)
     limits = settings or Limits()
     figures = figures_of(playback, trajectory)
-    failure = first_failure(figures, playback, trajectory, limits)
+    failure = first_failure(figures, playback, trajectory, limits, beside)
     psm_a = figures.arms[0]
     with_m = trajectory.psm_m is not None
     touching = figures.effort[~(playback.contact_n <= 0)]  # negated, so that NaN counts as contact

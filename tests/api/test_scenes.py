@@ -1,15 +1,17 @@
 """A policy learnt in a scene over HTTP: requested, served, verified by a client, on its card and page, and refused."""
 
 import io
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from skills.client.policies import rebuilt
 from skills.errors import Corrupt
-from skills.gridworld.scene import Scene
+from skills.gridworld.scene import Box, Scene, Tissue
 from skills.learning.policy import rollout_from
-from tests.api.service import KESTREL, POLICY, Service, assert_problem
+from skills.library.plans import differences
+from tests.api.service import GOAL_MM, KESTREL, POLICY, Service, assert_problem
 from tests.gridworld.paths import follow
 from tests.library.test_scenes import SCENE
 
@@ -104,3 +106,87 @@ def test_a_gamma_that_lets_the_goal_vanish_fails_the_job_and_says_so(trained: Se
     job = trained.train(learner={**EXACT, "gamma": 0.001}, scene=SCENE.as_json(), scene_costs={"touch": 1e6})
     assert job["state"] == "failed"
     assert "use a gamma nearer to 1" in job["error"]
+
+
+FREE = replace(SCENE, tissue=Tissue.plane((0.0, 0.0, -160.0), (0.0, 0.0, 1.0)), boxes=())
+
+
+def planned(service: Service, **asked) -> dict:
+    return service.client.plan(**KESTREL, suture_points=[{"position_mm": GOAL_MM}], handoff="none", **asked)
+
+
+def verdict_of(service: Service, plan: dict) -> dict:
+    """Play a plan in the simulator, and return the playback."""
+    service.client.play(plan["id"])
+    done = [job for job in service.work() if job["kind"] == "playback"]
+    return service.client.playback(done[-1]["result"]["playback"])
+
+
+def test_a_plan_takes_the_scene_of_its_policy_and_its_tool_touches(trained: Service):
+    """The fingers reach 10 mm below the tip, which is all that the grid world knows of the tool."""
+    about = in_scene(trained)
+    made = planned(trained)
+    assert made["scene"]["sha256"] == made["scene"]["learnt_sha256"] == about["scene"]["sha256"]
+    assert (made["scene"]["scene"], made["scene"]["differs"]) == (SCENE.as_json(), [])
+    assert "It is checked against the scene of its policy" in made["in_words"]
+    playback = verdict_of(trained, made)
+    assert not playback["feasible"]
+    assert playback["report"]["failure"]["quantity"] == "clearance of the scene"
+    nearest = playback["report"]["scene"]["nearest"][0]
+    assert (nearest["part"], nearest["body"]) == ("tissue", "PSM_A")
+    assert nearest["least_mm"] < 0
+    assert (
+        f"{nearest['link']} is {nearest['least_mm']:.2f} mm from tissue, in pass 0, A1" in playback["headline"]["text"]
+    )
+    assert "From tissue and obstacles" in trained.http.get(f"/pages/plans/{made['id']}").text
+    bag = trained.http.get(f"/plans/{made['id']}/trajectory?handoff=none", headers={"Accept": "application/zip"})
+    assert_problem(bag, 409)
+
+
+def test_a_plan_may_state_another_scene_and_says_how_it_differs(trained: Service):
+    in_scene(trained)
+    made = planned(trained, scene=FREE.as_json())
+    assert made["scene"]["sha256"] != made["scene"]["learnt_sha256"]
+    assert made["scene"]["differs"] == ["box 0 of the learnt scene is not in this one", "the tissue is another one"]
+    assert "not the one that its policy was learnt in: box 0 of the learnt scene" in made["in_words"]
+    assert made["id"] != planned(trained)["id"]
+    stranger = trained.http.post(
+        "/plans",
+        json={
+            **KESTREL,
+            "suture_points": [{"position_mm": GOAL_MM}],
+            "handoff": "none",
+            "scene": FREE.as_json() | {"frame": "PSM2_base"},
+        },
+    )
+    assert "give the scene in that frame" in assert_problem(stranger, 422)["detail"]
+
+
+@pytest.mark.nightly
+def test_a_plan_far_from_its_scene_is_feasible_and_states_the_distance(trained: Service):
+    made = planned(trained, scene=FREE.as_json())
+    playback = verdict_of(trained, made)
+    report = playback["report"]["scene"]
+    assert playback["feasible"]
+    assert report["limit_mm"] == 1.0 < report["at_least_mm"] <= report["nearest"][0]["least_mm"]
+    assert "of which its policy knows nothing" in playback["headline"]["text"]
+
+
+def test_a_plan_without_a_scene_says_that_no_tissue_is_checked(trained: Service):
+    made = planned(trained)
+    assert made["scene"] is None
+    assert "nothing is checked against tissue" in made["in_words"]
+    stated = planned(trained, scene=FREE.as_json())
+    assert (stated["scene"]["learnt_sha256"], stated["scene"]["differs"]) == (None, [])
+    assert "of which its policy knows nothing" in stated["in_words"]
+
+
+def test_the_differences_of_scenes_are_named():
+    more = replace(SCENE, boxes=(Box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)), *SCENE.boxes), tissue=None, margin_mm=1.0)
+    assert differences(more, SCENE) == [
+        "box 0 is not in the learnt scene",
+        "the tissue is missing",
+        "the margin is 1 mm and not 0.5 mm",
+    ]
+    assert differences(SCENE, replace(SCENE, capsules=())) == ["capsule 0 is not in the learnt scene"]
+    assert differences(SCENE, SCENE) == []

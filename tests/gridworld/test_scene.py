@@ -131,3 +131,51 @@ def test_what_is_no_scene_is_refused(wrong):
 def test_impossible_costs_are_refused(wrong):
     with pytest.raises(BadSettings):
         SceneCosts(**wrong)
+
+
+@settings(deadline=None, max_examples=100)
+@given(points, points)
+def test_distances_of_lines_are_the_least_of_points_along_them(a, b):
+    """Points in steps of 1/2000 are at most 0.03 mm from any point of the line."""
+    a, b = np.array(a), np.array(b)
+    along = a + np.linspace(0, 1, 2001)[:, None] * (b - a)
+    box = Scene("base", boxes=(BOX,)).clearance_mm(along).min()
+    assert box - 0.03 <= BOX.from_lines_mm(a[None], b[None])[0] <= box + 1e-9
+    arm = Scene("base", capsules=(ARM,)).clearance_mm(along).min()
+    assert arm - 0.03 <= max(ARM.from_lines_mm(a[None], b[None])[0], 0) <= arm + 1e-9
+    assert FLAT.from_lines_mm(a, b, 50.0) == pytest.approx(FLAT.above_mm(along).min())
+
+
+SURFACE = np.stack(np.meshgrid(np.linspace(-20, 20, 81), np.linspace(-20, 20, 81), [0.0]), axis=-1).reshape(-1, 3)
+SURFACE[:, 2] = -RIDGE.above_mm(SURFACE)
+
+
+@settings(deadline=None, max_examples=40)
+@given(points, points)
+def test_the_distance_from_a_height_map_is_a_lower_bound(a, b):
+    a, b = np.array(a), np.array(b)
+    along = a + np.linspace(0, 1, 21)[:, None] * (b - a)
+    bound = float(RIDGE.from_lines_mm(a[None], b[None], 8.0)[0])
+    if RIDGE.above_mm(along).min() > 0:
+        assert bound <= np.linalg.norm(along[:, None] - SURFACE, axis=2).min() + 1e-9
+    else:
+        assert bound <= 0
+    # a surface with slopes of 2 along both axes is at most three times as near as it is below
+    assert (
+        bound >= min(RIDGE.above_mm(a + np.linspace(0, 1, 2001)[:, None] * (b - a)).min() / 3, 8.0) - 0.2 or bound < 0
+    )
+
+
+def test_distances_of_lines_worked_by_hand_and_nan():
+    assert BOX.from_lines_mm(
+        np.array([[5, 5, 4], [13, 5, 0.5], [-5, 5, 3.0]]), np.array([[5, 5, 3], [13, 14, 0.5], [15, 5, 3]])
+    ) == pytest.approx([2, 3, 2])
+    assert RIDGE.from_lines_mm(np.array([[20.0, 20.0, 6.0]]), np.array([[20.0, 20.0, 300.0]]), 50.0) == pytest.approx(
+        [2.0], abs=0.13
+    )
+    lost = np.array([[np.nan, 0.0, 3.0]])
+    for apart in (BOX.from_lines_mm(lost, lost + 1), ARM.from_lines_mm(lost, lost + 1)):
+        assert np.isnan(apart).all()
+    for tissue in (FLAT, RIDGE):
+        assert np.isnan(tissue.from_lines_mm(np.full((1, 3), np.nan), np.zeros((1, 3)), 50.0)).all()
+        assert np.isnan(tissue.from_lines_mm(np.zeros((1, 3)), np.array([[0.0, 0.0, np.nan]]), 50.0)).all()

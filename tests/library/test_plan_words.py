@@ -40,6 +40,24 @@ def test_a_plan_says_what_it_does_and_leaves_out(of: dict[str, Any], words: str)
     assert hands_over(of) == (of["psm_m"] is not None)
 
 
+@pytest.mark.parametrize(
+    ("scene", "words"),
+    [
+        (None, "nothing is checked against tissue; the simulator's pad lies below every motion."),
+        ({"learnt_sha256": None, "differs": []}, "the stated scene, of which its policy knows nothing."),
+        ({"learnt_sha256": "ab", "differs": []}, "the scene of its policy, whose odds hold at the demonstrated place"),
+        (
+            {"learnt_sha256": "ab", "differs": ["box 0 is new", "c"]},
+            "the one that its policy was learnt in: box 0 is new, c",
+        ),
+    ],
+)
+def test_a_plan_and_its_verdict_say_which_scene_was_checked(scene: dict[str, Any] | None, words: str):
+    of = FULL | {"scene": scene}
+    assert words in plan_in_words(of)
+    assert words in told(of, 0.98)["text"]
+
+
 def test_a_plan_that_hands_over_and_succeeds_surely_is_good():
     line = told(FULL, 0.98)
     assert (line["level"], line["word"]) == ("good", "Likely to succeed")

@@ -21,9 +21,9 @@ from skills.learning.policy import Policy
 from skills.learning.q_learning import CellQLearning, PhaseQLearning
 from skills.learning.slip import FollowPolicy, draw_slips, follows, walk
 from skills.library import releases
-from skills.library.integrity import covered, learnt
+from skills.library.integrity import covered, learnt, scene_digest
 from skills.library.policies import about_rollout
-from skills.library.training import odds_limits, refusals, scene_digest
+from skills.library.training import odds_limits, refusals
 from skills.settings import Settings
 from tests.library import cases
 from tests.library.styles import ask_retraining, parts_of, styles_of
@@ -69,6 +69,7 @@ def test_a_style_is_learnt_in_a_scene_stored_and_served_with_its_odds(database):
     assert (policy.table()[:, forbidden] == -2).all(), "a client that knows no scenes stops there"
 
 
+@pytest.mark.nightly  # by day: tests/learning/test_in_scene.py, without the store
 def test_the_stored_odds_are_those_of_many_walks_that_slip(database):
     with_demo(database)
     version = trained(database, learner=replace(SLIPPING, slip=0.3))
