@@ -336,6 +336,9 @@ def _policy(row: PolicyVersion) -> Why:
         yield "its flag `releasable` contradicts its certificate"
     if (manifest["surgeon"], manifest["suture"]) != (row.surgeon.slug, row.suture):
         yield "its manifest names another style"
+    there, said = row.learnt.surroundings, manifest.get("scene")
+    if (there and there.as_json()) != (said and {name: said[name] for name in ("scene", "costs")}):
+        yield "its manifest states another scene than it was learnt in"
     if manifest["demos"] != [one.sha256 for one in demonstrations]:
         yield "it was learnt from another demonstration"
     if any((one.surgeon_row, one.suture) != (row.surgeon_row, row.suture) for one in demonstrations):

@@ -242,21 +242,21 @@ class StatedIn(TableIn):
 READING = {"column", "unit", "decimal", "table_arm", "instrument"}
 
 
-def _settings(of: type[Learner] | type[SceneCosts], **more: Any) -> Any:
+def _settings(of: type[Learner] | type[SceneCosts], name: str, **more: Any) -> Any:
     """Return a schema with the numbers of a settings class; the class itself checks their values."""
     settings: dict[str, Any] = {f.name: (Whole if f.type is int else Number, f.default) for f in fields(of)}
-    return create_model(of.__name__, __base__=Schema, __doc__=of.__doc__, **settings, **more)
+    return create_model(name, __base__=Schema, __doc__=of.__doc__, **settings, **more)
 
 
 def _learner(learner: type[Learner]) -> Any:
     # `kind` is the discriminator of `LearnerIn`, without a default.
-    return _settings(learner, kind=(Literal[learner.kind], ...))
+    return _settings(learner, learner.__name__, kind=(Literal[learner.kind], ...))
 
 
 LearnerIn: Any = Annotated[reduce(or_, map(_learner, LEARNERS.values())), Field(discriminator="kind")]
 
 
-SceneCostsIn: Any = _settings(SceneCosts)
+SceneCostsIn: Any = _settings(SceneCosts, "SceneCostsIn")
 
 
 class BoxIn(Schema):

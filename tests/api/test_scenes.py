@@ -10,6 +10,7 @@ from skills.client.policies import rebuilt
 from skills.errors import Corrupt
 from skills.gridworld.scene import Box, Scene, Tissue
 from skills.learning.policy import rollout_from
+from skills.library.inspection import inspect_installation
 from skills.library.plans import differences
 from tests.api.service import GOAL_MM, KESTREL, POLICY, Service, assert_problem
 from tests.gridworld.paths import follow
@@ -56,6 +57,20 @@ def test_a_client_of_before_that_runs_the_actions_as_they_are_never_touches(trai
         assert finished == rollout_from(policy, start).finished == (not policy.hazards.forbidden[start])
         centres = policy.path.grid.centres_mm(np.array(states))
         assert not finished or not SCENE.touches(centres[:-1], centres[1:]).any()
+
+
+def test_in_a_forbidden_cell_nothing_is_commanded(trained: Service):
+    about = in_scene(trained)
+    inside = {"position_mm": [-20.0, 40.0, -120.0]}
+    step = trained.http.post(f"{POLICY}/next", json=inside | {"phase": 0}).json()
+    assert (step["action"], step["next_position_mm"], step["done"]) == (None, None, False)
+    rollout = trained.client.rollout(**KESTREL, start_mm=inside["position_mm"])
+    assert (rollout["finished"], len(rollout["states"])) == (False, 1)
+    assert (rollout["finishing"], rollout["touching"]) == (0, 1)
+    view = trained.http.get(f"/pages/styles/kestrel/simple-running/versions/{about['version']}/view")
+    assert view.status_code == 200
+    planned(trained, scene=FREE.as_json())
+    assert [wrong for checked in inspect_installation(trained.database) for wrong in checked.wrong] == []
 
 
 def test_card_and_page_state_the_scene_and_its_odds(trained: Service):
