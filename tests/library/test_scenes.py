@@ -23,7 +23,9 @@ from skills.learning.slip import FollowPolicy, draw_slips, follows, walk
 from skills.library import releases
 from skills.library.integrity import covered, learnt, scene_digest
 from skills.library.policies import about_rollout
+from skills.library.retraining import request_retraining
 from skills.library.training import odds_limits, refusals
+from skills.schemas.requests import RetrainingIn
 from skills.settings import Settings
 from tests.library import cases
 from tests.library.styles import ask_retraining, parts_of, styles_of
@@ -167,6 +169,8 @@ def test_a_batch_keeps_the_scene_of_a_style_and_its_learner(database):
     with_demo(database)
     version = trained(database, release=True)
     assert [style.stale for style in styles_of(database, ask_retraining(database, only_stale=True))] == []
+    other = request_retraining(database, RetrainingIn(only_stale=True), "test", odds=OddsLimits(0.5, 0.5)).job
+    assert [style.stale for style in styles_of(database, other)] == [["other limits at the near starts"]]
     job = ask_retraining(database)
     for part in parts_of(database, job):
         cases.work(database, part)
