@@ -265,7 +265,8 @@ class Scene:
         """Return for each straight line between two points, (..., 3), whether it touches a part, (...,).
 
         Boxes grow by the margin along each axis, so their edges stay sharp. Tissue is compared at points at most a
-        quarter of its map's step apart, which for a plane is exact.
+        quarter of its map's step apart, which for a plane is exact; they depend on the line alone, so a line is judged
+        the same together with others. Written so that NaN touches.
         """
         a, b = np.broadcast_arrays(np.asarray(from_mm, float), np.asarray(to_mm, float))
         touched = np.zeros(a.shape[:-1], bool)
@@ -273,12 +274,13 @@ class Scene:
             touched |= _crosses(a, b, np.array(box.low_mm) - self.margin_mm, np.array(box.high_mm) + self.margin_mm)
         for capsule in self.capsules:
             apart = _between_segments_mm(a, b, np.array(capsule.a_mm), np.array(capsule.b_mm))
-            touched |= apart <= capsule.radius_mm + self.margin_mm
+            touched |= ~(apart > capsule.radius_mm + self.margin_mm)
         if self.tissue is not None:
-            longest = float(np.linalg.norm(b - a, axis=-1).max(initial=0.0))
-            samples = 2 if self.tissue.flat else 2 + int(SAMPLES_A_STEP * longest / self.tissue.step_mm)
-            for share in np.linspace(0.0, 1.0, samples):
-                touched |= self.tissue.above_mm((1 - share) * a + share * b) <= self.margin_mm
+            steps = 0.0 if self.tissue.flat else SAMPLES_A_STEP / self.tissue.step_mm
+            pieces = 1 + np.floor(steps * np.linalg.norm(b - a, axis=-1))
+            for piece in range(1 + int(pieces.max(initial=1.0, where=np.isfinite(pieces)))):
+                share = np.minimum(piece / pieces, 1.0)[..., None]
+                touched |= ~(self.tissue.above_mm((1 - share) * a + share * b) > self.margin_mm)
         return touched
 
 
@@ -449,7 +451,7 @@ def _crosses(a: Floats, b: Floats, low: Floats, high: Floats) -> Flags:
     within = (a >= low) & (a <= high)
     enters = np.where(still, np.where(within, -np.inf, np.inf), np.minimum(to_low, to_high)).max(axis=-1)
     leaves = np.where(still, np.where(within, np.inf, -np.inf), np.maximum(to_low, to_high)).min(axis=-1)
-    return np.asarray(np.maximum(enters, 0.0) <= np.minimum(leaves, 1.0))
+    return np.asarray(~(np.maximum(enters, 0.0) > np.minimum(leaves, 1.0)))
 
 
 def _between_segments_mm(a: Floats, b: Floats, c: Floats, d: Floats) -> Floats:

@@ -198,8 +198,8 @@ def certify(policy: Policy) -> tuple[Certificate, Coverage]:
         optimal, faint, best = _compared(policy, live)
     else:
         live &= policy.greedy >= 0
-        best = exact_values(mdp_of(policy))
-        optimal, faint = optimal_in_scene(mdp_of(policy), policy.greedy, live), np.zeros_like(live)
+        optimal, best = optimal_in_scene(mdp_of(policy), policy.greedy, live)
+        faint = np.zeros_like(live)
     finishing = finishes(policy)
     share = shares_of(policy, finishing)
     covered = Coverage(_reaches(policy, finishing), _joins_nearest(policy), share)
@@ -231,7 +231,7 @@ def _compared(policy: Policy, live: Flags) -> tuple[Flags, Flags, Floats]:
     return optimal, faint, best
 
 
-def optimal_in_scene(mdp: Mdp, greedy: Bytes, live: Flags) -> Flags:
+def optimal_in_scene(mdp: Mdp, greedy: Bytes, live: Flags) -> tuple[Flags, Floats]:
     """Compare greedy actions with exact values in a scene.
 
     Args:
@@ -240,7 +240,7 @@ def optimal_in_scene(mdp: Mdp, greedy: Bytes, live: Flags) -> Flags:
         live: The rows that are compared, (rows,).
 
     Returns:
-        Whether the action of each row is optimal, (rows,); meaningless in other rows.
+        Whether the action of each row is optimal, (rows,), meaningless in other rows; and the exact value, (rows,).
 
     Raises:
         BadSettings: Exact values do not settle, or some are too small to be compared, because gamma is too small.
@@ -256,7 +256,7 @@ def optimal_in_scene(mdp: Mdp, greedy: Bytes, live: Flags) -> Flags:
             "with the cost of touching; use a gamma nearer to 1.",
             gamma=mdp.gamma,
         )
-    return np.asarray(achieved >= best - TIE * np.abs(best) - noise)  # written so that NaN fails
+    return np.asarray(achieved >= best - TIE * np.abs(best) - noise), best  # written so that NaN fails
 
 
 def near_starts(policy: Policy, share: Floats, limits: NearLimits) -> NearStarts:

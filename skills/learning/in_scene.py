@@ -140,7 +140,7 @@ def certify_in_scene(policy: Policy, hazards: Hazards) -> tuple[SceneCertificate
     """
     mdp, domain = replace(mdp_of(policy), hazards=hazards), policy.domain
     live = domain.certified & ~domain.terminal & ~hazards.forbidden[domain.state_of] & (policy.greedy >= 0)
-    optimal = optimal_in_scene(mdp, policy.greedy, live)
+    optimal, _ = optimal_in_scene(mdp, policy.greedy, live)
     odds = odds_in_scene(policy, hazards, mdp.slip)
     starts = ~hazards.forbidden
     certificate = SceneCertificate(

@@ -50,9 +50,9 @@ def request_retraining(
     the same one.
 
     The styles are chosen now; they and all defaults are the job's identity. With `only_stale` a style is left out if
-    its newest version was learnt from that demonstration, with these settings and this learner, was not refused by an
-    older release gate, and was checked with the same limits at the near starts; if no style remains, the job has
-    succeeded at once.
+    its newest version was learnt from that demonstration, with these settings and this learner, in that scene, was not
+    refused by an older release gate, and was checked with the same limits at the near starts; if no style remains, the
+    job has succeeded at once.
 
     If an equal batch with `release` is done, and some of its styles now serve another version than when it ended, the
     new job consists of these styles: they are learnt again, which gives the same versions, and released by the same
@@ -232,15 +232,15 @@ def _reasons(
 ) -> dict[int, list[str]]:
     """Return, by demonstration, why its style's newest version is stale; an empty list if it is up to date.
 
-    It is up to date if it was learnt from this demonstration with these settings and this learner, not refused by an
-    older gate, and checked with the same limits at the near starts. A version from before there were such limits passed
-    the gate of its time, and is up to date.
+    It is up to date if it was learnt from this demonstration with these settings and this learner, in the scene of the
+    served version, not refused by an older gate, and checked with the same limits at the near starts. A version from
+    before there were such limits passed the gate of its time, and is up to date.
     """
     of = PolicyVersion
     last = select(func.max(of.version).label("version"), of.surgeon_row, of.suture).group_by(of.surgeon_row, of.suture)
     newest = last.where(*_styles(of, surgeon, suture)).subquery()
     said = [of.manifest[name] for name in ("demos", "learner", "settings", "seed", "learner_version")]
-    said += [of.manifest["scene"]["sha256"].as_string(), of.manifest["scene"]["near"]]
+    said += [of.manifest["scene"][name] for name in ("sha256", "costs", "near")]
     gate = of.releasable, of.manifest["grid_certificate"]["gate"], of.manifest["grid_certificate"]["near"]
     limits, chances = asdict(NearLimits(**asked.get("near", {}))), asdict(OddsLimits(**asked.get("odds", {})))
     query = select(of.surgeon_row, of.suture, *said, *gate).join(
@@ -254,14 +254,14 @@ def _reasons(
         if version is None:
             reasons[demo.row] = ["never trained"]
             continue
-        rests_on, *how, learner_version, scene, odds, releasable, gate, near = version
+        rests_on, *how, learner_version, scene, costs, odds, releasable, gate, near = version
         style = demo.surgeon_row, demo.suture
         there = kept.scenes.get(style)
         learner = learner_kept(asked, kept.rules.get(style), there)
         settings = {name: value for name, value in learner.items() if name != "kind"}
         found = {
             "a newer demonstration": demo.sha256 not in rests_on,
-            "another scene": scene != (there and there.sha256),
+            "another scene": (scene, costs) != ((there.sha256, there.surroundings["costs"]) if there else (None, None)),
             "other settings": how != [learner["kind"], settings, asked["seed"]],
             "a newer learner": learner_version != asked["learner_version"],
             "refused by an older gate": not releasable and gate != asked["gate"],

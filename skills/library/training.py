@@ -173,6 +173,8 @@ def request_training(
         request["depth_along"] = list(training.depth_along)
     if (surroundings := training.surroundings) is not None:
         scene_learner(learner)
+        if training.depth_along is not None:
+            raise BadInput("In a scene depths are not compared, but have a cost; omit `depth_along`.")
         for demo in chosen:
             refuse_unfit(surroundings.scene, demo.path, demo.frame)
         request["surroundings"] = surroundings.as_json()

@@ -276,6 +276,7 @@ def test_depth_in_another_frame_is_measured_along_a_given_direction(service: Ser
         ("PSM2_base", {"depth_along": [0, 0, 1]}, "depth is the distance from the remote centre"),
         ("ECM", {"depth_along": [0, 0, 0]}, "must not be"),
         ("ECM", {"depth_along": [0, 0, 1], "learner": {"kind": "cell-q-learning"}}, "does not compare depths"),
+        ("ECM", {"depth_along": [0, 0, 1], "scene": {"frame": "ECM"}}, "In a scene depths are not compared"),
     ],
 )
 def test_a_direction_of_depth_that_is_not_used_is_refused(service: Service, frame: str, more: dict, says: str):

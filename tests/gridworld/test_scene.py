@@ -47,6 +47,19 @@ def test_no_line_passes_through_a_thin_box():
     assert scene.clearance_mm([[5, 5, 3], [5, 5, -3]]).min() > 2.9
 
 
+def test_a_line_touches_also_when_it_is_compared_together_with_longer_ones():
+    """A policy asks for its own moves, and its odds for each action of all cells: both must be told the same."""
+    heights = np.random.default_rng(2).normal(0.0, 2.0, (9, 9))
+    scene = Scene("base", tissue=replace(RIDGE, heights_mm=tuple(map(tuple, heights))))
+    ends = np.random.default_rng(3).uniform((0, 0, -1), (16, 16, 5), (300, 2, 3))
+    together = scene.touches(ends[:, 0], ends[:, 1])
+    assert together.tolist() == [bool(scene.touches(a, b)) for a, b in ends]
+    assert 0.2 < together.mean() < 0.8
+    assert scene.touches([np.nan, 1, 9], [1, 1, 9])
+    assert Scene("base", capsules=(ARM,)).touches([np.nan, 1, 9], [1, 1, 9])
+    assert Scene("base", boxes=(BOX,)).touches([np.nan, 1, 9], [1, 1, 9])
+
+
 @settings(deadline=None, max_examples=150)
 @given(points, points)
 def test_touching_agrees_with_points_along_the_line(a, b):

@@ -176,6 +176,9 @@ def test_a_batch_keeps_the_scene_of_a_style_and_its_learner(database):
         cases.work(database, part)
     (style,) = styles_of(database, job)
     assert style.policy.sha256 == version.sha256
+    trained(database, scene_costs={"close": 0.2})  # newer, and not released
+    (style,) = styles_of(database, ask_retraining(database, only_stale=True))
+    assert style.stale == ["another scene"]
     named = ask_retraining(database, learner=PhaseQLearning(gamma=0.95))
     for part in parts_of(database, named):
         cases.work(database, part)
