@@ -39,6 +39,9 @@ from skills.verification.playback import CLEARANCE_SEEN_MM, LINKS, PSM_A, PSM_M
 
 LEAST_MM = 1.0  # ours, as of the pad: the error of a calibrated arm (0.65 mm) and half as much again
 LOOK_MM = 0.25  # ours: a distance that is judged is at most half of this too small, for that reason
+# PSM_M's jaw comes open and closes on the needle, at times that a trajectory does not state: its fingers, 2.2 mm thick,
+# move by 1.1 mm at their tips from one opening to the next, so nothing passes between two of them.
+JAWS_RAD = np.linspace(HOLDING_RAD, OPEN_RAD, 5).tolist()
 
 
 @schema
@@ -143,13 +146,12 @@ def clearance_of(trajectory: Trajectory, scene: Scene) -> SceneClearance:
 
 
 def _links(trajectory: Trajectory, body: str, at: Ints) -> tuple[Links, ...]:
-    """Return an arm's links at some samples, in the frame of PSM_A's base; PSM_M's with its jaw closed and open."""
+    """Return an arm's links at some samples, in the frame of PSM_A's base; PSM_M's with each opening of its jaw."""
     m = trajectory.psm_m
     if body == PSM_A or m is None:
         return (links_of(trajectory.joints[at], trajectory.instrument, openings(trajectory)[at]),)
     base = matrix_of(m.base_xyzw[None])[0]
-    jaws = HOLDING_RAD, OPEN_RAD
-    return tuple(links_of(m.joints[at], m.instrument, jaw).seen_from(base, m.base_mm) for jaw in jaws)
+    return tuple(links_of(m.joints[at], m.instrument, jaw).seen_from(base, m.base_mm) for jaw in JAWS_RAD)
 
 
 def _way_mm(trajectory: Trajectory, body: str) -> Floats:

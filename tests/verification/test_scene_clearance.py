@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 from skills.gridworld.scene import Box, Capsule, Scene, Tissue
+from skills.kinematics import matrix_of
+from skills.planning.handoff import HOLDING_RAD, OPEN_RAD
 from skills.planning.trajectory import A1
 from skills.verification.clearance import RADII_MM, links_of, openings, travel_mm
 from skills.verification.playback import PSM_A, PSM_M
@@ -96,6 +98,17 @@ def test_psm_m_is_compared_with_boxes_and_tissue_but_not_with_itself():
     hit = clearance_of(both, Scene("PSM2_base", boxes=(there,)))
     assert not judge(playback, both, beside=hit).feasible
     assert hit.report.nearest[0].body == PSM_M
+
+
+@pytest.mark.parametrize("share", [0.0, 0.4, 0.5, 0.7, 1.0])
+def test_psm_m_is_compared_with_its_jaw_closed_open_and_in_between(share):
+    """A small box at the tip of a finger, which passes it while the jaw closes."""
+    both = beside()
+    m, opening = both.psm_m, HOLDING_RAD + share * (OPEN_RAD - HOLDING_RAD)
+    there = links_of(m.joints[-1:], m.instrument, opening).seen_from(matrix_of(m.base_xyzw[None])[0], m.base_mm)
+    tip = there.end_mm[0, 2]
+    box = Box(tuple((tip - 0.01).tolist()), tuple((tip + 0.01).tolist()))
+    assert clearance_of(both, Scene("PSM2_base", boxes=(box,))).report.at_least_mm < 0
 
 
 def test_an_empty_scene_and_a_far_one_are_free():
