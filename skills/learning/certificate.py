@@ -104,9 +104,9 @@ class OddsLimits:
 
     Attributes:
         least_finishing: Least probability of finishing. Ours: 0.9; on the paper's user, with tissue 5 mm below its
-            path, exact policies have 0.96, 0.87 and 0.73 with slips of 0.1, 0.2 and 0.3 (docs/scenes.md).
+            path, exact policies have 0.96, 0.87 and 0.71 with slips of 0.1, 0.2 and 0.3 (docs/scenes.md).
         most_touching: Greatest probability of touching the scene. Ours: 0.05, half of the passes that may fail; there
-            the same policies have 0.04, 0.10 and 0.17.
+            the same policies have 0.04, 0.10 and 0.18.
     """
 
     least_finishing: float = 0.9
