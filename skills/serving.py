@@ -41,6 +41,7 @@ from skills.library.backup import keep_erasures, keep_up_erasures
 from skills.library.keys import refuse_without_keys
 from skills.remedies import Action, Remedy
 from skills.samples import load_samples
+from skills.sandbox.forked import layers_held, refuse_uncontained
 from skills.settings import PREFIX, Settings
 
 log = logging.getLogger("skills.serving")
@@ -254,7 +255,8 @@ def serve(settings: Settings, *, samples: bool = False) -> None:
     """Serve until a signal ends the process; the address must have been checked (`Settings.check_address`).
 
     Raises:
-        BadSettings: `samples` is for loopback without TLS only; or the address cannot be used.
+        BadSettings: `samples` is for loopback without TLS only; the address cannot be used; or the settings require
+            containment that this system does not offer.
         Conflict: See `refuse_keyless`.
     """
     if samples and (settings.beyond_loopback or settings.tls_cert is not None):
@@ -262,6 +264,8 @@ def serve(settings: Settings, *, samples: bool = False) -> None:
     refuse_taken(settings.host, settings.port)
     logs.configure(settings.log_level, as_json=settings.log_format == "json")
     check_wanted()
+    if settings.containment == "required":
+        refuse_uncontained()
     prepare(settings)
     refuse_keyless(settings)
     app = create_app(settings)
@@ -272,6 +276,7 @@ def serve(settings: Settings, *, samples: bool = False) -> None:
         if samples:
             threading.Thread(target=_load, args=(settings, app.state.access.own_key), daemon=True).start()
         warm_up(align_once)
+        layers_held()  # logs a warning if some are missing
 
     server = Server(
         uvicorn.Config(

@@ -59,6 +59,8 @@ class Settings(BaseSettings):
     reading_wall_s: float = Field(default=60.0, gt=0)  # other uploads may be read at the same time
     reading_file_bytes: int = Field(default=1024 * MEBIBYTE, gt=0)  # a bag unpacked from its archive
     reading_answer_bytes: int = Field(default=256 * MEBIBYTE, gt=0)  # 4 million poses
+    # of readers, simulators and learners: run with the layers that the system offers and warn, or refuse to start
+    containment: Literal["available", "required"] = "available"
     # a zip of 10,000 episodes of 10 s has half of it; storing it locks a SQLite database for some seconds
     max_dataset_bytes: int = Field(default=1024 * MEBIBYTE, gt=0)
     playback_timeout_s: float = Field(default=120.0, gt=0)

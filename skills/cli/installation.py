@@ -1,4 +1,4 @@
-"""Commands that act on this installation: serve, worker, migrate, seed, backup, restore, erasures, verify, keys."""
+"""Commands on this installation: serve, worker, migrate, seed, backup, restore, erasures, verify, doctor, keys."""
 
 import gc
 import json
@@ -216,6 +216,32 @@ def verify(
         for what, why in wrong:
             err.print(f"{what}: {why}", style="red", markup=False, soft_wrap=True)
     if wrong:
+        raise typer.Exit(1)
+
+
+@commands.command()
+@refusing
+def doctor(as_json: AsJson = False) -> None:
+    """Check what this installation needs to work, and which layers contain its readers; exit code 1 if a check fails.
+
+    A layer of containment that is missing fails only with SKILLS_CONTAINMENT=required.
+    """
+    from skills.jobs.readiness import refuse_unready
+    from skills.sandbox.containment import LAYERS
+    from skills.sandbox.forked import layers_held
+    from skills.settings import settings
+
+    try:
+        database, said = "ok", f"live workers: {refuse_unready(settings())}"
+    except SkillsError as error:
+        database, said = "failed", str(error)
+    checks = [{"check": "databases and workers", "state": database, "remark": said}]
+    held, without = layers_held(), "failed" if settings().containment == "required" else "missing"
+    for name, needs in LAYERS.items():
+        state, remark = ("ok", "") if name in held else (without, f"needs {needs}")
+        checks.append({"check": f"containment: {name}", "state": state, "remark": remark})
+    show(checks, as_json, ("check", "state", "remark"))
+    if any(one["state"] == "failed" for one in checks):
         raise typer.Exit(1)
 
 

@@ -34,6 +34,7 @@ PROGRESS = re.compile(rb"progress (\d\.\d+)\n")
 _ADVICE = {
     "hung": "request fewer steps, or allow more time",
     "crashed": "train again, and report it if it happens again",
+    "contained": "report it with the log",
     "out of memory": "request fewer steps or a smaller batch, or allow more",
     "too much": "which no training does; report it",
     "failed": "its last output is in the log",

@@ -205,6 +205,7 @@ Answer = TypeVar("Answer", Recording, Told)
 _ADVICE = {
     "hung": "cut the recording into parts and send each",
     "crashed": "the file may be damaged: send another copy of it",
+    "contained": "a recording has no cause to attempt that: check where it comes from, and report it if it is intact",
     "out of memory": "cut the recording into parts and send each",
     "too much": "cut the recording into parts and send each",
     "failed": "the file may be damaged: check it with `mcap doctor`, and report it if it is intact",
@@ -359,6 +360,8 @@ def answered(read: Callable[..., Recording | Told], file: BinaryIO, answer: Bina
         value = Refusal.of(error)
     except MemoryError:  # `skills.sandbox.perform` reports it by its exit code
         raise
+    except PermissionError as error:  # as well; the message names a file
+        raise PermissionError(error.errno, "refused").with_traceback(error.__traceback__) from None
     except Exception as error:  # a bug: its message may quote the file, and must not be logged
         raise RuntimeError(type(error).__name__).with_traceback(error.__traceback__) from None
     packing.write(answer, value, KNOWN)

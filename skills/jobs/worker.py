@@ -34,6 +34,7 @@ from skills.jobs import BATCHES, JOBS, POLLING_S, QUEUES, configuration, connect
 from skills.jobs.workflows import Leases, Perform, Watch, Work, register
 from skills.library.sweep import sweep
 from skills.logs import job_id, told
+from skills.sandbox.forked import refuse_uncontained
 from skills.settings import Settings
 
 TRIM, MMAP = -1, -3  # M_TRIM_THRESHOLD and M_MMAP_THRESHOLD of malloc.h
@@ -104,7 +105,10 @@ def run_worker(settings: Settings, *, parent: int | None = None, perform: Perfor
 
     Raises:
         Conflict: The database has not been migrated to this version, or is of a newer one.
+        BadSettings: The settings require containment that this system does not offer.
     """
+    if settings.containment == "required":
+        refuse_uncontained()
     keep_freed_memory()
     stop = _stopped_by_signals()
     perform = logged(perform or _library())

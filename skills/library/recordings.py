@@ -53,6 +53,7 @@ from skills.library.integrity import find_by_digest
 from skills.packing import canonical
 from skills.remedies import Action, Remedy
 from skills.sandbox import ProcessLimits
+from skills.sandbox.forked import refuse_uncontained
 from skills.schemas.requests import Reading
 from skills.settings import Settings
 
@@ -468,14 +469,20 @@ def recording_bytes(session: Session, stored: StoredRecording) -> Iterator[bytes
 
 
 def confined_reader(settings: Settings) -> ConfinedReader:
-    """Create a reader of recordings in processes of their own, with the resource limits of the settings."""
+    """Create a reader of recordings in processes of their own, with the resource limits of the settings.
+
+    Raises:
+        BadSettings: The settings require containment that this system does not offer.
+    """
+    if settings.containment == "required":
+        refuse_uncontained()
     limits = ProcessLimits(
         memory_bytes=settings.reading_memory_bytes,
         wall_s=settings.reading_wall_s,
         cpu_s=settings.reading_cpu_s,
         file_bytes=settings.reading_file_bytes,
         answer_bytes=settings.reading_answer_bytes,
-        children=False,
+        threads=False,
     )
     return ConfinedReader(limits, at_once=settings.readers)
 

@@ -3,6 +3,7 @@
     forked        `ForkServer` calls functions in forks of a small server that has imported everything already, within a
                   millisecond or two; `call_alone` calls one in a new interpreter; `Turns` shares the forks fairly
     fork_server   the server process itself
+    containment   what these processes cannot reach: files, processes, networks, rights; `system_calls` is its filter
 
 There is one mechanism: a new interpreter is a fork server without imports, for a single call. There is one format: an
 input is a file, or a value written by `skills.packing`, and a result is a value written by `skills.packing`, which is
@@ -19,6 +20,7 @@ that returned no result did one of these; the names are the causes in `Unanswere
     out of memory   it tried to allocate more than its limit
     too much        it wrote more than its limit
     failed          it exited by itself with an error; the end of its output contains the reason
+    contained       it attempted something that its containment refuses, and did not go on
     nonsense        its result is not one of the values that were allowed
 """
 
@@ -38,8 +40,9 @@ from typing import IO, NoReturn
 from skills.errors import BadInput, StorageFull, Unanswered
 
 # Our exit codes; the shell's conventions do not use them.
-_FAILED, _OUT_OF_MEMORY, _TOO_MUCH, _DISK_FULL = (1, 77, 78, 79)
+_FAILED, _OUT_OF_MEMORY, _TOO_MUCH, _DISK_FULL, _CONTAINED = (1, 77, 78, 79, 80)
 _CODES = {errno.EFBIG: _TOO_MUCH, errno.ENOSPC: _DISK_FULL, errno.EDQUOT: _DISK_FULL}
+_CODES |= {errno.EPERM: _CONTAINED, errno.EACCES: _CONTAINED}
 _NOTED_BYTES = 2000
 # numba needs its cache folder; without it every process would compile the loops again.
 _KEPT = ("PATH", "LD_LIBRARY_PATH", "NUMBA_CACHE_DIR", "XDG_CACHE_HOME", "HOME")
@@ -59,7 +62,8 @@ class ProcessLimits:
         file_bytes: Size of each file that it writes: its result, and temporary files.
         answer_bytes: Memory of its result in this process.
         open_files: Files open at once.
-        children: Whether it may start processes and threads. (Linux does not apply this limit to root.)
+        threads: Whether it may start threads.
+        program: The only program that it may start, as an absolute path; empty: none.
     """
 
     memory_bytes: int
@@ -68,7 +72,8 @@ class ProcessLimits:
     file_bytes: int = 512 << 20
     answer_bytes: int = 512 << 20
     open_files: int = 64
-    children: bool = True
+    threads: bool = True
+    program: str = ""
 
     def __post_init__(self) -> None:
         if not (isfinite(self.wall_s) and self.wall_s > 0 and self.memory_bytes > 0):
@@ -119,6 +124,8 @@ def check_end(code: int, said: IO[bytes], limits: ProcessLimits) -> None:
         raise unanswered("out of memory", f"needed more than its {limits.memory_bytes >> 20} MiB", said)
     if code == _TOO_MUCH:
         raise unanswered("too much", f"wrote more than its {limits.file_bytes >> 20} MiB", said)
+    if code in (_CONTAINED, -signal.SIGSYS):
+        raise unanswered("contained", "was stopped by its containment", said)
     if code == -signal.SIGXCPU:
         raise unanswered("hung", f"used up its {limits.cpu_s} s of processor time", said)
     if code < 0:
@@ -159,7 +166,7 @@ def confine(limits: ProcessLimits, parent: int) -> None:
         _limit(which, limit, limit)
     # SIGXCPU at the soft limit, which `check_end` can tell from other signals; SIGKILL only at the hard one.
     _limit(resource.RLIMIT_CPU, limits.cpu_s, limits.cpu_s + 1)
-    if not limits.children:
+    if not (limits.threads or limits.program):
         _limit(resource.RLIMIT_NPROC, 0, 0)
     if sys.platform == "linux":  # strictly, when the thread that started us ends; it waits for us
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)

@@ -8,6 +8,9 @@ with four open files attached:
     said      stdout and stderr of the fork, including output of C libraries
     line      the caller's socket: it receives "begun" and then the exit code; closing it ends the fork
 
+Before the first request it enters the layers of `skills.sandbox.containment` that a server enters, and tells its
+caller which layers its forks will have; each fork enters the others before it calls the function.
+
 Each fork has its own folder for temporary files, which the server removes however the fork ended. The server exits
 when its last caller has disconnected, and kills all its forks then. It imports little itself, because a call in a new
 interpreter starts one, too.
@@ -25,12 +28,13 @@ import socket
 import tempfile
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
 
 from skills.sandbox import ProcessLimits, confine, perform
+from skills.sandbox.containment import Place, enter, offered, shut
 
 MAX_REQUEST_BYTES = 16384
 BEGUN, NO_FORK = b"begun", b"no fork"
@@ -48,11 +52,22 @@ class _Child:
         return Path(tempfile.gettempdir(), str(self.pid))
 
 
-def main(folder: str, *modules: str) -> NoReturn:
+@dataclass(frozen=True)
+class _Inherited:
+    """What every fork has of the server: its containment, and the address space of the server's imports in bytes."""
+
+    place: Place
+    layers: tuple[str, ...]
+    held_bytes: int
+
+
+def main(folder: str, code: str, layers: str, *modules: str) -> NoReturn:
     """Run as the fork server until the last caller disconnects.
 
     Args:
         folder: For the temporary files of the forks; removed at the end.
+        code: The folders of code that forks may read, as JSON.
+        layers: The layers of containment to enter, as JSON; null: those that the system offers.
         modules: Imported before the first fork. One may be given as `module:function`: the function is called once,
             to prepare state that every fork inherits.
     """
@@ -65,10 +80,14 @@ def main(folder: str, *modules: str) -> NoReturn:
             getattr(imported, function)()
     gc.freeze()  # the collector would write to pages shared with the forks, and so copy them
     gc.enable()
+    place, wanted, held_bytes = Place(folder, tuple(json.loads(code))), json.loads(layers), _held_bytes()
+    inherited = _Inherited(place, tuple(offered(place) if wanted is None else wanted), held_bytes)
+    enter(place, inherited.layers)
     children: dict[int, _Child] = {}
     try:
         with socket.socket(fileno=0) as control, selectors.DefaultSelector() as events:
-            _serve(control, events, children)
+            control.send(json.dumps(inherited.layers).encode())
+            _serve(control, events, children, inherited)
     finally:
         for child in children.values():
             _kill(child)
@@ -77,7 +96,9 @@ def main(folder: str, *modules: str) -> NoReturn:
     os._exit(0)  # without the interpreter's shutdown, for which a caller in `call_alone` would wait
 
 
-def _serve(control: socket.socket, events: selectors.BaseSelector, children: dict[int, _Child]) -> None:
+def _serve(
+    control: socket.socket, events: selectors.BaseSelector, children: dict[int, _Child], inherited: _Inherited
+) -> None:
     """Fork, kill and report, one event at a time.
 
     Only the first pending event is handled before selecting again, because handling it may invalidate the others.
@@ -92,7 +113,7 @@ def _serve(control: socket.socket, events: selectors.BaseSelector, children: dic
         request, files, _, _ = socket.recv_fds(control, MAX_REQUEST_BYTES, 4)
         if not request:
             return
-        child = _fork(json.loads(request), *files)
+        child = _fork(json.loads(request), inherited, *files)
         if child is None:
             continue
         children[child.pid] = child
@@ -100,7 +121,9 @@ def _serve(control: socket.socket, events: selectors.BaseSelector, children: dic
         events.register(child.ended, selectors.EVENT_READ, partial(_ended, child, events, children))
 
 
-def _fork(request: dict[str, Any], given: int, answer: int, said: int, asker: int) -> _Child | None:
+def _fork(
+    request: dict[str, Any], inherited: _Inherited, given: int, answer: int, said: int, asker: int
+) -> _Child | None:
     """Fork a process for a request; return None where the system refuses another process."""
     server, line = os.getpid(), socket.socket(fileno=asker)
     try:
@@ -108,7 +131,7 @@ def _fork(request: dict[str, Any], given: int, answer: int, said: int, asker: in
     except OSError:
         pid = -1
     if pid == 0:
-        _be_child(request, given, answer, said, server)
+        _be_child(request, given, answer, said, server, inherited)
     for file in (given, answer, said):
         os.close(file)
     _tell(line, BEGUN if pid > 0 else NO_FORK)
@@ -152,8 +175,10 @@ def _tell(line: socket.socket, message: bytes) -> None:
         line.send(message)
 
 
-def _be_child(request: dict[str, Any], given: int, answer: int, said: int, server: int) -> NoReturn:
-    """Close all files but those of this request, apply the limits, call the function, exit."""
+def _be_child(
+    request: dict[str, Any], given: int, answer: int, said: int, server: int, inherited: _Inherited
+) -> NoReturn:
+    """Close all files but those of this request, apply the limits and the containment, call the function, exit."""
 
     def work() -> None:
         os.setpgid(0, 0)
@@ -164,10 +189,15 @@ def _be_child(request: dict[str, Any], given: int, answer: int, said: int, serve
         os.closerange(answer + 1, resource.getrlimit(resource.RLIMIT_NOFILE)[0])
         tempfile.tempdir = f"{tempfile.gettempdir()}/{os.getpid()}"
         os.mkdir(tempfile.tempdir)
+        os.environ["TMPDIR"] = os.environ["HOME"] = tempfile.tempdir  # for libraries that write to either
         limits = ProcessLimits(**request["limits"])
         # Memory on top of the inherited address space, so that the limit does not depend on the server's imports.
-        confine(ProcessLimits(**request["limits"] | {"memory_bytes": _held_bytes() + limits.memory_bytes}), server)
+        confine(replace(limits, memory_bytes=inherited.held_bytes + limits.memory_bytes), server)
         module, _, name = request["target"].partition(":")
+        # The outermost package before, because the folder that contains it can no longer be listed then.
+        importlib.import_module(module.partition(".")[0])
+        place = Place(tempfile.tempdir, inherited.place.code, threads=limits.threads, program=limits.program)
+        shut(place, inherited.layers)
         function = getattr(importlib.import_module(module), name)
         with os.fdopen(0, "rb", closefd=False) as file, os.fdopen(answer, "wb") as out:
             function(file, out, **request["arguments"])
@@ -176,5 +206,5 @@ def _be_child(request: dict[str, Any], given: int, answer: int, said: int, serve
 
 
 def _held_bytes() -> int:
-    """Return the address space of this process in bytes: that of the server's imports, which every fork inherits."""
+    """Return the address space of this process in bytes."""
     return int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()

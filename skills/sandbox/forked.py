@@ -7,6 +7,9 @@ dies. It is thread-safe. Linux only.
 `call_alone` calls one function in a server of its own without imports, which ends with the call: a new interpreter,
 which shares no state with this process or other calls, but takes a while to import what the function needs.
 
+Every fork is contained (`skills.sandbox.containment`). The first server of this process finds out which layers the
+system offers; later ones must take the same, or end. `layers_held` returns them.
+
     def function(given: BinaryIO, answer: BinaryIO, **arguments) -> None
 
 A function reads its input from a file, which is a stranger's or a value written by `skills.packing`, and writes its
@@ -20,6 +23,7 @@ once.
 """
 
 import json
+import logging
 import os
 import shutil
 import socket
@@ -30,16 +34,19 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from itertools import count
 from threading import Event, Lock
 from typing import IO, Any, BinaryIO, TypeVar
 
 from skills import packing
-from skills.errors import Busy, Unanswered
+from skills.errors import BadSettings, Busy, Unanswered
 from skills.packing import Known
 from skills.sandbox import ProcessLimits, check_end, environment, overdue
+from skills.sandbox.containment import LAYERS, code_folders
 from skills.sandbox.fork_server import BEGUN
+
+log = logging.getLogger(__name__)
 
 Watch = Callable[[bytes], None]
 Answer = TypeVar("Answer")
@@ -111,9 +118,11 @@ class Turns:
 
 
 START_S = 60.0  # timeout of the imports on a busy machine; usually they take 1 s, and forking a millisecond
+MAX_GREETING_BYTES = 4096
 WATCHED_S = 1.0  # between two calls of a `Watch`
 WATCHED_BYTES = 1000  # of the end of the output
 _NO_PROCESS = "The machine cannot start another process now; try again in a moment."
+_ENDS = "The fork server of this service ends repeatedly; try again in a moment."
 _ENTRY = "import sys; from skills.sandbox.fork_server import main; main(*sys.argv[1:])"
 
 
@@ -121,11 +130,13 @@ class _Dead(Exception):
     """The server has ended, or does not respond."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Server:
     process: subprocess.Popen[bytes]
     control: socket.socket
     folder: str  # for the temporary files of its forks
+    ready: bool = False  # it has imported its modules and is contained
+    greeting: Lock = field(default_factory=Lock)
 
     def end(self) -> None:
         """Stop the server: it exits when its control socket closes, and kills its forks."""
@@ -136,6 +147,42 @@ class _Server:
             self.process.kill()
             self.process.wait()
         shutil.rmtree(self.folder, ignore_errors=True)  # the server does so too, unless it was killed
+
+
+_layers: tuple[str, ...] | None = None  # those that the first server of this process held
+
+
+def layers_held() -> tuple[str, ...]:
+    """Return those of `containment.LAYERS` that hold in every process of the sandbox, as attempted by one of them.
+
+    Raises:
+        Busy: No process can be started.
+    """
+    if _layers is None:
+        with closing(ForkServer()) as server:
+            server.wait()
+    assert _layers is not None
+    return _layers
+
+
+def layers_missing() -> list[str]:
+    """Return those of `containment.LAYERS` that this system does not offer."""
+    return [name for name in LAYERS if name not in layers_held()]
+
+
+def refuse_uncontained() -> None:
+    """Refuse a system that does not offer every layer of containment.
+
+    Raises:
+        BadSettings: A layer does not hold; the message names it.
+    """
+    if missing := layers_missing():
+        raise BadSettings(
+            "SKILLS_CONTAINMENT=required, and this system does not offer all layers of containment: "
+            + "; ".join(f"{name} (needs {LAYERS[name]})" for name in missing)
+            + ".",
+            "Provide them, or set SKILLS_CONTAINMENT=available to run without them.",
+        )
 
 
 class ForkServer:
@@ -158,6 +205,17 @@ class ForkServer:
     def start(self) -> None:
         """Start the server without waiting for its imports."""
         self._running()
+
+    def wait(self) -> None:
+        """Start the server, and wait until it is ready.
+
+        Raises:
+            Busy: It cannot be started.
+        """
+        try:
+            _greet(self._running())
+        except _Dead as error:
+            raise Busy(_ENDS) from error
 
     def close(self) -> None:
         """Stop the server and all its forks; later calls of `run` raise `Busy`."""
@@ -218,6 +276,7 @@ class ForkServer:
                 with tempfile.TemporaryFile() as answer, tempfile.TemporaryFile() as said:
                     server = self._running()
                     try:
+                        _greet(server)
                         code = _ask(server, request, (given_fd, answer.fileno(), said.fileno()), limits.wall_s, watch)
                     except _Dead:
                         self._replace(server)
@@ -230,7 +289,7 @@ class ForkServer:
                     return
         finally:
             os.close(given_fd)
-        raise Busy("The fork server of this service ends repeatedly; try again in a moment.")
+        raise Busy(_ENDS)
 
     def _running(self) -> _Server:
         with self._lock:
@@ -304,13 +363,35 @@ def _start(modules: tuple[str, ...]) -> _Server:
     folder = tempfile.mkdtemp(prefix="suture-skills-")
     with theirs:
         process = subprocess.Popen(  # noqa: S603 - our own interpreter and module
-            [sys.executable, "-P", "-c", _ENTRY, folder, *modules],
+            [sys.executable, "-P", "-c", _ENTRY, folder, json.dumps(code_folders()), json.dumps(_layers), *modules],
             stdin=theirs.fileno(),
             stdout=subprocess.DEVNULL,
             env=environment(),
             start_new_session=True,  # Ctrl-C must not reach it; it exits when our socket closes
         )
     return _Server(process, ours, folder)
+
+
+def _greet(server: _Server) -> None:
+    """Wait until a server is ready, and note which layers its forks have.
+
+    Raises:
+        _Dead: It has ended, for example because it could not enter a layer, or does not respond.
+    """
+    global _layers
+    with server.greeting:
+        if server.ready:
+            return
+        server.control.settimeout(START_S)
+        try:
+            message = server.control.recv(MAX_GREETING_BYTES)
+        except OSError as error:
+            raise _Dead from error
+        if not message:
+            raise _Dead
+        first, _layers, server.ready = _layers is None, tuple(json.loads(message)), True
+    if first and (missing := layers_missing()):
+        log.warning("Readers, simulators and learners run without: %s (`skills doctor`).", ", ".join(missing))
 
 
 def _opened_again(file: BinaryIO) -> int:

@@ -369,3 +369,7 @@ class Ready(Given):
 
     status: Literal["ready"]
     workers: Count
+    containment: dict[str, bool] = Field(
+        default_factory=dict,
+        description="Layers that contain readers, simulators and learners, and whether each holds.",
+    )

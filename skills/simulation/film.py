@@ -91,13 +91,21 @@ def shoot(
     if target == CREW:
         scene.require_pybullet()
     at = frames_of(trajectory) if samples is None else np.asarray(samples, np.int64)
-    answer = simulated(target, _request(trajectory, at, pad_top_mm), ProcessLimits(memory_bytes, timeout_s))
+    limits = ProcessLimits(memory_bytes, timeout_s, program=_encoder())
+    answer = simulated(target, _request(trajectory, at, pad_top_mm), limits)
     mp4, gif = (part if isinstance(part := answer.get(name), bytes) else b"" for name in ("mp4", "gif"))
     if mp4[4:8] != b"ftyp" or gif[:6] != b"GIF89a":
         raise SimulationFailed(
             "The simulator returned no film; request it again, and report it if it happens again.", cause="nonsense"
         )
     return Film(mp4, gif)
+
+
+def _encoder() -> str:
+    """Return the path of the encoder, the program in the package."""
+    import imageio_ffmpeg
+
+    return str(imageio_ffmpeg.get_ffmpeg_exe())
 
 
 def frames_of(trajectory: Trajectory) -> Ints:
@@ -159,21 +167,17 @@ def film(given: BinaryIO, answer: BinaryIO) -> None:
 
 def encode(frames: Iterable[bytes]) -> tuple[bytes, bytes]:
     """Encode frames, each the bytes of an RGB image: an MP4 that a browser can play while it loads, and a GIF."""
-    import imageio_ffmpeg
-
     exact = ["-map_metadata", "-1", "-fflags", "+bitexact", "-flags:v", "+bitexact", "-threads", "1"]
     h264 = ["-c:v", "libx264", "-preset", "medium", "-crf", "21", "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
     # No dithering: the scene has few colours, and flickering dots would make the file three times as large.
     palette = "split[a][b];[a]palettegen=max_colors=128[p];[b][p]paletteuse=dither=none:diff_mode=rectangle"
-    # Files without a name, so that nothing is left of them, however this process ends.
-    with tempfile.TemporaryFile() as mp4, tempfile.TemporaryFile() as gif:
+    # By name, because a contained process has no /proc, through which the encoder could open a file without one.
+    with tempfile.NamedTemporaryFile() as mp4, tempfile.NamedTemporaryFile() as gif:
         raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{WIDTH}x{HEIGHT}", "-r", str(FRAMES_PER_S)]
-        command = [imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-y", *raw, "-i", "pipe:0"]
-        command += [*h264, *exact, "-f", "mp4", f"/proc/self/fd/{mp4.fileno()}"]
-        command += ["-filter_threads", "1", "-vf", palette, *exact, "-f", "gif", f"/proc/self/fd/{gif.fileno()}"]
-        with subprocess.Popen(  # noqa: S603 - the program in the package
-            command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, pass_fds=(mp4.fileno(), gif.fileno())
-        ) as encoder:
+        command = [_encoder(), "-loglevel", "error", "-y", *raw, "-i", "pipe:0"]
+        command += [*h264, *exact, "-f", "mp4", mp4.name]
+        command += ["-filter_threads", "1", "-vf", palette, *exact, "-f", "gif", gif.name]
+        with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL) as encoder:  # noqa: S603
             assert encoder.stdin is not None
             for frame in frames:
                 encoder.stdin.write(frame)

@@ -26,6 +26,7 @@ _PNG = b"\x89PNG\r\n\x1a\n"
 _ADVICE = {
     "hung": "play fewer passes",
     "crashed": "play it again, and report it if it happens again",
+    "contained": "report it with the log",
     "out of memory": "play fewer passes or allow more",
     "too much": "which no playback does; report it",
     "failed": "its last output is in the log",

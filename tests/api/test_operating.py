@@ -18,6 +18,8 @@ from skills.db.service_tables import Executor, Job
 from skills.db.session import Database
 from skills.errors import NotReady
 from skills.jobs.readiness import refuse_left_over, refuse_unready
+from skills.sandbox.containment import LAYERS
+from skills.sandbox.forked import layers_held
 from skills.settings import Settings
 from tests import backends
 from tests.api.conformance import conformance
@@ -67,7 +69,9 @@ def beat(settings: Settings, **late: float) -> None:
 def test_with_a_database_a_queue_and_a_worker_it_is_ready(house: House):
     assert refuse_unready(house.settings) == 1
     with serving(house.settings.database_url) as service:
-        assert service.http.get("/readyz").json() == {"status": "ready", "workers": 1}
+        containment = {name: name in layers_held() for name in LAYERS}
+        ready = {"status": "ready", "workers": 1, "containment": containment}
+        assert service.http.get("/readyz").json() == ready
     with pytest.raises(NotReady, match="another state of this database"):
         refuse_left_over(house.settings)
 

@@ -9,6 +9,7 @@ from tests.bench.atlas import atlas
 from tests.bench.batches import batches
 from tests.bench.beyond import learners
 from tests.bench.combining import combining
+from tests.bench.containing import containing
 from tests.bench.doubt import doubting
 from tests.bench.geometry import geometry
 from tests.bench.hands import hands
@@ -28,6 +29,7 @@ from tests.bench.writers import writers
 
 PARTS = {
     "reading": reading,
+    "containment": containing,
     "learning": learning,
     "ties": ties,
     "learners": learners,

@@ -24,7 +24,7 @@ from skills.sandbox.forked import ForkServer
 from tests.formats import bags
 
 LIMITS = ProcessLimits(
-    memory_bytes=512 << 20, wall_s=20.0, cpu_s=20, file_bytes=64 << 20, answer_bytes=32 << 20, children=False
+    memory_bytes=512 << 20, wall_s=20.0, cpu_s=20, file_bytes=64 << 20, answer_bytes=32 << 20, threads=False
 )
 HANG = "tests.sandbox.faults:hang"
 BAG = bags.pose_bag(bags.straight(40))

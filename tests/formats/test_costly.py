@@ -17,7 +17,7 @@ from tests.formats import costly
 
 MOST_CPU_S = 5.0  # for a file below 1 MB
 LIMITS = ProcessLimits(
-    memory_bytes=1 << 30, wall_s=60.0, cpu_s=30, file_bytes=1 << 30, answer_bytes=256 << 20, children=False
+    memory_bytes=1 << 30, wall_s=60.0, cpu_s=30, file_bytes=1 << 30, answer_bytes=256 << 20, threads=False
 )
 
 

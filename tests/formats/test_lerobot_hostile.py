@@ -30,7 +30,7 @@ from tests.formats.others import damaged, zipped
 
 MOST_CPU_S = 2.0
 LIMITS = ProcessLimits(
-    memory_bytes=1 << 30, wall_s=60.0, cpu_s=30, file_bytes=1 << 30, answer_bytes=256 << 20, children=False
+    memory_bytes=1 << 30, wall_s=60.0, cpu_s=30, file_bytes=1 << 30, answer_bytes=256 << 20, threads=False
 )
 
 

@@ -174,7 +174,7 @@ def test_a_file_that_is_cut_off_is_refused_at_every_length():
 
 def test_it_is_read_in_a_process_of_its_own_and_refusals_come_back():
     limits = ProcessLimits(
-        memory_bytes=512 << 20, wall_s=20.0, cpu_s=20, file_bytes=64 << 20, answer_bytes=32 << 20, children=False
+        memory_bytes=512 << 20, wall_s=20.0, cpu_s=20, file_bytes=64 << 20, answer_bytes=32 << 20, threads=False
     )
     with ConfinedReader(limits, at_once=2) as read, tempfile.TemporaryFile() as file:
         file.write(scene(world()))

@@ -1,5 +1,6 @@
 """Faults of a fork, one per function, to be named to a fork server: from a file to a file, with keywords."""
 
+import ctypes
 import json
 import os
 import signal
@@ -43,9 +44,9 @@ def surroundings(given: BinaryIO, answer: BinaryIO) -> None:
         json.dumps(
             {
                 "environment": sorted(os.environ),
-                "files": sorted(file for file in map(int, os.listdir("/proc/self/fd")) if _is_open(file)),
+                "files": [file for file in range(1000) if _is_open(file)],
                 "threads": threading.active_count(),
-                "own group": os.getpgid(0) == os.getpid(),
+                "own group": os.getpgrp() == os.getpid(),
             }
         ).encode()
     )
@@ -54,7 +55,7 @@ def surroundings(given: BinaryIO, answer: BinaryIO) -> None:
 def _is_open(file: int) -> bool:
     try:
         os.fstat(file)
-    except OSError:  # the descriptor of the listing itself
+    except OSError:
         return False
     return True
 
@@ -63,9 +64,7 @@ def write_to_what_is_given(given: BinaryIO, answer: BinaryIO) -> None:
     os.write(given.fileno(), b"other bytes")
 
 
-def hang(given: BinaryIO, answer: BinaryIO, pid_file: str | None = None) -> None:
-    if pid_file:
-        Path(pid_file).write_text(str(os.getpid()))
+def hang(given: BinaryIO, answer: BinaryIO) -> None:
     time.sleep(120)
 
 
@@ -126,18 +125,15 @@ def open_without_end(given: BinaryIO, answer: BinaryIO) -> None:
     answer.write(str(len(opened)).encode())
 
 
-def multiply(given: BinaryIO, answer: BinaryIO, pid_file: str) -> None:
-    """Fork again and again, with children that stay; if that is allowed, write their process ids."""
-    pids = [_stayed() for _ in range(20)]
-    Path(pid_file).write_text(json.dumps(pids))
-
-
-def _stayed() -> int:
-    pid = os.fork()
-    if pid == 0:
+def multiply(given: BinaryIO, answer: BinaryIO) -> None:
+    """Fork a child that stays."""
+    if os.fork() == 0:
         time.sleep(120)
         os._exit(0)
-    return pid
+
+
+def call_what_only_an_attack_needs(given: BinaryIO, answer: BinaryIO) -> None:
+    ctypes.CDLL(None).ptrace(16, os.getppid(), 0, 0)  # PTRACE_ATTACH
 
 
 def start_a_program(given: BinaryIO, answer: BinaryIO) -> None:
@@ -157,13 +153,9 @@ def environment(given: BinaryIO, answer: BinaryIO) -> None:
     packing.write(answer, {"names": tuple(os.environ)}, {})
 
 
-def hang_as_asked(given: BinaryIO, answer: BinaryIO) -> None:
-    hang(given, answer, **packing.read(given, {}))
-
-
 def report_and_hang(given: BinaryIO, answer: BinaryIO) -> None:
     print("." * 2000, "half", sep="\n", file=sys.stderr, flush=True)
-    hang_as_asked(given, answer)
+    hang(given, answer)
 
 
 # ---- invalid answers

@@ -1,9 +1,11 @@
 """A function in a new interpreter: its faults are named, and it never outlives its time limit or its parent."""
 
+import os
 import signal
 import subprocess
 import sys
 import tempfile
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +15,7 @@ import pytest
 from skills.errors import BadInput, Unanswered
 from skills.sandbox import ProcessLimits
 from skills.sandbox.forked import call_alone
-from tests.waiting import alive, crowded, until
+from tests.waiting import alive, children, crowded, until
 
 GIB = 1 << 30
 
@@ -65,33 +67,42 @@ def test_an_answer_that_is_too_large_is_not_read():
         assert caught.value.cause == cause
 
 
-def test_one_that_hangs_is_killed_when_its_time_is_over(tmp_path):
-    pid = tmp_path / "pid"
-    with pytest.raises(Unanswered, match="did not finish") as caught:
-        call("hang_as_asked", wall_s=3.0 * crowded(), pid_file=str(pid))
+def forks_of(pid: int) -> list[int]:
+    """Return the process ids of the forks of every server of a process."""
+    return [fork for server in children(pid) for fork in children(server)]
+
+
+def test_one_that_hangs_is_killed_when_its_time_is_over():
+    with ThreadPoolExecutor(1) as thread:
+        hanging = thread.submit(call, "hang", wall_s=3.0 * crowded())
+        until(lambda: forks_of(os.getpid()))
+        (pid,) = forks_of(os.getpid())
+        with pytest.raises(Unanswered, match="did not finish") as caught:
+            hanging.result()
     assert caught.value.cause == "hung"
-    assert not alive(int(pid.read_text()))
+    assert not alive(pid)
 
 
-def test_its_output_is_watched_and_whoever_raises_there_ends_it(tmp_path):
-    pid, seen = tmp_path / "pid", []
+def test_its_output_is_watched_and_whoever_raises_there_ends_it():
+    pids, seen = [], []
 
     def watch(said: bytes) -> None:
         seen.append(said)
+        pids.extend(forks_of(os.getpid()))
         if b"half" in said:
             raise OSError("enough")
 
     with pytest.raises(OSError, match="enough"):
         call_alone(
             "tests.sandbox.faults:report_and_hang",
-            {"pid_file": str(pid)},
+            {},
             returns=(dict,),
             classes={},
             limits=ProcessLimits(GIB, 60.0),
             watch=watch,
         )
     assert seen[-1].endswith(b"half\n") and len(seen[-1]) <= 1000
-    assert not alive(int(pid.read_text()))
+    assert pids and not any(map(alive, pids))
 
 
 def test_it_leaves_no_temporary_files_and_no_server(tmp_path, monkeypatch):
@@ -103,14 +114,14 @@ def test_it_leaves_no_temporary_files_and_no_server(tmp_path, monkeypatch):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells a process that its parent died")
-def test_it_dies_with_its_parent(tmp_path):
-    pid = tmp_path / "pid"
-    code = f"from tests.sandbox.test_alone import call; call('hang_as_asked', pid_file={str(pid)!r})"
+def test_it_dies_with_its_parent():
+    code = "from tests.sandbox.test_alone import call; call('hang')"
     parent = subprocess.Popen([sys.executable, "-c", code], cwd=Path(__file__).parents[2])
-    until(lambda: pid.exists() and pid.read_text())
+    until(lambda: forks_of(parent.pid), by=[parent])
+    (pid,) = forks_of(parent.pid)
     parent.send_signal(signal.SIGKILL)
     parent.wait()
-    until(lambda: not alive(int(pid.read_text())))
+    until(lambda: not alive(pid))
 
 
 @pytest.mark.parametrize("wrong", [{"wall_s": 0.0}, {"wall_s": float("nan")}, {"memory_bytes": 0}])

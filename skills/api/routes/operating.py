@@ -17,6 +17,8 @@ from skills.api.responses import say
 from skills.errors import BadInput, NotSignedIn
 from skills.jobs.readiness import refuse_unready
 from skills.library.keys import sign_in, sign_out
+from skills.sandbox.containment import LAYERS
+from skills.sandbox.forked import layers_held
 from skills.schemas.given import Alive, Ready
 from skills.settings import MEBIBYTE, Settings
 
@@ -37,9 +39,13 @@ def alive() -> Response:
 
 @router.get("/readyz", dependencies=[needs("reader", whole=True)], **says(Ready))
 def ready(request: Request) -> Response:
-    """Check the database, the job queue and its workers; 503 with the name of the one that cannot be used."""
+    """Check the database, the job queue and its workers; 503 with the name of the one that cannot be used.
+
+    `containment` has the layers that contain readers, simulators and learners, and whether this system offers each.
+    """
     settings: Settings = request.app.state.settings
-    return say({"status": "ready", "workers": refuse_unready(settings)})
+    workers, held = refuse_unready(settings), layers_held()
+    return say({"status": "ready", "workers": workers, "containment": {name: name in held for name in LAYERS}})
 
 
 @router.get("/metrics", dependencies=[needs("reader", whole=True)], response_class=PlainTextResponse)
