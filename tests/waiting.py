@@ -37,11 +37,15 @@ def alive(pid: int) -> bool:
 
 
 def children(pid: int) -> list[int]:
-    """Return the process ids of a process's children; a contained process cannot tell its own to a test."""
+    """Return the process ids of those children of a process that lead a process group, as servers and forks do.
+
+    A contained process cannot tell its own to a test.
+    """
     lists = Path(f"/proc/{pid}/task").glob("*/children")
     try:
-        return [int(one) for file in lists for one in file.read_text().split()]
-    except (ProcessLookupError, FileNotFoundError):  # a thread, or the process, has just ended
+        found = [int(one) for file in lists for one in file.read_text().split()]
+        return [one for one in found if os.getpgid(one) == one]
+    except (ProcessLookupError, FileNotFoundError):  # a thread, or a process, has just ended
         return []
 
 

@@ -2,7 +2,7 @@
 
     own network         network and IPC namespaces without an interface, so that it reaches no host, also not this one
     own files           a mount namespace whose root has the folders of code, read-only, and its temporary files; no
-                        `/proc`, no home, no database
+                        process in `/proc`, no home, no database
     own user            not root: as root, another user without groups
     no capabilities     none, and none to be had
     no new privileges   no program gives it the rights of another user
@@ -50,6 +50,8 @@ _CAPABILITIES_3, _SYS_ADMIN, _CAPABILITIES = 0x20080522, 21, 64
 NOBODY = 65534
 LIBRARIES = ("/usr/lib", "/usr/lib64", "/usr/local/lib", "/lib", "/lib64", "/usr/share/zoneinfo")
 FILES = ("/etc/ld.so.cache", "/etc/localtime")
+# Libraries choose their loops by the processor, so results would differ without; torch's also need the memory's size.
+PROCESSORS, OF_PROC = "/sys/devices/system/cpu", ("/proc/cpuinfo", "/proc/meminfo")
 DEVICES = ("/dev/null", "/dev/zero", "/dev/random", "/dev/urandom")
 
 _libc = ctypes.CDLL(None, use_errno=True)
@@ -78,7 +80,11 @@ def code_folders() -> list[str]:
     Folders on `sys.path` are not among them, because the current folder or a checkout may contain data too.
     """
     paths = sysconfig.get_paths()
-    found = [*LIBRARIES, *(f"{prefix}/{name}" for prefix in (sys.base_prefix, sys.prefix) for name in ("lib", "lib64"))]
+    found = [
+        *LIBRARIES,
+        PROCESSORS,
+        *(f"{prefix}/{name}" for prefix in (sys.base_prefix, sys.prefix) for name in ("lib", "lib64")),
+    ]
     found += [paths[name] for name in ("stdlib", "platstdlib", "purelib", "platlib")]
     found += [path for path in sys.path if Path(path).name in ("site-packages", "dist-packages")]
     found += [part for part in os.environ.get("LD_LIBRARY_PATH", "").split(os.pathsep) if part.startswith("/")]
@@ -126,6 +132,8 @@ def _own_files(place: Place) -> None:
     _unshare(_NEW_NS)
     _mount(None, "/", None, _RECURSIVE | _PRIVATE)  # nothing that is mounted here is seen outside
     root = "/proc"  # always there, and never a folder of code
+    opened = {file: os.open(file, os.O_PATH) for file in OF_PROC}  # it is about to be covered
+    descriptors = os.open("/proc/self/fd", os.O_PATH)
     _mount("tmpfs", root, "tmpfs", _NO_SET_ID | _NO_DEVICES, "mode=755,size=1m")
     for folder in place.code:
         if Path(folder).is_symlink():  # as /lib
@@ -134,10 +142,15 @@ def _own_files(place: Place) -> None:
     for folder in place.code:
         if not Path(folder).is_symlink():
             _show(folder, f"{root}{folder}", _READ_ONLY | _NO_SET_ID | _NO_DEVICES)
+    os.fchdir(descriptors)
+    for file in OF_PROC:
+        _show(str(opened[file]), f"{root}{file}", _READ_ONLY | _NO_SET_ID | _NO_DEVICES)
     for file in (*FILES, *DEVICES):
         if Path(file).exists():
             _show(file, f"{root}{file}", _NO_SET_ID | (0 if file in DEVICES else _READ_ONLY | _NO_DEVICES))
     _show(place.folder, f"{root}{place.folder}", _NO_SET_ID | _NO_DEVICES)
+    for one in (*opened.values(), descriptors):
+        os.close(one)
     os.chdir(root)
     _checked(_libc.pivot_root(b".", b"."))
     _checked(_libc.umount2(b".", _DETACH))
@@ -158,7 +171,7 @@ def _show(source: str, at: str, attributes: int) -> None:
 
 def _only_own_files(place: Place) -> bool:
     """Return whether the root has nothing else, and cannot be changed."""
-    wanted = {Path(one).parts[1] for one in (*place.code, *FILES, *DEVICES, place.folder)}
+    wanted = {Path(one).parts[1] for one in (*place.code, *OF_PROC, *FILES, *DEVICES, place.folder)}
     return set(os.listdir("/")) <= wanted and not Path("/proc/self").exists() and not _writes("/")
 
 
@@ -209,7 +222,7 @@ def _file_rights(place: Place) -> None:
     """Withhold every right on files, but for those that are listed here."""
     rights = _RIGHTS[min(_landlock_version(), max(_RIGHTS))]
     rules = [(folder, _READ | _LIST) for folder in place.code]
-    rules += [(file, _READ) for file in FILES]
+    rules += [(file, _READ) for file in (*FILES, *OF_PROC)]
     rules += [(file, _READ | _WRITE) for file in DEVICES]
     rules += [(place.folder, _READ | _LIST | _WRITE | _CHANGE)]
     if place.program:

@@ -72,6 +72,7 @@ def main(folder: str, code: str, layers: str, *modules: str) -> NoReturn:
             to prepare state that every fork inherits.
     """
     tempfile.tempdir = folder
+    in_use, remover = _removed_afterwards(folder)
     gc.disable()  # imports create no garbage, and looking for it takes a fifth of the start
     for given in modules:
         module, _, function = given.partition(":")
@@ -92,8 +93,27 @@ def main(folder: str, code: str, layers: str, *modules: str) -> NoReturn:
         for child in children.values():
             _kill(child)
             os.waitpid(child.pid, 0)  # when the server has ended, none of its forks runs any more
-        shutil.rmtree(folder, ignore_errors=True)
+        os.close(in_use)
+        os.waitpid(remover, 0)
     os._exit(0)  # without the interpreter's shutdown, for which a caller in `call_alone` would wait
+
+
+def _removed_afterwards(folder: str) -> tuple[int, int]:
+    """Fork a process that removes a folder when this one ends in any way; once contained, this one cannot.
+
+    Returns:
+        The file to close, and the process that then removes the folder and ends.
+    """
+    ended, in_use = os.pipe()
+    pid = os.fork()
+    if pid == 0:
+        os.close(in_use)
+        os.close(0)  # the caller learns from it that the server has ended
+        os.read(ended, 1)
+        shutil.rmtree(folder, ignore_errors=True)
+        os._exit(0)
+    os.close(ended)
+    return in_use, pid
 
 
 def _serve(

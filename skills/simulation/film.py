@@ -171,7 +171,7 @@ def encode(frames: Iterable[bytes]) -> tuple[bytes, bytes]:
     h264 = ["-c:v", "libx264", "-preset", "medium", "-crf", "21", "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
     # No dithering: the scene has few colours, and flickering dots would make the file three times as large.
     palette = "split[a][b];[a]palettegen=max_colors=128[p];[b][p]paletteuse=dither=none:diff_mode=rectangle"
-    # By name, because a contained process has no /proc, through which the encoder could open a file without one.
+    # By name, because a contained process has no /proc/self, through which the encoder could open a file without one.
     with tempfile.NamedTemporaryFile() as mp4, tempfile.NamedTemporaryFile() as gif:
         raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{WIDTH}x{HEIGHT}", "-r", str(FRAMES_PER_S)]
         command = [_encoder(), "-loglevel", "error", "-y", *raw, "-i", "pipe:0"]
