@@ -12,8 +12,8 @@
     system calls        seccomp: a list of allowed calls (`skills.sandbox.system_calls`)
 
 The layers overlap, so that a fault in one, or a kernel without it, does not open what another still closes. Not every
-system offers all of them: containers often have no namespaces, older kernels no Landlock. So `offered` tries them in a
-fork, each in turn and by attempting what it prevents. The layers that held there must be taken by every process after
+system offers all of them: containers often have no namespaces, older kernels no Landlock. So `offered` tries them in
+forks, each in turn and by attempting what it prevents. The layers that held there must be taken by every process after
 it: one that cannot take them ends before it reads anything.
 
 The fork server enters the first five, once (`enter`), and each of its forks the others (`shut`).
@@ -343,12 +343,11 @@ def _held_in_a_fork(place: Place, wanted: list[str]) -> list[str]:
     pid = os.fork()
     if pid == 0:
         try:
-            for name in wanted:
-                apply, holds = (_OF_SERVER | _OF_FORK)[name]
-                apply(place)
-                if not holds(place):
-                    break
-                os.write(send, json.dumps(name).encode() + b"\n")
+            if _tried(place, wanted, _OF_SERVER, send):
+                if os.fork() == 0:  # as later: its parent has the same user, and only the layers of a server
+                    _tried(place, wanted, _OF_FORK, send)
+                else:
+                    os.wait()
         except BaseException:  # noqa: S110 - whatever it was, the layer does not hold
             pass
         finally:
@@ -360,6 +359,17 @@ def _held_in_a_fork(place: Place, wanted: list[str]) -> list[str]:
     if os.geteuid() == 0:
         os.chown(place.folder, 0, 0)  # the fork gave it away
     return held
+
+
+def _tried(place: Place, wanted: list[str], layers: dict[str, Layer], told: int) -> bool:
+    """Enter layers, write the names of those that hold to a pipe, and return whether all hold."""
+    for name, (apply, holds) in layers.items():
+        if name in wanted:
+            apply(place)
+            if not holds(place):
+                return False
+            os.write(told, json.dumps(name).encode() + b"\n")
+    return True
 
 
 # ---- calls of the kernel -----------------------------------------------------------------------------------------

@@ -17,7 +17,7 @@ import sys
 import tempfile
 import threading
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -30,6 +30,7 @@ ATTEMPT = "tests.sandbox.hostile:attempt"
 LIMITS = ProcessLimits(memory_bytes=256 << 20, wall_s=60.0, threads=False)
 _libc = ctypes.CDLL(None, use_errno=True)
 BPF, CLONE = (321, 56) if os.uname().machine == "x86_64" else (280, 220)
+IO_URING_SETUP = 425
 PTRACE_ATTACH, PTRACE_DETACH = 16, 17
 PR_SET_PDEATHSIG, PR_SET_DUMPABLE, NEW_USER = 1, 4, 0x10000000
 
@@ -121,6 +122,16 @@ def _fork_into_namespaces() -> None:
     _process_ends(pid)
 
 
+def _link(prey: Prey) -> None:
+    path = f"{prey.writable}/link"
+    os.link(prey.secret, path)
+    os.unlink(path)
+
+
+def _io_uring(prey: Prey) -> None:
+    os.close(_of_c(_libc.syscall(IO_URING_SETUP, 1, ctypes.create_string_buffer(120))))
+
+
 def _device() -> None:
     path = f"{os.environ['TMPDIR']}/device"
     os.mknod(path, 0o020600, os.makedev(1, 1))
@@ -144,77 +155,107 @@ def _own_signals(prey: Prey) -> None:
     fcntl.fcntl(receive, fcntl.F_SETOWN, prey.pid)
 
 
+NETWORK, FILES, CAPABILITIES, RIGHTS, SIGNALS, CALLS = (
+    *("own network", "own files", "no capabilities", "file rights", "signals", "system calls"),
+)
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """One line of what an attacker tries.
+
+    Attributes:
+        act: The attempt; it raises unless it succeeds.
+        closed_by: The layers of which each alone refuses it, to any user; empty: it is refused without them.
+        ordinary: Whether an ordinary user could do it without containment, as root can.
+        everywhere: Whether it succeeds without containment on every system; some, as containers, refuse it themselves.
+    """
+
+    act: Callable[[Prey], object]
+    closed_by: frozenset[str]
+    ordinary: bool
+    everywhere: bool
+
+
+def _by(act: Callable[[Prey], object], *layers: str, ordinary: bool = True, everywhere: bool = True) -> Attempt:
+    return Attempt(act, frozenset(layers), ordinary, everywhere)
+
+
 # Refused with an error, so that one process can attempt all of them.
-REFUSED: dict[str, Callable[[Prey], object]] = {
-    "read the database": lambda prey: Path(prey.database).read_bytes(),
-    "change the database": _change_database,
-    "read a private key": lambda prey: Path(prey.secret).read_bytes(),
-    "read /etc/passwd": lambda prey: Path("/etc/passwd").read_bytes(),
-    "list the root": lambda prey: os.listdir("/"),
-    "list a folder of another": lambda prey: os.listdir(prey.writable),
-    "see that a file exists": lambda prey: os.stat(prey.secret),
-    "write to /tmp": lambda prey: _write("/tmp/hostile"),
-    "write to /dev/shm": lambda prey: _write("/dev/shm/hostile"),
-    "write to a folder of its user": lambda prey: _write(f"{prey.writable}/hostile"),
-    "write to the working folder": lambda prey: _write("hostile"),
-    "write beside the code": lambda prey: _write(f"{Path(packing.__file__).parent}/hostile"),
-    "make a device": lambda prey: _device(),
-    "read the environment of a process": lambda prey: Path(f"/proc/{prey.pid}/environ").read_bytes(),
-    "read the environment of its parent": lambda prey: Path(f"/proc/{os.getppid()}/environ").read_bytes(),
-    "list the processes": _names_of_processes,
-    "see that a process exists": lambda prey: os.stat(f"/proc/{prey.pid}"),
-    "ask for a process's group": lambda prey: os.getpgid(prey.pid),
-    "ask for a process's priority": lambda prey: os.getpriority(os.PRIO_PROCESS, prey.pid),
-    "signal a process": lambda prey: os.kill(prey.pid, 0),
-    "signal its parent": lambda prey: os.kill(os.getppid(), 0),
-    "signal every process": lambda prey: os.kill(-1, 0),
-    "signal its group": lambda prey: os.killpg(0, 0),
-    "signal through a pipe": _own_signals,
-    "open a process": lambda prey: os.pidfd_open(prey.pid),
-    "connect to loopback": lambda prey: _connected(socket.AF_INET, ("127.0.0.1", prey.port)),
-    "connect to loopback, IPv6": lambda prey: _connected(socket.AF_INET6, ("::1", prey.port)),
-    "send a datagram": _datagram,
-    "connect to a socket with a path": lambda prey: _connected(socket.AF_UNIX, prey.unix),
-    "connect to an abstract socket": lambda prey: _connected(socket.AF_UNIX, "\0" + prey.abstract),
-    "listen on a port": lambda prey: _listen(socket.AF_INET, ("127.0.0.1", 0)),
-    "listen on an abstract socket": lambda prey: _listen(socket.AF_UNIX, "\0hostile"),
-    "talk to the kernel": lambda prey: socket.socket(socket.AF_NETLINK, socket.SOCK_RAW).close(),
-    "make a pair of sockets": lambda prey: [one.close() for one in socket.socketpair()],
-    "fork": lambda prey: _fork(),
-    "fork into namespaces": lambda prey: _fork_into_namespaces(),
-    "start a thread": lambda prey: _thread(),
-    "start a program": lambda prey: subprocess.run([sys.executable, "-c", ""], check=True),
-    "become root": lambda prey: os.setresuid(0, 0, 0),
-    "join groups": lambda prey: os.setgroups([0, 1]),
-    "be dumpable again": lambda prey: _of_c(_libc.prctl(PR_SET_DUMPABLE, 1, 0, 0, 0)),
-    "hide from its parent's death": lambda prey: _of_c(_libc.prctl(PR_SET_PDEATHSIG, 0, 0, 0, 0)),
-    "change a limit": lambda prey: resource.setrlimit(resource.RLIMIT_NOFILE, (64, 64)),
-    "keep files in memory": lambda prey: os.close(os.memfd_create("hostile")),
-    "share memory": lambda prey: _shared("shmget", "shmctl"),
-    "queue messages": lambda prey: _shared("msgget", "msgctl"),
-    "write to what it was given": lambda prey: os.write(0, b"x"),
+REFUSED: dict[str, Attempt] = {
+    "read the database": _by(lambda prey: Path(prey.database).read_bytes(), FILES, RIGHTS),
+    "change the database": _by(_change_database, FILES, RIGHTS),
+    "read a private key": _by(lambda prey: Path(prey.secret).read_bytes(), FILES, RIGHTS),
+    "read /etc/passwd": _by(lambda prey: Path("/etc/passwd").read_bytes(), FILES, RIGHTS),
+    "list the root": _by(lambda prey: os.listdir("/"), RIGHTS),
+    "list a folder of another": _by(lambda prey: os.listdir(prey.writable), FILES, RIGHTS),
+    "see that a file exists": _by(lambda prey: os.stat(prey.secret), FILES),
+    "write to /tmp": _by(lambda prey: _write("/tmp/hostile"), FILES, RIGHTS),
+    "write to /dev/shm": _by(lambda prey: _write("/dev/shm/hostile"), FILES, RIGHTS, everywhere=False),
+    "write to a folder of its user": _by(lambda prey: _write(f"{prey.writable}/hostile"), FILES, RIGHTS),
+    "write to the working folder": _by(lambda prey: _write("hostile"), FILES, RIGHTS),
+    "write beside the code": _by(
+        lambda prey: _write(f"{Path(packing.__file__).parent}/hostile"), FILES, RIGHTS, ordinary=False, everywhere=False
+    ),
+    "link to a private key": _by(_link, FILES, RIGHTS, CALLS),
+    "make a device": _by(lambda prey: _device(), CAPABILITIES, RIGHTS, CALLS, ordinary=False, everywhere=False),
+    "read the environment of a process": _by(
+        lambda prey: Path(f"/proc/{prey.pid}/environ").read_bytes(), FILES, RIGHTS
+    ),
+    "read the environment of its parent": _by(
+        lambda prey: Path(f"/proc/{os.getppid()}/environ").read_bytes(), FILES, RIGHTS, ordinary=False, everywhere=False
+    ),
+    "list the processes": _by(_names_of_processes, FILES, RIGHTS),
+    "see that a process exists": _by(lambda prey: os.stat(f"/proc/{prey.pid}"), FILES),
+    "ask for a process's group": _by(lambda prey: os.getpgid(prey.pid), CALLS),
+    "read the limits of a process": _by(lambda prey: resource.prlimit(prey.pid, resource.RLIMIT_NOFILE), CALLS),
+    "ask for a process's priority": _by(lambda prey: os.getpriority(os.PRIO_PROCESS, prey.pid), CALLS),
+    "signal a process": _by(lambda prey: os.kill(prey.pid, 0), SIGNALS, CALLS),
+    "signal its parent": _by(lambda prey: os.kill(os.getppid(), 0), SIGNALS, CALLS, ordinary=False, everywhere=False),
+    "signal every process": _by(lambda prey: os.kill(-1, 0), CALLS),
+    "signal its group": _by(lambda prey: os.killpg(0, 0), CALLS),
+    "signal through a pipe": _by(_own_signals, CALLS),
+    "open a process": _by(lambda prey: os.pidfd_open(prey.pid), CALLS),
+    "connect to loopback": _by(
+        lambda prey: _connected(socket.AF_INET, ("127.0.0.1", prey.port)), NETWORK, SIGNALS, CALLS
+    ),
+    "connect to loopback, IPv6": _by(
+        lambda prey: _connected(socket.AF_INET6, ("::1", prey.port)), NETWORK, SIGNALS, CALLS, everywhere=False
+    ),
+    "send a datagram": _by(_datagram, NETWORK, CALLS),
+    "connect to a socket with a path": _by(lambda prey: _connected(socket.AF_UNIX, prey.unix), FILES, CALLS),
+    "connect to an abstract socket": _by(
+        lambda prey: _connected(socket.AF_UNIX, "\0" + prey.abstract), NETWORK, SIGNALS, CALLS
+    ),
+    "listen on a port": _by(lambda prey: _listen(socket.AF_INET, ("127.0.0.1", 0)), SIGNALS, CALLS),
+    "listen on an abstract socket": _by(lambda prey: _listen(socket.AF_UNIX, "\0hostile"), CALLS),
+    "talk to the kernel": _by(
+        lambda prey: socket.socket(socket.AF_NETLINK, socket.SOCK_RAW).close(), CALLS, everywhere=False
+    ),
+    "make a pair of sockets": _by(lambda prey: [one.close() for one in socket.socketpair()], CALLS),
+    "fork": _by(lambda prey: _fork(), CALLS),
+    "fork into namespaces": _by(lambda prey: _fork_into_namespaces(), CALLS, everywhere=False),
+    "start a thread": _by(lambda prey: _thread(), CALLS),
+    "start a program": _by(lambda prey: subprocess.run([sys.executable, "-c", ""], check=True), FILES, RIGHTS, CALLS),
+    "become root": _by(lambda prey: os.setresuid(0, 0, 0), CALLS, ordinary=False),
+    "join groups": _by(lambda prey: os.setgroups([0, 1]), CAPABILITIES, CALLS, ordinary=False, everywhere=False),
+    "be dumpable again": _by(lambda prey: _of_c(_libc.prctl(PR_SET_DUMPABLE, 1, 0, 0, 0)), CALLS),
+    "hide from its parent's death": _by(lambda prey: _of_c(_libc.prctl(PR_SET_PDEATHSIG, 0, 0, 0, 0)), CALLS),
+    "change a limit": _by(lambda prey: resource.setrlimit(resource.RLIMIT_NOFILE, (64, 64)), CALLS),
+    "keep files in memory": _by(lambda prey: os.close(os.memfd_create("hostile")), CALLS),
+    "have the kernel work aside": _by(_io_uring, CALLS, everywhere=False),
+    "share memory": _by(lambda prey: _shared("shmget", "shmctl"), CALLS, everywhere=False),
+    "queue messages": _by(lambda prey: _shared("msgget", "msgctl"), CALLS, everywhere=False),
+    "write to what it was given": _by(lambda prey: os.write(0, b"x"), everywhere=False),
 }
 # End the process: nothing but an attack calls them.
-ENDED: dict[str, Callable[[Prey], object]] = {
-    "attach to a process": _trace,
-    "read a process's memory": _read_memory,
-    "load a program into the kernel": lambda prey: _of_c(_libc.syscall(BPF, 0, None, 0)),
-    "mount": _mount,
-    "make namespaces": lambda prey: _of_c(_libc.unshare(NEW_USER)),
-    "change its root": lambda prey: os.chroot("/"),
-}
-# Where they fail without containment too: as an ordinary user, with a Python and a parent of another one; and always,
-# because the process of the test has no such input, a machine may have no IPv6, and that call needs a program.
-ROOT_ONLY = {
-    *("write beside the code", "make a device", "become root", "join groups", "mount"),
-    *("read the environment of its parent", "signal its parent"),
-}
-UNTRIED = {"write to what it was given", "connect to loopback, IPv6", "load a program into the kernel"}
-# Closed by one layer alone, and open where the system does not offer it.
-BY_LAYER = {
-    "see that a file exists": "own files",
-    "see that a process exists": "own files",
-    "list the root": "file rights",
+ENDED: dict[str, Attempt] = {
+    "attach to a process": _by(_trace, RIGHTS, SIGNALS, CALLS, everywhere=False),
+    "read a process's memory": _by(_read_memory, RIGHTS, SIGNALS, CALLS, everywhere=False),
+    "load a program into the kernel": _by(lambda prey: _of_c(_libc.syscall(BPF, 0, None, 0)), CALLS, everywhere=False),
+    "mount": _by(_mount, CAPABILITIES, RIGHTS, CALLS, ordinary=False, everywhere=False),
+    "make namespaces": _by(lambda prey: _of_c(_libc.unshare(NEW_USER)), CALLS, everywhere=False),
+    "change its root": _by(lambda prey: os.chroot("/"), CAPABILITIES, CALLS, ordinary=False, everywhere=False),
 }
 
 
@@ -228,7 +269,7 @@ def attempted(names: Iterable[str], prey: Prey) -> dict[str, str]:
     came = {}
     for name in names:
         try:
-            (REFUSED | ENDED)[name](prey)
+            (REFUSED | ENDED)[name].act(prey)
         except (OSError, sqlite3.Error, RuntimeError, ValueError) as error:
             came[name] = f"{type(error).__name__}: {error}"
         else:
@@ -266,11 +307,15 @@ def prepared(folder: Path) -> Iterator[Prey]:
             server.bind(address)
             server.listen(16)
             servers.append(server)
+        port = servers[0].getsockname()[1]
+        with suppress(OSError):  # a machine without IPv6
+            sixth = ended.enter_context(socket.socket(socket.AF_INET6))
+            sixth.bind(("::1", port))
+            sixth.listen(16)
         command = [sys.executable, "-c", _VICTIM]
         victim = ended.enter_context(
             subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env={"SKILLS_SECRET": "hush"})
         )
-        port = servers[0].getsockname()[1]
         yield Prey(
             str(database),
             str(secret),
@@ -290,8 +335,8 @@ def main() -> None:
     """
     forked._layers = tuple(sys.argv[1:]) or None
     with tempfile.TemporaryDirectory() as folder, prepared(Path(folder)) as prey:
-        came = {"uid": os.geteuid(), "contained": contained(prey), "layers": forked.layers_held()}
         os.chdir(folder)
+        came = {"uid": os.geteuid(), "contained": contained(prey), "layers": forked.layers_held()}
         print(json.dumps(came | {"free": attempted([*REFUSED, *ENDED], prey)}))
 
 

@@ -2,8 +2,12 @@
 
 import json
 import logging
+import os
+import subprocess
+import sys
 import tempfile
 from contextlib import closing
+from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
@@ -17,20 +21,43 @@ from skills.sandbox.forked import ForkServer, layers_held, refuse_uncontained
 from skills.settings import Settings, settings
 from tests.sandbox.test_forked import LIMITS
 
-SOME = tuple(name for name in LAYERS if name not in ("own network", "own files", "own user"))
+PROJECT = Path(__file__).parents[2]
+TAKEN_AWAY = {"own network", "own files", "own user"}
 
 
 @pytest.fixture
-def with_some_layers(monkeypatch):
-    monkeypatch.setattr(forked, "_layers", SOME)
+def some_layers(monkeypatch):
+    """Let every server have those layers alone that this system offers, without three."""
+    some = tuple(name for name in layers_held() if name not in TAKEN_AWAY)
+    monkeypatch.setattr(forked, "_layers", some)
+    return some
 
 
 def test_each_layer_is_attempted_once_and_in_order():
     assert list(layers_held()) == [name for name in LAYERS if name in layers_held()]
-    assert {"no new privileges", "not dumpable", "no capabilities", "system calls"} <= set(layers_held())
+    assert {"no new privileges", "not dumpable", "no capabilities"} <= set(layers_held())
 
 
-def test_missing_layers_are_refused_by_name_if_all_are_required(with_some_layers):
+def test_a_layer_that_is_not_entered_is_not_said_to_hold(tmp_path):
+    """Each in turn is replaced by one that does nothing; another one may close the same."""
+    code = (
+        "import json, sys; from skills.sandbox import containment as c; "
+        "place = c.Place(sys.argv[1], tuple(c.code_folders())); held = {}\n"
+        "for layers in (c._OF_SERVER, c._OF_FORK):\n"
+        "    for name, (apply, holds) in layers.items():\n"
+        "        layers[name] = lambda place: None, holds\n"
+        "        held[name] = c.offered(place)\n"
+        "        layers[name] = apply, holds\n"
+        "print(json.dumps(held))"
+    )
+    done = subprocess.run([sys.executable, "-c", code, tmp_path], cwd=PROJECT, stdout=subprocess.PIPE, check=True)
+    by_another = {"no capabilities", "not dumpable"} if os.geteuid() == 0 else {"own user"}  # another user has neither
+    held = json.loads(done.stdout)
+    assert held.keys() == LAYERS.keys()
+    assert {name for name in held if name in held[name]} <= by_another
+
+
+def test_missing_layers_are_refused_by_name_if_all_are_required(some_layers):
     with pytest.raises(BadSettings, match=r"own network \(needs network and IPC namespaces.*own files.*own user"):
         refuse_uncontained()
     with pytest.raises(BadSettings):
@@ -38,14 +65,14 @@ def test_missing_layers_are_refused_by_name_if_all_are_required(with_some_layers
     confined_reader(Settings())
 
 
-def test_the_doctor_names_what_a_missing_layer_needs_and_fails_if_it_is_required(with_some_layers, monkeypatch):
+def test_the_doctor_names_what_a_missing_layer_needs_and_fails_if_it_is_required(some_layers, monkeypatch):
     for mode, state in (("available", "missing"), ("required", "failed")):
         monkeypatch.setenv("SKILLS_CONTAINMENT", mode)
         settings.cache_clear()
         done = CliRunner().invoke(app, ["doctor", "--json"])
         _, *layers = json.loads(done.stdout)
         assert {one["check"].removeprefix("containment: "): one["state"] for one in layers} == {
-            name: "ok" if name in SOME else state for name in LAYERS
+            name: "ok" if name in some_layers else state for name in LAYERS
         }
         assert layers[0]["remark"] == f"needs {LAYERS['own network']}"
     assert done.exit_code == 1
@@ -83,15 +110,14 @@ def test_without_namespaces_the_first_server_finds_the_other_layers(monkeypatch)
     monkeypatch.setattr(forked, "_ENTRY", unable + forked._ENTRY)
     held = layers_held()
     assert {"own network", "own files"}.isdisjoint(held)
-    assert {"no capabilities", "no new privileges", "not dumpable", "system calls"} <= set(held)
+    assert {"no capabilities", "no new privileges", "not dumpable"} <= set(held)
 
 
-def test_the_layers_of_a_server_are_those_demanded(with_some_layers):
-    server = ForkServer("tests.sandbox.faults")
+def test_the_layers_of_a_server_are_those_demanded(some_layers):
     with (
+        closing(ForkServer("tests.sandbox.faults")) as server,
         tempfile.TemporaryFile() as given,
         server.run("tests.sandbox.faults:surroundings", given, {}, LIMITS) as answer,
     ):
         assert json.load(answer)["threads"] == 1
-    server.close()
-    assert forked._layers == SOME
+    assert forked._layers == some_layers

@@ -18,7 +18,7 @@ import pytest
 
 from skills.errors import Busy, Unanswered
 from skills.sandbox import ProcessLimits
-from skills.sandbox.forked import ForkServer
+from skills.sandbox.forked import ForkServer, layers_held
 from tests.measured import peak_mib
 from tests.waiting import alive, children, crowded, until
 
@@ -161,6 +161,8 @@ def test_one_that_spins_is_ended_by_its_processor_time(server, given):
 
 @pytest.mark.parametrize("fault", ["multiply", "start_a_program", "call_what_only_an_attack_needs"])
 def test_what_containment_refuses_is_told_as_such(server, given, fault):
+    if "system calls" not in layers_held():
+        pytest.skip("NOT TRIED: this system offers no filter of system calls.")
     with pytest.raises(Unanswered, match="was stopped by its containment") as caught:
         run(server, fault, given)
     assert caught.value.cause == "contained"

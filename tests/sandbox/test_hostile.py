@@ -6,6 +6,7 @@ import subprocess
 import sys
 import tempfile
 import warnings
+from collections import defaultdict
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -14,9 +15,18 @@ import numpy as np
 import pytest
 
 from skills.sandbox.containment import LAYERS, NOBODY
-from tests.sandbox.hostile import BY_LAYER, ENDED, REFUSED, ROOT_ONLY, UNTRIED
+from tests.sandbox.hostile import CALLS, ENDED, REFUSED
 
 PROJECT, PACKAGES = Path(__file__).parents[2], Path(np.__file__).parents[1]
+ATTEMPTS = REFUSED | ENDED
+# Further attempts that a layer refuses to an ordinary user alone, or where namespaces come with a user namespace.
+_TRACED = {
+    "read the environment of a process",
+    "read the environment of its parent",
+    "attach to a process",
+    "read a process's memory",
+}
+BY_THE_WAY = defaultdict(set, {"own network": _TRACED, "own files": _TRACED, "signals": _TRACED})
 ORDINARY_PYTHON = f"/usr/bin/python3.{sys.version_info.minor}"
 
 
@@ -49,18 +59,21 @@ def _runs(python: str, how: dict[str, Any]) -> bool:
 
 
 def check(came: dict[str, Any]) -> None:
-    """Check every line; warn of those that this system leaves open because it does not offer their layer."""
-    missing = [name for name in LAYERS if name not in came["layers"]]
-    opened = sorted(name for name, error in came["contained"].items() if not error)
-    excused = {name for name, layer in BY_LAYER.items() if layer in missing}
-    if missing:
-        warnings.warn(UserWarning(f"This system does not offer {missing}; not refused: {opened}"), stacklevel=2)
-    assert set(opened) <= excused, came["contained"]
-    assert came["contained"].keys() == {*REFUSED, *ENDED}
-    assert all(came["contained"][name].startswith("contained") for name in ENDED)
+    """Check every line; tell those that stay open because this system offers none of the layers that close them."""
+    held = set(came["layers"])
+    opened = {name for name, error in came["contained"].items() if not error}
+    excused = {name for name, one in ATTEMPTS.items() if one.closed_by and held.isdisjoint(one.closed_by)}
+    if missing := [name for name in LAYERS if name not in held]:
+        told = f"Without {', '.join(missing)}, user {came['uid']} was not refused: {', '.join(sorted(opened)) or '-'}."
+        warnings.warn(UserWarning(told), stacklevel=2)
+    assert came["contained"].keys() == ATTEMPTS.keys()
+    assert opened <= excused, sorted(opened - excused)
+    if CALLS in held:
+        assert all(came["contained"][name].startswith("contained") for name in ENDED)
 
 
 @pytest.mark.parametrize("user", sorted({0, NOBODY, os.geteuid()}), ids=lambda user: f"user{user}")
+@pytest.mark.filterwarnings("default:Without")
 def test_a_hostile_reader_is_refused_every_attempt(user):
     if user == 0 != os.geteuid():
         pytest.skip("NOT TRIED as root: the tests do not run as root.")
@@ -68,17 +81,32 @@ def test_a_hostile_reader_is_refused_every_attempt(user):
     assert came["uid"] == user
     check(came)
     free = {name for name, error in came["free"].items() if not error}
-    possible = {*REFUSED, *ENDED} - UNTRIED - (ROOT_ONLY if user else set())
+    possible = {name for name, one in ATTEMPTS.items() if one.everywhere and (user == 0 or one.ordinary)}
     assert free >= possible, {name: came["free"][name] for name in possible - free}
+
+
+def ordinary() -> int:
+    return NOBODY if os.geteuid() == 0 else os.geteuid()
 
 
 @pytest.mark.parametrize(
     "missing", [{"own network", "own files"}, {"file rights", "signals"}], ids=["spaces", "Landlock"]
 )
-@pytest.mark.filterwarnings("ignore:This system does not offer")
+@pytest.mark.filterwarnings("ignore:Without")
 def test_without_some_layers_the_others_still_refuse(missing):
-    user = NOBODY if os.geteuid() == 0 else os.geteuid()
-    offered = attack(user)["layers"]
-    came = attack(user, *(name for name in offered if name not in missing))
+    offered = attack(ordinary())["layers"]
+    came = attack(ordinary(), *(name for name in offered if name not in missing))
     assert not missing & set(came["layers"])
     check(came)
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("layer", sorted({name for one in ATTEMPTS.values() for name in one.closed_by}))
+def test_a_layer_alone_refuses_what_it_closes_and_nothing_else(layer):
+    """The table of `hostile` and of docs/operating.md, measured; ordinary users need the one of no new privileges."""
+    if layer not in attack(ordinary())["layers"]:
+        pytest.skip(f"NOT TRIED: this system does not offer {layer}.")
+    alone, none = (attack(ordinary(), "no new privileges", *more)["contained"] for more in ((layer,), ()))
+    closes = {name for name, one in ATTEMPTS.items() if layer in one.closed_by}
+    assert all(alone[name] for name in closes)
+    assert {name for name in ATTEMPTS if alone[name] and not none[name]} - closes <= BY_THE_WAY[layer]
