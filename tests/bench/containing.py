@@ -3,9 +3,11 @@
 The times are of the processor, of all processes that take part; on a busy machine others would say little.
 """
 
+import json
 import os
 import resource
 import tempfile
+import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from functools import partial
@@ -16,6 +18,7 @@ from rich.table import Table
 
 from skills.formats.reader_process import ConfinedReader
 from skills.sandbox import ProcessLimits, forked
+from skills.sandbox.containment import Place, code_folders, enter, offered, shut
 from skills.sandbox.forked import ForkServer, call_alone, layers_held
 from skills.simulation.player import play
 from tests.bench.timing import in_turn
@@ -30,6 +33,13 @@ ROUNDS, FORKS = 7, 50
 def containing(table: Table) -> None:
     """Measure each with the layers that hold here, and with none."""
     table.add_row("containment: layers that hold here", f"{len(layers_held())}", ", ".join(layers_held()))
+    with tempfile.TemporaryDirectory() as folder:
+        place = Place(folder, tuple(code_folders()))
+        (found_s,) = in_turn(partial(offered, place), rounds=ROUNDS, clock=_processor_s)
+        entered_s, shut_s = map(min, zip(*(_entering_s(place) for _ in range(ROUNDS)), strict=True))
+    table.add_row("  finding out which hold, once for each service", f"{found_s * 1e3:.1f} ms", "")
+    table.add_row("  entering those of a server", f"{entered_s * 1e3:.1f} ms", "")
+    table.add_row("  entering those of a fork", f"{shut_s * 1e3:.1f} ms", "")
     _row(table, "a new interpreter that returns a number", _alone, _alone, ROUNDS)
     with _server(True) as contained, _server(False) as free, tempfile.TemporaryFile() as given:
         calls = (partial(_calls, server, given) for server in (contained, free))
@@ -42,6 +52,26 @@ def containing(table: Table) -> None:
 
 
 READY = "skills.formats.reader_process:get_ready"
+
+
+def _entering_s(place: Place) -> tuple[float, float]:
+    """Return the processor time that a fork needs to enter the layers of a server, and those of a fork."""
+    held = layers_held()
+    receive, send = os.pipe()
+    if (pid := os.fork()) == 0:
+        try:
+            began = time.thread_time()
+            enter(place, held)
+            entered = time.thread_time()
+            shut(place, held)
+            os.write(send, json.dumps((entered - began, time.thread_time() - entered)).encode())
+        finally:
+            os._exit(0)
+    os.close(send)
+    with open(receive, "rb") as told:
+        entered_s, shut_s = json.load(told)
+    os.waitpid(pid, 0)
+    return entered_s, shut_s
 
 
 @contextmanager

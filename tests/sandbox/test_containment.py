@@ -12,8 +12,10 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from skills import serving
 from skills.cli import app
 from skills.errors import BadSettings, Busy
+from skills.jobs.worker import run_worker
 from skills.library.recordings import confined_reader
 from skills.sandbox import forked
 from skills.sandbox.containment import LAYERS
@@ -63,6 +65,15 @@ def test_missing_layers_are_refused_by_name_if_all_are_required(some_layers):
     with pytest.raises(BadSettings):
         confined_reader(Settings(containment="required"))
     confined_reader(Settings())
+
+
+def test_no_service_and_no_worker_starts_without_all_layers_if_they_are_required(some_layers, tmp_path, monkeypatch):
+    wanted = Settings(containment="required", database_url=f"sqlite:///{tmp_path}/skills.sqlite", port=0)
+    monkeypatch.setattr(serving.logs, "configure", lambda *how, **more: None)
+    for start in (serving.serve, run_worker):
+        with pytest.raises(BadSettings, match="SKILLS_CONTAINMENT=required"):
+            start(wanted)
+    assert not list(tmp_path.iterdir())
 
 
 def test_the_doctor_names_what_a_missing_layer_needs_and_fails_if_it_is_required(some_layers, monkeypatch):

@@ -85,6 +85,17 @@ def test_a_hostile_reader_is_refused_every_attempt(user):
     assert free >= possible, {name: came["free"][name] for name in possible - free}
 
 
+def test_the_table_in_the_documentation_has_every_attempt_with_its_layers():
+    written = {}
+    text = (PROJECT / "docs" / "operating.md").read_text()
+    for row in text.partition("| layers | attempts |\n|---|---|\n")[2].partition("\n\n")[0].splitlines():
+        _, layers, attempts, _ = (cell.strip() for cell in row.split("|"))
+        named = frozenset(() if layers.startswith("none") else layers.split("; "))
+        written |= dict.fromkeys(attempts.split("; "), named)
+    assert written == {name: one.closed_by for name, one in ATTEMPTS.items()}
+    assert f"All\n{len(ATTEMPTS)} were refused" in text
+
+
 def ordinary() -> int:
     return NOBODY if os.geteuid() == 0 else os.geteuid()
 
