@@ -16,7 +16,8 @@ system offers all of them: containers often have no namespaces, older kernels no
 forks, each in turn and by attempting what it prevents. The layers that held there must be taken by every process after
 it: one that cannot take them ends before it reads anything.
 
-The fork server enters the first five, once (`enter`), and each of its forks the others (`shut`).
+The fork server enters the first five, once (`enter`), and each of its forks the others (`shut`). A fork has the layers
+of the one thread that forked it.
 """
 
 import ctypes
@@ -304,8 +305,18 @@ LAYERS = {  # in the order in which they are entered, with what each needs
 }
 
 
+def prepare(layers: Iterable[str]) -> None:
+    """Enter the user namespace that namespaces need without root, before an import starts a thread, which forbids it.
+
+    Raises:
+        OSError: The system refuses it.
+    """
+    if not {"own network", "own files"}.isdisjoint(layers):
+        _own_rights()
+
+
 def enter(place: Place, layers: Iterable[str]) -> None:
-    """Enter those of the layers that a fork server enters; it must have one thread.
+    """Enter those of the layers that a fork server enters, after `prepare`; its other threads do not enter all.
 
     Raises:
         OSError: The system refuses one of them.
@@ -382,13 +393,17 @@ def _checked(result: int) -> int:
 
 
 def _unshare(flags: int) -> None:
-    """Move into new namespaces; without the capability for it, in a user namespace in which everybody has it."""
+    _own_rights()
+    _checked(_libc.unshare(flags))
+
+
+def _own_rights() -> None:
+    """Move into a user namespace in which this process has every capability, unless it may make namespaces already."""
     if not _capabilities()[_SYS_ADMIN // 32] & 1 << _SYS_ADMIN % 32:
         user, group = os.geteuid(), os.getegid()
         _checked(_libc.unshare(_NEW_USER))
         for file, text in (("setgroups", "deny"), ("uid_map", f"{user} {user} 1"), ("gid_map", f"{group} {group} 1")):
             Path("/proc/self", file).write_text(text)
-    _checked(_libc.unshare(flags))
 
 
 def _capabilities() -> list[int]:

@@ -34,7 +34,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from skills.sandbox import ProcessLimits, confine, perform
-from skills.sandbox.containment import Place, enter, offered, shut
+from skills.sandbox.containment import Place, enter, offered, prepare, shut
 
 MAX_REQUEST_BYTES = 16384
 BEGUN, NO_FORK = b"begun", b"no fork"
@@ -73,6 +73,9 @@ def main(folder: str, code: str, layers: str, *modules: str) -> NoReturn:
     """
     tempfile.tempdir = folder
     in_use, remover = _removed_afterwards(folder)
+    place, wanted = Place(folder, tuple(json.loads(code))), json.loads(layers)
+    held = tuple(offered(place) if wanted is None else wanted)
+    prepare(held)
     gc.disable()  # imports create no garbage, and looking for it takes a fifth of the start
     for given in modules:
         module, _, function = given.partition(":")
@@ -81,9 +84,8 @@ def main(folder: str, code: str, layers: str, *modules: str) -> NoReturn:
             getattr(imported, function)()
     gc.freeze()  # the collector would write to pages shared with the forks, and so copy them
     gc.enable()
-    place, wanted, held_bytes = Place(folder, tuple(json.loads(code))), json.loads(layers), _held_bytes()
-    inherited = _Inherited(place, tuple(offered(place) if wanted is None else wanted), held_bytes)
-    enter(place, inherited.layers)
+    inherited = _Inherited(place, held, _held_bytes())
+    enter(place, held)
     children: dict[int, _Child] = {}
     try:
         with socket.socket(fileno=0) as control, selectors.DefaultSelector() as events:

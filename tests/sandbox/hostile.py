@@ -259,6 +259,11 @@ ENDED: dict[str, Attempt] = {
 }
 
 
+def start_a_thread() -> None:
+    """Leave a thread in the server, as Arrow's allocator does."""
+    threading.Thread(target=threading.Event().wait, daemon=True).start()
+
+
 def attempt(given: BinaryIO, answer: BinaryIO, *, names: list[str], prey: dict[str, Any]) -> None:
     """Write what came of each attempt: an empty text if it succeeded, else its error."""
     answer.write(json.dumps(attempted(names, Prey(**prey))).encode())
@@ -343,7 +348,10 @@ def main() -> None:
 def contained(prey: Prey) -> dict[str, str]:
     """Return what came of each attempt in a fork; the cause of its end, where it ended the fork."""
     came: dict[str, str] = {}
-    with closing(forked.ForkServer("tests.sandbox.hostile")) as server, tempfile.TemporaryFile() as given:
+    with (
+        closing(forked.ForkServer("tests.sandbox.hostile:start_a_thread")) as server,
+        tempfile.TemporaryFile() as given,
+    ):
         for names in (list(REFUSED), *([name] for name in ENDED)):
             try:
                 with server.run(ATTEMPT, given, {"names": names, "prey": vars(prey)}, LIMITS) as answer:
