@@ -9,7 +9,7 @@ Each is grown by `margin_mm`. A *cell* is forbidden if its centre touches someth
 commands; a *move* touches if the straight line between the two centres does, so no move passes through a thin box. The
 distance of the tip from the centre of its cell, and the size of the tool, belong into the margin.
 
-Tissue is a plane or a height map above a plane; meshes are not supported yet.
+Tissue is a plane or a height map above a plane, also that of a mesh (`skills.gridworld.mesh`).
 """
 
 from collections.abc import Mapping
