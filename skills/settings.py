@@ -31,6 +31,11 @@ def _cores() -> int:
     return min(4, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
 
 
+def _state_folder() -> Path:
+    within = os.environ.get("XDG_STATE_HOME")
+    return (Path(within) if within else Path.home() / ".local" / "state") / "suture-skills"
+
+
 class Settings(BaseSettings):
     """The settings of an installation."""
 
@@ -43,6 +48,9 @@ class Settings(BaseSettings):
     server: str | None = None  # address of the service for the client; None: the application in this process
     api_key: SecretStr | None = None  # the client's key for it
     erasures_file: Path | None = None  # list of erasures to apply after a restore; kept up to date if it is named
+    # secret key that signs the history, made at the first start; kept apart from the database and its backups
+    signing_key: Path = Field(default_factory=lambda: _state_folder() / "signing.key")
+    checkpoints: Path | None = None  # file to which each signed head of the history is appended
     sample_recordings: Path | None = None
     paper_data: Path | None = None
 

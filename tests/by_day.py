@@ -34,6 +34,12 @@ ON_BOTH = {
     "test_two_services_that_start_together_migrate_once",
     "test_a_release_is_taken_over_and_serves_the_same_bytes",
     "test_down_and_up_again_keeps_every_row_and_every_answer",
+    # the history
+    "test_the_triggers_note_every_logged_table",
+    "test_what_the_service_wrote_is_whole_and_signed",
+    "test_random_edits_are_found_and_named",
+    "test_proofs_are_checked_offline_and_stay_valid_after_an_erasure",
+    "test_a_row_written_past_the_service_is_not_logged_for_its_author",
     # backups that are restored
     "test_a_demonstration_erased_after_the_backup_leaves_nothing_served",
     "test_a_deleted_recording_that_is_used_again_does_not_block_a_restore",

@@ -58,6 +58,7 @@ def begin() -> subprocess.Popen[bytes]:
     guarding.stdin.write(f"{folder}\n".encode())
     guarding.stdin.flush()
     os.environ[FOLDER], os.environ["TMPDIR"] = str(folder), str(folder / "tmp")
+    os.environ["XDG_STATE_HOME"] = str(folder / "state")  # for the key that signs histories
     tempfile.tempdir = None  # so that it is computed again
     _GUARDS.append(guarding)
     return guarding

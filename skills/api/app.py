@@ -23,6 +23,7 @@ from skills.api.sessions import Sessions
 from skills.db.session import Database
 from skills.jobs import Engine
 from skills.library.catalogue import seed_catalogue
+from skills.library.history import keep_signed
 from skills.library.recordings import confined_reader
 from skills.logs import request_id
 from skills.settings import Settings
@@ -43,7 +44,7 @@ def create_app(settings: Settings) -> FastAPI:
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        await to_thread.run_sync(prepare_database, app.state.database)
+        await to_thread.run_sync(prepare_database, app.state.database, settings)
         async with app.state.served.watching():
             with confined_reader(settings) as app.state.reader:
                 yield
@@ -62,7 +63,7 @@ def create_app(settings: Settings) -> FastAPI:
         max_body_size=settings.max_upload_bytes,
     )
     app.state.settings = settings
-    app.state.database = Database(settings.database_url)
+    app.state.database = Database(settings.database_url, signing_key=settings.signing_key)
     app.state.engine = Engine(settings)
     app.state.encoded = Encoded()
     app.state.served = PolicyCache(app.state.database, app.state.encoded)
@@ -100,11 +101,12 @@ def create_app(settings: Settings) -> FastAPI:
     return app
 
 
-def prepare_database(database: Database) -> None:
-    """Migrate a database, and seed its catalogue if it is empty."""
+def prepare_database(database: Database, settings: Settings) -> None:
+    """Migrate a database, seed its catalogue if it is empty, and sign its history."""
     database.migrate()
     with database.writing() as session:
         seed_catalogue(session)
+    keep_signed(database, settings.checkpoints)
 
 
 class Service(FastAPI):

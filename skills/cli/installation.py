@@ -183,9 +183,20 @@ def verify(
     decode_all: Annotated[
         bool, typer.Option("--decode-all", help="Decode every recording again, and not only the newest.")
     ] = False,
+    head: Annotated[
+        Path | None,
+        typer.Option(
+            help="A file of signed checkpoints that was kept elsewhere, as of SKILLS_CHECKPOINTS: the history must "
+            "continue each of them.",
+            dir_okay=False,
+        ),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Check every digest and reference of this installation, or one replay bag; exit code 1 if anything is wrong."""
+    """Check every digest, reference and leaf of the history of this installation, or one replay bag.
+
+    The exit code is 1 if anything is wrong.
+    """
     if bag is not None:
         from skills.formats.verify import verify_bag
 
@@ -193,9 +204,11 @@ def verify(
         _say("\n".join(lines), as_json, whole=True, checked=lines)
         return
     from skills.db.session import Database
+    from skills.library.history import keep_signed
     from skills.library.inspection import Checked, inspect_installation
     from skills.library.recordings import confined_reader
     from skills.settings import settings
+    from skills.transparency import read_notes
 
     found: dict[str, Checked] = {}
     with (
@@ -203,7 +216,10 @@ def verify(
         confined_reader(settings()) as reader,
         _telling("verifying") as told,
     ):
-        for part in inspect_installation(database, reader.tell, decode_all=decode_all):
+        with _files():
+            heads = [] if head is None else read_notes(head.read_text())
+        keep_signed(database, settings().checkpoints)
+        for part in inspect_installation(database, reader.tell, decode_all=decode_all, heads=heads):
             found[part.what] = part
             told(f"{part.what} {part.count or ''}")
     wrong = [one for part in found.values() for one in part.wrong]

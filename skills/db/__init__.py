@@ -6,6 +6,7 @@ models           the tables of the library
 service_tables   the tables of the service: jobs, workers, keys, sign-ins, the audit log
 session          opening the database; sessions and their errors; a full and a failed disk; migrations
 packed           values in one column, and the archive format that they are stored in
+history          the log of all changes, written with them
 row_visibility   rules that restrict a caller's queries to some surgeons
 changes          a cache, and change detection for caches, without reading a table
 archive          backups

@@ -18,28 +18,11 @@ from datetime import datetime
 from typing import IO, Any
 from zipfile import ZIP_STORED, ZipFile
 
-from sqlalchemy import (
-    JSON,
-    BigInteger,
-    Boolean,
-    Column,
-    Connection,
-    Double,
-    Float,
-    Integer,
-    LargeBinary,
-    MetaData,
-    String,
-    Table,
-    insert,
-    select,
-    text,
-)
-from sqlalchemy.types import NullType, TypeEngine
+from sqlalchemy import Column, Connection, MetaData, Table, insert, select, text
 
-from skills.db import Base, Moment, now, rfc3339
+from skills.db import Base, now, rfc3339
+from skills.db.history import KINDS, kind_of
 from skills.db.models import ParsedChunk, ParsedRecording
-from skills.db.packed import Packed
 from skills.db.service_tables import Executor, SignIn
 from skills.db.session import revision_of, revisions, upgrade
 from skills.errors import Conflict, Corrupt, UnknownFormat
@@ -56,15 +39,6 @@ LEFT_OUT = {
 }
 ROWS_AT_ONCE = 500
 ROWS_WITH_BYTES_AT_ONCE = 8  # a recording's chunk has 1 MiB
-
-KINDS: dict[str, TypeEngine[Any]] = {
-    "bytes": LargeBinary(),
-    "json": JSON(none_as_null=True),
-    "moment": Moment(),
-    "truth": Boolean(),
-    "plain": NullType(),  # text and numbers, which all drivers and JSON represent alike
-}
-PLAIN = (String, Integer, BigInteger, Float, Double)
 
 
 @dataclass(frozen=True)
@@ -104,16 +78,6 @@ class Manifest:
 def tables() -> list[Table]:
     """Return the tables that are backed up, each after those that it refers to."""
     return [table for table in Base.metadata.sorted_tables if table.name not in LEFT_OUT]
-
-
-def kind_of(column: Column[Any]) -> str:
-    """Return the kind of a column, a key of `KINDS`, which decides how its values are written."""
-    if isinstance(column.type, Packed | LargeBinary):
-        return "bytes"
-    for kind, types in (("json", JSON), ("moment", Moment), ("truth", Boolean), ("plain", PLAIN)):
-        if isinstance(column.type, types):
-            return kind
-    raise AssertionError(f"no backup format for {column}")
 
 
 # ---- writing -----------------------------------------------------------------------------------------------------

@@ -47,9 +47,11 @@ from sqlalchemy.exc import ArgumentError, DatabaseError, DBAPIError, Operational
 from sqlalchemy.orm import Session, sessionmaker
 from sqlalchemy.pool import ConnectionPoolEntry
 
+from skills.db.history import FORGET_NOTES, NOTES_OF_CONNECTION, NOTING, History
 from skills.db.row_visibility import ONLY, Only
 from skills.errors import BadSettings, Busy, Conflict, Corrupt, DatabaseUnusable, SkillsError, StorageFull
 from skills.remedies import Action, Remedy
+from skills.settings import settings
 
 if TYPE_CHECKING:
     from alembic.config import Config
@@ -98,12 +100,13 @@ log = logging.getLogger(__name__)
 class Database:
     """Sessions on one database; thread-safe."""
 
-    def __init__(self, url: str, *, patience_ms: int | None = None) -> None:
+    def __init__(self, url: str, *, patience_ms: int | None = None, signing_key: Path | None = None) -> None:
         """Open a database; it connects on first use.
 
         Args:
             url: SQLAlchemy URL of a SQLite file or a PostgreSQL database.
             patience_ms: Timeout for locks and for connections, `BUSY_TIMEOUT_MS` by default.
+            signing_key: The file of the key that its history is written with, by default of `SKILLS_SIGNING_KEY`.
 
         Raises:
             BadSettings: The URL is not one of these, or the folder of the file cannot be created.
@@ -111,6 +114,7 @@ class Database:
         """
         self.url = url
         self.engine = _open(url, patience_ms or BUSY_TIMEOUT_MS)
+        self.history = History(self.engine, signing_key or settings().signing_key)
         self._sessions = sessionmaker(self.engine, expire_on_commit=False)
 
     @contextmanager
@@ -123,6 +127,8 @@ class Database:
     def writing(self, names: Iterable[str] | None = None) -> Iterator[Session]:
         """Open a session whose block is one transaction, committed if it ends without an exception.
 
+        What it has changed is added to the history at its end.
+
         Args:
             names: What it changes or relies on, see `skills.library.locks`: transactions with a common name run one
                 after the other. None: everything. No names: changes that are decided by a single statement each.
@@ -131,6 +137,9 @@ class Database:
         bind = self.engine.execution_options(writes=locks)
         with self._in_words(), self._sessions(bind=bind) as session, session.begin():
             yield session
+            if session.in_transaction():  # otherwise the block has undone its changes
+                session.flush()
+                self.history.settle(session.connection())
 
     def seen_by(self, only: Only | None) -> "Database":
         """Return this database restricted to the rows that a caller may see; None: without restriction."""
@@ -146,9 +155,15 @@ class Database:
         Raises:
             Conflict: The database was written by a newer version of the code.
             Busy: It cannot be reached or written.
+            BadSettings: The signing key of its history is missing, or cannot be made.
         """
         with self._in_words(), self.engine.execution_options(writes=True).connect() as connection:
+            before = revision_of(connection)
             upgrade(connection)
+            self.history.begin(connection)
+            if before != revisions()[0]:
+                self.history.settle(connection)
+                self.history.log_schema(connection)
             connection.commit()
 
     def forget(self) -> None:
@@ -279,9 +294,23 @@ def _open(url: str, patience_ms: int) -> Engine:
 
     @event.listens_for(engine, "begin")
     def _begin(connection: Connection) -> None:
-        connection.exec_driver_sql("BEGIN IMMEDIATE" if "writes" in connection.get_execution_options() else "BEGIN")
+        writes = "writes" in connection.get_execution_options()
+        connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")
+        if writes:  # notes of somebody who wrote past the service are not ours to log
+            connection.info[NOTING] = _forgotten(connection)
 
     return engine
+
+
+def _forgotten(connection: Connection) -> bool:
+    """Delete the notes for the history that others have left; return whether there is a history."""
+    try:
+        connection.connection.cursor().execute(FORGET_NOTES)
+    except sqlite3.OperationalError as error:
+        if "no such table" not in str(error):
+            raise
+        return False
+    return True
 
 
 def _make_file(file: Path) -> None:
@@ -378,6 +407,13 @@ def _open_postgresql(url: URL, patience_ms: int) -> Engine:
     engine = create_engine(url, pool_pre_ping=True, connect_args=waits, **_pool(patience_ms))
     # A restart of the server must not fail the requests that connect during it.
     event.listen(engine, "do_connect", Returning(min(RESTART_S, patience_ms / 1000)).connect)
+
+    @event.listens_for(engine, "connect")
+    def _note(connection: Any, record: ConnectionPoolEntry) -> None:
+        connection.autocommit = True
+        connection.execute(NOTES_OF_CONNECTION)
+        connection.autocommit = False
+        record.info[NOTING] = True
 
     @event.listens_for(engine, "begin")
     def _begin(connection: Connection) -> None:

@@ -113,15 +113,14 @@ def run_worker(settings: Settings, *, parent: int | None = None, perform: Perfor
     stop = _stopped_by_signals()
     perform = logged(perform or _library())
     executor = f"{os.getpid()}-{uuid.uuid4().hex}"  # unique: with a reused id the engine would run its work twice
-    database = Database(settings.database_url)
+    database = Database(settings.database_url, signing_key=settings.signing_key)
     with database.reading() as session:
         refuse_other_tables(session.connection())
     client = connect(settings)
     work = Work(database, settings, perform)
+    leases, recover = Leases(settings.lease_s), DBOS._recover_pending_workflows
     sweeping = partial(sweep, database, settings, SWEEPING_S)
-    watch = Watch(
-        database, client, executor, Leases(settings.lease_s), DBOS._recover_pending_workflows, work.doing, sweeping
-    )
+    watch = Watch(database, client, executor, leases, recover, work.doing, sweeping, settings.checkpoints)
     try:
         watch.beat()  # registered before it can hold any job, so that others can take over
         with _engine(work, executor, watch):

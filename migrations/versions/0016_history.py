@@ -1,0 +1,141 @@
+"""The history of all changes: its leaves and checkpoints, and the triggers that note which rows a transaction changed.
+
+The notes are read before the commit. PostgreSQL keeps them in a temporary table of each connection of the service;
+without it, as in `psql`, nothing is noted.
+"""
+
+import sqlalchemy as sa
+from alembic import op
+
+revision = "0016"
+down_revision = "0015"
+branch_labels = None
+depends_on = None
+
+ROW = sa.BigInteger().with_variant(sa.Integer(), "sqlite")
+JOBS = "id, kind, identity, state, request, plan, result, error, surgeon_row, asked_by, created_at, ended_at"
+# The key of each logged table, and the columns whose change is noted where not all are logged.
+LOGGED = {
+    "surgeons": ("row",),
+    "erasures": ("row",),
+    "suture_types": ("slug",),
+    "recordings": ("row",),
+    "recording_uploads": ("recording_row", "actor"),
+    "recording_surgeons": ("recording_row", "surgeon_row"),
+    "demonstrations": ("row",),
+    "demonstration_outcomes": ("row",),
+    "reward_maps": ("row",),
+    "policy_versions": ("row",),
+    "policy_demonstrations": ("policy_row", "demonstration_row"),
+    "pose_styles": ("row",),
+    "releases": ("row",),
+    "plans": ("row",),
+    "playbacks": ("row",),
+    "playback_pictures": ("row",),
+    "calibrations": ("row",),
+    "jobs": ("row",),
+    "dataset_demonstrations": ("job_row", "demonstration_row"),
+    "datasets": ("row",),
+    "keys": ("row",),
+    "key_surgeons": ("key_row", "surgeon_row"),
+    "events": ("row",),
+    "measured_shapes": ("demonstration_row",),
+    "parsed_recordings": ("recording_row",),
+}
+CHANGES = (("add", "INSERT"), ("change", "UPDATE"), ("remove", "DELETE"))
+UNCHANGEABLE = "row, table_name, entry, seal"
+
+
+def upgrade() -> None:
+    op.create_table(
+        "history",
+        sa.Column("row", ROW, autoincrement=True, nullable=False),
+        sa.Column("number", sa.BigInteger(), nullable=True),
+        sa.Column("table_name", sa.String(length=64), nullable=False),
+        sa.Column("key", sa.String(length=300), nullable=True),
+        sa.Column("entry", sa.String(length=1000), nullable=False),
+        sa.Column("seal", sa.LargeBinary(), nullable=False),
+        sa.Column("salt", sa.LargeBinary(), nullable=True),
+        sa.Column("digests", sa.JSON(), nullable=True),
+        sa.PrimaryKeyConstraint("row", name="pk_history"),
+        sa.UniqueConstraint("number", name="uq_history_number"),
+        sqlite_autoincrement=True,
+    )
+    op.create_index("ix_history_key", "history", ["table_name", "key"])
+    unsigned = sa.text("number IS NULL")
+    op.create_index("ix_history_unsigned", "history", ["row"], sqlite_where=unsigned, postgresql_where=unsigned)
+    op.create_table(
+        "history_checkpoints",
+        sa.Column("row", ROW, autoincrement=True, nullable=False),
+        sa.Column("size", sa.BigInteger(), nullable=False),
+        sa.Column("note", sa.String(length=1000), nullable=False),
+        sa.Column("subtrees", sa.LargeBinary(), nullable=False),
+        sa.Column("signed_at", sa.DateTime(timezone=True), nullable=False),
+        sa.PrimaryKeyConstraint("row", name="pk_history_checkpoints"),
+        sqlite_autoincrement=True,
+    )
+    if op.get_bind().dialect.name == "sqlite":
+        _on_sqlite()
+    else:
+        _on_postgresql()
+
+
+def _on_sqlite() -> None:
+    op.execute("CREATE TABLE history_notes (table_name TEXT, change TEXT, key TEXT)")
+    for table, keys in LOGGED.items():
+        for change, statement in CHANGES:
+            row = "NEW" if change == "add" else "OLD"
+            key = " || '/' || ".join(f"{row}.{name}" for name in keys)
+            op.execute(
+                f"CREATE TRIGGER {table}_noted_{change} AFTER {_of(table, statement)} ON {table} "  # noqa: S608 - ours
+                f"BEGIN INSERT INTO history_notes VALUES ('{table}', '{change}', {key}); END"
+            )
+    for table, what in (("history", f"UPDATE OF {UNCHANGEABLE}"), ("history_checkpoints", "UPDATE")):
+        for name, statement in (("append_only", what), ("kept", "DELETE")):
+            op.execute(
+                f"CREATE TRIGGER {table}_{name} BEFORE {statement} ON {table} "
+                f"BEGIN SELECT RAISE(ABORT, '{table} is append-only'); END"
+            )
+
+
+def _on_postgresql() -> None:
+    for table, keys in LOGGED.items():
+        new, old = (", ".join(f"{row}.{name}" for name in keys) for row in ("NEW", "OLD"))
+        op.execute(
+            f"CREATE FUNCTION skills_note_{table}() RETURNS trigger LANGUAGE plpgsql AS $$ BEGIN "  # noqa: S608 - ours
+            "IF to_regclass('pg_temp.history_notes') IS NULL THEN NULL; "
+            "ELSIF TG_OP = 'INSERT' THEN "
+            f"INSERT INTO pg_temp.history_notes VALUES (TG_TABLE_NAME, TG_ARGV[0], concat_ws('/', {new})); "
+            "ELSE "
+            f"INSERT INTO pg_temp.history_notes VALUES (TG_TABLE_NAME, TG_ARGV[0], concat_ws('/', {old})); "
+            "END IF; RETURN NULL; END $$"
+        )
+        for change, statement in CHANGES:
+            op.execute(
+                f"CREATE TRIGGER {table}_noted_{change} AFTER {_of(table, statement)} ON {table} "
+                f"FOR EACH ROW EXECUTE FUNCTION skills_note_{table}('{change}')"
+            )
+    for table, what in (("history", f"UPDATE OF {UNCHANGEABLE}"), ("history_checkpoints", "UPDATE")):
+        for name, statement in (("append_only", what), ("kept", "DELETE")):
+            op.execute(
+                f"CREATE TRIGGER {table}_{name} BEFORE {statement} ON {table} "
+                "FOR EACH ROW EXECUTE FUNCTION skills_append_only()"
+            )
+
+
+def _of(table: str, statement: str) -> str:
+    return f"UPDATE OF {JOBS}" if (table, statement) == ("jobs", "UPDATE") else statement
+
+
+def downgrade() -> None:
+    """Drop the history: the older version would not go on with it."""
+    on_sqlite = op.get_bind().dialect.name == "sqlite"
+    for table in LOGGED:
+        for change, _ in CHANGES:
+            op.execute(f"DROP TRIGGER {table}_noted_{change}" + ("" if on_sqlite else f" ON {table}"))
+        if not on_sqlite:
+            op.execute(f"DROP FUNCTION skills_note_{table}()")
+    op.drop_table("history_checkpoints")
+    op.drop_table("history")
+    if on_sqlite:
+        op.drop_table("history_notes")

@@ -1,0 +1,629 @@
+"""The history: a leaf of a Merkle log for each change of a logged row, written in the transaction of the change.
+
+Triggers note the key of every row that a transaction adds, changes or removes, by whatever statement. Before the commit
+`History.settle` reads these rows as they then are and adds a leaf for each:
+
+    entry     what is logged for good: table, change, time, *commitment*, and the hash of the row's leaf before
+    commitment   SHA-256 over the digests of all logged columns; each is salted with 32 random bytes of the leaf
+    seal      a MAC of the entry by the signing key, which is not in the database: a process of the service wrote it
+
+When a row is deleted, its leaves lose salt, digests and key. Their entries stay, and reveal nothing that could be
+guessed, so all proofs stay valid. `skills.library.history` numbers the leaves, signs the tree and verifies all of it.
+
+Everything is logged but what `NOT_LOGGED` and `COLUMNS_NOT_LOGGED` name with a reason.
+"""
+
+import hashlib
+import hmac
+import json
+import os
+import secrets
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from functools import cache, cached_property
+from pathlib import Path
+from typing import Any, cast
+
+from sqlalchemy import (
+    JSON,
+    BigInteger,
+    Boolean,
+    Column,
+    ColumnElement,
+    Connection,
+    Double,
+    Engine,
+    Float,
+    Index,
+    Integer,
+    LargeBinary,
+    MetaData,
+    Select,
+    String,
+    Table,
+    bindparam,
+    insert,
+    inspect,
+    select,
+    text,
+    tuple_,
+    update,
+)
+from sqlalchemy.orm import Mapped, mapped_column
+from sqlalchemy.types import NullType, TypeEngine
+
+from skills.db import Base, Moment, RowId, now, rfc3339
+from skills.db.packed import Packed
+from skills.errors import BadSettings, Corrupt
+from skills.packing import canonical, sha256
+from skills.remedies import Action, Remedy
+from skills.transparency import HASH_BYTES, Checkpoint, Seal, SigningKey, Tree, leaf_hash, read_notes
+
+ADD, CHANGE, REMOVE, FOUND = "add", "change", "remove", "found"
+SCHEMA = "schema"  # the name under which triggers, indexes and constraints are logged as if they were rows
+SALT_BYTES, DIGEST_BYTES = 32, 16
+SIGNED_AT_ONCE = 1000  # leaves in one transaction, some 50 ms
+ROWS_AT_ONCE = 200
+ORIGIN = "suture-skills/"  # and 16 random hex digits: the name of one log
+
+OF_A_RUN = "the state of running processes, replaced every second"
+IN_PIECES = "the row that the pieces belong to has their digest, which `skills verify` computes again"
+SWEPT = "what the sweep has yet to delete, and nobody sees; `skills verify` finds one that names an existing row"
+NOT_LOGGED = {
+    "executors": OF_A_RUN,
+    "sign_ins": "browser sessions, which end within a day; what is done in one is an event",
+    "retraining_styles": "the progress of a batch; the versions and releases that it made are logged",
+    "loose_chunks": SWEPT,
+    "erased_surgeons": SWEPT,
+    "recording_chunks": IN_PIECES,
+    "parsed_chunks": IN_PIECES,
+    "dataset_chunks": IN_PIECES,
+    "history": "the history itself",
+    "history_checkpoints": "the history itself",
+}
+CACHES = ("measured_shapes", "parsed_recordings")  # logged, but anybody may delete their rows at any time
+COLUMNS_NOT_LOGGED = {
+    ("jobs", "progress"): OF_A_RUN,
+    ("jobs", "attempt"): OF_A_RUN,
+    ("jobs", "told_at"): OF_A_RUN,
+    ("jobs", "started_at"): OF_A_RUN,
+}
+
+
+class Leaf(Base):
+    """A leaf of the history; `number` is its place in the tree, None until it is under a signed checkpoint.
+
+    `digests` are of the row's columns, by their names; together with `salt` and `key` they are removed with the row.
+    """
+
+    __tablename__ = "history"
+
+    row: Mapped[RowId]
+    number: Mapped[int | None] = mapped_column(BigInteger, unique=True)
+    table_name: Mapped[str] = mapped_column(String(64))
+    key: Mapped[str | None] = mapped_column(String(300))
+    entry: Mapped[str] = mapped_column(String(1000))
+    seal: Mapped[bytes] = mapped_column(LargeBinary)
+    salt: Mapped[bytes | None] = mapped_column(LargeBinary)
+    digests: Mapped[dict[str, Any] | None] = mapped_column(JSON(none_as_null=True))
+
+    __table_args__ = (
+        Index("ix_history_key", "table_name", "key"),
+        Index(
+            "ix_history_unsigned",
+            "row",
+            sqlite_where=text("number IS NULL"),
+            postgresql_where=text("number IS NULL"),
+        ),
+    )
+
+
+class StoredCheckpoint(Base):
+    """A signed head of the history, and the hashes of the complete subtrees of its tree, from which it grows."""
+
+    __tablename__ = "history_checkpoints"
+
+    row: Mapped[RowId]
+    size: Mapped[int] = mapped_column(BigInteger)
+    note: Mapped[str] = mapped_column(String(1000))
+    subtrees: Mapped[bytes] = mapped_column(LargeBinary)
+    signed_at: Mapped[datetime] = mapped_column(default=now)
+
+
+LEAVES = cast(Table, Leaf.__table__)
+CHECKPOINTS = cast(Table, StoredCheckpoint.__table__)
+
+# ---- rows as they are stored -----------------------------------------------------------------------------------------
+
+KINDS: dict[str, TypeEngine[Any]] = {
+    "bytes": LargeBinary(),
+    "json": JSON(none_as_null=True),
+    "moment": Moment(),
+    "truth": Boolean(),
+    "plain": NullType(),  # text and numbers, which all drivers and JSON represent alike
+}
+PLAIN = (String, Integer, BigInteger, Float, Double)
+
+
+def kind_of(column: Column[Any]) -> str:
+    """Return the kind of a column, a key of `KINDS`, which decides how its values are represented elsewhere."""
+    if isinstance(column.type, Packed | LargeBinary):
+        return "bytes"
+    for kind, types in (("json", JSON), ("moment", Moment), ("truth", Boolean), ("plain", PLAIN)):
+        if isinstance(column.type, types):
+            return kind
+    raise AssertionError(f"no raw form of {column}")
+
+
+@dataclass(frozen=True)
+class Logged:
+    """A logged table with raw columns: serialised values stay bytes."""
+
+    raw: Table
+    keys: tuple[str, ...]
+
+    @cached_property
+    def columns(self) -> tuple[str, ...]:
+        """The names of the logged columns."""
+        return tuple(column.name for column in self.raw.columns)
+
+    @cached_property
+    def key_columns(self) -> list[Column[Any]]:
+        """The columns of the primary key."""
+        return [self.raw.c[name] for name in self.keys]
+
+    @cached_property
+    def _of_values(self) -> Select[Any]:
+        # By the first column of the key alone, which its index begins with; few other rows share its value.
+        return select(self.raw).where(self.key_columns[0].in_(bindparam("values", expanding=True)))
+
+    def key_of(self, row: Any) -> str:
+        """Return the key of a row as text."""
+        return "/".join(str(getattr(row, name)) for name in self.keys)
+
+    def _first_of(self, key: str) -> Any:
+        return key if self._of_text else int(key.partition("/")[0])
+
+    @cached_property
+    def _of_text(self) -> bool:
+        return isinstance(Base.metadata.tables[self.raw.name].c[self.keys[0]].type, String)
+
+    def rows_of(self, connection: Connection, keys: Sequence[str]) -> Iterator[Any]:
+        """Yield the rows with some keys, of those that exist."""
+        for at in range(0, len(keys), ROWS_AT_ONCE):
+            some = frozenset(keys[at : at + ROWS_AT_ONCE])
+            values = sorted({self._first_of(key) for key in some})
+            for row in connection.execute(self._of_values, {"values": values}):
+                if self.key_of(row) in some:
+                    yield row
+
+    def after(self, key: Sequence[Any]) -> ColumnElement[bool]:
+        """Return the condition of the rows whose keys come after a key, given as its values."""
+        return tuple_(*self.key_columns) > tuple_(*key)
+
+    def pages(self, connection: Connection) -> Iterator[list[Any]]:
+        """Yield all rows in the order of their keys, some at a time."""
+        query = select(self.raw).order_by(*self.key_columns).limit(ROWS_AT_ONCE)
+        page = list(connection.execute(query))
+        while page:
+            yield page
+            last = [getattr(page[-1], name) for name in self.keys]
+            page = list(connection.execute(query.where(self.after(last))))
+
+
+@cache
+def logged() -> Mapping[str, Logged]:
+    """Return the logged tables by name, each after those that it refers to."""
+    return {table.name: _logged(table) for table in Base.metadata.sorted_tables if table.name not in NOT_LOGGED}
+
+
+def _logged(table: Table) -> Logged:
+    columns = [one for one in table.columns if (table.name, one.name) not in COLUMNS_NOT_LOGGED]
+    raw = Table(table.name, MetaData(), *(Column(one.name, KINDS[kind_of(one)]) for one in columns))
+    return Logged(raw, tuple(one.name for one in table.primary_key))
+
+
+def digests_of(names: Sequence[str], values: Sequence[Any], salt: bytes) -> dict[str, str]:
+    """Return the salted digests of a row's columns in hex, by name."""
+    return {
+        name: hashlib.sha256(salt + name.encode() + _as_bytes(value)).digest()[:DIGEST_BYTES].hex()
+        for name, value in zip(names, values, strict=True)
+    }
+
+
+_encode = json.JSONEncoder(separators=(",", ":")).encode
+
+
+def _as_bytes(value: Any) -> bytes:
+    """Return the bytes that a value is digested by, equal on both back ends; the order in JSON objects counts."""
+    if value is None:
+        return b"\0none"
+    if isinstance(value, bytes):
+        return b"\0bytes" + value
+    if isinstance(value, datetime):
+        return b"\0moment" + value.isoformat().encode()
+    return b"\0json" + _encode(value).encode()
+
+
+def commitment_to(digests: Mapping[str, str]) -> str:
+    """Return the digest that stands for a row in the log."""
+    return sha256(canonical(dict(digests)))
+
+
+# ---- the database's schema, logged as if each of its objects were a row --------------------------------------------
+
+_OBJECTS = {
+    "sqlite": "SELECT type || ' ' || name, sql FROM sqlite_master WHERE type IN ('trigger', 'index', 'table', 'view') "
+    "AND name NOT LIKE 'sqlite_%' AND name <> 'alembic_version' AND sql IS NOT NULL",
+    "postgresql": """
+        SELECT 'trigger ' || c.relname || ' ' || t.tgname, pg_get_triggerdef(t.oid) || ' ' || t.tgenabled::text
+          FROM pg_trigger t JOIN pg_class c ON c.oid = t.tgrelid
+         WHERE NOT t.tgisinternal AND c.relnamespace = current_schema()::regnamespace
+        UNION ALL
+        SELECT 'function ' || p.proname, pg_get_functiondef(p.oid)
+          FROM pg_proc p WHERE p.pronamespace = current_schema()::regnamespace AND p.proname LIKE 'skills%'
+        UNION ALL
+        SELECT 'constraint ' || c.relname || ' ' || n.conname, pg_get_constraintdef(n.oid)
+          FROM pg_constraint n JOIN pg_class c ON c.oid = n.conrelid
+         WHERE n.connamespace = current_schema()::regnamespace AND c.relname = ANY(:tables)
+        UNION ALL
+        SELECT 'index ' || indexname, indexdef FROM pg_indexes
+         WHERE schemaname = current_schema() AND tablename = ANY(:tables)""",
+}
+
+
+def schema_of(connection: Connection) -> dict[str, str]:
+    """Return the definitions of triggers, functions, constraints, indexes and (on SQLite) tables, by kind and name."""
+    kind = connection.dialect.name
+    given = {"tables": list(Base.metadata.tables)} if kind == "postgresql" else {}
+    return {name: sql for name, sql in connection.execute(text(_OBJECTS[kind]), given)}  # noqa: C416 - mypy
+
+
+# ---- the notes of a transaction ------------------------------------------------------------------------------------
+
+# Where triggers note changed rows until the commit. PostgreSQL has one for each connection, which other transactions
+# never read; on SQLite, with one writer, it is an ordinary table of the migrations.
+NOTES_OF_CONNECTION = (
+    "CREATE TEMPORARY TABLE IF NOT EXISTS history_notes (table_name text, change text, key text) ON COMMIT DELETE ROWS"
+)
+_NOTED = {
+    "sqlite": "SELECT table_name, change, key FROM history_notes ORDER BY rowid",
+    "postgresql": "SELECT table_name, change, key FROM pg_temp.history_notes ORDER BY ctid",
+}
+FORGET_NOTES = "DELETE FROM history_notes"
+NOTING = "noting"  # in a connection's `info`: whether its transactions note changes
+
+
+@dataclass(frozen=True)
+class Effect:
+    """Whether a row existed before a transaction and whether it exists after it."""
+
+    before: bool
+    after: bool
+
+
+def effects_of(notes: Iterable[tuple[str, str, str]]) -> dict[str, dict[str, Effect]]:
+    """Return the effects of a transaction's notes, by table and key, in the order of their first notes."""
+    found: dict[str, dict[str, Effect]] = {}
+    for table, change, key in notes:
+        of_table = found.setdefault(table, {})
+        first = of_table.get(key)
+        of_table[key] = Effect(change != ADD if first is None else first.before, change != REMOVE)
+    return found
+
+
+# ---- writing leaves ------------------------------------------------------------------------------------------------
+
+
+class History:
+    """The history of one database, written with the signing key of this installation."""
+
+    def __init__(self, engine: Engine, key_file: Path) -> None:
+        """Name the database and the file of the key; both are read at the first use."""
+        self._engine = engine
+        self.key_file = key_file
+        self._seal: Seal | None = None
+        self._origin: str | None = None
+
+    @cached_property
+    def key(self) -> SigningKey:
+        """The signing key.
+
+        Raises:
+            BadSettings: The file is missing or cannot be read.
+            Corrupt: It is not a key.
+        """
+        try:
+            return SigningKey.read(self.key_file.read_text())
+        except (OSError, UnicodeDecodeError) as error:
+            why = "is missing" if isinstance(error, FileNotFoundError) else "cannot be read"
+            raise BadSettings(
+                f"The signing key {self.key_file} {why}, and this database has a history that was begun with one.",
+                "Put the file back, or name it in SKILLS_SIGNING_KEY.",
+            ) from error
+
+    def origin(self, connection: Connection) -> str | None:
+        """Return the name of the log; None where none was begun."""
+        if self._origin is None:
+            first = connection.scalar(select(CHECKPOINTS.c.note).order_by(CHECKPOINTS.c.row).limit(1))
+            self._origin = None if first is None else first.partition("\n")[0]
+        return self._origin
+
+    def settle(self, connection: Connection) -> None:
+        """Add a leaf for each logged row that the transaction has changed; call it before the commit.
+
+        Raises:
+            BadSettings: The signing key cannot be read.
+        """
+        if not connection.info.get(NOTING):
+            return  # the job engine's database, or one that is not migrated yet
+        notes = connection.exec_driver_sql(_NOTED[connection.dialect.name]).all()
+        if not notes:
+            return
+        connection.exec_driver_sql(FORGET_NOTES)
+        at = rfc3339(now())
+        leaves = []
+        for table, effects in effects_of(cast(Sequence[tuple[str, str, str]], notes)).items():
+            if (known := logged().get(table)) is not None:
+                leaves += list(self._leaves_of(connection, known, effects, at))
+        self._write(connection, leaves)
+
+    def _leaves_of(
+        self, connection: Connection, table: Logged, effects: Mapping[str, Effect], at: str | None
+    ) -> Iterator[dict[str, Any]]:
+        before = [key for key, effect in effects.items() if effect.before]
+        cached = table.raw.name in CACHES
+        latest = latest_leaves(connection, table.raw.name, list(effects) if cached else before)
+        for row in table.rows_of(connection, [key for key, effect in effects.items() if effect.after]):
+            key = table.key_of(row)
+            if not effects[key].before:
+                # after an earlier leaf only where somebody has emptied a cache
+                yield new_leaf(table.raw.name, ADD, at, key, digested(table.columns, row), latest.get(key))
+            elif key in latest:
+                yield new_leaf(table.raw.name, CHANGE, at, key, digested(table.columns, row), latest[key])
+            # a row without a leaf was not written by the service: `skills verify` goes on naming it
+        gone = [key for key in before if not effects[key].after]
+        yield from removals(connection, table.raw.name, gone, latest, at)
+
+    def _write(self, connection: Connection, leaves: Sequence[dict[str, Any]]) -> None:
+        if not leaves:
+            return
+        if self._seal is None:
+            origin = self.origin(connection)
+            assert origin is not None, "no history was begun: migrate first"
+            self._seal = self.key.seal_of(origin)
+        for leaf in leaves:
+            leaf["seal"] = self._seal.of(leaf["entry"].encode())
+        connection.execute(insert(LEAVES), leaves)
+
+    # ---- beginning, migrations and restorations
+
+    def begin(self, connection: Connection) -> None:
+        """Begin a history, if there is none: make a key, and log every row and the schema as they are found."""
+        self._origin = self._seal = None  # of a history that a downgrade may have dropped
+        connection.info[NOTING] = True
+        if not inspect(connection).has_table(LEAVES.name) or self.origin(connection) is not None:
+            return
+        self.sign_empty(connection)
+        at = rfc3339(now())
+        for table in logged().values():
+            for page in table.pages(connection):
+                self._write(
+                    connection,
+                    [
+                        new_leaf(table.raw.name, FOUND, at, table.key_of(row), digested(table.columns, row))
+                        for row in page
+                    ],
+                )
+        connection.exec_driver_sql(FORGET_NOTES)
+        self.log_schema(connection)
+
+    def sign(self, connection: Connection, *, adopt: bool = False) -> str | None:
+        """Number the leaves that have no number yet, at most some, and sign the tree that they extend.
+
+        Leaves without a valid seal are left alone: nobody who wrote them had the key, and `skills verify` names them.
+
+        Args:
+            connection: In a transaction in which nobody else signs.
+            adopt: Take over a history that was signed with another key, with all its leaves.
+
+        Returns:
+            The signed checkpoint; None where there is nothing to sign.
+
+        Raises:
+            BadSettings: The signing key cannot be read.
+            Corrupt: The stored tree is not the one that was signed last; nothing is signed on top of it.
+        """
+        query = select(LEAVES.c.row, LEAVES.c.entry, LEAVES.c.seal).where(LEAVES.c.number.is_(None))
+        query = query.order_by(LEAVES.c.row).limit(None if adopt else SIGNED_AT_ONCE)
+        # a leaf that an erasure is changing waits for the next time, so that neither waits for the other
+        leaves = connection.execute(query.with_for_update(skip_locked=True)).all()
+        if not leaves and not adopt:
+            return None
+        origin, tree = self._continued(connection, adopt)
+        seal = self.key.seal_of(origin)
+        numbered = []
+        for row, entry, sealed in leaves:
+            if adopt or hmac.compare_digest(sealed, seal.of(entry.encode())):
+                numbered.append({"of_row": row, "as_number": tree.size})
+                tree.append(leaf_hash(entry.encode()))
+        if not numbered and not adopt:
+            return None
+        if numbered:
+            number = update(LEAVES).where(LEAVES.c.row == bindparam("of_row")).values(number=bindparam("as_number"))
+            connection.execute(number, numbered)
+        note = self.key.sign(Checkpoint(origin, tree.size, tree.root))
+        stored = {"size": tree.size, "note": note, "subtrees": b"".join(tree.subtrees)}
+        connection.execute(insert(CHECKPOINTS), [stored])
+        return note
+
+    def _continued(self, connection: Connection, adopt: bool) -> tuple[str, Tree]:
+        """Return the log's name and its tree as signed last."""
+        columns = (CHECKPOINTS.c.size, CHECKPOINTS.c.note, CHECKPOINTS.c.subtrees)
+        size, text_of, hashes = connection.execute(select(*columns).order_by(CHECKPOINTS.c.row.desc()).limit(1)).one()
+        (note,) = read_notes(text_of)
+        subtrees = [hashes[at : at + HASH_BYTES] for at in range(0, len(hashes), HASH_BYTES)]
+        signed = note.checkpoint
+        if len(subtrees) == size.bit_count() and (adopt or note.signed_by(self.key.public)):
+            tree = Tree(size, subtrees)
+            if (signed.origin, signed.size, signed.root) == (self.origin(connection), size, tree.root):
+                return signed.origin, tree
+        raise Corrupt(
+            "The history is not as it was signed last with this signing key, so nothing is signed on top of it.",
+            Remedy(Action.VERIFY),
+        )
+
+    def sign_empty(self, connection: Connection) -> None:
+        """Write the first checkpoint of a new log, of no leaves, with a key that is made if there is none."""
+        self.make_key()
+        empty = Checkpoint(ORIGIN + secrets.token_hex(8), 0, Tree().root)
+        connection.execute(insert(CHECKPOINTS), [{"size": 0, "note": self.key.sign(empty), "subtrees": b""}])
+
+    def make_key(self) -> None:
+        """Make a signing key that only this user can read, if there is no file of that name.
+
+        Raises:
+            BadSettings: The file would be beside the database, or cannot be written.
+        """
+        file = self.key_file
+        if file.exists():
+            return
+        if self._engine.dialect.name == "sqlite":
+            beside = Path(self._engine.url.database or "").resolve().parent
+            if file.resolve().parent == beside or beside in file.resolve().parents:
+                raise BadSettings(
+                    f"The signing key {file} would be in the folder of the database, whose owner could then rewrite "
+                    "the history.",
+                    "Name a file in another folder in SKILLS_SIGNING_KEY.",
+                )
+        try:
+            file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            handle, name = tempfile.mkstemp(prefix=f".{file.name}-", dir=file.parent)  # mode 0600
+            with os.fdopen(handle, "w") as out:
+                out.write(str(SigningKey(secrets.token_bytes(32))))
+                out.flush()
+                os.fsync(out.fileno())
+            try:
+                os.link(name, file)  # unlike a rename it never replaces the key of another process
+            except FileExistsError:
+                pass
+            finally:
+                Path(name).unlink()
+        except OSError as error:
+            raise BadSettings(
+                f"The signing key {file} cannot be made: {error.strerror}.", "Name another file in SKILLS_SIGNING_KEY."
+            ) from error
+
+    def log_schema(self, connection: Connection) -> None:
+        """Log the changes of triggers, indexes and constraints since they were last logged, after a migration."""
+        at = rfc3339(now())
+        here, known = schema_of(connection), latest_leaves(connection, SCHEMA)
+        leaves = []
+        for name, sql in here.items():
+            if name not in known:
+                leaves.append(new_leaf(SCHEMA, ADD, at, name, digested(("sql",), (sql,))))
+            elif not known[name].matches(("sql",), (sql,)):
+                leaves.append(new_leaf(SCHEMA, CHANGE, at, name, digested(("sql",), (sql,)), known[name]))
+        gone = [name for name in known if name not in here]
+        self._write(connection, [*leaves, *removals(connection, SCHEMA, gone, known, at)])
+
+    def go_on_after_restore(self, connection: Connection) -> None:
+        """Continue the history of a backup in the database that it was just loaded into.
+
+        Its rows were logged before, so the notes of their insertion are dropped. A history that was signed
+        with another key goes on with the one of this installation.
+
+        Raises:
+            Corrupt: The tree of the backup is not the one that was signed.
+        """
+        connection.exec_driver_sql(FORGET_NOTES)
+        connection.info[NOTING] = True
+        self._origin = self._seal = None
+        if self.origin(connection) is None:
+            self.begin(connection)
+            return
+        self.make_key()
+        last = connection.scalar(select(CHECKPOINTS.c.note).order_by(CHECKPOINTS.c.row.desc()).limit(1))
+        if not read_notes(last or "")[0].signed_by(self.key.public):
+            self.sign(connection, adopt=True)
+        self.log_schema(connection)
+
+
+@dataclass(frozen=True)
+class Latest:
+    """The newest leaf of a row that exists."""
+
+    row: int
+    entry: str
+    salt: bytes
+    digests: Mapping[str, str]
+
+    @property
+    def hash(self) -> str:
+        """The hash of its entry, by which the row's next leaf names it."""
+        return leaf_hash(self.entry.encode()).hex()
+
+    def differing(self, names: Sequence[str], values: Sequence[Any]) -> list[str]:
+        """Return the names of the columns that differ from a row."""
+        here = digests_of(names, values, self.salt)
+        return sorted(name for name in {*here, *self.digests} if here.get(name) != self.digests.get(name))
+
+    def matches(self, names: Sequence[str], values: Sequence[Any]) -> bool:
+        """Return whether a row is as it was logged."""
+        return not self.differing(names, values)
+
+
+def latest_leaves(connection: Connection, table: str, keys: Sequence[str] | None = None) -> dict[str, Latest]:
+    """Return the newest leaves of some rows that exist, or of all rows of a table, by key."""
+    if keys is not None and not keys:
+        return {}
+    columns = (LEAVES.c.key, LEAVES.c.row, LEAVES.c.entry, LEAVES.c.salt, LEAVES.c.digests)
+    query = select(*columns).where(LEAVES.c.table_name == table, LEAVES.c.key.is_not(None)).order_by(LEAVES.c.row)
+    if keys is None:
+        return {key: Latest(*about) for key, *about in connection.execute(query)}
+    found = {}
+    for at in range(0, len(keys), ROWS_AT_ONCE):
+        these = query.where(LEAVES.c.key.in_(keys[at : at + ROWS_AT_ONCE]))
+        found.update({key: Latest(*about) for key, *about in connection.execute(these)})
+    return found
+
+
+Digested = tuple[bytes, dict[str, str]]
+
+
+def digested(names: Sequence[str], values: Sequence[Any]) -> Digested:
+    """Return a new salt, and the digests of a row's columns with it."""
+    salt = secrets.token_bytes(SALT_BYTES)
+    return salt, digests_of(names, values, salt)
+
+
+def new_leaf(
+    table: str, change: str, at: str | None, key: str | None, of: Digested | None, after: Latest | None = None
+) -> dict[str, Any]:
+    """Return the columns of a new leaf, without its seal."""
+    salt, digests = of or (None, None)
+    entry = {
+        "table": table,
+        "change": change,
+        "at": at,
+        "commitment": None if digests is None else commitment_to(digests),
+        "previous": None if after is None else after.hash,
+    }
+    return {
+        "table_name": table, "key": key, "entry": canonical(entry).decode(), "salt": salt, "digests": digests,
+    }  # fmt: skip
+
+
+def removals(
+    connection: Connection, table: str, keys: Sequence[str], latest: Mapping[str, Latest], at: str | None
+) -> Iterator[dict[str, Any]]:
+    """Yield a leaf for each removed row, and remove what the row's earlier leaves reveal about it."""
+    known = [key for key in keys if key in latest]
+    if known:
+        empty = {"salt": None, "digests": None, "key": None}
+        blank = update(LEAVES).where(LEAVES.c.table_name == table, LEAVES.c.key == bindparam("of_key")).values(**empty)
+        connection.execute(blank, [{"of_key": key} for key in known])
+    for key in known:
+        yield new_leaf(table, REMOVE, at, None, None, latest[key])

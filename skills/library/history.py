@@ -1,0 +1,335 @@
+"""The history, signed and verified: every logged row against its newest leaf, every leaf against the signed tree.
+
+    leaves --sign_history--> checkpoints, in the database and in the file of `SKILLS_CHECKPOINTS`
+    database, key, heads --verify_history--> findings, each named by table, key and column
+
+What verification finds depends on what the attacker lacks. With the database alone nobody can write a leaf that the
+signing key sealed, or a checkpoint that it signed. Somebody who puts back an older state of the whole database, with
+its older checkpoint, is found by a later head that was kept elsewhere.
+"""
+
+import hmac
+import json
+import logging
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from math import inf
+from pathlib import Path
+from time import monotonic
+from typing import Any
+
+from sqlalchemy import Connection, exists, select, text
+
+from skills.db import in_parts
+from skills.db.history import (
+    CACHES,
+    CHECKPOINTS,
+    LEAVES,
+    REMOVE,
+    ROWS_AT_ONCE,
+    SCHEMA,
+    History,
+    Latest,
+    Logged,
+    commitment_to,
+    logged,
+    schema_of,
+)
+from skills.db.session import Database
+from skills.errors import BadSettings, Corrupt, SkillsError
+from skills.transparency import Note, Tree, leaf_hash, read_notes
+
+SIGNING_LOCK = 0x5C112  # ours: the number of the advisory lock under which one process at a time signs
+SIGNING_S = 0.5  # ours: a worker must write its heartbeat meanwhile
+NAMED = 20  # leaves that are named for one reason, of all that are counted
+
+log = logging.getLogger(__name__)
+Finding = tuple[str, str]
+_Read = tuple[str, Sequence[Any] | Exception]  # a row's key, and its columns or the error of reading them
+
+
+def sign_history(database: Database, checkpoints: Path | None, at_most_s: float = inf) -> str | None:
+    """Sign all leaves that no checkpoint covers yet, and append the checkpoint to a file.
+
+    Several processes may call it; one at a time signs.
+
+    Args:
+        database: The database, without restriction.
+        checkpoints: The file, if any. If it cannot be written now, a later checkpoint covers the same leaves.
+        at_most_s: Stop after the transaction during which this time has passed.
+
+    Returns:
+        The last checkpoint; None where there was nothing to sign.
+
+    Raises:
+        BadSettings: The signing key cannot be read.
+        Corrupt: The stored tree is not the one that was signed last.
+    """
+    note, began_s = None, monotonic()
+    while (signed := _sign_some(database)) is not None:
+        note = signed
+        if monotonic() - began_s > at_most_s:
+            break
+    if checkpoints is not None and (note is not None or not checkpoints.exists()):
+        with database.reading() as session:
+            newest = note or newest_checkpoint(session.connection())
+        if newest is not None:
+            append_checkpoint(checkpoints, newest)
+    return note
+
+
+def keep_signed(database: Database, checkpoints: Path | None) -> None:
+    """Sign some of the history; log why where it cannot be signed, because work goes on without."""
+    try:
+        sign_history(database, checkpoints, SIGNING_S)
+    except (BadSettings, Corrupt) as error:
+        log.error("The history is not signed: %s", error)
+
+
+def _sign_some(database: Database) -> str | None:
+    with database.reading() as session:
+        if not session.scalar(select(exists().where(LEAVES.c.number.is_(None)))):
+            return None
+    with database.writing(()) as session:  # nobody waits for it: it changes no row but its own
+        connection = session.connection()
+        if connection.dialect.name == "postgresql":
+            mine = connection.scalar(text("SELECT pg_try_advisory_xact_lock(:lock)"), {"lock": SIGNING_LOCK})
+            if not mine:
+                return None
+        return database.history.sign(connection)
+
+
+def append_checkpoint(file: Path, note: str) -> None:
+    """Append a signed checkpoint to a file, durably; a failure is logged, because the next one will do as well."""
+    try:
+        handle = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+        try:
+            os.write(handle, f"{note}\n".encode())
+            os.fsync(handle)
+        finally:
+            os.close(handle)
+    except OSError as error:
+        log.error("The checkpoint could not be appended to SKILLS_CHECKPOINTS (%s).", error.strerror)
+
+
+def newest_checkpoint(connection: Connection) -> str | None:
+    """Return the newest signed checkpoint as a note; None where no history was begun."""
+    note: str | None = connection.scalar(select(CHECKPOINTS.c.note).order_by(CHECKPOINTS.c.row.desc()).limit(1))
+    return note
+
+
+# ---- verification ----------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Verified:
+    """The numbers of leaves and rows that a verification has compared."""
+
+    leaves: int = 0
+    rows: int = 0
+
+
+@dataclass
+class _Log:
+    """The leaves as they were read: the newest of each row that exists, and the hashes in the order of the tree."""
+
+    live: dict[bytes, tuple[str, str | None, int]] = field(default_factory=dict)  # by hash: table, key, row of the leaf
+    hashes: dict[int, bytes] = field(default_factory=dict)
+    seen: set[bytes] = field(default_factory=set)  # the hashes of all leaves
+
+
+def verify_history(
+    connection: Connection, history: History, heads: Sequence[Note], done: Verified
+) -> Iterator[Finding]:
+    """Verify the history and every logged row, in one consistent state.
+
+    Args:
+        connection: In a transaction that reads one state.
+        history: The history, with its key.
+        heads: Checkpoints that were kept elsewhere; the history must continue each of them.
+        done: Counts what was compared.
+
+    Yields:
+        Findings: what is wrong, and why.
+    """
+    origin = history.origin(connection)
+    if origin is None:
+        yield "history", "none was begun; run `skills migrate`"
+        return
+    try:
+        public, seal = history.key.public, history.key.seal_of(origin)
+    except SkillsError as error:
+        yield "history", error.words()
+        return
+    signed, since = [], None
+    for row, stored, note in _checkpoints(connection):
+        name = f"history_checkpoints {row}"
+        if note is None or note.checkpoint.size != stored or note.checkpoint.origin != origin:
+            yield name, "it is not a checkpoint of this history"
+        elif note.signed_by(public):
+            since = note.checkpoint.size if since is None else min(since, note.checkpoint.size)
+            signed.append((name, note))
+        elif since is not None:  # those before may be of the installation that a backup came from
+            yield name, "it is not signed with the key of this installation"
+    if since is None:
+        yield "history", "no checkpoint is signed with the key of this installation"
+    for note in heads:
+        name = f"head of {note.checkpoint.size} leaves"
+        if note.checkpoint.origin != origin:
+            yield name, f"it is of the history {note.checkpoint.origin}, and this one is {origin}"
+        elif not note.signed_by(public):
+            yield name, "it is not signed with the key of this installation"
+        else:
+            signed.append((name, note))
+    read = _Log()
+    for leaf in _leaves(connection):
+        name = f"{leaf.table_name} {leaf.key or '(erased)'}"
+        for why in _wrong_with(leaf, read):
+            yield name, why
+        under_other_key = leaf.number is not None and since is not None and leaf.number < since
+        if not under_other_key and not hmac.compare_digest(leaf.seal, seal.of(leaf.entry.encode())):
+            yield name, f"its leaf {leaf.row} of the history was not written by the service: the seal is wrong"
+        done.leaves += 1
+    yield from _wrong_roots(read.hashes, signed)
+    yield from _wrong_rows(connection, read, done)
+
+
+def _checkpoints(connection: Connection) -> Iterator[tuple[int, int, Note | None]]:
+    query = select(CHECKPOINTS.c.row, CHECKPOINTS.c.size, CHECKPOINTS.c.note, CHECKPOINTS.c.subtrees)
+    for row, size, said, subtrees in connection.execute(query.order_by(CHECKPOINTS.c.row)):
+        try:
+            (note,) = read_notes(said)
+            tree = Tree(size, [subtrees[at : at + 32] for at in range(0, len(subtrees), 32)])
+        except (SkillsError, ValueError, AssertionError):
+            note = None
+        yield row, size, note if note is not None and tree.root == note.checkpoint.root else None
+
+
+def _leaves(connection: Connection) -> Iterator[Any]:
+    after = 0
+    while page := connection.execute(
+        select(LEAVES).where(LEAVES.c.row > after).order_by(LEAVES.c.row).limit(ROWS_AT_ONCE)
+    ).all():
+        yield from page
+        after = page[-1].row
+
+
+def _wrong_with(leaf: Any, read: _Log) -> Iterator[str]:
+    """Add a leaf to those read, and yield the faults of its content and of its place among the row's leaves."""
+    digest = leaf_hash(leaf.entry.encode())
+    if leaf.number is not None:
+        read.hashes[leaf.number] = digest
+    if digest in read.seen:  # such as of a row that was erased, and put back together with its old leaf
+        yield f"its leaf {leaf.row} is a copy of an earlier one"
+    read.seen.add(digest)
+    try:
+        entry = json.loads(leaf.entry)
+        table, change, commitment, previous = (entry[name] for name in ("table", "change", "commitment", "previous"))
+        before = None if previous is None else bytes.fromhex(previous)
+    except (ValueError, KeyError, TypeError):
+        yield f"the entry of its leaf {leaf.row} cannot be read"
+        return
+    if table != leaf.table_name:
+        yield f"the entry of its leaf {leaf.row} is of {table}"
+    if leaf.digests is not None and commitment_to(leaf.digests) != commitment:
+        yield f"the digests of its leaf {leaf.row} are not those that were logged"
+    if before is not None and read.live.pop(before, None) is None:
+        yield f"the leaf before its leaf {leaf.row} is missing, or was followed by another"
+    if change != REMOVE:
+        read.live[digest] = (table, leaf.key, leaf.row)
+
+
+def _wrong_roots(hashes: dict[int, bytes], signed: Sequence[tuple[str, Note]]) -> Iterator[Finding]:
+    """Yield the signed heads that the tree does not continue, and the numbers that are missing in it."""
+    tree = Tree()
+    sized: dict[int, list[tuple[str, Note]]] = {}
+    for name, note in signed:
+        sized.setdefault(note.checkpoint.size, []).append((name, note))
+    for size in sorted(sized):
+        while tree.size < size and tree.size in hashes:
+            tree.append(hashes[tree.size])
+        for name, note in sized[size]:
+            if tree.size < size:
+                yield name, f"it was signed over {size} leaves, and leaf {tree.size} is missing: the history was cut"
+            elif tree.root != note.checkpoint.root:
+                yield name, "the leaves are not those that were signed"
+    size = max(sized, default=0)
+    beyond = [number for number in hashes if number >= size]
+    for number in beyond[:NAMED]:
+        yield f"leaf {number}", "it has a number, and no signed checkpoint covers it"
+
+
+def _wrong_rows(connection: Connection, read: _Log, done: Verified) -> Iterator[Finding]:
+    """Yield the rows that differ from their newest leaf, rows without a leaf, and leaves without their row."""
+    newest: dict[str, dict[str, int]] = {}
+    for table, key, row in read.live.values():
+        of_table = newest.setdefault(table, {})
+        if key is None:
+            yield f"{table} (erased)", f"its leaf {row} has lost its content, and no leaf says that the row was removed"
+        elif key in of_table:
+            yield f"{table} {key}", f"its leaf {row} is another first leaf"
+        else:
+            of_table[key] = row
+    for name, known in logged().items():
+        left = newest.pop(name, {})
+        for page in _pages(connection, known):
+            yield from _wrong_page(connection, name, known.columns, page, left)
+            done.rows += len(page)
+        yield from _missing(name, left)
+    left = newest.pop(SCHEMA, {})
+    schema: list[_Read] = [(key, (sql,)) for key, sql in schema_of(connection).items()]
+    yield from _wrong_page(connection, SCHEMA, ("sql",), schema, left)
+    yield from _missing(SCHEMA, left)
+    for other, rows in newest.items():
+        yield from _missing(other, rows)
+
+
+def _pages(connection: Connection, table: Logged) -> Iterator[list[_Read]]:
+    """Yield all rows some at a time: the key, and the logged columns or the error of reading them."""
+    after: Sequence[Any] | None = None
+    while True:
+        query = select(*table.key_columns).order_by(*table.key_columns).limit(ROWS_AT_ONCE)
+        page = connection.execute(query if after is None else query.where(table.after(after))).all()
+        if not page:
+            return
+        keys = [table.key_of(row) for row in page]
+        try:
+            yield [(table.key_of(row), row) for row in table.rows_of(connection, keys)]
+        except Exception:  # one of them cannot be read; reading each alone finds which
+            yield [_alone(connection, table, key) for key in keys]
+        after = page[-1]
+
+
+def _alone(connection: Connection, table: Logged, key: str) -> _Read:
+    try:
+        (row,) = table.rows_of(connection, [key])
+    except Exception as error:
+        return key, error
+    return key, row
+
+
+def _wrong_page(
+    connection: Connection, table: str, columns: Sequence[str], page: Sequence[_Read], left: dict[str, int]
+) -> Iterator[Finding]:
+    """Compare rows with their newest leaves, and remove these from those that are left."""
+    leaves = {key: left.pop(key) for key, _ in page if key in left}
+    about = (LEAVES.c.row, LEAVES.c.entry, LEAVES.c.salt, LEAVES.c.digests)
+    found = {}
+    for some in in_parts(sorted(leaves.values())):
+        found.update({row[0]: row for row in connection.execute(select(*about).where(LEAVES.c.row.in_(some)))})
+    for key, values in page:
+        name = f"{table} {key}"
+        if key not in leaves:
+            yield name, "no leaf of the history says that it was added"
+        elif isinstance(values, Exception):
+            yield name, f"it cannot be compared with the history ({type(values).__name__})"
+        elif (leaf := found[leaves[key]]).salt is None or leaf.digests is None:
+            yield name, "its digests were removed from the history, and no leaf says that the row was"
+        elif differing := Latest(*leaf).differing(columns, values):
+            yield name, f"not as the history has it: {', '.join(differing)}"
+
+
+def _missing(name: str, left: dict[str, int]) -> Iterator[Finding]:
+    for key in left if name not in CACHES else ():
+        yield f"{name} {key}", "it is missing, and no leaf of the history says that it was removed"

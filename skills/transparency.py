@@ -1,0 +1,246 @@
+"""Merkle trees over log entries, and signed checkpoints of them, as transparency logs use.
+
+    entries --leaf_hash--> Tree --checkpoint--> Checkpoint --SigningKey.sign--> signed note --open_note--> Checkpoint
+
+The hashes are those of RFC 6962: a leaf is SHA-256(0x00 || entry), a node SHA-256(0x01 || left || right). A checkpoint
+is the text of the C2SP specification tlog-checkpoint (the log's origin, the number of leaves, the root), signed as a
+C2SP signed note with Ed25519, so that tools for other transparency logs can verify it.
+"""
+
+import base64
+import binascii
+import hashlib
+import hmac
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+from skills.errors import Corrupt
+
+if TYPE_CHECKING:
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
+ED25519 = b"\x01"  # the signature type of a signed note
+KEY_ID_BYTES, SEED_BYTES, HASH_BYTES = 4, 32, 32
+KEY_NAME = "suture-skills"  # in the text of a secret key, which may sign several logs
+
+
+def leaf_hash(entry: bytes) -> bytes:
+    """Return the hash of a log entry."""
+    return hashlib.sha256(b"\0" + entry).digest()
+
+
+def node_hash(left: bytes, right: bytes) -> bytes:
+    """Return the hash of a node of the tree."""
+    return hashlib.sha256(b"\1" + left + right).digest()
+
+
+class Tree:
+    """A Merkle tree that grows at its end, of which only the roots of the complete subtrees are held.
+
+    The subtrees are the largest ones of which the tree consists from left to right, one for each bit of its size.
+    """
+
+    def __init__(self, size: int = 0, subtrees: Sequence[bytes] = ()) -> None:
+        assert len(subtrees) == size.bit_count()
+        self.size = size
+        self.subtrees = list(subtrees)
+
+    def append(self, leaf: bytes) -> None:
+        """Add the hash of a leaf."""
+        rest = self.size
+        while rest & 1:  # each complete subtree of this size becomes the left half of one twice as large
+            leaf = node_hash(self.subtrees.pop(), leaf)
+            rest >>= 1
+        self.subtrees.append(leaf)
+        self.size += 1
+
+    @property
+    def root(self) -> bytes:
+        """The hash of the whole tree."""
+        if not self.subtrees:
+            return hashlib.sha256().digest()
+        *others, root = self.subtrees
+        for left in reversed(others):
+            root = node_hash(left, root)
+        return root
+
+
+def root_of(leaves: Iterable[bytes]) -> bytes:
+    """Return the root of the tree of some leaf hashes."""
+    tree = Tree()
+    for leaf in leaves:
+        tree.append(leaf)
+    return tree.root
+
+
+def inclusion_proof(leaves: Sequence[bytes], index: int) -> list[bytes]:
+    """Return the hashes beside the path from a leaf to the root, from the leaf upwards (RFC 6962, 2.1.1).
+
+    Args:
+        leaves: The leaf hashes of the whole tree.
+        index: Which of them.
+    """
+    if len(leaves) <= 1:
+        return []
+    half = 1 << (len(leaves) - 1).bit_length() - 1
+    if index < half:
+        return [*inclusion_proof(leaves[:half], index), root_of(leaves[half:])]
+    return [*inclusion_proof(leaves[half:], index - half), root_of(leaves[:half])]
+
+
+# ---- checkpoints -----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """The head of a log: its name, the number of its leaves, and the root of their tree."""
+
+    origin: str
+    size: int
+    root: bytes
+
+    def __str__(self) -> str:
+        """Return the text that is signed."""
+        return f"{self.origin}\n{self.size}\n{base64.b64encode(self.root).decode()}\n"
+
+
+@dataclass(frozen=True)
+class Note:
+    """A checkpoint with signatures that have not been verified, by name and key id."""
+
+    checkpoint: Checkpoint
+    signatures: tuple[tuple[str, bytes, bytes], ...]
+
+    def signed_by(self, public: bytes) -> bool:
+        """Return whether an Ed25519 public key signed it under the log's name."""
+        from cryptography.exceptions import InvalidSignature
+        from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
+
+        name = self.checkpoint.origin
+        for signer, number, signature in self.signatures:
+            if (signer, number) == (name, key_id(name, public)):
+                try:
+                    Ed25519PublicKey.from_public_bytes(public).verify(signature, str(self.checkpoint).encode())
+                except InvalidSignature:
+                    return False
+                return True
+        return False
+
+
+_NOTE = re.compile(
+    r"^(?P<origin>[^\s+]+)\n(?P<size>0|[1-9]\d{0,18})\n(?P<root>[A-Za-z0-9+/]{43}=)\n\n"
+    r"(?P<signed>(?:\u2014 [^\s+]+ [A-Za-z0-9+/=]+\n)+)",
+    re.MULTILINE,
+)
+
+
+def read_notes(text: str) -> list[Note]:
+    """Read one or more signed checkpoints that follow each other in a text.
+
+    Raises:
+        Corrupt: The text has anything else, or nothing.
+    """
+    notes = [_note(found) for found in _NOTE.finditer(text)]
+    if not notes or _NOTE.sub("", text).strip():
+        raise Corrupt(
+            "This is not a signed checkpoint of a history.", "Name a file of checkpoints as the service wrote them."
+        )
+    return notes
+
+
+def _note(found: re.Match[str]) -> Note:
+    signatures = []
+    for line in found["signed"].splitlines():
+        _, name, encoded = line.split(" ")
+        try:
+            said = base64.b64decode(encoded, validate=True)
+        except binascii.Error:
+            continue  # a line that no key of ours wrote
+        signatures.append((name, said[:KEY_ID_BYTES], said[KEY_ID_BYTES:]))
+    root = base64.b64decode(found["root"])
+    return Note(Checkpoint(found["origin"], int(found["size"]), root), tuple(signatures))
+
+
+def key_id(name: str, public: bytes) -> bytes:
+    """Return the number by which a signed note names an Ed25519 key."""
+    return hashlib.sha256(name.encode() + b"\n" + ED25519 + public).digest()[:KEY_ID_BYTES]
+
+
+class SigningKey:
+    """The secret key of an installation: it signs checkpoints, and seals entries that are not yet under one."""
+
+    def __init__(self, seed: bytes) -> None:
+        assert len(seed) == SEED_BYTES
+        self._seed = seed
+
+    @classmethod
+    def read(cls, text: str) -> "SigningKey":
+        """Read the key from the text that `str()` returns.
+
+        Raises:
+            Corrupt: It is not such a text.
+        """
+        try:
+            word, kind, name, number, encoded = text.strip().split("+", 4)
+            kind_and_seed = base64.b64decode(encoded, validate=True)
+            key = cls(kind_and_seed[1:])
+            if (
+                (word, kind, name) != ("PRIVATE", "KEY", KEY_NAME)
+                or kind_and_seed[:1] != ED25519
+                or number != key._number
+            ):
+                raise ValueError
+        except (ValueError, AssertionError) as error:
+            raise Corrupt("This is not a signing key, or it was changed.", "Put the file of the key back.") from error
+        return key
+
+    def __str__(self) -> str:
+        """Return the key as text, in the usual form of keys for signed notes."""
+        return f"PRIVATE+KEY+{KEY_NAME}+{self._number}+{base64.b64encode(ED25519 + self._seed).decode()}\n"
+
+    def __repr__(self) -> str:
+        """Return the class alone: a secret must not appear in a log."""
+        return "SigningKey()"
+
+    @property
+    def _number(self) -> str:
+        return key_id(KEY_NAME, self.public).hex()
+
+    @cached_property
+    def _private(self) -> "Ed25519PrivateKey":
+        from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey  # slow, and rarely needed
+
+        return Ed25519PrivateKey.from_private_bytes(self._seed)
+
+    @cached_property
+    def public(self) -> bytes:
+        """The public key, 32 bytes."""
+        return self._private.public_key().public_bytes_raw()
+
+    def verifier(self, origin: str) -> str:
+        """Return the public key for a log as text, in the usual form for verifiers of signed notes."""
+        return f"{origin}+{key_id(origin, self.public).hex()}+{base64.b64encode(ED25519 + self.public).decode()}"
+
+    def sign(self, checkpoint: Checkpoint) -> str:
+        """Return the checkpoint as a signed note."""
+        text = str(checkpoint)
+        signature = key_id(checkpoint.origin, self.public) + self._private.sign(text.encode())
+        return f"{text}\n\u2014 {checkpoint.origin} {base64.b64encode(signature).decode()}\n"
+
+    def seal_of(self, origin: str) -> "Seal":
+        """Return the seal of one log."""
+        return Seal(hmac.digest(self._seed, b"suture-skills seal\n" + origin.encode(), "sha256"))
+
+
+@dataclass(frozen=True, repr=False)
+class Seal:
+    """The secret with which a process marks the entries that it wrote itself."""
+
+    secret: bytes
+
+    def of(self, entry: bytes) -> bytes:
+        """Return the seal of an entry, 32 bytes."""
+        return hmac.digest(self.secret, entry, "sha256")

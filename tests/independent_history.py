@@ -1,0 +1,46 @@
+"""A check of the history's proofs that shares no code with the package: RFC 6962, C2SP signed notes, Ed25519."""
+
+import base64
+import hashlib
+
+from cryptography.exceptions import InvalidSignature
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
+
+
+def root_in(note: str, verifier: str) -> tuple[int, bytes]:
+    """Return size and root of a signed checkpoint, after checking its signature by a verifier's key."""
+    name, number, encoded = verifier.split("+", 2)
+    public = base64.b64decode(encoded)
+    assert public[:1] == b"\x01"
+    assert hashlib.sha256(name.encode() + b"\n" + public).hexdigest()[:8] == number
+    body, _, signatures = note.rpartition("\n\n")
+    for line in signatures.splitlines():
+        dash, signer, blob = line.split(" ")
+        said = base64.b64decode(blob)
+        if (dash, signer, said[:4].hex()) == ("\u2014", name, number):
+            try:
+                Ed25519PublicKey.from_public_bytes(public[1:]).verify(said[4:], f"{body}\n".encode())
+            except InvalidSignature as error:
+                raise AssertionError("the signature is wrong") from error
+            origin, size, root = body.split("\n")
+            assert origin == name
+            return int(size), base64.b64decode(root)
+    raise AssertionError("the key did not sign it")
+
+
+def check_inclusion(entry: str, number: int, proof: list[bytes], note: str, verifier: str) -> None:
+    """Assert that an entry is the leaf of this number under a signed checkpoint."""
+    size, root = root_in(note, verifier)
+    assert 0 <= number < size
+    node, last = hashlib.sha256(b"\0" + entry.encode()).digest(), size - 1
+    for beside in proof:
+        assert last > 0, "the proof is too long"
+        if number % 2 == 1 or number == last:
+            node = hashlib.sha256(b"\1" + beside + node).digest()
+            while number % 2 == 0 and number:
+                number, last = number // 2, last // 2
+        else:
+            node = hashlib.sha256(b"\1" + node + beside).digest()
+        number, last = number // 2, last // 2
+    assert last == 0, "the proof is too short"
+    assert node == root, "the entry is not under the checkpoint"

@@ -1,0 +1,343 @@
+"""The history: every change adds a leaf, and every change that bypasses the service is found and named."""
+
+import os
+import random
+import shutil
+from collections.abc import Iterator
+from contextlib import closing, suppress
+from pathlib import Path
+
+import pytest
+from sqlalchemy import Connection, func, select, text
+
+from skills.db import Base
+from skills.db.history import CHECKPOINTS, COLUMNS_NOT_LOGGED, LEAVES, NOT_LOGGED, logged
+from skills.db.models import Release
+from skills.db.session import Database
+from skills.errors import BadSettings, Corrupt
+from skills.library.catalogue import find_surgeon, put_surgeon
+from skills.library.erasure import erase_surgeon
+from skills.library.history import Verified, append_checkpoint, newest_checkpoint, sign_history, verify_history
+from skills.library.releases import withdraw
+from skills.transparency import SigningKey, inclusion_proof, leaf_hash, read_notes
+from tests import backends
+from tests.db.test_tables import fill
+from tests.independent_history import check_inclusion
+from tests.library import cases
+from tests.library.attacks import cover_up, found, random_edit, sign_again, tampering
+
+
+@pytest.fixture(scope="module", params=backends.BACKENDS)
+def full(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Database]:
+    """Yield a signed database with rows in every logged table; its tests undo their changes."""
+    url = backends.fresh(request.param, tmp_path_factory.mktemp("full"))
+    database = Database(url)
+    sign_history(database, None)
+    fill(database)
+    sign_history(database, None)
+    yield database
+    database.close()
+    backends.drop(url)
+
+
+def wrong_in(database: Database) -> list[tuple[str, str]]:
+    with database.reading() as session:
+        return found(session.connection(), database.history)
+
+
+# ---- what is logged
+
+
+def test_every_column_is_logged_or_named_as_not_logged_with_a_reason():
+    assert {*logged(), *NOT_LOGGED} == {*Base.metadata.tables}
+    for name, about in logged().items():
+        here = {column.name for column in Base.metadata.tables[name].columns}
+        assert here - {*about.columns} == {column for table, column in COLUMNS_NOT_LOGGED if table == name}
+
+
+def test_the_triggers_note_every_logged_table(full: Database):
+    query = {
+        "sqlite": "SELECT name FROM sqlite_master WHERE type = 'trigger' AND name LIKE '%_noted_%'",
+        "postgresql": "SELECT tgname FROM pg_trigger WHERE tgname LIKE '%_noted_%'",
+    }[full.engine.dialect.name]
+    with full.reading() as session:
+        names = {*session.scalars(text(query))}
+    assert names == {f"{table}_noted_{change}" for table in logged() for change in ("add", "change", "remove")}
+
+
+def test_what_the_service_wrote_is_whole_and_signed(full: Database):
+    assert wrong_in(full) == []
+    with full.reading() as session:
+        tables = {*session.scalars(select(LEAVES.c.table_name))}
+        assert {*logged()} <= tables
+        assert session.scalar(select(LEAVES.c.row).where(LEAVES.c.number.is_(None))) is None
+
+
+def test_a_transaction_that_fails_leaves_no_leaf(full: Database):
+    with full.reading() as session:
+        before = session.scalars(select(LEAVES.c.row)).all()
+    with suppress(RuntimeError), full.writing() as session:
+        put_surgeon(session, "heron", {}, "test")
+        raise RuntimeError
+    with full.reading() as session:
+        assert session.scalars(select(LEAVES.c.row)).all() == before
+
+
+# ---- deliberate edits
+
+BLOB = {"sqlite": "x'00'", "postgresql": "'\\x00'::bytea"}
+# The statement, the row that it changes, and how.
+EDITS = [
+    ("UPDATE policy_versions SET learnt = {blob} WHERE row = 1", "policy_versions 1", "learnt"),
+    ("UPDATE policy_versions SET covered = {blob} WHERE row = 1", "policy_versions 1", "covered"),
+    ("UPDATE policy_versions SET manifest = '{{}}' WHERE row = 1", "policy_versions 1", "manifest"),
+    ("UPDATE policy_versions SET sha256 = 'f' WHERE row = 1", "policy_versions 1", "sha256"),
+    ("UPDATE policy_versions SET releasable = NOT releasable WHERE row = 2", "policy_versions 2", "releasable"),
+    ("INSERT INTO releases (row, policy_row, surgeon_row, suture, released_at, released_by) SELECT 99, policy_row, "
+     "surgeon_row, suture, released_at, released_by FROM releases WHERE row = 1", "releases 99", "add"),
+    ("DELETE FROM releases WHERE row = 1", "releases 1", "remove"),
+    ("UPDATE releases SET withdrawn_at = released_at WHERE row = 1", "releases 1", "withdrawn_at"),
+    ("UPDATE releases SET released_at = '2020-01-01 00:00:00.000000+00:00'", "releases 1", "released_at"),
+    ("UPDATE releases SET policy_row = 1 WHERE row = 1", "releases 1", "policy_row"),
+    ("UPDATE releases SET released_by = 'ada' WHERE row = 1", "releases 1", "released_by"),
+    ("DELETE FROM events WHERE row = 2", "events 2", "remove"),
+    ("UPDATE events SET actor = 'ada' WHERE row = 2", "events 2", "actor"),
+    ("UPDATE events SET object_id = 'ada' WHERE row = 2", "events 2", "object_id"),
+    ("UPDATE surgeons SET consent = '{{}}' WHERE row = 1", "surgeons 1", "consent"),
+    ("UPDATE surgeons SET slug = 'heron' WHERE row = 1", "surgeons 1", "slug"),
+    ("UPDATE keys SET role = 'admin' WHERE row = 1", "keys 1", "role"),
+    ("UPDATE keys SET digest = 'f' WHERE row = 1", "keys 1", "digest"),
+    ("UPDATE keys SET restricted = NOT restricted WHERE row = 1", "keys 1", "restricted"),
+    ("DELETE FROM key_surgeons", "key_surgeons 1/1", "remove"),
+    ("INSERT INTO recording_uploads VALUES (1, 'mallory')", "recording_uploads 1/mallory", "add"),
+    ("UPDATE recordings SET reading = '{{}}' WHERE row = 1", "recordings 1", "reading"),
+    ("UPDATE demonstrations SET path = {blob} WHERE row = 1", "demonstrations 1", "path"),
+    ("UPDATE demonstrations SET withdrawn_at = created_at WHERE row = 1", "demonstrations 1", "withdrawn_at"),
+    ("DELETE FROM demonstration_outcomes WHERE row = 1", "demonstration_outcomes 1", "remove"),
+    ("UPDATE demonstration_outcomes SET outcome = 'success' WHERE row = 1", "demonstration_outcomes 1", "outcome"),
+    ("UPDATE reward_maps SET map = {blob} WHERE row = 1", "reward_maps 1", "map"),
+    ("UPDATE pose_styles SET poses = {blob} WHERE row = 1", "pose_styles 1", "poses"),
+    ("UPDATE plans SET about = '{{}}' WHERE row = 1", "plans 1", "about"),
+    ("UPDATE playbacks SET feasible = NOT feasible WHERE row = 1", "playbacks 1", "feasible"),
+    ("UPDATE playbacks SET measured = {blob} WHERE row = 1", "playbacks 1", "measured"),
+    ("UPDATE playback_pictures SET drawn = {blob} WHERE row = 1", "playback_pictures 1", "drawn"),
+    ("DELETE FROM erasures WHERE row = 1", "erasures 1", "remove"),
+    ("UPDATE datasets SET sha256 = 'f' WHERE row = 1", "datasets 1", "sha256"),
+    ("UPDATE jobs SET result = '{{}}' WHERE row = 1", "jobs 1", "result"),
+    ("UPDATE calibrations SET about = '{{\"a\": 1}}' WHERE row = 1", "calibrations 1", "about"),
+    ("UPDATE suture_types SET name = 'other' WHERE slug = 'simple-running'", "suture_types simple-running", "name"),
+]  # fmt: skip
+
+
+def test_every_deliberate_edit_is_found_and_named(full: Database):
+    assert len(EDITS) >= 30
+    _deliberate_edits(full, 0)
+
+
+@pytest.mark.nightly
+def test_every_deliberate_edit_is_found_covered_up_or_not(full: Database):
+    _deliberate_edits(full, 1)
+
+
+def _deliberate_edits(full: Database, turn: int) -> None:
+    """Make all edits, every second one with digests, tree and checkpoints computed again."""
+    for number, (statement, name, kind) in enumerate(EDITS):
+        covered = (number + turn) % 2 == 1
+        with tampering(full) as connection:
+            done = connection.exec_driver_sql(statement.format(blob=BLOB[connection.dialect.name]))
+            assert done.rowcount >= 1, statement
+            if covered:
+                table, _, key = name.partition(" ")
+                cover_up(connection, table, key, kind if kind in ("add", "remove") else "change")
+            findings = dict(found(connection, full.history))
+        assert name in findings or (kind == "remove" and covered and _names_table(findings, name)), statement
+        if kind not in ("add", "remove") and not covered:
+            assert kind in findings[name], statement
+
+
+def _names_table(findings: dict[str, str], name: str) -> bool:
+    """Return whether the removal of a row is named by its table: its forged leaf has no key."""
+    return f"{name.partition(' ')[0]} (erased)" in findings
+
+
+def _edits_at_random(full: Database, seed: int, count: int) -> None:
+    rng = random.Random(seed)
+    for number in range(count):
+        with tampering(full) as connection:
+            name, kind = random_edit(connection, rng)
+            covered = rng.random() < 0.5
+            if covered:
+                cover_up(connection, *name.split(" ", 1), kind)
+            findings = dict(found(connection, full.history))
+            assert name in findings or (kind == "remove" and covered and _names_table(findings, name)), (number, name)
+
+
+def test_random_edits_are_found_and_named(full: Database):
+    _edits_at_random(full, 7, 30 if full.engine.dialect.name == "sqlite" else 10)
+
+
+@pytest.mark.nightly
+def test_a_thousand_random_edits_are_found_and_named(full: Database):
+    _edits_at_random(full, 8, 1000)
+
+
+# ---- edits of the history itself, and of the schema
+
+HISTORY_EDITS = [
+    "DELETE FROM history WHERE number = {n}",
+    "UPDATE history SET number = CASE number WHEN {n} THEN -1 ELSE {n} END WHERE number IN ({n}, {next})",
+    "UPDATE history SET entry = replace(entry, '2026', '2025') WHERE number = {n}",
+    "UPDATE history SET entry = replace(entry, '\"add\"', '\"found\"') WHERE table_name = 'policy_versions'",
+    "UPDATE history SET salt = NULL, digests = NULL, key = NULL WHERE table_name = 'releases'",
+    "UPDATE history SET key = '77' WHERE table_name = 'releases'",
+    "UPDATE history_checkpoints SET note = replace(note, 'suture-skills', 'suture-others')",
+    "DELETE FROM history_checkpoints",
+    "UPDATE history_checkpoints SET subtrees = {blob}",
+    "UPDATE history SET seal = {blob} WHERE number = {n}",
+]
+
+
+def test_every_edit_of_the_history_itself_is_found(full: Database):
+    with full.reading() as session:
+        first = session.scalar(select(func.min(LEAVES.c.number)).where(LEAVES.c.table_name == "events"))
+    for statement in HISTORY_EDITS:
+        for again in (False, True):
+            with tampering(full) as connection:
+                edit = statement.format(blob=BLOB[connection.dialect.name], n=first, next=first + 1)
+                assert connection.exec_driver_sql(edit).rowcount >= 1
+                if again and "checkpoints" not in statement and "-1" not in statement:
+                    sign_again(connection)
+                assert found(connection, full.history), statement
+
+
+def test_a_trigger_or_an_index_that_is_gone_is_named(full: Database):
+    on = {"sqlite": "", "postgresql": " ON releases"}[full.engine.dialect.name]
+    said = {
+        "sqlite": "schema trigger releases_append_only",
+        "postgresql": "schema trigger releases releases_append_only",
+    }
+    with full.engine.execution_options(writes=True).connect() as connection:
+        connection.exec_driver_sql(f"DROP TRIGGER releases_append_only{on}")
+        connection.exec_driver_sql("DROP INDEX uq_jobs_identity_live")
+        names = {one[0] for one in _all_found(connection, full)}
+        connection.rollback()
+    assert names == {said[full.engine.dialect.name], "schema index uq_jobs_identity_live"}
+
+
+def _all_found(connection: Connection, database: Database) -> list[tuple[str, str]]:
+    return list(verify_history(connection, database.history, (), Verified()))
+
+
+def test_a_head_kept_elsewhere_finds_an_older_state_put_back(tmp_path: Path):
+    database = Database(backends.fresh("sqlite", tmp_path))
+    cases.add_surgeon(database)
+    sign_history(database, tmp_path / "heads")
+    database.close()
+    older, file = tmp_path / "older.sqlite", Path(database.url.removeprefix("sqlite:///"))
+    with closing(Database(database.url)) as database:
+        database.forget()
+        shutil.copy(file, older)
+        cases.add_surgeon(database, "heron")
+        sign_history(database, tmp_path / "heads")
+        heads = tuple(read_notes((tmp_path / "heads").read_text()))
+        assert len(heads) == 2
+        with database.reading() as session:
+            assert found(session.connection(), database.history, heads) == []
+    with closing(Database(f"sqlite:///{older}")) as put_back, put_back.reading() as session:
+        assert found(session.connection(), put_back.history) == []
+        ((name, why),) = found(session.connection(), put_back.history, heads)
+    assert name == f"head of {heads[1].checkpoint.size} leaves"
+    assert "the history was cut" in why
+
+
+def test_a_row_written_past_the_service_is_not_logged_for_its_author(database: Database):
+    sign_history(database, None)
+    with database.engine.connect() as connection:  # with triggers, without the service's `writing`
+        connection.exec_driver_sql("UPDATE surgeons SET skill_level = 'expert'")
+        connection.commit()
+    cases.add_surgeon(database, "heron")  # a transaction of the service after it
+    sign_history(database, None)
+    assert wrong_in(database) == [("surgeons 1", "not as the history has it: skill_level")]
+
+
+# ---- proofs, erasure, keys
+
+
+def test_proofs_are_checked_offline_and_stay_valid_after_an_erasure(database: Database):
+    cases.add_demo(database)
+    cases.train(database, release=True)
+    sign_history(database, None)
+    with database.reading() as session:
+        connection = session.connection()
+        note = newest_checkpoint(connection) or ""
+        leaves = connection.execute(select(LEAVES.c.number, LEAVES.c.entry).order_by(LEAVES.c.number)).all()
+        verifier = database.history.key.verifier(note.partition("\n")[0])
+    hashes = [leaf_hash(entry.encode()) for _, entry in leaves]
+    proofs = {number: inclusion_proof(hashes, number) for number, _ in leaves}
+    with database.writing() as session:
+        erase_surgeon(session, "kestrel", "test")
+    sign_history(database, None)
+    with database.reading() as session:
+        after = dict(session.execute(select(LEAVES.c.number, LEAVES.c.entry)).all())
+        of_erased = LEAVES.c.table_name.in_(("demonstrations", "surgeons", "releases"))
+        left = LEAVES.c.key.is_not(None) | LEAVES.c.salt.is_not(None) | LEAVES.c.digests.is_not(None)
+        assert session.scalars(select(LEAVES.c.row).where(of_erased, left)).all() == []
+    for number, proof in proofs.items():
+        check_inclusion(after[number], number, proof, note, verifier)
+    assert wrong_in(database) == []
+
+
+def test_changes_of_a_row_follow_each_other_in_the_history(database: Database):
+    cases.add_demo(database)
+    version = cases.train(database, release=True)
+    with database.writing() as session:
+        withdraw(session, find_surgeon(session, "kestrel"), version.suture, "test")
+    with database.reading() as session:
+        of_release = (LEAVES.c.table_name == "releases", LEAVES.c.key == str(session.scalar(select(Release.row))))
+        entries = session.scalars(select(LEAVES.c.entry).where(*of_release).order_by(LEAVES.c.row)).all()
+    assert len(entries) == 2
+    assert leaf_hash(entries[0].encode()).hex() in entries[1]
+    assert wrong_in(database) == []
+
+
+def test_without_its_key_the_history_is_neither_written_nor_verified(tmp_path: Path):
+    url, key = backends.blank("sqlite", tmp_path), tmp_path / "state" / "key"
+    (tmp_path / "data").mkdir()
+    url = url.replace(str(tmp_path), str(tmp_path / "data"))
+    with closing(Database(url, signing_key=key)) as database:
+        database.migrate()
+        assert key.stat().st_mode & 0o777 == 0o600
+        cases.add_surgeon(database)
+    key.rename(tmp_path / "away")
+    with closing(Database(url, signing_key=key)) as database:
+        database.migrate()
+        with pytest.raises(BadSettings, match="is missing"), database.writing() as session:
+            put_surgeon(session, "heron", {}, "test")
+        assert "is missing" in wrong_in(database)[0][1]
+    key.write_text(str(SigningKey(b"another" * 4 + b"key!")))
+    with closing(Database(url, signing_key=key)) as database:
+        assert any("not signed with the key" in why or "seal is wrong" in why for _, why in wrong_in(database))
+
+
+def test_a_key_beside_the_database_is_refused(tmp_path: Path):
+    database = Database(backends.blank("sqlite", tmp_path), signing_key=tmp_path / "keys" / "key")
+    with closing(database), pytest.raises(BadSettings, match="in the folder of the database"):
+        database.migrate()
+
+
+def test_a_tree_that_was_changed_is_not_signed_on(full: Database):
+    with full.engine.execution_options(writes=True).connect() as connection:
+        connection.exec_driver_sql("UPDATE surgeons SET skill_level = 'expert'")
+        full.history.settle(connection)
+        on = {"sqlite": "", "postgresql": " ON history_checkpoints"}[connection.dialect.name]
+        connection.exec_driver_sql(f"DROP TRIGGER history_checkpoints_append_only{on}")
+        connection.execute(CHECKPOINTS.update().values(subtrees=b"0" * 32))
+        with pytest.raises(Corrupt, match="nothing is signed on top"):
+            full.history.sign(connection)
+        connection.rollback()
+
+
+def test_checkpoints_that_cannot_be_appended_are_no_reason_to_stop(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    append_checkpoint(tmp_path / "none" / "heads", "note")
+    assert "could not be appended to SKILLS_CHECKPOINTS" in caplog.text
+    assert os.listdir(tmp_path) == []
