@@ -38,6 +38,8 @@ ON_BOTH = {
     "test_the_triggers_note_every_logged_table",
     "test_what_the_service_wrote_is_whole_and_signed",
     "test_random_edits_are_found_and_named",
+    "test_signing_and_writing_do_not_wait_for_each_other",
+    "test_uploads_in_pieces_erasures_in_steps_and_retentions_keep_the_history_whole",
     "test_proofs_are_checked_offline_and_stay_valid_after_an_erasure",
     "test_a_row_written_past_the_service_is_not_logged_for_its_author",
     # backups that are restored

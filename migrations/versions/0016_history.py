@@ -13,8 +13,7 @@ branch_labels = None
 depends_on = None
 
 ROW = sa.BigInteger().with_variant(sa.Integer(), "sqlite")
-JOBS = "id, kind, identity, state, request, plan, result, error, surgeon_row, asked_by, created_at, ended_at"
-# The key of each logged table, and the columns whose change is noted where not all are logged.
+# The key of each logged table.
 LOGGED = {
     "surgeons": ("row",),
     "erasures": ("row",),
@@ -41,6 +40,20 @@ LOGGED = {
     "events": ("row",),
     "measured_shapes": ("demonstration_row",),
     "parsed_recordings": ("recording_row",),
+}
+# The logged columns of the tables whose rows may change: the notes name those that a change has changed.
+CHANGING = {
+    "surgeons": "row slug subject skill_level handedness protocol consent created_at",
+    "suture_types": "slug name also_called family description",
+    "demonstrations": "withdrawn_at",
+    "releases": "withdrawn_at",
+    "jobs": "row id kind identity state request result error surgeon_row plan asked_by created_at ended_at",
+    "keys": "row id digest owner role restricted created_at created_by expires_at revoked_at",
+    "measured_shapes": "demonstration_row version measured",
+    "parsed_recordings": "recording_row version reading sha256",
+    "recording_uploads": "recording_row actor",
+    "recording_surgeons": "recording_row surgeon_row",
+    "key_surgeons": "key_row surgeon_row",
 }
 CHANGES = (("add", "INSERT"), ("change", "UPDATE"), ("remove", "DELETE"))
 UNCHANGEABLE = "row, table_name, entry, seal"
@@ -81,14 +94,16 @@ def upgrade() -> None:
 
 
 def _on_sqlite() -> None:
-    op.execute("CREATE TABLE history_notes (table_name TEXT, change TEXT, key TEXT)")
+    op.execute("CREATE TABLE history_notes (table_name TEXT, change TEXT, key TEXT, changed TEXT)")
     for table, keys in LOGGED.items():
         for change, statement in CHANGES:
             row = "NEW" if change == "add" else "OLD"
             key = " || '/' || ".join(f"{row}.{name}" for name in keys)
+            names = CHANGING.get(table, "").split() if change == "change" else ()
+            changed = " || ".join(f"iif(NEW.{name} IS NOT OLD.{name}, '{name} ', '')" for name in names) or "NULL"
             op.execute(
                 f"CREATE TRIGGER {table}_noted_{change} AFTER {_of(table, statement)} ON {table} "  # noqa: S608 - ours
-                f"BEGIN INSERT INTO history_notes VALUES ('{table}', '{change}', {key}); END"
+                f"BEGIN INSERT INTO history_notes VALUES ('{table}', '{change}', {key}, {changed}); END"
             )
     for table, what in (("history", f"UPDATE OF {UNCHANGEABLE}"), ("history_checkpoints", "UPDATE")):
         for name, statement in (("append_only", what), ("kept", "DELETE")):
@@ -101,19 +116,24 @@ def _on_sqlite() -> None:
 def _on_postgresql() -> None:
     for table, keys in LOGGED.items():
         new, old = (", ".join(f"{row}.{name}" for name in keys) for row in ("NEW", "OLD"))
+        differs = "CASE WHEN NEW.{0}::text IS DISTINCT FROM OLD.{0}::text THEN '{0} ' END"
+        changed = ", ".join(differs.format(name) for name in CHANGING.get(table, "").split()) or "NULL"
         op.execute(
             f"CREATE FUNCTION skills_note_{table}() RETURNS trigger LANGUAGE plpgsql AS $$ BEGIN "  # noqa: S608 - ours
             "IF to_regclass('pg_temp.history_notes') IS NULL THEN NULL; "
             "ELSIF TG_OP = 'INSERT' THEN "
-            f"INSERT INTO pg_temp.history_notes VALUES (TG_TABLE_NAME, TG_ARGV[0], concat_ws('/', {new})); "
+            f"INSERT INTO pg_temp.history_notes VALUES (TG_TABLE_NAME, 'add', concat_ws('/', {new})); "
+            "ELSIF TG_OP = 'DELETE' THEN "
+            f"INSERT INTO pg_temp.history_notes VALUES (TG_TABLE_NAME, 'remove', concat_ws('/', {old})); "
             "ELSE "
-            f"INSERT INTO pg_temp.history_notes VALUES (TG_TABLE_NAME, TG_ARGV[0], concat_ws('/', {old})); "
+            f"INSERT INTO pg_temp.history_notes VALUES (TG_TABLE_NAME, 'change', concat_ws('/', {old}), "
+            f"concat({changed})); "
             "END IF; RETURN NULL; END $$"
         )
         for change, statement in CHANGES:
             op.execute(
                 f"CREATE TRIGGER {table}_noted_{change} AFTER {_of(table, statement)} ON {table} "
-                f"FOR EACH ROW EXECUTE FUNCTION skills_note_{table}('{change}')"
+                f"FOR EACH ROW EXECUTE FUNCTION skills_note_{table}()"
             )
     for table, what in (("history", f"UPDATE OF {UNCHANGEABLE}"), ("history_checkpoints", "UPDATE")):
         for name, statement in (("append_only", what), ("kept", "DELETE")):
@@ -124,7 +144,8 @@ def _on_postgresql() -> None:
 
 
 def _of(table: str, statement: str) -> str:
-    return f"UPDATE OF {JOBS}" if (table, statement) == ("jobs", "UPDATE") else statement
+    # not of the progress of a job, which is not logged
+    return f"UPDATE OF {', '.join(CHANGING[table].split())}" if (table, statement) == ("jobs", "UPDATE") else statement
 
 
 def downgrade() -> None:

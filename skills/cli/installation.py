@@ -186,8 +186,8 @@ def verify(
     head: Annotated[
         Path | None,
         typer.Option(
-            help="A file of signed checkpoints that was kept elsewhere, as of SKILLS_CHECKPOINTS: the history must "
-            "continue each of them.",
+            help="A file of signed checkpoints that was kept elsewhere, by default of SKILLS_CHECKPOINTS: the history "
+            "must continue each of them.",
             dir_okay=False,
         ),
     ] = None,
@@ -217,6 +217,8 @@ def verify(
         _telling("verifying") as told,
     ):
         with _files():
+            kept = settings().checkpoints
+            head = head or (kept if kept is not None and kept.exists() else None)
             heads = [] if head is None else read_notes(head.read_text())
         keep_signed(database, settings().checkpoints)
         for part in inspect_installation(database, reader.tell, decode_all=decode_all, heads=heads):

@@ -147,8 +147,9 @@ def _references(session: Session, checked: Checked) -> None:
         for row in session.execute(select(*table.primary_key).where(*left).limit(NAMED)):
             checked.wrong.append((_name(table, row), f"its {column.key} has no row in {owner.__tablename__}"))
         due = Base.metadata.tables[late.class_.__tablename__]
-        for row in session.execute(select(late).where(exists().where(owner.row == late)).limit(NAMED)):
-            checked.wrong.append((_name(due, row), f"it is to be deleted, and {owner.__tablename__} {row[0]} exists"))
+        for number in session.scalars(select(late).where(exists().where(owner.row == late)).limit(NAMED)):
+            why = f"it says that {owner.__tablename__} {number} was deleted, which exists"
+            checked.wrong.append((_name(due, [number]), why))
 
 
 def _history(heads: Sequence[Note], database: Database, session: Session, checked: Checked) -> None:

@@ -13,6 +13,7 @@ from tests.bench.containing import containing
 from tests.bench.doubt import doubting
 from tests.bench.geometry import geometry
 from tests.bench.hands import hands
+from tests.bench.history import history
 from tests.bench.joining import joining
 from tests.bench.kinematics import kinematics
 from tests.bench.learning import learning
@@ -40,6 +41,7 @@ PARTS = {
     "scaling": scaling,
     "million": million,
     "writers": writers,
+    "history": history,
     "serving": serving,
     "atlas": atlas,
     "combining": combining,

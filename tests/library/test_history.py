@@ -2,29 +2,38 @@
 
 import os
 import random
+import runpy
 import shutil
 from collections.abc import Iterator
 from contextlib import closing, suppress
+from datetime import timedelta
 from pathlib import Path
 
 import pytest
-from sqlalchemy import Connection, func, select, text
+from sqlalchemy import Connection, func, select, text, update
 
-from skills.db import Base
+from skills.db import Base, now
 from skills.db.history import CHECKPOINTS, COLUMNS_NOT_LOGGED, LEAVES, NOT_LOGGED, logged
 from skills.db.models import Release
+from skills.db.service_tables import Job
 from skills.db.session import Database
 from skills.errors import BadSettings, Corrupt
+from skills.library import erasure, locks, recordings, sweep
 from skills.library.catalogue import find_surgeon, put_surgeon
 from skills.library.erasure import erase_surgeon
 from skills.library.history import Verified, append_checkpoint, newest_checkpoint, sign_history, verify_history
+from skills.library.inspection import inspect_installation
+from skills.library.recordings import stored_recording
 from skills.library.releases import withdraw
+from skills.settings import Settings
 from skills.transparency import SigningKey, inclusion_proof, leaf_hash, read_notes
 from tests import backends
-from tests.db.test_tables import fill
+from tests.db.test_tables import FROZEN, WITHDRAWABLE, fill
 from tests.independent_history import check_inclusion
 from tests.library import cases
 from tests.library.attacks import cover_up, found, random_edit, sign_again, tampering
+
+SURGEONS = logged()["surgeons"].raw
 
 
 @pytest.fixture(scope="module", params=backends.BACKENDS)
@@ -71,6 +80,17 @@ def test_what_the_service_wrote_is_whole_and_signed(full: Database):
         tables = {*session.scalars(select(LEAVES.c.table_name))}
         assert {*logged()} <= tables
         assert session.scalar(select(LEAVES.c.row).where(LEAVES.c.number.is_(None))) is None
+
+
+def test_an_update_of_any_logged_column_of_a_job_is_noted(full: Database):
+    """The trigger of jobs names columns, because their progress is not logged."""
+    with full.engine.execution_options(writes=True).connect() as connection:
+        for column in logged()["jobs"].columns:
+            connection.exec_driver_sql(f'UPDATE jobs SET "{column}" = "{column}" WHERE row = 1')
+            notes = connection.exec_driver_sql("SELECT table_name, change, key FROM history_notes").all()
+            connection.exec_driver_sql("DELETE FROM history_notes")
+            assert [tuple(note) for note in notes] == [("jobs", "change", "1")], column
+        connection.rollback()
 
 
 def test_a_transaction_that_fails_leaves_no_leaf(full: Database):
@@ -258,6 +278,149 @@ def test_a_row_written_past_the_service_is_not_logged_for_its_author(database: D
     cases.add_surgeon(database, "heron")  # a transaction of the service after it
     sign_history(database, None)
     assert wrong_in(database) == [("surgeons 1", "not as the history has it: skill_level")]
+
+
+CHANGED = [  # by somebody, then by the service, in the same row
+    ("surgeons", "skill_level = 'expert'", "handedness = 'left'"),
+    ("surgeons", "consent = '{\"training\": true}'", "skill_level = 'novice'"),
+    ("suture_types", "name = 'another'", "description = 'longer'"),
+    ("keys", "role = 'admin'", "revoked_at = created_at"),
+    ("keys", "digest = 'f'", "restricted = NOT restricted"),
+    ("jobs", "result = '{\"sha256\": 1}'", "error = 'none'"),
+    ("jobs", "request = '{}'", "state = 'cancelled', ended_at = created_at"),
+]
+
+
+def test_a_change_by_the_service_does_not_cover_another_column_of_the_row(full: Database):
+    for table, by_somebody, by_service in CHANGED:
+        with full.engine.execution_options(writes=True).connect() as connection:
+            connection.exec_driver_sql(f"UPDATE {table} SET {by_somebody}")
+            connection.exec_driver_sql("DELETE FROM history_notes")
+            before = {name for name, _ in found(connection, full.history)}
+            connection.exec_driver_sql(f"UPDATE {table} SET {by_service}")
+            full.history.settle(connection)
+            findings = dict(found(connection, full.history))
+            connection.rollback()
+        assert {*findings} == before
+        column = by_somebody.partition(" ")[0]
+        assert {*findings.values()} == {f"not as the history has it: {column}"}, by_service
+
+
+def test_the_notes_name_every_logged_column_that_may_change():
+    """The others are of rows that only somebody past the service can change, which no leaf covers."""
+    changing = runpy.run_path(str(Path("migrations") / "versions" / "0016_history.py"))["CHANGING"]
+    for table, names in changing.items():
+        if table not in WITHDRAWABLE:
+            assert names.split() == [*logged()[table].columns], table
+    assert {*changing} == {*logged()} - {*FROZEN} and {*WITHDRAWABLE} <= {*changing}
+
+
+def test_a_row_that_was_erased_and_is_put_back_with_its_old_leaf_is_found(database: Database):
+    cases.add_surgeon(database, "heron")
+    leaf = select(LEAVES).where(LEAVES.c.table_name == "surgeons", LEAVES.c.key == "2")
+    with database.reading() as session:
+        row = session.execute(select(SURGEONS).where(SURGEONS.c.row == 2)).one()._mapping
+        old = session.execute(leaf).one()._mapping
+    with database.writing() as session:
+        erase_surgeon(session, "heron", "test")
+    sign_history(database, None)
+    with tampering(database) as connection:
+        connection.execute(SURGEONS.insert(), [dict(row)])
+        connection.execute(LEAVES.insert(), [{**old, "row": old["row"] + 1000, "number": None}])
+        assert database.history.sign(connection) is not None  # its seal is right
+        copied = f"its leaf {old['row'] + 1000} is a copy of an earlier one"
+        assert found(connection, database.history) == [("surgeons 2", copied)]
+
+
+# ---- pieces, caches, steps
+
+
+def test_changed_bytes_and_forged_deletions_are_found_beside_the_history(database: Database):
+    cases.add_demo(database)
+    with tampering(database) as connection:
+        blob = BLOB[connection.dialect.name]
+        connection.exec_driver_sql(f"UPDATE recording_chunks SET data = {blob}")
+        connection.exec_driver_sql(f"UPDATE parsed_chunks SET data = {blob}")
+        connection.exec_driver_sql("INSERT INTO loose_chunks VALUES (1, '2020-01-01 00:00:00.000000+00:00')")
+        connection.exec_driver_sql("INSERT INTO erased_surgeons VALUES (1)")
+        connection.commit()
+    wrong = {name for part in inspect_installation(database) for name, _ in part.wrong}
+    assert {"recordings 1", "parsed_recordings 1", "loose_chunks 1", "erased_surgeons 1"} <= wrong
+
+
+def test_a_cache_may_be_emptied_by_hand_and_is_logged_again(database: Database):
+    demo = cases.add_demo(database)
+    for turn in range(2):
+        with database.engine.connect() as connection:
+            connection.exec_driver_sql("DELETE FROM parsed_chunks")
+            connection.exec_driver_sql("DELETE FROM parsed_recordings")
+            connection.commit()
+        assert wrong_in(database) == []
+        stored_recording(database, demo.recording.sha256)
+        assert wrong_in(database) == []
+        with database.reading() as session:
+            leaves = session.scalars(select(LEAVES.c.row).where(LEAVES.c.table_name == "parsed_recordings")).all()
+        assert len(leaves) == turn + 2
+    with database.writing() as session:
+        erase_surgeon(session, "kestrel", "test")
+    assert wrong_in(database) == []
+
+
+def test_uploads_in_pieces_erasures_in_steps_and_retentions_keep_the_history_whole(
+    database: Database, monkeypatch: pytest.MonkeyPatch
+):
+    for room in (recordings, sweep, erasure):
+        monkeypatch.setattr(room, "AT_ONCE_BYTES", 1024)
+    monkeypatch.setattr(recordings, "CHUNK_BYTES", 1024)
+    monkeypatch.setattr(sweep, "CHUNK_BYTES", 1024)
+    monkeypatch.setattr(sweep, "JOBS_AT_ONCE", 2)
+    cases.add_demo(database)
+    for seed in range(3):
+        cases.train(database, seed=seed)
+    cases.add_surgeon(database, "heron")
+    cases.add_demo(database, cases.hand_off((1.0, 0.0, 0.0)), "heron")
+    cases.train(database, "heron")
+    assert wrong_in(database) == []
+    with database.writing() as session:
+        erase_surgeon(session, "kestrel", "test")
+    assert wrong_in(database) == []  # what is left to the sweep is logged still
+    sweep.sweep_erased(database)
+    assert wrong_in(database) == []
+    with database.writing() as session:
+        session.execute(update(Job).values(ended_at=now() - timedelta(days=2)))
+    sweep.sweep(database, Settings(database_url=database.url, keep_jobs_days=1))
+    assert wrong_in(database) == []
+    with database.reading() as session:
+        jobs = session.execute(select(LEAVES.c.key, LEAVES.c.entry).where(LEAVES.c.table_name == "jobs")).all()
+        assert session.scalar(select(func.count()).select_from(Job)) == 0
+    assert {key for key, _ in jobs} == {None}
+    assert sum('"remove"' in entry for _, entry in jobs) == 4
+
+
+def test_signing_and_writing_do_not_wait_for_each_other(database: Database):
+    """On PostgreSQL; a leaf that is committed after a later one gets a later number."""
+    if database.engine.dialect.name == "sqlite":
+        return
+    impatient = Database(database.url, patience_ms=200)
+    with closing(impatient), database.writing([locks.surgeon("heron")]) as session:
+        put_surgeon(session, "heron", {}, "test")
+        session.flush()
+        database.history.settle(session.connection())  # its leaves have their rows
+        with impatient.writing([locks.surgeon("egret")]) as other:
+            put_surgeon(other, "egret", {}, "test")
+        assert sign_history(impatient, None) is not None
+    signing = database.engine.execution_options(writes=()).connect()
+    with closing(impatient), closing(signing):
+        assert database.history.sign(signing) is not None  # and not committed yet
+        with impatient.writing([locks.surgeon("swift")]) as other:
+            put_surgeon(other, "swift", {}, "test")
+        signing.commit()
+    sign_history(database, None)
+    with database.reading() as session:
+        of_surgeons = select(LEAVES.c.number, LEAVES.c.row).where(LEAVES.c.table_name == "surgeons")
+        numbers = session.execute(of_surgeons.order_by(LEAVES.c.row)).all()
+    assert [number for number, _ in numbers] != sorted(number for number, _ in numbers)
+    assert wrong_in(database) == []
 
 
 # ---- proofs, erasure, keys
