@@ -331,10 +331,14 @@ NOTING = "noting"  # in a connection's `info`: whether its transactions note cha
 
 @dataclass(frozen=True)
 class Effect:
-    """Whether a row existed before a transaction, whether it exists after it, and the columns that were changed."""
+    """Whether a row existed before a transaction, whether it exists after it, and the columns that were changed.
+
+    `written` says that the row was inserted, so all of its columns are the transaction's.
+    """
 
     before: bool
     after: bool
+    written: bool
     changed: frozenset[str]
 
 
@@ -343,8 +347,9 @@ def effects_of(notes: Iterable[tuple[str, str, str, str | None]]) -> dict[str, d
     found: dict[str, dict[str, Effect]] = {}
     for table, change, key, changed in notes:
         of_table = found.setdefault(table, {})
-        first = of_table.get(key, Effect(change != ADD, True, frozenset()))
-        of_table[key] = Effect(first.before, change != REMOVE, first.changed.union((changed or "").split()))
+        so_far = of_table.get(key, Effect(change != ADD, True, False, frozenset()))
+        columns = so_far.changed.union((changed or "").split())
+        of_table[key] = Effect(so_far.before, change != REMOVE, so_far.written or change == ADD, columns)
     return found
 
 
@@ -415,6 +420,8 @@ class History:
             if not effects[key].before:
                 # after an earlier leaf only where somebody has emptied a cache
                 yield new_leaf(table.raw.name, ADD, at, key, digested(table.columns, row), latest.get(key))
+            elif key in latest and effects[key].written:  # removed, and added again
+                yield new_leaf(table.raw.name, CHANGE, at, key, digested(table.columns, row), latest[key])
             elif key in latest and (changed := effects[key].changed):
                 # the other columns keep their digests: if somebody else has changed one, that stays to be found
                 digests = {**latest[key].digests, **latest[key].digests_of(changed, row)}
@@ -527,8 +534,9 @@ class History:
         if file.exists():
             return
         if self._engine.dialect.name == "sqlite":
-            beside = Path(self._engine.url.database or "").resolve().parent
-            if file.resolve().parent == beside or beside in file.resolve().parents:
+            beside, around = Path(self._engine.url.database or "").resolve().parent, file.resolve().parents
+            # somebody who keeps the database in the home folder has the state folder below it
+            if beside == around[0] or (beside in around and not Path.home().resolve().is_relative_to(beside)):
                 raise BadSettings(
                     f"The signing key {file} would be in the folder of the database, whose owner could then rewrite "
                     "the history.",

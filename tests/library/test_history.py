@@ -315,6 +315,28 @@ def test_the_notes_name_every_logged_column_that_may_change():
     assert {*changing} == {*logged()} - {*FROZEN} and {*WITHDRAWABLE} <= {*changing}
 
 
+def test_a_row_that_is_removed_and_added_again_is_logged_whole(database: Database):
+    cases.add_demo(database)
+    stored = logged()["recording_uploads"].raw
+    with database.writing() as session:
+        session.execute(stored.delete())
+        session.execute(stored.insert().values(recording_row=1, actor="test"))
+    with database.writing() as session:
+        session.execute(text("UPDATE parsed_recordings SET version = 0"))
+    with database.reading() as session:
+        before = session.scalar(select(func.count()).select_from(LEAVES))
+    for values in ("3", "3", "version"):  # changed, equal, and equal by itself
+        with database.writing() as session:
+            session.execute(text(f"UPDATE parsed_recordings SET version = {values}"))
+    with database.writing() as session:
+        row = session.execute(text("SELECT * FROM parsed_recordings")).one()._mapping
+        session.execute(text("DELETE FROM parsed_recordings"))
+        session.execute(logged()["parsed_recordings"].raw.insert(), [{**row, "version": 4}])
+    with database.reading() as session:
+        assert session.scalar(select(func.count()).select_from(LEAVES)) == before + 2
+    assert wrong_in(database) == []
+
+
 def test_a_row_that_was_erased_and_is_put_back_with_its_old_leaf_is_found(database: Database):
     cases.add_surgeon(database, "heron")
     leaf = select(LEAVES).where(LEAVES.c.table_name == "surgeons", LEAVES.c.key == "2")
@@ -485,6 +507,18 @@ def test_without_its_key_the_history_is_neither_written_nor_verified(tmp_path: P
 def test_a_key_beside_the_database_is_refused(tmp_path: Path):
     database = Database(backends.blank("sqlite", tmp_path), signing_key=tmp_path / "keys" / "key")
     with closing(database), pytest.raises(BadSettings, match="in the folder of the database"):
+        database.migrate()
+
+
+def test_a_database_in_the_home_folder_may_have_its_key_below_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    url = backends.blank("sqlite", tmp_path)
+    with closing(Database(url, signing_key=tmp_path / ".local" / "state" / "key")) as database:
+        database.migrate()
+    with (
+        closing(Database(backends.blank("sqlite", tmp_path), signing_key=tmp_path / "key")) as database,
+        pytest.raises(BadSettings, match="in the folder of the database"),
+    ):
         database.migrate()
 
 
