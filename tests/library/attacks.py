@@ -12,6 +12,7 @@ from datetime import timedelta
 from typing import Any
 
 from sqlalchemy import Column, Connection, MetaData, Table, delete, insert, select, update
+from sqlalchemy.exc import IntegrityError
 
 from skills.db import now
 from skills.db.history import (
@@ -101,6 +102,15 @@ def sign_again(connection: Connection) -> None:
 
 def random_edit(connection: Connection, rng: random.Random) -> tuple[str, str]:
     """Change, add or remove a random row, or a random column of it; return its name, and the kind of the edit."""
+    while True:
+        try:
+            with connection.begin_nested():
+                return _some_edit(connection, rng)
+        except IntegrityError:  # a value that must be unique and is not: no database would hold it, so another edit
+            continue
+
+
+def _some_edit(connection: Connection, rng: random.Random) -> tuple[str, str]:
     filled = {name: [row for page in about.pages(connection) for row in page] for name, about in logged().items()}
     table = rng.choice([name for name, rows in filled.items() if rows])
     about, row = logged()[table], rng.choice(filled[table])
