@@ -21,7 +21,7 @@ from tests.bench.writers import synced
 from tests.library import cases
 from tests.needs import NEEDS
 
-ROUNDS = 12
+ROUNDS = 8
 WRITES_OF_ROUND = 10  # and one signature; a busy service signs once a second
 TRIGGERS = {
     "sqlite": "SELECT 'DROP TRIGGER ' || name FROM sqlite_master WHERE type = 'trigger' AND name LIKE '%_noted_%'",
