@@ -32,7 +32,7 @@ import os
 import sqlite3
 import stat
 from collections.abc import Iterable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, closing, contextmanager, suppress
 from copy import copy
 from functools import cache
 from importlib import resources
@@ -66,7 +66,6 @@ SPELLING = (
     "Write SKILLS_DATABASE_URL as sqlite:////folder/skills.sqlite or postgresql://user:password@host:5432/database."
 )
 STARTED = "Start it, or correct SKILLS_DATABASE_URL."
-SQLITE_HEAD = b"SQLite format 3\x00"
 UNUSABLE = {  # by SQLite's result code: the message and the remedy
     sqlite3.SQLITE_CANTOPEN: (
         "cannot be opened",
@@ -323,14 +322,9 @@ def _make_file(file: Path) -> None:
     """
     if file.is_dir():
         raise DatabaseUnusable(f"The database {file} cannot be opened.", UNUSABLE[sqlite3.SQLITE_CANTOPEN][1])
-    try:
-        with file.open("rb") as there:
-            begins = there.read(len(SQLITE_HEAD))
-        if begins and begins != SQLITE_HEAD:  # another program's file: its permissions must not change
-            reason, advice = UNUSABLE[sqlite3.SQLITE_NOTADB]
-            raise DatabaseUnusable(f"The database {file} {reason}.", advice)
-    except OSError:
-        pass  # it does not exist yet, or opening it reports the error
+    if _is_anothers(file):  # another program's file: its permissions must not change
+        reason, advice = UNUSABLE[sqlite3.SQLITE_NOTADB]
+        raise DatabaseUnusable(f"The database {file} {reason}.", advice)
     try:
         make_private(file)
     except OSError as error:
@@ -341,6 +335,23 @@ def _make_file(file: Path) -> None:
         raise BadSettings(
             f"The folder {file.parent} of the database {why}: {error.strerror}.", "Name another in SKILLS_DATABASE_URL."
         ) from error
+
+
+def _is_anothers(file: Path) -> bool:
+    """Return whether a file exists and is not SQLite's.
+
+    Only SQLite may read it: closing a descriptor of our own would drop all locks of this process on the file (POSIX,
+    `fcntl`). Another process that closes the file would then take itself for the last one and delete the write-ahead
+    log, to which this process goes on committing.
+    """
+    with suppress(sqlite3.OperationalError):  # missing, busy or unreadable: opening it reports that
+        address = f"{file.absolute().as_uri()}?mode=ro"
+        with closing(sqlite3.connect(address, uri=True, timeout=0)) as connection:
+            try:
+                connection.execute("PRAGMA schema_version")
+            except sqlite3.DatabaseError as error:
+                return error.sqlite_errorcode & 0xFF == sqlite3.SQLITE_NOTADB
+    return False
 
 
 def _pool(patience_ms: int) -> dict[str, Any]:
@@ -465,8 +476,8 @@ def make_private(database: Path) -> None:
                 log.warning("%s could be read by others; its permissions are 0600 now.", path.name)
             except PermissionError:
                 log.warning("%s can be read by others and belongs to another user; run chmod 600 on it.", path.name)
-    if not database.exists():
-        os.close(os.open(database, os.O_RDWR | os.O_CREAT, 0o600))
+    with suppress(FileExistsError):  # never opened where it exists: see `_is_anothers`
+        os.close(os.open(database, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600))
 
 
 def is_full(error: DBAPIError) -> bool:

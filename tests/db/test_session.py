@@ -17,6 +17,7 @@ from sqlalchemy import event, text
 
 from skills.db import session as sessions
 from skills.db.models import SutureType
+from skills.db.service_tables import Executor
 from skills.db.session import EXIT_CODE, Database, make_private
 from skills.errors import Busy, DatabaseUnusable, StorageFull
 from skills.jobs import prepare
@@ -315,3 +316,37 @@ def test_a_file_that_others_could_read_is_tightened_and_the_log_says_so(
     caplog.clear()
     make_private(database)
     assert not caplog.text
+
+
+READ = "import sqlite3, sys; c = sqlite3.connect(sys.argv[1]); print(c.execute(sys.argv[2]).fetchone()[0]); c.close()"
+
+
+@pytest.mark.parametrize("anothers", [False, True])
+def test_opening_a_file_once_more_gives_up_no_lock_on_it(tmp_path: Path, anothers: bool, monkeypatch):
+    """Closing any descriptor of a file drops this process's locks on it, as POSIX demands.
+
+    Without them the next process that ends takes itself for the last one and deletes the write-ahead log, and what is
+    committed here afterwards is in a file without a name.
+    """
+    file = tmp_path / "skills.sqlite"
+
+    def count_elsewhere() -> str:
+        command = [sys.executable, "-c", READ, str(file), "SELECT count(*) FROM executors"]
+        return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
+
+    def refuse(*_: object) -> None:
+        raise PermissionError
+
+    with closing(Database(f"sqlite:///{file}")) as one:
+        one.migrate()
+        with one.writing() as session:
+            session.add(Executor(id="first"))
+        if anothers:  # a file of another user, which everybody may read
+            file.chmod(0o644)
+            monkeypatch.setattr(Path, "chmod", refuse)
+        with closing(Database(f"sqlite:///{file}")) as again, again.reading() as session:
+            assert session.get(Executor, "first") is not None
+        assert count_elsewhere() == "1"
+        with one.writing() as session:
+            session.add(Executor(id="second"))
+        assert count_elsewhere() == "2"
