@@ -72,6 +72,23 @@ def problem(
 
 
 SHOWN = 1e12  # larger numbers are not repeated in messages
+# Errors of the system in a request, outside of the database: each is over as soon as its cause is.
+SYSTEM: dict[int, errors.Busy] = {
+    **dict.fromkeys(
+        (errno.ENOSPC, errno.EDQUOT),
+        errors.StorageFull("The disk for temporary files is full, so nothing was stored; free some space on it."),
+    ),
+    **dict.fromkeys(
+        (errno.EMFILE, errno.ENFILE), errors.Busy("The service has too many files open; try again in a moment.")
+    ),
+    **dict.fromkeys(
+        (errno.EIO, errno.EROFS),
+        errors.Busy(
+            "The disk for temporary files failed.",
+            "Ask the operator of the service to check the disk and its log, then send the same request again.",
+        ),
+    ),
+}
 LIMITS = {
     "missing": "is missing",
     "greater_than": "must be more than {gt}",
@@ -243,13 +260,11 @@ def answer_refusals(app: FastAPI) -> None:
         return problem(error.status_code, kind, title, detail, headers=headers, **more)
 
     @app.exception_handler(OSError)
-    def full(_request: Request, error: OSError) -> Response:
-        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+    def refused_by_system(_request: Request, error: OSError) -> Response:
+        if error.errno not in SYSTEM:
             raise error
-        log.error("A disk is full: %s", error)
-        return answer_to(
-            errors.StorageFull("The disk for temporary files is full, so nothing was stored; free some space on it.")
-        )
+        log.error("The system refused what a request needs: %s", error.strerror)
+        return answer_to(SYSTEM[error.errno])
 
     @app.exception_handler(Exception)
     def unexpected(_request: Request, error: Exception) -> Response:

@@ -18,7 +18,6 @@ import time
 import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partial
 from itertools import cycle
 from threading import Event, Thread
 from types import FrameType
@@ -32,7 +31,7 @@ from skills.db.session import Database, refuse_other_tables
 from skills.errors import SkillsError
 from skills.jobs import BATCHES, JOBS, POLLING_S, QUEUES, configuration, connect
 from skills.jobs.workflows import Leases, Perform, Watch, Work, register
-from skills.library.sweep import sweep
+from skills.library.sweep import SteadyClock, sweep
 from skills.logs import job_id, told
 from skills.sandbox.forked import refuse_uncontained
 from skills.settings import Settings
@@ -118,8 +117,11 @@ def run_worker(settings: Settings, *, parent: int | None = None, perform: Perfor
         refuse_other_tables(session.connection())
     client = connect(settings)
     work = Work(database, settings, perform)
-    leases, recover = Leases(settings.lease_s), DBOS._recover_pending_workflows
-    sweeping = partial(sweep, database, settings, SWEEPING_S)
+    leases, recover, clock = Leases(settings.lease_s), DBOS._recover_pending_workflows, SteadyClock()
+
+    def sweeping() -> bool:
+        return sweep(database, settings, SWEEPING_S, by_age=clock.is_steady())
+
     watch = Watch(database, client, executor, leases, recover, work.doing, sweeping, settings.checkpoints)
     try:
         watch.beat()  # registered before it can hold any job, so that others can take over

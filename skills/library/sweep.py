@@ -3,8 +3,14 @@
 Each step deletes at most `JOBS_AT_ONCE` jobs or `AT_ONCE_BYTES` of chunks, because others wait for it. A step that is
 interrupted is repeated, so any process may sweep: whoever has erased something, before it answers; and the workers,
 once a minute.
+
+A clock that is set ahead by mistake makes everything look old. So a worker deletes by age only while its clock has run
+steadily for `STEADY_S` (`SteadyClock`): that is the time in which a wrong clock can be corrected without loss.
 """
 
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
 from datetime import timedelta
 from math import inf
 from time import monotonic
@@ -26,7 +32,28 @@ from skills.settings import Settings
 JOBS_AT_ONCE = 300
 PICTURES_AT_ONCE = 10
 UNDIVIDED_S = 600.0  # ours: the styles of a batch are added within seconds, or its request was interrupted
+STEADY_S = 3600.0  # ours: retentions are of a year, so an hour more changes nothing
+STEP_S = 60.0  # ours: a larger difference is no correction of a clock that was right
 INTERRUPTED = "The service stopped before all styles of the batch were added; request it again."
+
+
+@dataclass
+class SteadyClock:
+    """Compares the wall clock with the monotonic one, each time that it is asked."""
+
+    wall: Callable[[], float] = time.time
+    elapsed: Callable[[], float] = monotonic
+    _ahead_s: float | None = None
+    _since_s: float = 0.0
+
+    def is_steady(self) -> bool:
+        """Return whether the wall clock has run for `STEADY_S` without a step of more than `STEP_S`."""
+        at_s = self.elapsed()
+        ahead_s = self.wall() - at_s
+        if self._ahead_s is None or not abs(ahead_s - self._ahead_s) <= STEP_S:
+            self._since_s = at_s
+        self._ahead_s = ahead_s
+        return at_s - self._since_s >= STEADY_S
 
 
 def sweep_erased(database: Database) -> None:
@@ -35,13 +62,14 @@ def sweep_erased(database: Database) -> None:
         pass
 
 
-def sweep(database: Database, settings: Settings, at_most_s: float = inf) -> bool:
+def sweep(database: Database, settings: Settings, at_most_s: float = inf, *, by_age: bool = True) -> bool:
     """Delete what is left of erasures, and what is older than its retention; fail batches that were interrupted.
 
     Args:
         database: The database, without restriction.
         settings: The retentions.
         at_most_s: Stop after the step during which this time has passed.
+        by_age: Delete what is older than its retention.
 
     Returns:
         Whether nothing is left to delete.
@@ -52,8 +80,7 @@ def sweep(database: Database, settings: Settings, at_most_s: float = inf) -> boo
     while (
         _sweep_chunks(database)
         or _sweep_jobs(database)
-        or _sweep_pictures(database, pictures)
-        or _sweep_ended(database, ended)
+        or (by_age and (_sweep_pictures(database, pictures) or _sweep_ended(database, ended)))
     ):
         if monotonic() - began_s > at_most_s:
             return False

@@ -1,6 +1,8 @@
-"""A full disk: 507 with the cause in the log, while stored data are still served."""
+"""A full or failed disk and used up descriptors: 507 or 503 with the cause in the log; stored data are still served."""
 
+import errno
 import logging
+import os
 from pathlib import Path
 from typing import IO
 
@@ -37,6 +39,35 @@ def test_a_full_disk_for_temporary_files_is_507(service: Service, caplog: pytest
     answer = service.http.post("/demos", params=KESTREL, content=cases.hand_off(), headers={"Content-Type": CSV})
     assert_problem(answer, 507, "storage-full")
     assert "No space left on device" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("number", "status", "kind"),
+    [
+        (errno.EMFILE, 503, "busy"),
+        (errno.ENFILE, 503, "busy"),
+        (errno.EIO, 503, "busy"),
+        (errno.EROFS, 503, "busy"),
+        (errno.EDQUOT, 507, "storage-full"),
+    ],
+)
+@pytest.mark.parametrize(
+    "place", ["skills.api.dependencies.tempfile.SpooledTemporaryFile", "skills.sandbox.forked._ask"]
+)
+def test_what_the_system_refuses_for_now_is_no_internal_error(
+    service: Service, place: str, number: int, status: int, kind: str, caplog: pytest.LogCaptureFixture, monkeypatch
+):
+    def refuse(*_: object, **__: object) -> None:
+        raise OSError(number, os.strerror(number))
+
+    service.client.put_surgeon("kestrel")
+    monkeypatch.setattr(logging.getLogger("skills.api"), "disabled", False)
+    monkeypatch.setattr(place, refuse)
+    answer = service.http.post("/demos", params=KESTREL, content=cases.hand_off(), headers={"Content-Type": CSV})
+    assert_problem(answer, status, kind)
+    assert ("retry-after" in answer.headers) == (status == 503)
+    assert os.strerror(number) in caplog.text
+    assert "unexpected" not in caplog.text
 
 
 def test_how_somebody_else_read_the_same_bytes_is_not_told(tmp_path: Path):

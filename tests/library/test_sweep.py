@@ -19,7 +19,7 @@ from skills.library.erasure import delete_recording, erase_surgeon
 from skills.library.inspection import inspect_installation
 from skills.library.jobs import find_job, identity_of, list_jobs
 from skills.library.recordings import find_recording, recording_bytes, store_recording, stored_recording
-from skills.library.sweep import sweep_erased
+from skills.library.sweep import STEADY_S, SteadyClock, sweep_erased
 from skills.settings import Settings
 from tests.library import cases
 from tests.library.styles import ask_retraining, look, parts_of
@@ -292,3 +292,36 @@ def test_bytes_sent_twice_at_once_are_kept_once(database: Database, small: None)
     with database.reading() as session:
         assert session.scalars(select(RecordingChunk.recording).distinct()).all() == [ahead[0]]
         assert b"".join(recording_bytes(session, find_recording(session, first.sha256))) == data
+
+
+def test_a_clock_that_is_set_ahead_deletes_nothing_by_its_age():
+    """A worker deletes by age once the clock has run like the monotonic one for an hour."""
+    wall_s, passed_s = 1000.0, 0.0
+    clock = SteadyClock(lambda: wall_s, lambda: passed_s)
+
+    def after(seconds: float, jump_s: float = 0.0) -> bool:
+        nonlocal wall_s, passed_s
+        wall_s, passed_s = wall_s + seconds + jump_s, passed_s + seconds
+        return clock.is_steady()
+
+    assert not after(0.0)
+    assert not after(STEADY_S - 1.0)
+    assert after(1.0)
+    assert after(60.0, jump_s=5.0)  # as a clock that is corrected gently
+    assert not after(60.0, jump_s=400 * 86_400.0)
+    assert not after(60.0, jump_s=-400 * 86_400.0)
+    assert not after(STEADY_S - 1.0)
+    assert after(1.0)
+
+
+def test_without_a_steady_clock_only_erasures_are_swept(database: Database):
+    cases.add_surgeon(database)
+    cases.add_demo(database)
+    ended = cases.work(database, cases.ask_training(database))
+    with database.writing() as session:
+        session.execute(update(Job).values(ended_at=now() - timedelta(days=400)))
+        session.add(ErasedSurgeon(surgeon_row=99))
+    assert sweep.sweep(database, settings_of(database), by_age=False)
+    assert (count(database, Job), count(database, ErasedSurgeon)) == (1, 0)
+    assert sweep.sweep(database, settings_of(database))
+    assert count(database, Job) == 0, ended.id
