@@ -13,7 +13,7 @@ export SKILLS_PAPER_DATA ?= $(abspath $(wildcard ../shared/paper/data))
 export SKILLS_TEST_JIGSAWS ?= $(abspath $(wildcard ../shared/jigsaws))
 export SKILLS_TEST_BENCHMARKS ?= $(abspath $(wildcard ../shared/benchmarks))
 
-.PHONY: demo test serve bench nightly deep lint lock wheelhouse fixture clean
+.PHONY: demo test serve bench faults nightly deep lint lock wheelhouse fixture clean
 
 # uv where it is present, venv and pip otherwise; either way the same versions, checked by their hashes. One package,
 # movement-primitives, comes as source: setuptools is there first, and without Cython it is built with no compiler.
@@ -59,6 +59,10 @@ serve: $(READY)
 
 bench: $(READY)
 	@$(BIN)/python -m tests.bench $(PARTS)
+
+# The real service with failing disks, clocks and processes; `make faults FAULTS="full-disk clock-forward"` for some.
+faults: $(READY)
+	@$(BIN)/python -m tests.faults $(FAULTS)
 
 # The sweeps, and ten runs of the suite in a row: none red, nothing left behind.
 nightly: $(READY)
