@@ -20,11 +20,10 @@ from skills.library.backup import back_up
 from skills.packing import sha256
 from tests.faults.ledger import Ledger, Read
 from tests.library import cases
-from tests.waiting import until
+from tests.waiting import END_S, until
 
 AGAIN_S = 0.15  # between two attempts of a client that was not answered with success
 ANSWER_S = 60.0  # timeout of an answer
-PATIENCE_S = 240.0  # until something of each kind is acknowledged
 STYLES = ("kestrel", "wren")  # each has one writer, so the order of its releases is known
 UPLOADER = "heron"
 LARGE_ROWS = 60_000  # over 4 MiB: it is stored in several transactions
@@ -121,7 +120,7 @@ class Crew:
             if self._over.wait(AGAIN_S):
                 return None
 
-    def wait(self, done: Callable[[], object], within_s: float = PATIENCE_S) -> None:
+    def wait(self, done: Callable[[], object], within_s: float = END_S) -> None:
         """Wait for what the clients do; fail if one of them has failed."""
 
         def reached() -> bool:

@@ -26,7 +26,7 @@ from skills.db.session import Database
 from tests.backends import new_server, start
 from tests.e2e.conftest import WORKER
 from tests.faults.audit import Verdict, audit, stored
-from tests.faults.crew import PATIENCE_S, STYLES, UPLOADER, Crew
+from tests.faults.crew import STYLES, UPLOADER, Crew
 from tests.faults.installation import Installation
 from tests.faults.ledger import Ledger
 from tests.faults.shim import Shim, compiler
@@ -299,7 +299,7 @@ def run(fault: Fault, folder: Path, seed: int) -> Row:
         for url in urls:
             with httpx.Client(base_url=url, timeout=END_S) as one:
                 until(lambda one=one: one.get("/readyz").status_code == 200)
-        until(lambda: _unfinished(database) == 0, PATIENCE_S)
+        until(lambda: _unfinished(database) == 0)
         verdict = audit(ledger, http, database, backups, before)
         logged: Counter[str] = Counter()
         for service, place in zip(site.services, places, strict=True):
