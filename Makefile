@@ -13,7 +13,7 @@ export SKILLS_PAPER_DATA ?= $(abspath $(wildcard ../shared/paper/data))
 export SKILLS_TEST_JIGSAWS ?= $(abspath $(wildcard ../shared/jigsaws))
 export SKILLS_TEST_BENCHMARKS ?= $(abspath $(wildcard ../shared/benchmarks))
 
-.PHONY: demo test serve bench faults nightly deep lint lock wheelhouse fixture clean
+.PHONY: demo test serve bench faults nightly mutants deep lint lock wheelhouse fixture clean
 
 # uv where it is present, venv and pip otherwise; either way the same versions, checked by their hashes. One package,
 # movement-primitives, comes as source: setuptools is there first, and without Cython it is built with no compiler.
@@ -68,6 +68,10 @@ faults: $(READY)
 nightly: $(READY)
 	@$(BIN)/python -m pytest --hypothesis-profile=nightly -m nightly
 	@for run in 1 2 3 4 5 6 7 8 9 10; do $(BIN)/python -m pytest --hypothesis-profile=nightly || exit 1; done
+
+# Small changes of the code that guards, each of which a test must notice; about half an hour. CONTRIBUTING.md says more.
+mutants: $(READY)
+	@$(BIN)/python -m tests.mutants
 
 lint: $(READY)
 	@$(BIN)/ruff check --fix .

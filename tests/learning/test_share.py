@@ -1,6 +1,6 @@
 """The share of the demonstration that a start follows, and the joining rules, which set the least of it."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from math import nan
 
 import numpy as np
@@ -16,6 +16,7 @@ from skills.learning.certificate import (
     Coverage,
     NearLimits,
     NearStarts,
+    OddsLimits,
     certify,
     coverage,
     finishes,
@@ -264,6 +265,20 @@ def test_a_near_start_below_the_limit_or_without_a_share_fails():
 def test_limits_that_mean_nothing_are_refused(limits):
     with pytest.raises(BadSettings, match="radius_mm must be positive"):
         NearLimits(*limits)
+
+
+@pytest.mark.parametrize("odds", [(-0.1, 0.05), (1.1, 0.05), (0.9, -0.1), (0.9, 1.1), (nan, 0.05), (0.9, nan)])
+def test_odds_that_mean_nothing_are_refused(odds):
+    with pytest.raises(BadSettings, match="least_finishing and most_touching"):
+        OddsLimits(*odds)
+
+
+def test_the_limits_of_a_release_are_the_stated_ones_and_may_be_all_or_nothing():
+    assert asdict(NearLimits()) == {"radius_mm": 3.0, "least_share": 0.4}
+    assert asdict(OddsLimits()) == {"least_finishing": 0.9, "most_touching": 0.05}
+    for extreme in (0.0, 1.0):
+        assert NearLimits(1e-9, extreme).least_share == extreme
+        assert OddsLimits(extreme, 1.0 - extreme).least_finishing == extreme
 
 
 def test_a_path_that_comes_back_beside_its_start_fails_and_the_remedy_mends_it():
