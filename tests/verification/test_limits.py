@@ -7,6 +7,7 @@ import pytest
 
 from skills.kinematics import CANNULA_MM, JOINTS, instrument_of
 from skills.planning.trajectory import TRANSFER
+from skills.verification.playback import LINKS
 from skills.verification.verdict import Limits, judge
 from tests.planning.motions import ideal_playback
 from tests.verification.test_playback import HAND_OFF, SAMPLE, TRAJECTORY, beside, failed, planted, with_psm_m
@@ -109,9 +110,39 @@ def test_a_margin_of_the_joints_is_a_part_of_their_range(joint, side):
     assert failed(judge(near, TRAJECTORY, replace(free, joint_margin=0.021))) == (JOINTS[joint], SAMPLE)
 
 
+@pytest.mark.parametrize("joint", range(6))
+@pytest.mark.parametrize("side", ["lower", "upper"])
+def test_a_joint_may_be_at_its_limit_and_no_further(joint, side):
+    limit = getattr(instrument_of(TRAJECTORY.instrument), side)[joint]
+    outwards = 1e-8 if side == "upper" else -1e-8
+    measured = np.array(TRAJECTORY.joints)
+    free = Limits(speed_ratio=1e9, acceleration_ratio=1e9, insertion_mm=0.0)
+    measured[SAMPLE, joint] = limit
+    assert judge(replace(ideal_playback(TRAJECTORY), joints=measured), TRAJECTORY, free).feasible
+    measured[SAMPLE, joint] = limit + outwards
+    beyond = judge(replace(ideal_playback(TRAJECTORY), joints=measured), TRAJECTORY, free)
+    assert failed(beyond) == (JOINTS[joint], SAMPLE)
+
+
+@pytest.mark.parametrize(("early", "passes"), [(1e-7, True), (1e-5, False)])
+def test_stamps_may_be_early_by_round_off_alone(early, passes):
+    stamps = np.array(TRAJECTORY.stamps_s)
+    stamps[SAMPLE:] -= early / TRAJECTORY.rate_hz
+    hurried = replace(TRAJECTORY, stamps_s=stamps)
+    assert judge(ideal_playback(hurried), hurried).feasible is passes
+
+
 def test_the_transfer_alone_excuses_fingers_after_the_hand_off():
     pair = "PSM_A finger_1 to PSM_M finger_2"
     apart = np.full(len(TRAJECTORY), 20.0)
     after = int(np.flatnonzero((np.arange(len(TRAJECTORY)) > HAND_OFF) & (TRAJECTORY.phase != TRANSFER))[0])
     apart[HAND_OFF : after + 1] = 0.4
     assert failed(judge(with_psm_m(apart), beside())) == (f"clearance of {pair}", after)
+
+
+def test_of_two_pairs_too_near_at_one_sample_the_nearer_is_reported():
+    seen = np.full((len(TRAJECTORY), 4), 5.0)
+    seen[:, LINKS.index("finger_2")] = 50.0
+    seen[SAMPLE, LINKS.index("roll_link")], seen[SAMPLE, LINKS.index("finger_2")] = 0.5, 0.2
+    report = judge(replace(ideal_playback(TRAJECTORY), clearances_mm=seen), TRAJECTORY)
+    assert failed(report) == ("clearance of PSM_A finger_2 to the pad", SAMPLE)
