@@ -233,8 +233,8 @@ class Recorder:
         test["lines"] = sorted({*map(tuple, test["lines"]), *self.lines})
         self.lines.clear()
 
-    def pytest_sessionstart(self) -> None:
-        """Begin to trace, in all threads."""
+    def begin(self) -> None:
+        """Begin to trace, in all threads, before pytest imports anything."""
         threading.settrace(self.trace)
         sys.settrace(self.trace)
 
@@ -273,6 +273,8 @@ def run(tree: Path, tests: list[str], plugin: object, patience_s: float, said: P
             sys.path[:] = [str(tree), *(one for one in sys.path if one not in ("", str(ROOT)))]
             os.environ["PYTHONPATH"] = str(tree)
             _reuse_filled(said.parent / "kept")
+            if isinstance(plugin, Recorder):
+                plugin.begin()
             status = int(pytest.main(["-x", "-q", "-n", "0", *QUIET, *tests], plugins=[plugin]))
         except BaseException:
             traceback.print_exc()
@@ -349,7 +351,8 @@ GUARDS = (
     Guard(
         "skills/library/training.py", 25,
         ("tests/library/test_release_gate.py", "tests/library/test_joining.py", "tests/library/test_scenes.py",
-         "tests/library/test_library.py"),
+         "tests/library/test_library.py", "tests/library/test_outcomes.py",
+         "tests/api/test_policies.py::test_a_demo_in_a_frame_other_than_the_arms_base_is_not_released"),
         ("refusals", "_unlikely", "_not_the_style", "_driven", "_refusal", "_version"),
     ),
     Guard(
@@ -360,20 +363,20 @@ GUARDS = (
          "_clearance_gates", "_handing_over"),
     ),
     Guard(
-        "skills/library/releases.py", 30,
+        "skills/library/releases.py", 22,
         ("tests/library/test_release_gate.py", "tests/library/test_library.py", "tests/library/test_consent.py",
          "tests/library/test_outcomes.py", "tests/library/test_combined.py", "tests/library/test_hands.py",
          "tests/api/test_consent.py", "tests/api/test_repeated_releases.py", "tests/api/test_gate.py", TOLD),
     ),
     Guard("skills/api/authorisation.py", 22, ("tests/api/test_roles.py", "tests/api/test_seen.py")),
     Guard("skills/library/consent.py", 18, ("tests/library/test_consent.py", "tests/api/test_consent.py")),
-    Guard("skills/api/policy_cache.py", 28, ("tests/api/test_served.py", "tests/api/test_policies.py")),
+    Guard("skills/api/policy_cache.py", 22, ("tests/api/test_policy_cache.py", "tests/api/test_served.py")),
     Guard(
         "skills/library/erasure.py", 30,
         ("tests/library/test_erasing.py", "tests/library/test_sweep.py", "tests/api/test_deleting_recordings.py",
-         "tests/library/test_parsed.py", TOLD),
+         "tests/library/test_parsed.py", "tests/library/test_what_remains.py", TOLD),
     ),
-    Guard("skills/library/sweep.py", 25, ("tests/library/test_sweep.py", "tests/library/test_erasing.py")),
+    Guard("skills/library/sweep.py", 20, ("tests/library/test_sweep.py", "tests/library/test_erasing.py")),
 )  # fmt: skip
 
 # By file and name (`Mutant.name`): why nobody can tell the mutant from the code.

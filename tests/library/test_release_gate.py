@@ -8,12 +8,13 @@ import io
 from dataclasses import replace
 from itertools import pairwise
 from math import atan2, radians
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from skills.demonstration.recording import Joints, Motion, Recording
-from skills.errors import Conflict
+from skills.errors import Conflict, NotFound
 from skills.formats import read_recording, write_mcap
 from skills.gridworld.grid import GridPath, GridWorld
 from skills.gridworld.reward import sparse_reward
@@ -24,10 +25,12 @@ from skills.learning.policy import Policy, learn_tabular
 from skills.learning.q_learning import PhaseQLearning
 from skills.library import releases, retraining, training
 from tests.formats.bags import sample_folder
+from tests.gridworld.paths import learnt
 from tests.library import cases
 from tests.library.styles import ask_retraining, styles_of
 
 LIMIT_RAD = radians(53)
+STAY = 13  # the action
 Z_MM = -112.4  # at the lower edge of the cells whose centres are at -110 mm
 
 
@@ -152,6 +155,79 @@ def test_values_too_small_to_be_learnt_are_refused_with_a_gamma_that_does(learne
     assert "larger cells" in releases.remedy(reason)
     better = learn_tabular(reward, replace(learner, gamma=float(reason.rpartition(" gamma of ")[2])))
     assert reasons(better) == []
+
+
+def test_values_too_small_to_be_learnt_are_no_reason_where_every_action_is_optimal():
+    grid = GridWorld((0.0, 0.0, 0.0), 1.0, (450, 3, 3))
+    policy = learn_tabular(sparse_reward(GridPath(grid, grid.states_of([[448, 1, 1], [449, 1, 1]]))), PhaseQLearning())
+    certificate, _ = certify(policy)
+    assert certificate.faint > 0 and certificate.every_action_optimal
+    assert reasons(policy) == []
+
+
+def test_a_rollout_that_is_not_the_demonstration_is_a_reason_of_its_own():
+    policy = learnt("an angle")
+    q = policy.q.copy()
+    q[policy.row(1, policy.path.start), STAY] = 100
+    still = replace(policy, q=q)
+    assert "the rollout from the demonstrated start is not the demonstration" in reasons(still)
+    certificate, covered = certify(policy)
+    near = near_starts(policy, covered.share, NearLimits())
+    assert training.refusals(policy, certificate, near) == []
+    unlike = replace(certificate, demonstration_reproduced=False)
+    assert len(training.refusals(policy, unlike, near)) == 1
+    assert training.refusals(learnt("an angle", phased=False), unlike, replace(near, share=0.0)) == []
+
+
+@pytest.mark.parametrize(
+    ("value", "margin", "words"),
+    [
+        (None, None, "no joints put the tip there"),
+        (None, -0.1, "no joints put the tip there"),
+        (-0.9, None, "no joints put the tip there"),
+        (-0.9, -0.1, "the arm needs pitch -0.9000 rad, 0.1000 rad beyond the limit -0.8000"),
+    ],
+)
+@pytest.mark.parametrize(("path", "way"), [("fitted", "the fitted path"), ("centres", "the centres of its cells")])
+def test_a_place_beyond_the_limits_is_told_with_its_joint_or_without(value, margin, words, path, way, monkeypatch):
+    nearest = SimpleNamespace(tip_mm=(1, 2, 3), joint="pitch", unit="rad", limit=-0.8, value=value, margin=margin)
+    driven = SimpleNamespace(beyond=2, samples=9, path=path, nearest_limit=nearest)
+    monkeypatch.setattr(training, "driven_pass", lambda _policy, _demo: driven)
+    demo = SimpleNamespace(frame="PSM2_base", instrument="400006")
+    found, (reason,) = training._driven(learnt("an angle"), demo)
+    assert found is driven
+    assert f"at (1.0, 2.0, 3.0) mm in PSM2_base {words}" in reason
+    assert way in reason and "of 2 of 9 places" in reason
+
+
+@pytest.mark.parametrize(
+    ("demo", "others", "why"),
+    [
+        (None, [], "was erased while"),
+        (None, [{}], "was erased while"),
+        ({}, [None], "was erased while"),
+        ({"withdrawn_at": 1}, [], "was withdrawn while"),
+        ({"withdrawn_at": 1}, [{}], "was withdrawn while"),
+        ({}, [{}, {"withdrawn_at": 1}], "was withdrawn while"),
+        ({"outcome": "failure"}, [{"outcome": "success"}], "was marked failure while"),
+        ({}, [{"outcome": "recovery"}], "was marked recovery while"),
+        ({"consent": {"uses": []}}, [{}], "does not cover training"),
+        ({"outcome": "success"}, [{}, {}], None),
+    ],
+)
+@pytest.mark.parametrize("outcomes", ["success", "any"])
+def test_what_changed_during_a_training_forbids_storing_it(demo, others, why, outcomes):
+    sound = {"withdrawn_at": None, "outcome": None, "slug": "kestrel", "consent": None}
+    first, *rest = (None if one is None else SimpleNamespace(**sound | one) for one in (demo, *others))
+    session = SimpleNamespace(get=lambda _kind, row: rest[row])
+    manifest = {} if outcomes == "success" else {"outcomes": "any"}
+    finished = SimpleNamespace(lesson=SimpleNamespace(others=range(len(rest))), manifest=manifest)
+    refused = training._refusal(session, finished, first)
+    if why is None or ("marked" in why and outcomes == "any"):
+        assert refused is None
+    else:
+        assert why in str(refused)
+        assert isinstance(refused, NotFound if "erased" in why else Conflict)
 
 
 def test_where_slips_leave_no_gamma_to_name_the_reason_names_none():
