@@ -1,6 +1,8 @@
 """Plans of a recorded hand: what they state, what is stored, and the gates on a jaw that is held."""
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -125,3 +127,30 @@ def test_a_plan_of_several_follows_their_pose_style(database: Database):
     plan = cases.add_plan(database)
     assert plan.about["orientation"] == "recorded"
     assert plan.about["passes"][0]["turn_deg"] == pytest.approx(45, abs=2)  # the mean of 60 and 30
+
+
+@pytest.mark.parametrize(
+    ("turns_deg", "driven", "limit_deg", "refused"),
+    [
+        ([None], {}, 0.0, False),
+        ([12.0], {}, 12.0, False),
+        ([12.0], {}, 11.9, True),
+        ([None, 3.0, 12.0], {"orientation": "constant"}, 11.9, True),
+        ([12.0, 90.0], {"orientation": "recorded"}, 0.0, False),
+        ([90.0], None, 0.0, False),
+    ],
+)
+def test_a_version_checked_with_the_jaw_held_may_turn_so_far(turns_deg, driven, limit_deg, refused, monkeypatch):
+    turns = iter(turns_deg)
+    monkeypatch.setattr(releases, "departure_of", lambda _demo: None if (deg := next(turns)) is None else Turn(deg))
+    demos = [SimpleNamespace(demo=None) for _ in turns_deg]
+    policy = SimpleNamespace(manifest={"grid_certificate": {"driven": driven}}, demonstrations=demos)
+    found = releases._held(policy, limit_deg)
+    assert bool(found) == refused
+    assert all(f"turns by 12.0 degrees, over {limit_deg:g}" in one for one in found)
+
+
+class Turn(NamedTuple):
+    """A departure of a demonstration's orientation from its first one."""
+
+    deg: float
