@@ -1,7 +1,8 @@
 """Consent in the library: checked at every storage; an ended consent stops serving everything that depends on it."""
 
 from collections.abc import Callable
-from datetime import date, timedelta
+from datetime import UTC, date, datetime, timedelta
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -23,6 +24,7 @@ from tests.library.styles import add_styles, ask_retraining, counted, parts_of, 
 ALL = {"uses": ["training", "export", "atlas"], "until": None}
 NO_TRAINING = {"uses": ["export", "atlas"], "until": None}
 TODAY = date(2031, 3, 31)
+REALLY_TODAY = consent.today
 
 
 @pytest.fixture(autouse=True)
@@ -288,6 +290,35 @@ def test_the_question_is_answered_alike_in_python_and_in_sql(
             wanted = uses is None or (use in uses and (until is None or date.fromisoformat(until) >= TODAY))
             found = session.scalar(select(type(surgeon).row).where(covered(use)))
             assert (may(surgeon, use), found == surgeon.row) == (wanted, wanted)
+
+
+@pytest.mark.parametrize(
+    ("uses", "until", "why"),
+    [
+        ([], None, "The consent of 'kestrel' does not cover training; it covers nothing."),
+        (["export", "atlas"], None, "The consent of 'kestrel' does not cover training; it covers export, atlas."),
+        (["training"], "2031-03-30", "The consent of 'kestrel' expired on 2031-03-30."),
+        (["training"], "2031-03-31", None),
+        (["training"], "2031-04-01", None),
+        (["training"], None, None),
+    ],
+)
+def test_a_refusal_says_what_the_consent_covers_or_when_it_ended(uses: list[str], until: str | None, why: str | None):
+    surgeon = SimpleNamespace(slug="kestrel", consent={"uses": uses, "until": until})
+    assert may(surgeon, "training") is (why is None)
+    refused = consent.refusal(surgeon, "training")
+    assert (refused and str(refused)) == why
+    assert consent.last_day(surgeon.consent) == (None if until is None else date.fromisoformat(until))
+    if why is not None:
+        with pytest.raises(Conflict):
+            consent.require(surgeon, "training")
+
+
+def test_a_day_ends_in_utc(monkeypatch: pytest.MonkeyPatch):
+    for minute, day in ((59, TODAY), (60, TODAY + timedelta(days=1))):
+        moment = datetime(2031, 3, 31, 23, tzinfo=UTC) + timedelta(minutes=minute)
+        monkeypatch.setattr(consent, "now", lambda moment=moment: moment)
+        assert REALLY_TODAY() == day
 
 
 def test_a_surgeon_of_whom_nothing_was_ever_recorded_covers_everything(database: Database):

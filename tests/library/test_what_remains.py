@@ -7,8 +7,8 @@ from sqlalchemy import select, text
 from sqlalchemy.orm import Session
 
 from skills.comparison.combining import Medoid
-from skills.db.models import Base, Plan, StoredPictures, Surgeon
-from skills.db.service_tables import Job
+from skills.db.models import Base, Erasure, Plan, StoredPictures, Surgeon
+from skills.db.service_tables import Event, Job
 from skills.db.session import Database
 from skills.learning.max_ent_irl import MaxEntIRL
 from skills.library import erasure, sweep
@@ -98,11 +98,16 @@ def test_erasing_leaves_what_was_there_before_and_nothing_else(database: Databas
     assert rows(database) == with_osprey
 
     with database.writing() as session:
+        subject = session.query(Surgeon).filter_by(slug="osprey").one().subject
         theirs = queued_of(session, "osprey")
         assert len(erase_surgeon(session, "osprey", "test")) == theirs == 2
     assert (rows(database) != before) == in_steps
     sweep_erased(database)
     assert rows(database) == before
+    with database.reading() as session:
+        said = session.query(Event).filter_by(action="erase").order_by(Event.row)
+        assert [(one.object_kind, one.object_id) for one in said] == [("demonstration", demo), ("surgeon", subject)]
+        assert session.query(Erasure).count() == 1
 
 
 def queued_of(session: Session, surgeon: str) -> int:
