@@ -10,7 +10,16 @@ from sqlalchemy import func, select, text, update
 from sqlalchemy.orm import Session
 
 from skills.db import now
-from skills.db.models import LooseChunks, ParsedChunk, ParsedRecording, RecordingChunk, StoredRecording
+from skills.db.models import (
+    LooseChunks,
+    ParsedChunk,
+    ParsedRecording,
+    Plan,
+    RecordingChunk,
+    StoredPictures,
+    StoredPlayback,
+    StoredRecording,
+)
 from skills.db.service_tables import ErasedSurgeon, Event, Job, StyleToRetrain
 from skills.db.session import Database
 from skills.errors import Busy, NotFound
@@ -18,11 +27,15 @@ from skills.library import recordings, retraining, sweep
 from skills.library.erasure import delete_recording, erase_surgeon
 from skills.library.inspection import inspect_installation
 from skills.library.jobs import find_job, identity_of, list_jobs
+from skills.library.plans import planned, trajectory_of
 from skills.library.recordings import find_recording, recording_bytes, store_recording, stored_recording
 from skills.library.sweep import STEADY_S, SteadyClock, sweep_erased
 from skills.settings import Settings
+from skills.verification.playback import Pictures
 from tests.library import cases
 from tests.library.styles import ask_retraining, look, parts_of
+from tests.library.test_pictures import store_playback
+from tests.planning.motions import ideal_playback
 
 KIB = 1 << 10
 
@@ -212,6 +225,33 @@ def test_a_sweep_ends_in_time_and_says_that_something_is_left(database: Database
     assert count(database, Job) == 5
     assert sweep.sweep(database, days)
     assert count(database, Job) == 1
+
+
+def test_pictures_are_deleted_after_their_retention_with_the_jobs_that_drew_them(database: Database, monkeypatch):
+    monkeypatch.setattr(sweep, "PICTURES_AT_ONCE", 2)
+    cases.add_demo(database)
+    cases.train(database, release=True)
+    plan = cases.add_plan(database)
+    names = [f"{number:064x}" for number in range(5)]
+    with database.writing() as session:
+        measured = ideal_playback(trajectory_of(planned(session.get_one(Plan, plan.row))))
+        playbacks = [store_playback(session, plan, name, measured) for name in names]
+        session.execute(update(Job).where(Job.kind == "pictures").values(state="succeeded", ended_at=now()))
+        for number, playback in enumerate(playbacks):
+            drawn = StoredPictures(playback_row=playback.row, drawn=Pictures(b"mp4", b"gif", b"png", b"png"))
+            drawn.created_at = now() - timedelta(days=(30, 10, 30, 30, 21)[number])
+            session.add(drawn)
+        last = identity_of("pictures", {"plan": plan.sha256, "playback": names[4]})
+        session.execute(update(Job).where(Job.identity == last).values(state="running", ended_at=None))
+    assert sweep.sweep(database, settings_of(database))
+    assert count(database, StoredPictures) == 5, "the default is a year"
+    assert sweep.sweep(database, settings_of(database, keep_pictures_days=20))
+    with database.reading() as session:
+        assert session.scalars(select(StoredPictures.playback_row)).all() == [playbacks[1].row]
+        asked = session.scalars(select(Job.request).where(Job.kind == "pictures").order_by(Job.row)).all()
+        assert [one["playback"] for one in asked] == [names[1], names[4]]
+        assert session.scalar(select(func.count()).where(Job.kind == "training")) == 1
+    assert count(database, StoredPlayback) == 5
 
 
 def test_a_batch_does_not_end_before_all_its_styles_are_added(database: Database, monkeypatch: pytest.MonkeyPatch):
