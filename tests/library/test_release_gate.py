@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from skills.demonstration.recording import Joints, Motion, Recording
-from skills.errors import Conflict, NotFound
+from skills.errors import BadPlan, Conflict, NotFound
 from skills.formats import read_recording, write_mcap
 from skills.gridworld.grid import GridPath, GridWorld
 from skills.gridworld.reward import sparse_reward
@@ -198,6 +198,22 @@ def test_a_place_beyond_the_limits_is_told_with_its_joint_or_without(value, marg
     assert found is driven
     assert f"at (1.0, 2.0, 3.0) mm in PSM2_base {words}" in reason
     assert way in reason and "of 2 of 9 places" in reason
+
+
+def test_a_pass_that_cannot_be_checked_is_refused_and_one_within_the_limits_is_not(monkeypatch):
+    policy, demo = learnt("an angle"), SimpleNamespace(frame="PSM2_base", instrument="400006")
+    found, (reason,) = training._driven(policy, SimpleNamespace(frame="ECM"))
+    assert found is None and "'ECM' is not the arm's base" in reason
+    within = SimpleNamespace(beyond=0)
+    monkeypatch.setattr(training, "driven_pass", lambda _policy, _demo: within)
+    assert training._driven(policy, demo) == (within, [])
+
+    def refusing(_policy: object, _demo: object) -> None:
+        raise BadPlan("It is too short.")
+
+    monkeypatch.setattr(training, "driven_pass", refusing)
+    found, (reason,) = training._driven(policy, demo)
+    assert found is None and reason.endswith("not checked: It is too short")
 
 
 @pytest.mark.parametrize(
