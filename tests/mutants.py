@@ -392,6 +392,10 @@ GUARDS = (
 # By file and name (`Mutant.name`): why nobody can tell the mutant from the code.
 EQUIVALENT: dict[tuple[str, str], str] = {
     (
+        "skills/library/sweep.py",
+        "_sweep_ended: return None  # parts of a batch that has not ended so long ago",
+    ): "the last of the conditions of a loop, for which None ends it as False does",
+    (
         "skills/verification/verdict.py",
         "figures_of: ticks=np.append(2.0, np.diff(trajectory.stamps_s) * trajectory.rate_hz),",
     ): "the first sample has none before it; its gate asks for 1 or more, and reports the number nowhere",

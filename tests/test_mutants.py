@@ -71,7 +71,7 @@ def test_every_explanation_is_of_a_mutant_that_exists():
 
 @pytest.mark.parametrize(("new", "status"), [(b"1 + 1 == 2", 0), (b"1 + 1 == 3", 1)])
 def test_a_fork_tells_how_its_tests_ended(new, status, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """The tree is a folder with one test; its process ends by `os._exit`, and never returns here."""
+    """The tree is a folder with one test; the process of the fork never returns here."""
     (tmp_path / "test_one.py").write_bytes(b"def test_one():\n    assert " + new + b"\n")
     (tmp_path / "pytest.ini").write_text("[pytest]\n")
     monkeypatch.setattr("tests.mutants._reuse_filled", lambda kept: None)

@@ -273,7 +273,7 @@ def test_odds_that_mean_nothing_are_refused(odds):
         OddsLimits(*odds)
 
 
-def test_the_limits_of_a_release_are_the_stated_ones_and_may_be_all_or_nothing():
+def test_the_limits_of_a_release_are_the_stated_ones_or_all_or_nothing():
     assert asdict(NearLimits()) == {"radius_mm": 3.0, "least_share": 0.4}
     assert asdict(OddsLimits()) == {"least_finishing": 0.9, "most_touching": 0.05}
     for extreme in (0.0, 1.0):

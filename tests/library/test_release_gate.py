@@ -157,7 +157,7 @@ def test_values_too_small_to_be_learnt_are_refused_with_a_gamma_that_does(learne
     assert reasons(better) == []
 
 
-def test_values_too_small_to_be_learnt_are_no_reason_where_every_action_is_optimal():
+def test_too_small_values_are_no_reason_if_every_action_is_optimal():
     grid = GridWorld((0.0, 0.0, 0.0), 1.0, (450, 3, 3))
     policy = learn_tabular(sparse_reward(GridPath(grid, grid.states_of([[448, 1, 1], [449, 1, 1]]))), PhaseQLearning())
     certificate, _ = certify(policy)
@@ -200,7 +200,7 @@ def test_a_place_beyond_the_limits_is_told_with_its_joint_or_without(value, marg
     assert way in reason and "of 2 of 9 places" in reason
 
 
-def test_a_pass_that_cannot_be_checked_is_refused_and_one_within_the_limits_is_not(monkeypatch):
+def test_a_pass_that_cannot_be_checked_is_refused(monkeypatch):
     policy, demo = learnt("an angle"), SimpleNamespace(frame="PSM2_base", instrument="400006")
     found, (reason,) = training._driven(policy, SimpleNamespace(frame="ECM"))
     assert found is None and "'ECM' is not the arm's base" in reason

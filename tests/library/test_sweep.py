@@ -227,7 +227,7 @@ def test_a_sweep_ends_in_time_and_says_that_something_is_left(database: Database
     assert count(database, Job) == 1
 
 
-def test_pictures_are_deleted_after_their_retention_with_the_jobs_that_drew_them(database: Database, monkeypatch):
+def test_old_pictures_are_deleted_with_the_jobs_that_drew_them(database: Database, monkeypatch):
     monkeypatch.setattr(sweep, "PICTURES_AT_ONCE", 2)
     cases.add_demo(database)
     cases.train(database, release=True)
