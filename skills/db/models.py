@@ -347,11 +347,6 @@ class PolicyVersion(Base):
         return sorted([self.demonstration, *self.others], key=lambda one: one.row)
 
     @property
-    def newest_demonstration_row(self) -> int:
-        """The row number of the newest demonstration; needs no query where there is only one."""
-        return self.demonstrations[-1].row if "combined" in self.manifest else self.demonstration_row
-
-    @property
     def of_any_outcome(self) -> bool:
         """True if it was trained from demonstrations of any outcome; its manifest then names the outcomes."""
         return "outcomes" in self.manifest

@@ -34,7 +34,7 @@ from skills.library import integrity, jobs, locks, releases
 from skills.library.consent import refusal
 from skills.library.demos import newest_demos
 from skills.library.jobs import PartRequest, RetrainingRequest, Store, TrainingRequest
-from skills.library.policies import LearntIn, Recipe, joining_rules, learner_kept, recipes_of, refuse_unlike, scenes_of
+from skills.library.policies import LearntIn, Recipe, kept_of, learner_kept, recipes_of, refuse_unlike
 from skills.library.releases import fit_of, not_worse, shown_mm, taught, way_of
 from skills.library.training import Learnt, Lesson, Stored, combined_lesson, learn_style, lessons, store_styles
 from skills.schemas.policies import FitOnTheSame, PolicyFigures, StoredComparison
@@ -210,13 +210,12 @@ def _waiting(database: Database, part: int) -> list[_Style]:
         rows = session.execute(left.order_by(of.tries, of.row)).all()
         read = {lesson.row: lesson for lesson in lessons(session, [demonstration for demonstration, *_ in rows])}
         surgeons = {lesson.surgeon.row for lesson in read.values()}
-        recipes, rules = recipes_of(session, surgeons), joining_rules(session, surgeons)
-        scenes = scenes_of(session, surgeons)
+        recipes, kept = recipes_of(session, surgeons), kept_of(session, surgeons)
     styles = []
     for demonstration, row, tries in rows:
         lesson = read[demonstration]
         name = lesson.surgeon.row, lesson.suture
-        styles.append(_Style(row, tries, lesson, recipes.get(name), rules.get(name), scenes.get(name)))
+        styles.append(_Style(row, tries, lesson, recipes.get(name), kept.rules.get(name), kept.scenes.get(name)))
     return styles
 
 

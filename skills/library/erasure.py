@@ -80,6 +80,21 @@ def erase_surgeon(session: Session, slug: str, actor: str) -> Dropped:
     return dropped
 
 
+def erased_with(session: Session, surgeon: Surgeon, demo: Demonstration | None = None) -> list[int]:
+    """Return the rows of the recordings that are erased with a surgeon, or with one of the surgeon's demonstrations."""
+    of, named = Demonstration, RecordingSurgeon
+    which = of.surgeon_row == surgeon.row if demo is None else of.row == demo.row
+    rows = {*session.scalars(select(of.recording_row).where(which))}
+    if demo is None:
+        rows |= {*session.scalars(select(named.recording_row).where(named.surgeon_row == surgeon.row))}
+    shared: set[int] = set()
+    for some in in_parts(sorted(rows)):
+        shared |= {*session.scalars(select(of.recording_row).where(of.recording_row.in_(some), ~which))}
+        others = select(named.recording_row).where(named.recording_row.in_(some), named.surgeon_row != surgeon.row)
+        shared |= {*session.scalars(others)}
+    return sorted(rows - shared)
+
+
 def erase_demo(session: Session, demo_sha256: str, actor: str) -> Dropped:
     """Erase one demonstration and everything that was learnt from it.
 
@@ -138,6 +153,22 @@ def delete_recording(session: Session, recording_sha256: str, actor: str, *, any
         NotAllowed: Only others have uploaded it.
         Conflict: Demonstrations were cut out of it.
     """
+    stored, alone = deletable_recording(session, recording_sha256, actor, anybodys=anybodys)
+    if not alone:
+        mine = (RecordingUpload.recording_row == stored.row, RecordingUpload.actor == actor)
+        session.execute(delete(RecordingUpload).where(*mine), **UNSYNCHRONISED)
+        return
+    record_event(session, actor, "erase", "recording", recording_sha256)
+    _delete_recordings(session, [stored.row])
+
+
+def deletable_recording(
+    session: Session, recording_sha256: str, actor: str, *, anybodys: bool
+) -> tuple[StoredRecording, bool]:
+    """Return the recording that `delete_recording` would delete, and whether it itself and not only an upload of it.
+
+    The arguments and errors are those of `delete_recording`.
+    """
     stored = find_recording(session, recording_sha256)
     senders = set(session.scalars(select(RecordingUpload.actor).where(RecordingUpload.recording_row == stored.row)))
     if not anybodys and actor not in senders:
@@ -147,12 +178,7 @@ def delete_recording(session: Session, recording_sha256: str, actor: str, *, any
     if session.scalar(resting.execution_options(**EVERYBODYS)):
         why = "Demonstrations, active or withdrawn, depend on this recording."
         raise Conflict(why, Remedy(Action.ERASE_DEMOS))
-    if not anybodys and senders != {actor}:
-        mine = (RecordingUpload.recording_row == stored.row, RecordingUpload.actor == actor)
-        session.execute(delete(RecordingUpload).where(*mine), **UNSYNCHRONISED)
-        return
-    record_event(session, actor, "erase", "recording", recording_sha256)
-    _delete_recordings(session, [stored.row])
+    return stored, anybodys or senders == {actor}
 
 
 def _resting_on(which: ColumnElement[bool]) -> Select[int]:

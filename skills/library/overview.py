@@ -14,17 +14,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy import ColumnElement, Select, case, exists, func, select, text
-from sqlalchemy.orm import Session, selectinload
+from sqlalchemy.orm import Session
 
 from skills.db import now
 from skills.db.models import (
     Demonstration,
     Plan,
+    PolicyDemonstration,
     PolicyVersion,
     Release,
     StoredPictures,
@@ -347,7 +348,10 @@ def _styles(session: Session, surgeons: Sequence[int], suture: str | None = None
     served = select(Release.surgeon_row, Release.suture, Release.policy_row).where(*mine(Release), is_served())
     released = {(who, what): policy for who, what, policy in session.execute(served)}
     wanted = {**newest_version, **released}
-    told = {one.row: one for one in session.scalars(select(by).where(by.row.in_(wanted.values())))}
+    # Columns and not entities, of which a page has hundreds.
+    others = select(func.max(PolicyDemonstration.demonstration_row)).where(PolicyDemonstration.policy_row == by.row)
+    about = select(by.row, by.version, by.manifest, by.demonstration_row, others.scalar_subquery().label("other"))
+    told = {one.row: one for one in session.execute(about.where(by.row.in_(wanted.values())))}
     return {
         style: _sum_up(
             style,
@@ -361,9 +365,7 @@ def _styles(session: Session, surgeons: Sequence[int], suture: str | None = None
     }
 
 
-def _sum_up(
-    style: _Row, demos: int, versions: int, shown: PolicyVersion | None, newest_demo: int, released: bool
-) -> Style:
+def _sum_up(style: _Row, demos: int, versions: int, shown: Any, newest_demo: int, released: bool) -> Style:
     if shown is None:
         return Style(style[1], "stored", demos)
     return Style(
@@ -373,7 +375,7 @@ def _sum_up(
         versions=versions,
         released=shown.version if released else None,
         shown=shown.manifest,
-        waiting=newest_demo > shown.newest_demonstration_row,
+        waiting=newest_demo > max(shown.demonstration_row, shown.other or 0),
     )
 
 
@@ -426,14 +428,21 @@ def all_suture_types(session: Session, limit: int = 1000) -> Sequence[SutureType
     return session.scalars(select(SutureType).order_by(SutureType.slug).limit(limit)).all()
 
 
-def released_styles(session: Session, limit: int = 1000) -> Sequence[Release]:
-    """List the served releases by surgeon and suture type, for a selection in a form."""
-    found = select(Release).where(is_served()).join(Surgeon, Surgeon.row == Release.surgeon_row)
-    by_name = found.order_by(Surgeon.slug, Release.suture)
-    # With all versions at once, and without their manifests, which one of them alone needs.
+class ReleasedStyle(NamedTuple):
+    """A style and the version that it serves, for a selection."""
+
+    surgeon: str
+    suture: str
+    version: int
+    policy_row: int
+
+
+def released_styles(session: Session, limit: int = 1000) -> list[ReleasedStyle]:
+    """List the styles that serve a version, by surgeon and suture type, for a selection in a form."""
     by = PolicyVersion
-    by_name = by_name.options(selectinload(Release.policy).load_only(by.version, by.surgeon_row, by.suture))
-    return session.scalars(by_name.limit(limit)).all()
+    found = select(Surgeon.slug, Release.suture, by.version, by.row).join(Release, Release.surgeon_row == Surgeon.row)
+    found = found.join(by, by.row == Release.policy_row).where(is_served()).order_by(Surgeon.slug, Release.suture)
+    return [ReleasedStyle(*one) for one in session.execute(found.limit(limit))]
 
 
 def newest_recordings(

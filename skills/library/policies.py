@@ -6,13 +6,14 @@ compares the resulting path with the policy's.
 """
 
 import io
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from sqlalchemy import exists, func, select
-from sqlalchemy.orm import Session
+import orjson
+from sqlalchemy import Select, Text, cast, exists, func, select
+from sqlalchemy.orm import Session, selectinload
 
 from skills.comparison.combining import COMBININGS, Combined, Combining, Corridor, Followed, followed
 from skills.db import rfc3339
@@ -36,6 +37,7 @@ from skills.schemas.policies import Rollout
 
 MAX_JSON_ACTIONS = 10**6  # ours: above it, JSON has the certified domain alone, in `live_actions`
 MOST_DEMOS = 50  # ours: all pairs are compared, and the combined path with each some ten times, in a third of a second
+ROWS_AT_ONCE = 1000  # of a query that reads many manifests, some 3 kB each
 BEST = Corridor()  # nearest to left-out demonstrations, with an outlier and without: docs/results.md
 
 
@@ -106,6 +108,8 @@ def list_served(
         query = query.where(Release.surgeon_row == find_surgeon(session, surgeon).row)
     if suture is not None:
         query = query.where(Release.suture == find_suture_type(session, suture).slug)
+    # The versions of the whole page with one statement more; a join would make SQLite read all of them.
+    query = query.options(selectinload(Release.policy))
     return session.scalars(query.order_by(Release.row).limit(limit)).all()
 
 
@@ -388,28 +392,6 @@ def recipes_of(session: Session, surgeons: Collection[int] | None = None) -> dic
     return {(who, suture): Recipe(more + 1, combining_of({"kind": how})) for who, suture, how, more in found}
 
 
-def joining_rules(session: Session, surgeons: Collection[int] | None = None) -> dict[tuple[int, str], float]:
-    """Return the joining rules of the styles that serve a policy with another one than the nearest waypoint.
-
-    Args:
-        session: The caller's transaction.
-        surgeons: The rows of surgeons; None: all.
-
-    Returns:
-        The least share, by style: a surgeon's row and a suture type.
-    """
-    if surgeons is not None and not surgeons:
-        return {}
-    rule = PolicyVersion.manifest["settings"]["join_share"].as_float()
-    query = select(Release.surgeon_row, Release.suture, rule).join(
-        PolicyVersion, PolicyVersion.row == Release.policy_row
-    )
-    query = query.where(is_served(), rule.is_not(None))
-    if surgeons is not None:
-        query = query.where(Release.surgeon_row.in_(surgeons))
-    return {(who, suture): share for who, suture, share in session.execute(query)}
-
-
 @dataclass(frozen=True)
 class LearntIn:
     """The scene that a served policy was learnt in, its digest, and the learner, as JSON."""
@@ -419,30 +401,49 @@ class LearntIn:
     learner: dict[str, Any]
 
 
-def scenes_of(session: Session, surgeons: Collection[int] | None = None) -> dict[tuple[int, str], LearntIn]:
-    """Return the scenes of the styles that serve a policy learnt in one.
+@dataclass
+class Kept:
+    """The properties of served policies that a batch keeps, by style: a surgeon's row and a suture type.
+
+    A style has no rule if its policy joins at the nearest waypoint, and no scene if it was learnt in none.
+    """
+
+    rules: dict[tuple[int, str], float] = field(default_factory=dict)
+    scenes: dict[tuple[int, str], LearntIn] = field(default_factory=dict)
+
+
+def kept_of(session: Session, surgeons: Collection[int] | None = None) -> Kept:
+    """Return the joining rules and the scenes of the styles that serve a policy.
 
     Args:
         session: The caller's transaction.
         surgeons: The rows of surgeons; None: all.
-
-    Returns:
-        By style: a surgeon's row and a suture type.
     """
-    query = select(Release.surgeon_row, Release.suture, PolicyVersion.manifest).join(
-        PolicyVersion, PolicyVersion.row == Release.policy_row
-    )
-    query = query.where(is_served(), PolicyVersion.manifest["scene"]["sha256"].as_string().is_not(None))
+    kept = Kept()
+    if surgeons is not None and not surgeons:
+        return kept
+    by = PolicyVersion
+    query = select(Release.surgeon_row, Release.suture, cast(by.manifest, Text)).join(by, by.row == Release.policy_row)
+    query = query.where(is_served())
     if surgeons is not None:
         query = query.where(Release.surgeon_row.in_(surgeons))
-    return {
-        (who, suture): LearntIn(
-            about["scene"]["sha256"],
-            {name: about["scene"][name] for name in ("scene", "costs")},
-            {"kind": about["learner"], **about["settings"]},
-        )
-        for who, suture, about in session.execute(query)
-    }
+    for who, suture, text in in_pieces(session, query):
+        about = orjson.loads(text)
+        scene, settings = about.get("scene"), about["settings"]
+        if (share := settings.get("join_share")) is not None:
+            kept.rules[who, suture] = share
+        if scene is not None:
+            surroundings = {name: scene[name] for name in ("scene", "costs")}
+            kept.scenes[who, suture] = LearntIn(scene["sha256"], surroundings, {"kind": about["learner"], **settings})
+    return kept
+
+
+def in_pieces(session: Session, query: Select[*tuple[Any, ...]]) -> Iterator[Any]:
+    """Yield the rows of a query that may return very many, without having all of them in memory.
+
+    Columns of JSON are requested as text, and parsed here: the databases parse them anew for each part of them.
+    """
+    yield from session.execute(query, execution_options={"yield_per": ROWS_AT_ONCE})
 
 
 def learner_kept(asked: RetrainingRequest, rule: float | None, there: LearntIn | None) -> dict[str, Any]:

@@ -8,7 +8,8 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from sqlalchemy import ColumnElement, func, insert, select, update
+import orjson
+from sqlalchemy import ColumnElement, Text, cast, func, insert, select, update
 from sqlalchemy.orm import Session
 
 from skills.db import now, rfc3339
@@ -22,7 +23,7 @@ from skills.library import jobs, locks
 from skills.library.catalogue import find_surgeon, find_suture_type
 from skills.library.demos import newest_demos
 from skills.library.jobs import BATCH, KEPT, PART, Asked, PartRequest, RetrainingRequest, did_nothing
-from skills.library.policies import LearntIn, Recipe, joining_rules, learner_kept, recipes_of, scenes_of
+from skills.library.policies import Kept, Recipe, in_pieces, kept_of, learner_kept, recipes_of
 from skills.library.releases import Outcome
 from skills.library.training import GATE_VERSION, POSES_VERSION, learner_to_train
 from skills.packing import canonical, sha256
@@ -136,8 +137,9 @@ def choose_styles(
         asked["odds"] = asdict(odds)
     if batch.chosen is None:
         asked["joins"] = KEPT
-    surgeons = {demo.surgeon_row for demo in demos}
-    kept = _Kept({} if batch.chosen is not None else joining_rules(session, surgeons), scenes_of(session, surgeons))
+    kept = kept_of(session, None if who is None else [who.row])
+    if batch.chosen is not None:
+        kept.rules.clear()
     stale = _reasons(session, demos, asked, kept, who, what)
     chosen = [demo for demo in demos if stale[demo.row] or not batch.only_stale]
     request, unsettled = _unsettled(session, asked, chosen, kept)
@@ -145,7 +147,7 @@ def choose_styles(
 
 
 def _unsettled(
-    session: Session, asked: RetrainingRequest, chosen: Sequence["_Newest"], kept: "_Kept"
+    session: Session, asked: RetrainingRequest, chosen: Sequence["_Newest"], kept: Kept
 ) -> tuple[RetrainingRequest, Sequence["_Newest"]]:
     """Return the request to make, and its styles; if an equal batch is done, only the styles that it would now release.
 
@@ -169,7 +171,7 @@ def _made_of(
     session: Session,
     demo: "_Newest",
     recipes: dict[tuple[int, str], Recipe],
-    kept: "_Kept",
+    kept: Kept,
 ) -> str | list[Any]:
     """Return the digest of a style's newest demonstration, or the combination, digests, rule and scene of others."""
     style = demo.surgeon_row, demo.suture
@@ -179,14 +181,6 @@ def _made_of(
         return [demo.sha256, *rule, *there] if rule or there else demo.sha256
     newest = newest_demos(session, demo.surgeon_row, demo.suture, recipe.demos)
     return [recipe.how.kind, *(one.sha256 for one in newest), *rule, *there]
-
-
-@dataclass(frozen=True)
-class _Kept:
-    """The properties of served policies that a batch keeps: joining rules and scenes, by style."""
-
-    rules: dict[tuple[int, str], float]
-    scenes: dict[tuple[int, str], LearntIn]
 
 
 def _did_nothing(session: Session, job: Job) -> str:
@@ -226,7 +220,7 @@ def _reasons(
     session: Session,
     demos: Sequence[_Newest],
     asked: RetrainingRequest,
-    kept: "_Kept",
+    kept: Kept,
     surgeon: Surgeon | None,
     suture: SutureType | None,
 ) -> dict[int, list[str]]:
@@ -239,32 +233,31 @@ def _reasons(
     of = PolicyVersion
     last = select(func.max(of.version).label("version"), of.surgeon_row, of.suture).group_by(of.surgeon_row, of.suture)
     newest = last.where(*_styles(of, surgeon, suture)).subquery()
-    said = [of.manifest[name] for name in ("demos", "learner", "settings", "seed", "learner_version")]
-    said += [of.manifest["scene"][name] for name in ("sha256", "costs", "near")]
-    gate = of.releasable, of.manifest["grid_certificate"]["gate"], of.manifest["grid_certificate"]["near"]
     limits, chances = asdict(NearLimits(**asked.get("near", {}))), asdict(OddsLimits(**asked.get("odds", {})))
-    query = select(of.surgeon_row, of.suture, *said, *gate).join(
+    query = select(of.surgeon_row, of.suture, of.releasable, cast(of.manifest, Text)).join(
         newest,
         (of.surgeon_row == newest.c.surgeon_row) & (of.suture == newest.c.suture) & (of.version == newest.c.version),
     )
-    versions = {(surgeon, suture): about for surgeon, suture, *about in session.execute(query)}
-    reasons: dict[int, list[str]] = {}
-    for demo in demos:
-        version = versions.get((demo.surgeon_row, demo.suture))
-        if version is None:
-            reasons[demo.row] = ["never trained"]
+    of_style = {(demo.surgeon_row, demo.suture): demo for demo in demos}
+    reasons = {demo.row: ["never trained"] for demo in demos}
+    for who, what, releasable, text in in_pieces(session, query):
+        demo = of_style.get((who, what))
+        if demo is None:
             continue
-        rests_on, *how, learner_version, scene, costs, odds, releasable, gate, near = version
-        style = demo.surgeon_row, demo.suture
-        there = kept.scenes.get(style)
-        learner = learner_kept(asked, kept.rules.get(style), there)
+        about = orjson.loads(text)
+        scene, certificate = about.get("scene") or {}, about["grid_certificate"]
+        odds, near = scene.get("near"), certificate.get("near")
+        there = kept.scenes.get((who, what))
+        learner = learner_kept(asked, kept.rules.get((who, what)), there)
         settings = {name: value for name, value in learner.items() if name != "kind"}
+        how = about["learner"], about["settings"], about["seed"]
+        place = scene.get("sha256"), scene.get("costs")
         found = {
-            "a newer demonstration": demo.sha256 not in rests_on,
-            "another scene": (scene, costs) != ((there.sha256, there.surroundings["costs"]) if there else (None, None)),
-            "other settings": how != [learner["kind"], settings, asked["seed"]],
-            "a newer learner": learner_version != asked["learner_version"],
-            "refused by an older gate": not releasable and gate != asked["gate"],
+            "a newer demonstration": demo.sha256 not in about["demos"],
+            "another scene": place != ((there.sha256, there.surroundings["costs"]) if there else (None, None)),
+            "other settings": how != (learner["kind"], settings, asked["seed"]),
+            "a newer learner": about["learner_version"] != asked["learner_version"],
+            "refused by an older gate": not releasable and certificate.get("gate") != asked["gate"],
             "other limits at the near starts": (near is not None and not limits.items() <= near.items())
             or (odds is not None and not chances.items() <= odds.items()),
         }
@@ -274,24 +267,30 @@ def _reasons(
 
 def _divide(session: Session, job: Job, styles: Sequence[dict[str, Any]], size: int) -> None:
     """Insert a row for each of some styles, and divide them into parts; a demonstration that was erased is left out."""
-    rows = [style["demonstration_row"] for style in styles]
-    there = set(session.scalars(select(Demonstration.row).where(Demonstration.row.in_(rows))))
+    demos = [style["demonstration_row"] for style in styles]
+    there = set(session.scalars(select(Demonstration.row).where(Demonstration.row.in_(demos))))
     left = [style for style in styles if style["demonstration_row"] in there]
-    for first in range(0, len(left), size):
-        part = Job(
-            id=(name := secrets.token_hex(8)),
-            kind=PART,
-            identity=jobs.identity_of(PART, {"retraining": job.id, "part": name}),
-            request={},
-            surgeon_row=job.surgeon_row,
-            asked_by=job.asked_by,
-        )
-        session.add(part)
-        session.flush()
+    parts = [_new_part(job) for _ in range(0, len(left), size)]
+    session.add_all(parts)
+    session.flush()
+    rows = []
+    for number, part in enumerate(parts):
         request: PartRequest = {"retraining": job.row, "part": part.row}
         part.request, part.identity = {**request}, jobs.identity_of(PART, request)
-        of_part = [{"job_row": job.row, "part_row": part.row, **style} for style in left[first : first + size]]
-        session.execute(insert(StyleToRetrain), of_part)
+        rows += [{"job_row": job.row, "part_row": part.row, **style} for style in left[number * size :][:size]]
+    session.execute(insert(StyleToRetrain), rows)
+
+
+def _new_part(job: Job) -> Job:
+    """Return a part of a batch without its request, which names the part's row."""
+    return Job(
+        id=(name := secrets.token_hex(8)),
+        kind=PART,
+        identity=jobs.identity_of(PART, {"retraining": job.id, "part": name}),
+        request={},
+        surgeon_row=job.surgeon_row,
+        asked_by=job.asked_by,
+    )
 
 
 def find_retraining(session: Session, job_id: str) -> Job:

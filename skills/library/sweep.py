@@ -9,7 +9,7 @@ steadily for `STEADY_S` (`SteadyClock`): that is the time in which a wrong clock
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from datetime import timedelta
 from math import inf
@@ -20,13 +20,22 @@ from sqlalchemy import Select, Table, delete, exists, or_, select, update
 from sqlalchemy.orm import Session
 
 from skills.db import now
-from skills.db.models import LooseChunks, Plan, RecordingChunk, StoredPictures, StoredPlayback
+from skills.db.models import (
+    LooseChunks,
+    ParsedChunk,
+    ParsedRecording,
+    Plan,
+    RecordingChunk,
+    StoredPictures,
+    StoredPlayback,
+    StoredRecording,
+)
 from skills.db.row_visibility import EVERYBODYS
 from skills.db.service_tables import ErasedSurgeon, Job, StyleToRetrain
 from skills.db.session import Database
 from skills.library import locks
 from skills.library.jobs import ACTIVE, BATCH, EXPORT, PICTURES, UNSYNCHRONISED, cancel_parts, identity_of
-from skills.library.recordings import AT_ONCE_BYTES, CHUNK_BYTES
+from skills.library.recordings import AT_ONCE_BYTES, CHUNK_BYTES, UNFINISHED
 from skills.settings import Settings
 
 JOBS_AT_ONCE = 300
@@ -34,6 +43,7 @@ PICTURES_AT_ONCE = 10
 UNDIVIDED_S = 600.0  # ours: the styles of a batch are added within seconds, or its request was interrupted
 STEADY_S = 3600.0  # ours: retentions are of a year, so an hour more changes nothing
 STEP_S = 60.0  # ours: a larger difference is no correction of a clock that was right
+_JOBS = cast(Table, Job.__table__)  # bare: who erases need not be allowed to see all that is left
 INTERRUPTED = "The service stopped before all styles of the batch were added; request it again."
 
 
@@ -58,7 +68,9 @@ class SteadyClock:
 
 def sweep_erased(database: Database) -> None:
     """Delete all that is left of erased surgeons, deleted recordings and interrupted uploads."""
-    while _sweep_chunks(database) or _sweep_jobs(database):
+    for _ in _sweep_jobs(database):
+        pass
+    while _sweep_chunks(database):
         pass
 
 
@@ -76,22 +88,55 @@ def sweep(database: Database, settings: Settings, at_most_s: float = inf, *, by_
     """
     began_s = monotonic()
     _fail_undivided(database)
+    return all(monotonic() - began_s <= at_most_s for _ in _steps(database, settings, by_age))
+
+
+def _steps(database: Database, settings: Settings, by_age: bool) -> Iterator[None]:
+    """Delete what is due, what is old only `by_age`, and yield after each transaction."""
+    yield from _sweep_jobs(database)
     pictures, ended = timedelta(days=settings.keep_pictures_days), timedelta(days=settings.keep_jobs_days)
-    while (
-        _sweep_chunks(database)
-        or _sweep_jobs(database)
-        or (by_age and (_sweep_pictures(database, pictures) or _sweep_ended(database, ended)))
+    while _sweep_chunks(database) or (
+        by_age and (_sweep_pictures(database, pictures) or _sweep_ended(database, ended))
     ):
-        if monotonic() - began_s > at_most_s:
-            return False
-    return True
+        yield
 
 
 def delete_jobs(session: Session, surgeon_row: int) -> None:
     """Delete the jobs of an erased surgeon that have ended; more than a few are hidden, and left to the sweep."""
-    session.add(ErasedSurgeon(surgeon_row=surgeon_row))
-    session.flush()
-    _delete_jobs_of(session, surgeon_row)
+    if len(session.scalars(_jobs_of(surgeon_row).limit(JOBS_AT_ONCE + 1)).all()) <= JOBS_AT_ONCE:
+        session.execute(delete(_JOBS).where(_JOBS.c.surgeon_row == surgeon_row))
+    else:
+        session.add(ErasedSurgeon(surgeon_row=surgeon_row))
+
+
+def drop_contents(database: Database, recordings: Iterable[int]) -> None:
+    """Delete the cached contents of recordings in steps, before the transaction that erases these.
+
+    Otherwise they are deleted with the recordings, in one step. A recording that remains is decoded at its next use.
+
+    Args:
+        database: The database, restricted or not.
+        recordings: The rows of the recordings; one of them may be gone.
+    """
+    for row in recordings:
+        while _drop_content(database, row):
+            pass
+
+
+def _drop_content(database: Database, recording_row: int) -> bool:
+    """Delete some chunks of a cached content, which is not used from then on; return whether there may be more."""
+    of, at_once = ParsedChunk, AT_ONCE_BYTES // CHUNK_BYTES
+    mine = (of.recording_row == recording_row,)
+    with database.reading() as session:
+        sha256 = session.scalar(select(StoredRecording.sha256).where(StoredRecording.row == recording_row))
+    if sha256 is None:
+        return False
+    with database.writing([locks.recording(sha256)]) as session:
+        entry = update(ParsedRecording).where(ParsedRecording.recording_row == recording_row)
+        session.execute(entry.values(version=UNFINISHED), **UNSYNCHRONISED)
+        numbers = session.scalars(select(of.number).where(*mine).order_by(of.number).limit(at_once)).all()
+        session.execute(delete(of).where(*mine, of.number.in_(numbers)), **UNSYNCHRONISED)
+        return len(numbers) == at_once
 
 
 def _sweep_chunks(database: Database) -> bool:
@@ -110,21 +155,29 @@ def _sweep_chunks(database: Database) -> bool:
         return True
 
 
-def _sweep_jobs(database: Database) -> bool:
-    """Delete some jobs of an erased surgeon; return whether there were any."""
-    with database.writing([locks.SWEEP]) as session:
-        surgeon_row = session.scalar(select(ErasedSurgeon.surgeon_row).limit(1))
-        if surgeon_row is not None:
-            _delete_jobs_of(session, surgeon_row)
-        return surgeon_row is not None
+def _sweep_jobs(database: Database) -> Iterator[None]:
+    """Delete the jobs of erased surgeons, and yield after each transaction.
+
+    The rows of a surgeon's jobs are read once: PostgreSQL finds the next ones of a surgeon with many by walking along
+    the table, each time past all that are deleted already.
+    """
+    with database.reading() as session:
+        surgeons = session.scalars(select(ErasedSurgeon.surgeon_row)).all()
+    for surgeon_row in surgeons:
+        with database.reading() as session:
+            rows = session.scalars(_jobs_of(surgeon_row)).all()
+        for first in range(0, len(rows), JOBS_AT_ONCE):
+            with database.writing([locks.SWEEP]) as session:
+                session.execute(delete(_JOBS).where(_JOBS.c.row.in_(rows[first : first + JOBS_AT_ONCE])))
+            yield
+        with database.writing([locks.SWEEP]) as session:
+            done = delete(ErasedSurgeon).where(ErasedSurgeon.surgeon_row == surgeon_row)
+            session.execute(done, **UNSYNCHRONISED)
+        yield
 
 
-def _delete_jobs_of(session: Session, surgeon_row: int) -> None:
-    jobs = cast(Table, Job.__table__)  # the bare table: whoever erases need not be allowed to see all that is left
-    some = select(jobs.c.row).where(jobs.c.surgeon_row == surgeon_row).limit(JOBS_AT_ONCE)
-    deleted = session.execute(delete(jobs).where(jobs.c.row.in_(some)).returning(jobs.c.row)).all()
-    if len(deleted) < JOBS_AT_ONCE:
-        session.execute(delete(ErasedSurgeon).where(ErasedSurgeon.surgeon_row == surgeon_row), **UNSYNCHRONISED)
+def _jobs_of(surgeon_row: int) -> Select[int]:
+    return select(_JOBS.c.row).where(_JOBS.c.surgeon_row == surgeon_row)
 
 
 def _fail_undivided(database: Database) -> None:

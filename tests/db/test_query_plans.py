@@ -13,7 +13,7 @@ from sqlalchemy.orm import Session
 from skills.db.session import Database
 from skills.jobs.workflows import Leases, Watch
 from skills.library import batch_work, catalogue, demos, jobs, policies, retraining, training
-from skills.library.overview import condition_of, newest_job
+from skills.library.overview import condition_of, matrix, newest_job, released_styles
 from skills.schemas.requests import RetrainingIn, TrainingIn
 from tests import backends
 from tests.library import hospital
@@ -91,6 +91,23 @@ def test_what_is_asked_often_is_answered_by_an_index(filled: Database, what: str
         assert asked
         for statement, values in asked:
             assert wasteful(session, statement, values, walks=what in IN_ORDER) == [], statement
+
+
+PAGES: dict[str, Callable[[Session, int], object]] = {
+    "what is served": lambda s, most: [policies.summary_json(one) for one in policies.list_served(s, most, 0)],
+    "the styles": lambda s, most: matrix(s, limit=most),
+    "the styles to plan with": released_styles,
+}
+
+
+@pytest.mark.parametrize("what", PAGES)
+def test_a_longer_page_takes_no_more_statements(filled: Database, what: str):
+    numbers = []
+    for most in (1, 5):
+        with filled.reading() as session, noted(session) as asked:
+            PAGES[what](session, most)
+            numbers.append(len(asked))
+    assert 0 < numbers[0] == numbers[1]
 
 
 def test_what_a_watch_looks_at_is_found_by_its_state(filled: Database):

@@ -43,7 +43,7 @@ def served(database: Database) -> int | None:
     """Return the version that kestrel's style serves, None if there is none; all lists of served styles must agree."""
     with database.reading() as session:
         listed = [one.policy.version for one in policies.list_served(session, 10, None)]
-        assert [one.policy.version for one in overview.released_styles(session)] == listed
+        assert [one.version for one in overview.released_styles(session)] == listed
         assert overview.matrix(session).counts["released styles"] == len(listed)
         shown = overview.whole_style(session, "kestrel", SUTURE)
         assert (shown.style.state == "released", shown.served is not None) == (bool(listed), bool(listed))

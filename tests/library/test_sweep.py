@@ -29,9 +29,10 @@ from skills.library.inspection import inspect_installation
 from skills.library.jobs import find_job, identity_of, list_jobs
 from skills.library.plans import planned, trajectory_of
 from skills.library.recordings import find_recording, recording_bytes, store_recording, stored_recording
-from skills.library.sweep import STEADY_S, SteadyClock, sweep_erased
+from skills.library.sweep import STEADY_S, SteadyClock, drop_contents, sweep_erased
 from skills.settings import Settings
 from skills.verification.playback import Pictures
+from tests.db.test_query_plans import noted
 from tests.library import cases
 from tests.library.styles import ask_retraining, look, parts_of
 from tests.library.test_pictures import store_playback
@@ -159,6 +160,24 @@ def test_a_deleted_recording_is_gone_at_once_and_swept_later(database: Database,
         assert session.scalars(select(RecordingChunk.recording).distinct()).all() == [again.row]
 
 
+def test_a_cached_content_is_dropped_in_steps_and_not_used_from_the_first_on(
+    database: Database, small: None, monkeypatch: pytest.MonkeyPatch
+):
+    data = cases.hand_off()
+    stored, _ = store_recording(database, cases.upload(data), "test")
+    chunks = count(database, ParsedChunk)
+    assert chunks > 2
+    with failing_at(monkeypatch, 2), pytest.raises(KeyboardInterrupt):  # killed after the first step
+        drop_contents(database, [stored.row])
+    assert count(database, ParsedChunk) == chunks - 1
+    assert stored_recording(database, stored.sha256).recording.duration_s > 0, "decoded, and cached again"
+    assert count(database, ParsedChunk) == chunks
+    with failing_at(monkeypatch, 0) as begun:
+        drop_contents(database, [stored.row, stored.row + 1])  # the second one is gone
+    assert (count(database, ParsedChunk), len(begun)) == (0, chunks + 1)
+    assert not [one for one in inspect_installation(database) if one.wrong]
+
+
 def add_jobs(database: Database, number: int, **about: Any) -> None:
     with database.reading() as session:
         first = session.scalars(select(Job)).first()
@@ -182,7 +201,7 @@ def test_an_erased_surgeons_jobs_are_gone_at_once_and_swept_later(
     add_jobs(database, 10)
     with database.writing() as session:
         erase_surgeon(session, "kestrel", "test")
-    assert (count(database, Job), count(database, ErasedSurgeon)) == (8, 1)
+    assert (count(database, Job), count(database, ErasedSurgeon)) == (11, 1)
     with database.reading() as session:
         assert list(list_jobs(session, 50, None, None)) == []
         with pytest.raises(NotFound):
@@ -190,8 +209,11 @@ def test_an_erased_surgeons_jobs_are_gone_at_once_and_swept_later(
     assert not [one for one in inspect_installation(database) if one.wrong]
     with failing_at(monkeypatch, 3), pytest.raises(KeyboardInterrupt):  # killed in the middle
         sweep_erased(database)
-    sweep_erased(database)
+    assert count(database, Job) == 5
+    with noted(database) as asked:
+        sweep_erased(database)
     assert (count(database, Job), count(database, ErasedSurgeon)) == (0, 0)
+    assert sum("FROM jobs" in statement for statement, _ in asked) == 1, "for all its steps together"
 
 
 def test_ended_jobs_are_deleted_after_their_retention_with_their_batch(database: Database, small: None):

@@ -11,10 +11,10 @@ import each other by relative URLs, and so stay within a version.
 import gzip
 import hashlib
 from base64 import b64encode
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from functools import cache
+from functools import cache, lru_cache
 from importlib import resources
 from math import degrees
 from typing import Any, get_args
@@ -163,31 +163,40 @@ def outline(style: Style) -> dict[str, Any] | None:
     """
     if style.shown is None:
         return None
-    grid = style.shown["grid"]
-    _, ny, nz = grid["shape"]
-    cells = [(at // (ny * nz), at // nz % ny, at % nz) for at in style.shown["waypoints"]]
-    ends = [n - 1 for n in grid["shape"]]
+    nx, ny, nz = style.shown["grid"]["shape"]
+    seen, box = _box(nx, ny, nz)
+    path = [seen(at // (ny * nz), at // nz % ny, at % nz) for at in style.shown["waypoints"]]
+    return {**box, "path": _line(path), "start": path[0], "goal": path[-1]}
+
+
+Seen = tuple[float, float]  # a point in the square
+
+
+@lru_cache(maxsize=1000)
+def _box(nx: int, ny: int, nz: int) -> tuple[Callable[[int, int, int], Seen], dict[str, str]]:
+    """Return where a cell of a grid of this shape is seen, and the lines of the grid's box; many styles share them."""
+    x, y, z = ends = nx - 1, ny - 1, nz - 1
     across = [(0.94, -0.34, 0.0), (0.14, 0.40, 0.91)]  # screen axes: turned by 20 degrees, seen from 25 degrees above
     low = [sum(min(0, part * end) for part, end in zip(axis, ends, strict=True)) for axis in across]
     high = [sum(max(0, part * end) for part, end in zip(axis, ends, strict=True)) for axis in across]
     scale = 92 / max(high[0] - low[0], high[1] - low[1], 1)
+    (ux, uy, uz), (vx, vy, vz) = across
+    middle_u, middle_v = ((below + above) / 2 for below, above in zip(low, high, strict=True))
 
-    def seen(*cell: int) -> tuple[float, float]:
-        u, v = (sum(part * at for part, at in zip(axis, cell, strict=True)) for axis in across)
-        return round(50 + scale * (u - (low[0] + high[0]) / 2), 1), round(50 - scale * (v - (low[1] + high[1]) / 2), 1)
+    def seen(i: int, j: int, k: int) -> Seen:
+        u, v = ux * i + uy * j + uz * k, vx * i + vy * j + vz * k
+        return round(50 + scale * (u - middle_u), 1), round(50 - scale * (v - middle_v), 1)
 
-    def line(points: Sequence[tuple[int, int, int]]) -> str:
-        return " ".join(f"{u},{v}" for u, v in (seen(*point) for point in points))
-
-    x, y, z = ends
-    return {
-        "floor": line([(0, 0, 0), (x, 0, 0), (x, y, 0), (0, y, 0), (0, 0, 0)]),
-        "back": line([(0, y, 0), (0, y, z), (x, y, z), (x, 0, z), (x, 0, 0)]),
-        "spine": line([(x, y, 0), (x, y, z)]),
-        "path": line(cells),
-        "start": seen(*cells[0]),
-        "goal": seen(*cells[-1]),
+    lines = {
+        "floor": [(0, 0, 0), (x, 0, 0), (x, y, 0), (0, y, 0), (0, 0, 0)],
+        "back": [(0, y, 0), (0, y, z), (x, y, z), (x, 0, z), (x, 0, 0)],
+        "spine": [(x, y, 0), (x, y, z)],
     }
+    return seen, {name: _line([seen(*cell) for cell in cells]) for name, cells in lines.items()}
+
+
+def _line(points: Sequence[Seen]) -> str:
+    return " ".join(f"{u},{v}" for u, v in points)
 
 
 FILTERS = {

@@ -11,7 +11,7 @@ from skills.api.responses import Condition, Giving, refuse_changed, say, stored
 from skills.library import catalogue, erasure, locks
 from skills.library.catalogue import surgeon_json, suture_json
 from skills.library.keys import about_key, create_key, list_keys, revoke_key
-from skills.library.sweep import sweep_erased
+from skills.library.sweep import drop_contents, sweep_erased
 from skills.schemas import SkillLevel
 from skills.schemas.given import Key, NewKey, Page, Surgeon, SutureType
 from skills.schemas.requests import KEY, LINE, KeyIn, SurgeonIn, SutureTypeIn
@@ -60,6 +60,9 @@ def get_surgeon(surgeon: Slug, db: Db, give: Giving) -> Response:
 @router.delete("/surgeons/{surgeon}", dependencies=[needs("admin")], **ends(404, 410, 412))
 def erase_surgeon(surgeon: Slug, db: Db, jobs: Jobs, actor: Actor, if_match: Condition = None) -> None:
     """Erase a surgeon and everything derived from their data, permanently."""
+    with db.reading() as session:
+        recordings = erasure.erased_with(session, catalogue.find_surgeon(session, surgeon))
+    drop_contents(db, recordings)
     with db.writing() as session:
         if if_match:
             refuse_changed(surgeon_json(catalogue.find_surgeon(session, surgeon)), if_match)

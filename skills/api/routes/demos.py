@@ -37,7 +37,7 @@ from skills.library.atlas import CONFOUNDED, DISTANCE, MOST, SESSIONS, atlas_of,
 from skills.library.catalogue import find_suture_type
 from skills.library.demos import demo_json, path_json, reward_map_json
 from skills.library.recordings import recording_json
-from skills.library.sweep import sweep_erased
+from skills.library.sweep import drop_contents, sweep_erased
 from skills.schemas import OutcomeAsked
 from skills.schemas.given import Atlas, Demonstration, DemoPath, Page, Recording, RecordingPreview, RewardMap, Score
 from skills.schemas.requests import COUNT, DIGEST, SLUG, DemoIn, OutcomeIn, ScoreIn, SlugField, TableIn
@@ -107,10 +107,13 @@ def get_recording(recording: Digest, db: Db, give: Giving) -> Response:
 @router.delete("/recordings/{recording}", dependencies=[needs("uploader")], **ends(404, 409))
 def delete_recording(recording: Digest, db: Db, caller: Asking) -> None:
     """Delete a recording without demonstrations permanently; allowed to its uploader and to admins."""
+    anybodys = caller.role == "admin"
     with db.reading() as session:
-        recording = recordings.find_recording(session, recording).sha256  # in full: the argument may be a prefix
+        stored, alone = erasure.deletable_recording(session, recording, caller.name, anybodys=anybodys)
+    recording = stored.sha256  # in full: the argument may be a prefix
+    drop_contents(db, [stored.row] if alone else [])
     with db.writing([locks.recording(recording)]) as session:
-        erasure.delete_recording(session, recording, caller.name, anybodys=caller.role == "admin")
+        erasure.delete_recording(session, recording, caller.name, anybodys=anybodys)
     sweep_erased(db)
     db.forget()
 
@@ -233,7 +236,9 @@ def withdraw_demo(
     """Withdraw a demonstration and the releases that rest on it; with `erase`, delete it and its derived data."""
     dropped: erasure.Dropped = []
     with db.reading() as session:
-        surgeon = demos.find_demo(session, demo).surgeon.slug
+        found = demos.find_demo(session, demo)
+        surgeon, erased = found.surgeon.slug, erasure.erased_with(session, found.surgeon, found) if erase else []
+    drop_contents(db, erased)
     with db.writing(None if erase else [locks.surgeon(surgeon)]) as session:
         if if_match:
             refuse_changed(demo_json(demos.find_demo(session, demo)), if_match)

@@ -247,7 +247,7 @@ def show_plan_editor(
         if surgeon is not None and suture is not None:
             policy = policies.choose(session, surgeon, suture, version)
         elif released:
-            policy = released[0].policy
+            policy = policies.choose(session, released[0].surgeon, released[0].suture, released[0].version)
         return render(
             request,
             "plan_editor.html",
