@@ -145,6 +145,8 @@ def test_an_erased_surgeon_is_nowhere_in_the_files(service: Service):
     rows = {name: count for name, count in service.counts().items() if count}
     assert rows.pop("events") > 0
     assert rows.pop("suture_types") == 11
+    assert rows.pop("history") > 0
+    assert rows.pop("history_checkpoints") > 0
     # heron uploaded the same bytes
     shared = dict.fromkeys(["recordings", "recording_chunks", "recording_uploads", "parsed_recordings"], 1)
     shared["parsed_chunks"] = 1
