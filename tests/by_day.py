@@ -38,6 +38,7 @@ ON_BOTH = {
     "test_the_triggers_note_every_logged_table",
     "test_what_the_service_wrote_is_whole_and_signed",
     "test_random_edits_are_found_and_named",
+    "test_a_transaction_that_changes_many_rows_one_by_one_is_logged_whole",
     "test_signing_and_writing_do_not_wait_for_each_other",
     "test_uploads_in_pieces_erasures_in_steps_and_retentions_keep_the_history_whole",
     "test_proofs_are_checked_offline_and_stay_valid_after_an_erasure",

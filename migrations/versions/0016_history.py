@@ -1,7 +1,7 @@
 """The history of all changes: its leaves and checkpoints, and the triggers that note which rows a transaction changed.
 
-The notes are read before the commit. PostgreSQL keeps them in a temporary table of each connection of the service;
-without it, as in `psql`, nothing is noted.
+The notes are read before the commit. PostgreSQL keeps them in settings of the transaction, of some 16 kB each, on the
+connections of the service, which have the setting "skills.noting"; on others, as of `psql`, nothing is noted.
 """
 
 import sqlalchemy as sa
@@ -114,20 +114,29 @@ def _on_sqlite() -> None:
 
 
 def _on_postgresql() -> None:
+    op.execute(
+        "CREATE FUNCTION skills_note(noted json) RETURNS void LANGUAGE plpgsql AS $$ "
+        "DECLARE part text := current_setting('skills.noting'); "
+        "so_far text := current_setting('skills.notes' || part, true); BEGIN "
+        "IF octet_length(so_far) > 16000 THEN "
+        "part := part::int + 1; so_far := ''; PERFORM set_config('skills.noting', part, true); "
+        "END IF; "
+        "PERFORM set_config('skills.notes' || part, concat(so_far, noted, chr(10)), true); END $$"
+    )
     for table, keys in LOGGED.items():
         new, old = (", ".join(f"{row}.{name}" for name in keys) for row in ("NEW", "OLD"))
         differs = "CASE WHEN NEW.{0}::text IS DISTINCT FROM OLD.{0}::text THEN '{0} ' END"
         changed = ", ".join(differs.format(name) for name in CHANGING.get(table, "").split()) or "NULL"
         op.execute(
-            f"CREATE FUNCTION skills_note_{table}() RETURNS trigger LANGUAGE plpgsql AS $$ BEGIN "  # noqa: S608 - ours
-            "IF to_regclass('pg_temp.history_notes') IS NULL THEN NULL; "
+            f"CREATE FUNCTION skills_note_{table}() RETURNS trigger LANGUAGE plpgsql AS $$ BEGIN "
+            "IF coalesce(current_setting('skills.noting', true), '') = '' THEN NULL; "
             "ELSIF TG_OP = 'INSERT' THEN "
-            f"INSERT INTO pg_temp.history_notes VALUES (TG_TABLE_NAME, 'add', concat_ws('/', {new})); "
+            f"PERFORM skills_note(json_build_array(TG_TABLE_NAME, 'add', concat_ws('/', {new}), NULL)); "
             "ELSIF TG_OP = 'DELETE' THEN "
-            f"INSERT INTO pg_temp.history_notes VALUES (TG_TABLE_NAME, 'remove', concat_ws('/', {old})); "
+            f"PERFORM skills_note(json_build_array(TG_TABLE_NAME, 'remove', concat_ws('/', {old}), NULL)); "
             "ELSE "
-            f"INSERT INTO pg_temp.history_notes VALUES (TG_TABLE_NAME, 'change', concat_ws('/', {old}), "
-            f"concat({changed})); "
+            f"PERFORM skills_note(json_build_array(TG_TABLE_NAME, 'change', concat_ws('/', {old}), "
+            f"concat({changed}))); "
             "END IF; RETURN NULL; END $$"
         )
         for change, statement in CHANGES:
@@ -158,5 +167,7 @@ def downgrade() -> None:
             op.execute(f"DROP FUNCTION skills_note_{table}()")
     op.drop_table("history_checkpoints")
     op.drop_table("history")
-    if on_sqlite:
+    if not on_sqlite:
+        op.execute("DROP FUNCTION skills_note(json)")
+    else:
         op.drop_table("history_notes")

@@ -22,9 +22,10 @@ import tempfile
 from collections import namedtuple
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import UTC, datetime
 from functools import cache, cached_property
 from json.encoder import encode_basestring_ascii
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, cast
 
@@ -43,7 +44,6 @@ from sqlalchemy import (
     Integer,
     LargeBinary,
     MetaData,
-    Select,
     String,
     Table,
     bindparam,
@@ -177,54 +177,53 @@ class Logged:
         """The columns of the primary key."""
         return [self.raw.c[name] for name in self.keys]
 
-    def rows_by(self, connection: Connection, first: str | int) -> list[Any]:
-        """Return the rows whose key begins with a value; most transactions change one row of a table.
-
-        The statement goes to the driver itself, which takes half the time.
-        """
-        compiled, processors = self._by_driver(connection.dialect)
-        given = (first,) if compiled.positional else {"value": first}
-        rows = connection.exec_driver_sql(str(compiled), given)
-        return [
-            self._row(*(value if read is None else read(value) for read, value in zip(processors, row, strict=True)))
-            for row in rows
-        ]
-
     @cached_property
-    def _row(self) -> Callable[..., Any]:
-        return namedtuple("_row", self.columns)
+    def row(self) -> Callable[..., Any]:
+        """The class of a row as `changed_rows` returns it, with the logged columns."""
+        return namedtuple("row", self.columns)
 
     @cache  # noqa: B019 - a few dialects and tables in a process
-    def _by_driver(self, dialect: Dialect) -> tuple[Any, list[Callable[[Any], Any] | None]]:
-        compiled = select(self.raw).where(self.key_columns[0] == bindparam("value")).compile(dialect=dialect)
-        types = [column.type.dialect_impl(dialect) for column in self.raw.columns]
-        return compiled, [one.result_processor(dialect, None) for one in types]
-
-    def _rows_with(self, connection: Connection, values: Sequence[Any]) -> Iterable[Any]:
-        return connection.execute(self._of_values, {"values": values})
+    def readers(self, dialect: Dialect) -> list[Callable[[Any], Any] | None]:
+        """Return the conversion of each column from its form in `changed_rows`."""
+        if dialect.name == "sqlite":
+            return [column.type.dialect_impl(dialect).result_processor(dialect, None) for column in self.raw.columns]
+        return [_FROM_JSON.get(kind_of(self._mapped.c[name])) or self._number(name) for name in self.columns]
 
     @cached_property
-    def _of_values(self) -> Select[Any]:
-        # By the first column of the key alone, which its index begins with; few other rows share its value.
-        return select(self.raw).where(self.key_columns[0].in_(bindparam("values", expanding=True)))
+    def names(self) -> tuple[str, ...]:
+        """The quoted names of the columns."""
+        return tuple(f'"{name}"' for name in self.columns)
+
+    @cached_property
+    def of_bytes(self) -> tuple[int, ...]:
+        """The positions of the columns of bytes."""
+        return tuple(at for at, name in enumerate(self.columns) if kind_of(self._mapped.c[name]) == "bytes")
+
+    def _number(self, name: str) -> Callable[[Any], Any] | None:
+        return _float if isinstance(self._mapped.c[name].type, Float) else None
+
+    @property
+    def _mapped(self) -> Table:
+        return Base.metadata.tables[self.raw.name]
 
     def key_of(self, row: Any) -> str:
         """Return the key of a row as text."""
         return "/".join(str(getattr(row, name)) for name in self.keys)
 
-    def _first_of(self, key: str) -> Any:
-        return key if self._of_text else int(key.partition("/")[0])
+    def firsts_of(self, keys: Iterable[str]) -> list[Any]:
+        """Return the values with which some keys begin; few other rows share them, and all indexes begin with them."""
+        return sorted({key if self.of_text else int(key.partition("/")[0]) for key in keys})
 
     @cached_property
-    def _of_text(self) -> bool:
-        return isinstance(Base.metadata.tables[self.raw.name].c[self.keys[0]].type, String)
+    def of_text(self) -> bool:
+        """Whether keys are texts."""
+        return isinstance(self._mapped.c[self.keys[0]].type, String)
 
     def rows_of(self, connection: Connection, keys: Sequence[str]) -> Iterator[Any]:
         """Yield the rows with some keys, of those that exist."""
         for at in range(0, len(keys), ROWS_AT_ONCE):
             some = frozenset(keys[at : at + ROWS_AT_ONCE])
-            values = sorted({self._first_of(key) for key in some})
-            rows = self.rows_by(connection, values[0]) if len(values) == 1 else self._rows_with(connection, values)
+            rows = connection.execute(select(self.raw).where(self.key_columns[0].in_(self.firsts_of(some))))
             yield from (row for row in rows if self.key_of(row) in some)
 
     def after(self, key: Sequence[Any]) -> ColumnElement[bool]:
@@ -239,6 +238,15 @@ class Logged:
             yield page
             last = [getattr(page[-1], name) for name in self.keys]
             page = list(connection.execute(query.where(self.after(last))))
+
+
+def _float(value: Any) -> Any:
+    return None if value is None else float(value)
+
+
+_FROM_JSON: dict[str, Callable[[Any], Any]] = {  # as PostgreSQL writes them; in JSON the float 1.0 is 1
+    "moment": lambda value: None if value is None else datetime.fromisoformat(value).astimezone(UTC),
+}
 
 
 @cache
@@ -256,7 +264,7 @@ def _logged(table: Table) -> Logged:
 def digests_of(names: Sequence[str], values: Sequence[Any], salt: bytes) -> dict[str, str]:
     """Return the salted digests of a row's columns in hex, by name."""
     return {
-        name: hashlib.sha256(salt + name.encode() + _as_bytes(value)).hexdigest()[: 2 * DIGEST_BYTES]
+        name: hashlib.sha256(salt + name.encode() + as_bytes(value)).hexdigest()[: 2 * DIGEST_BYTES]
         for name, value in zip(names, values, strict=True)
     }
 
@@ -264,7 +272,7 @@ def digests_of(names: Sequence[str], values: Sequence[Any], salt: bytes) -> dict
 _encode = json.JSONEncoder(separators=(",", ":")).encode
 
 
-def _as_bytes(value: Any) -> bytes:
+def as_bytes(value: Any) -> bytes:
     """Return the bytes that a value is digested by, equal on both back ends; the order in JSON objects counts."""
     if isinstance(value, str):
         return b"\0json" + encode_basestring_ascii(value).encode()
@@ -315,17 +323,20 @@ def schema_of(connection: Connection) -> dict[str, str]:
 
 # ---- the notes of a transaction ------------------------------------------------------------------------------------
 
-# Where triggers note changed rows until the commit. PostgreSQL has one for each connection, which other transactions
-# never read; on SQLite, with one writer, it is an ordinary table of the migrations.
-NOTES_OF_CONNECTION = (
-    "CREATE TEMPORARY TABLE IF NOT EXISTS history_notes (table_name text, change text, key text, changed text) "
-    "ON COMMIT DELETE ROWS"
-)
-_NOTED = {
-    "sqlite": "SELECT table_name, change, key, changed FROM history_notes ORDER BY rowid",
-    "postgresql": "SELECT table_name, change, key, changed FROM pg_temp.history_notes ORDER BY ctid",
-}
+# Triggers note changed rows until the commit. On SQLite, with one writer, that is in a table. On PostgreSQL it is in
+# settings of the transaction, which cost no page and end with it: "skills.notes0" and, where there are many, further
+# ones up to the number in "skills.noting", which only connections of the service have.
+NOTING_CONNECTION = "-c skills.noting=0"  # for the options of a connection
 FORGET_NOTES = "DELETE FROM history_notes"
+_TAKEN = {
+    "sqlite": "DELETE FROM history_notes RETURNING rowid, table_name, change, key, changed",
+    "postgresql": "SELECT current_setting('skills.noting', true), current_setting('skills.notes0', true), "
+    "set_config('skills.notes0', '', true)",
+}
+_FURTHER = (
+    "SELECT current_setting('skills.notes' || n, true), set_config('skills.notes' || n, '', true), "
+    "set_config('skills.noting', '0', true) FROM generate_series(1, %s) n"
+)
 NOTING = "noting"  # in a connection's `info`: whether its transactions note changes
 
 
@@ -351,6 +362,17 @@ def effects_of(notes: Iterable[tuple[str, str, str, str | None]]) -> dict[str, d
         columns = so_far.changed.union((changed or "").split())
         of_table[key] = Effect(so_far.before, change != REMOVE, so_far.written or change == ADD, columns)
     return found
+
+
+def take_notes(connection: Connection) -> list[Any]:
+    """Remove and return the notes of the transaction so far: table, change, key and changed columns, in their order."""
+    taken = connection.exec_driver_sql(_TAKEN[connection.dialect.name])
+    if connection.dialect.name == "sqlite":
+        return [note for _, *note in sorted(taken, key=itemgetter(0))]
+    last, noted, _ = taken.one()
+    if int(last or 0):
+        noted += "".join(part for part, *_ in connection.exec_driver_sql(_FURTHER, (int(last),)))
+    return [json.loads(note) for note in noted.splitlines()] if noted else []
 
 
 # ---- writing leaves ------------------------------------------------------------------------------------------------
@@ -398,37 +420,18 @@ class History:
         """
         if not connection.info.get(NOTING):
             return  # the job engine's database, or one that is not migrated yet
-        notes = connection.exec_driver_sql(_NOTED[connection.dialect.name]).all()
-        if not notes:
-            return
-        connection.exec_driver_sql(FORGET_NOTES)
+        effects = effects_of(take_notes(connection))
         at = rfc3339(now())
-        leaves = []
-        for table, effects in effects_of(cast(Sequence[tuple[str, str, str, str | None]], notes)).items():
-            if (known := logged().get(table)) is not None:
-                leaves += list(self._leaves_of(connection, known, effects, at))
-        self._write(connection, leaves)
-
-    def _leaves_of(
-        self, connection: Connection, table: Logged, effects: Mapping[str, Effect], at: str | None
-    ) -> Iterator[dict[str, Any]]:
-        before = [key for key, effect in effects.items() if effect.before]
-        cached = table.raw.name in CACHES
-        latest = latest_leaves(connection, table.raw.name, list(effects) if cached else before)
-        for row in table.rows_of(connection, [key for key, effect in effects.items() if effect.after]):
-            key = table.key_of(row)
-            if not effects[key].before:
-                # after an earlier leaf only where somebody has emptied a cache
-                yield new_leaf(table.raw.name, ADD, at, key, digested(table.columns, row), latest.get(key))
-            elif key in latest and effects[key].written:  # removed, and added again
-                yield new_leaf(table.raw.name, CHANGE, at, key, digested(table.columns, row), latest[key])
-            elif key in latest and (changed := effects[key].changed):
-                # the other columns keep their digests: if somebody else has changed one, that stays to be found
-                digests = {**latest[key].digests, **latest[key].digests_of(changed, row)}
-                yield new_leaf(table.raw.name, CHANGE, at, key, (latest[key].salt, digests), latest[key])
-            # a row without a leaf was not written by the service: `skills verify` goes on naming it
-        gone = [key for key in before if not effects[key].after]
-        yield from removals(connection, table.raw.name, gone, latest, at)
+        every = [(table, key) for table, of_table in effects.items() if table in logged() for key in of_table]
+        for first in range(0, len(every), ROWS_AT_ONCE):
+            some: dict[str, dict[str, Effect]] = {}
+            for table, key in every[first : first + ROWS_AT_ONCE]:
+                some.setdefault(table, {})[key] = effects[table][key]
+            rows, latest = changed_rows(connection, some)
+            leaves: list[dict[str, Any]] = []
+            for table, of_table in some.items():
+                leaves += _leaves_of(connection, logged()[table], of_table, rows[table], latest[table], at)
+            self._write(connection, leaves)
 
     def _write(self, connection: Connection, leaves: Sequence[dict[str, Any]]) -> None:
         if not leaves:
@@ -439,7 +442,7 @@ class History:
             self._seal = self.key.seal_of(origin)
         for leaf in leaves:
             leaf["seal"] = self._seal.of(leaf["entry"].encode())
-        connection.execute(insert(LEAVES), leaves)
+        add_leaves(connection, leaves)
 
     # ---- beginning, migrations and restorations
 
@@ -460,7 +463,7 @@ class History:
                         for row in page
                     ],
                 )
-        connection.exec_driver_sql(FORGET_NOTES)
+        take_notes(connection)
         self.log_schema(connection)
 
     def sign(self, connection: Connection, *, adopt: bool = False) -> str | None:
@@ -490,13 +493,12 @@ class History:
         numbered = []
         for row, entry, sealed in leaves:
             if adopt or hmac.compare_digest(sealed, seal.of(entry.encode())):
-                numbered.append({"of_row": row, "as_number": tree.size})
+                numbered.append((tree.size, row))
                 tree.append(leaf_hash(entry.encode()))
         if not numbered and not adopt:
             return None
         if numbered:
-            number = update(LEAVES).where(LEAVES.c.row == bindparam("of_row")).values(number=bindparam("as_number"))
-            connection.execute(number, numbered)
+            _number_leaves(connection, numbered)
         note = self.key.sign(Checkpoint(origin, tree.size, tree.root))
         stored = {"size": tree.size, "note": note, "subtrees": b"".join(tree.subtrees)}
         connection.execute(insert(CHECKPOINTS), [stored])
@@ -582,7 +584,7 @@ class History:
         Raises:
             Corrupt: The tree of the backup is not the one that was signed.
         """
-        connection.exec_driver_sql(FORGET_NOTES)
+        take_notes(connection)
         connection.info[NOTING] = True
         self._origin = self._seal = None
         if self.origin(connection) is None:
@@ -593,6 +595,43 @@ class History:
         if not read_notes(last or "")[0].signed_by(self.key.public):
             self.sign(connection, adopt=True)
         self.log_schema(connection)
+
+
+def _number_leaves(connection: Connection, numbered: Sequence[tuple[int, int]]) -> None:
+    """Give leaves their numbers, each with the row of its leaf."""
+    if connection.dialect.name == "sqlite":
+        connection.exec_driver_sql('UPDATE history SET number = ? WHERE "row" = ?', list(numbered))
+    else:
+        connection.exec_driver_sql(
+            "UPDATE history SET number = given.number FROM unnest(%s::bigint[], %s::bigint[]) AS given(number, of_row) "
+            'WHERE history."row" = given.of_row',
+            tuple(list(column) for column in zip(*numbered, strict=True)),
+        )
+
+
+def _leaves_of(
+    connection: Connection,
+    table: Logged,
+    effects: Mapping[str, Effect],
+    rows: Iterable[Any],
+    latest: Mapping[str, "Latest"],
+    at: str | None,
+) -> Iterator[dict[str, Any]]:
+    name = table.raw.name
+    for row in rows:
+        key = table.key_of(row)
+        if not effects[key].before:
+            # after an earlier leaf only where somebody has emptied a cache
+            yield new_leaf(name, ADD, at, key, digested(table.columns, row), latest.get(key))
+        elif key in latest and effects[key].written:  # removed, and added again
+            yield new_leaf(name, CHANGE, at, key, digested(table.columns, row), latest[key])
+        elif key in latest and (changed := effects[key].changed):
+            # the other columns keep their digests: if somebody else has changed one, that stays to be found
+            digests = {**latest[key].digests, **latest[key].digests_of(changed, row)}
+            yield new_leaf(name, CHANGE, at, key, (latest[key].salt, digests), latest[key])
+        # a row without a leaf was not written by the service: `skills verify` goes on naming it
+    gone = [key for key, effect in effects.items() if effect.before and not effect.after]
+    yield from removals(connection, name, gone, latest, at)
 
 
 @dataclass(frozen=True)
@@ -637,6 +676,115 @@ def latest_leaves(connection: Connection, table: str, keys: Sequence[str] | None
         these = query.where(LEAVES.c.key.in_(keys[at : at + ROWS_AT_ONCE]))
         found.update({key: Latest(*about) for key, *about in connection.execute(these)})
     return found
+
+
+_OF_LEAF, _SALT = ("table_name", "key", '"row"', "entry", "salt", "digests"), (4,)
+_Query = tuple[tuple[str, ...], tuple[int, ...], str, str]
+
+
+def changed_rows(
+    connection: Connection, effects: Mapping[str, Mapping[str, Effect]]
+) -> tuple[dict[str, list[Any]], dict[str, dict[str, Latest]]]:
+    """Return the rows that a transaction has left, and the newest leaves of those of before, by table.
+
+    One statement reads all of them: what a small transaction costs is the number of its statements.
+    """
+    rows: dict[str, list[Any]] = {table: [] for table in effects}
+    latest: dict[str, dict[str, Latest]] = {table: {} for table in effects}
+    statements: list[_Query] = []
+    given: list[tuple[str, Any]] = []
+    parts: list[tuple[Logged, frozenset[str]]] = []
+    dialect = connection.dialect
+    for table, of_table in effects.items():
+        left = [key for key, effect in of_table.items() if effect.after]
+        if left:
+            known = logged()[table]
+            parts.append((known, frozenset(left)))
+            statements.append((known.names, known.of_bytes, table, f'"{known.keys[0]}"'))
+            given.append(("text" if known.of_text else "bigint", known.firsts_of(left)))
+    for table, of_table in effects.items():
+        logged_before = [key for key, effect in of_table.items() if effect.before or table in CACHES]
+        if logged_before:
+            statements.append((_OF_LEAF, _SALT, "history", f"table_name = '{table}' AND key"))
+            given.append(("text", logged_before))
+    found = []
+    for part, values in _united(connection, statements, given):
+        if part >= len(parts):
+            found.append(values[: len(_OF_LEAF)])
+            continue
+        known, some = parts[part]
+        readers = known.readers(dialect)
+        row = known.row(*(value if read is None else read(value) for read, value in zip(readers, values, strict=False)))
+        if known.key_of(row) in some:
+            rows[known.raw.name].append(row)
+    for table, key, row, entry, salt, digests in sorted(found, key=itemgetter(2)):
+        if dialect.name == "sqlite":
+            digests = json.loads(digests)
+        latest[table][key] = Latest(row, entry, salt, digests)
+    return rows, latest
+
+
+def _united(
+    connection: Connection, statements: Sequence[_Query], given: Sequence[tuple[str, Any]]
+) -> Iterator[tuple[int, Sequence[Any]]]:
+    """Yield the rows of several queries that are sent as one, each with the number of its query.
+
+    Args:
+        connection: In the transaction.
+        statements: For each query its columns, the positions of those of bytes, the table, and the column that is
+            compared, after further conditions.
+        given: For each query the type and the values of that column.
+    """
+    if not statements:
+        return
+    if connection.dialect.name == "sqlite":
+        widest = max(len(columns) for columns, *_ in statements)
+        queries = [
+            f"SELECT {number}, {', '.join((*columns, *('NULL',) * (widest - len(columns))))} FROM {table} "  # noqa: S608
+            f"WHERE {compared} IN (SELECT value FROM json_each(?))"
+            for number, (columns, _, table, compared) in enumerate(statements)
+        ]
+        values = tuple(json.dumps(values) for _, values in given)
+        for number, *row in connection.exec_driver_sql(" UNION ALL ".join(queries), values):
+            yield number, row
+        return
+    most = max(len(of_bytes) for _, of_bytes, *_ in statements)
+    queries = []
+    for number, ((columns, of_bytes, table, compared), (kind, _)) in enumerate(zip(statements, given, strict=True)):
+        plain = ("NULL" if at in of_bytes else column for at, column in enumerate(columns))
+        beside = [f", {columns[at]}" for at in of_bytes] + [", NULL::bytea"] * (most - len(of_bytes))
+        queries.append(
+            f"SELECT {number}, json_build_array({', '.join(plain)})::text{''.join(beside)} FROM {table} "  # noqa: S608
+            f"WHERE {compared} = ANY(%s::{kind}[])"
+        )
+    values = tuple(values for _, values in given)
+    for number, as_json, *contents in connection.exec_driver_sql(" UNION ALL ".join(queries), values):
+        row = json.loads(as_json)
+        for at, content in zip(statements[number][1], contents, strict=False):
+            row[at] = content
+        yield number, row
+
+
+_ADDED = ("table_name", "key", "entry", "seal", "salt", "digests")
+_ADDING = {
+    "sqlite": "INSERT INTO history (table_name, key, entry, seal, salt, digests) VALUES (?, ?, ?, ?, ?, ?)",
+    "postgresql": "INSERT INTO history (table_name, key, entry, seal, salt, digests) "
+    "SELECT a, b, c, d, e, f::json FROM unnest(%s::text[], %s::text[], %s::text[], %s::bytea[], %s::bytea[], "
+    "%s::text[]) AS given(a, b, c, d, e, f)",
+}
+
+
+def add_leaves(connection: Connection, leaves: Sequence[Mapping[str, Any]]) -> None:
+    """Insert leaves in their order, in one statement on PostgreSQL."""
+    rows: list[tuple[Any, ...]] = []
+    for leaf in leaves:
+        *values, digests = (leaf[name] for name in _ADDED)
+        rows.append((*values, None if digests is None else _encode(digests)))
+    if connection.dialect.name == "sqlite":
+        connection.exec_driver_sql(_ADDING["sqlite"], rows)
+    else:
+        columns = tuple(list(column) for column in zip(*rows, strict=True))
+        connection.exec_driver_sql(_ADDING["postgresql"], columns)
 
 
 Digested = tuple[bytes, dict[str, str]]

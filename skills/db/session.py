@@ -47,7 +47,7 @@ from sqlalchemy.exc import ArgumentError, DatabaseError, DBAPIError, Operational
 from sqlalchemy.orm import Session, sessionmaker
 from sqlalchemy.pool import ConnectionPoolEntry
 
-from skills.db.history import FORGET_NOTES, NOTES_OF_CONNECTION, NOTING, History
+from skills.db.history import FORGET_NOTES, NOTING, NOTING_CONNECTION, History
 from skills.db.row_visibility import ONLY, Only
 from skills.errors import BadSettings, Busy, Conflict, Corrupt, DatabaseUnusable, SkillsError, StorageFull
 from skills.remedies import Action, Remedy
@@ -414,16 +414,16 @@ def write_ahead(connection: sqlite3.Connection, patience_ms: int = BUSY_TIMEOUT_
 
 
 def _open_postgresql(url: URL, patience_ms: int) -> Engine:
-    waits = {"options": f"-c lock_timeout={patience_ms}", "connect_timeout": max(2, patience_ms // 1000)}
+    waits = {
+        "options": f"-c lock_timeout={patience_ms} {NOTING_CONNECTION}",
+        "connect_timeout": max(2, patience_ms // 1000),
+    }
     engine = create_engine(url, pool_pre_ping=True, connect_args=waits, **_pool(patience_ms))
     # A restart of the server must not fail the requests that connect during it.
     event.listen(engine, "do_connect", Returning(min(RESTART_S, patience_ms / 1000)).connect)
 
     @event.listens_for(engine, "connect")
-    def _note(connection: Any, record: ConnectionPoolEntry) -> None:
-        connection.autocommit = True
-        connection.execute(NOTES_OF_CONNECTION)
-        connection.autocommit = False
+    def _note(_connection: Any, record: ConnectionPoolEntry) -> None:
         record.info[NOTING] = True
 
     @event.listens_for(engine, "begin")
