@@ -2,6 +2,8 @@
 
 import base64
 import hashlib
+import json
+from typing import Any
 
 from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
@@ -44,3 +46,19 @@ def check_inclusion(entry: str, number: int, proof: list[bytes], note: str, veri
         number, last = number // 2, last // 2
     assert last == 0, "the proof is too short"
     assert node == root, "the entry is not under the checkpoint"
+
+
+def check_disclosed(proof: dict[str, Any], note: str, verifier: str) -> dict[str, Any]:
+    """Return the disclosed columns of a row, after checking them down to a signed checkpoint."""
+    salt, values = bytes.fromhex(proof["salt"]), {}
+    for name, said in proof["disclosed"].items():
+        digest = hashlib.sha256(salt + name.encode() + b"\0" + said.encode()).hexdigest()[:32]
+        assert digest == proof["digests"][name], f"{name} is not as it was logged"
+        values[name] = None if said == "none" else json.loads(said[4:]) if said[:4] == "json" else said[6:]
+    entry = json.loads(proof["entry"])
+    digests = json.dumps(proof["digests"], sort_keys=True, separators=(",", ":"))
+    assert hashlib.sha256(digests.encode()).hexdigest() == entry["commitment"], "the digests are not those of the entry"
+    assert entry["table"] == proof["table"]
+    hashes = [bytes.fromhex(one) for one in proof["hashes"]]
+    check_inclusion(proof["entry"], proof["number"], hashes, note, verifier)
+    return values

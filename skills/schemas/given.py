@@ -58,6 +58,7 @@ __all__ = [
     "Demonstration",
     "Job",
     "Key",
+    "LeafProof",
     "NewKey",
     "NextPose",
     "NextStep",
@@ -77,8 +78,10 @@ __all__ = [
     "RewardMap",
     "Rollout",
     "Score",
+    "ServedAt",
     "SessionOpening",
     "SessionPose",
+    "SignedCheckpoint",
     "Surgeon",
     "SuturePoints",
     "SutureType",
@@ -362,6 +365,42 @@ class Alive(Given):
 
     status: Literal["ok"]
     use: str
+
+
+class SignedCheckpoint(Given):
+    """The newest head of the history, signed."""
+
+    note: str = Field(description="A C2SP signed note of a tlog-checkpoint: origin, size, root, signatures.")
+    verifier: str = Field(description="The public key of the note: its name, number and Ed25519 key.")
+
+
+class LeafProof(Given):
+    """The proof that a row was logged as it is disclosed.
+
+    SHA-256 of salt, name, a zero byte and the disclosed text of a column begins with the digest of that name. SHA-256
+    of the digests in canonical JSON is the commitment in the entry. The entry is the leaf `number` of the tree.
+    """
+
+    table: str
+    number: Count
+    entry: str = Field(description="JSON; the leaf's hash is SHA-256 of a zero byte and this text.")
+    salt: str = Field(description="32 bytes in hex.")
+    disclosed: dict[str, str] = Field(description="Columns as they are digested: `json` and the value, and so on.")
+    digests: dict[str, str] = Field(description="Of all logged columns, 16 bytes each in hex.")
+    hashes: list[str] = Field(description="Hashes beside the path from the leaf to the root (RFC 6962), in hex.")
+
+
+class ServedAt(Given):
+    """The version of a style that was served at a time, with proofs of its release and of its digest."""
+
+    surgeon: Slug
+    suture: Slug
+    at: datetime
+    policy: Sha256
+    released_at: datetime
+    withdrawn_at: datetime | None
+    proofs: list[LeafProof]
+    checkpoint: SignedCheckpoint
 
 
 class Ready(Given):

@@ -20,9 +20,11 @@ OPERATIONS = {
     "get_policy_card", "get_policy_version", "get_policy_version_card", "get_recording", "get_report",
     "get_retraining", "get_reward_map", "get_surgeon", "get_suture_type", "get_trajectory", "get_version",
     "list_all_keys", "list_demos", "list_jobs", "list_policies", "list_surgeons", "list_suture_types",
-    "list_versions", "make_key", "make_plan", "mark_demo", "metrics", "next_action", "play", "preview_recording",
+    "list_versions", "make_key", "make_plan", "mark_demo", "metrics", "newest_head", "next_action", "play",
+    "preview_recording",
     "put_surgeon", "put_suture_type",
-    "read_suture_points", "ready", "release", "retrain", "roll_out", "score", "train", "upload_demo", "watch_job",
+    "read_suture_points", "ready", "release", "retrain", "roll_out", "score", "served_at", "train",
+    "upload_demo", "watch_job",
     "withdraw", "withdraw_demo",
     "delete_dataset", "export_dataset", "get_dataset", "get_dataset_episodes",
 }  # fmt: skip

@@ -6,10 +6,11 @@ from urllib.parse import parse_qs
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import PlainTextResponse
+from pydantic import AwareDatetime
 
 from skills.api.authentication import COOKIE, Access, refuse_without_token
 from skills.api.authorisation import Asking, needs, open_to_all
-from skills.api.dependencies import Configured
+from skills.api.dependencies import Configured, Db
 from skills.api.metrics import CONTENT_TYPE, ServiceMetrics
 from skills.api.openapi import router_of, says
 from skills.api.pages import render
@@ -17,9 +18,11 @@ from skills.api.responses import say
 from skills.errors import BadInput, NotSignedIn
 from skills.jobs.readiness import refuse_unready
 from skills.library.keys import sign_in, sign_out
+from skills.library.proofs import checkpoint_json, served_json
 from skills.sandbox.containment import LAYERS
 from skills.sandbox.forked import layers_held
-from skills.schemas.given import Alive, Ready
+from skills.schemas.given import Alive, Ready, ServedAt, SignedCheckpoint
+from skills.schemas.requests import SLUG
 from skills.settings import MEBIBYTE, Settings
 
 router = router_of(tags=["operating"])
@@ -46,6 +49,25 @@ def ready(request: Request) -> Response:
     settings: Settings = request.app.state.settings
     workers, held = refuse_unready(settings), layers_held()
     return say({"status": "ready", "workers": workers, "containment": {name: name in held for name in LAYERS}})
+
+
+@router.get("/history", dependencies=[needs("reader")], **says(ServedAt, 404, 410))
+def served_at(
+    db: Db,
+    surgeon: Annotated[str, Query(pattern=SLUG)],
+    suture: Annotated[str, Query(pattern=SLUG)],
+    at: Annotated[AwareDatetime, Query(description="A moment with its zone, such as 2026-01-31T12:00:00Z.")],
+) -> Response:
+    """Return the version of a style that was served at a time, with proofs that need no trust in this service."""
+    with db.reading() as session:
+        return say(served_json(session, db.history, surgeon, suture, at))
+
+
+@router.get("/history/checkpoint", dependencies=[needs("reader")], **says(SignedCheckpoint))
+def newest_head(db: Db) -> Response:
+    """Return the newest signed checkpoint of the history, to be kept elsewhere."""
+    with db.reading() as session:
+        return say(checkpoint_json(session.connection(), db.history))
 
 
 @router.get("/metrics", dependencies=[needs("reader", whole=True)], response_class=PlainTextResponse)

@@ -1,0 +1,119 @@
+"""Proofs of the history for a third party: which version of a style was served at a time, and the newest checkpoint.
+
+A proof is checked without the service and the database, given the verifier's key: the disclosed columns give some of
+the digests, the digests the commitment in the entry, and the entry with the hashes beside its path the signed root.
+"""
+
+from collections.abc import Sequence
+from datetime import datetime
+from typing import Any
+
+from sqlalchemy import Connection, or_, select
+from sqlalchemy.orm import Session
+
+from skills.db import rfc3339
+from skills.db.history import LEAVES, History, as_bytes, latest_leaves, logged
+from skills.db.models import PolicyVersion, Release
+from skills.errors import Busy, Corrupt, NotFound
+from skills.library.catalogue import find_surgeon
+from skills.library.history import newest_checkpoint
+from skills.remedies import Action, Remedy
+from skills.transparency import inclusion_proof, leaf_hash, read_notes
+
+DISCLOSED = {  # of the rows that a proof is about; the digests of their other columns reveal nothing without a guess
+    "releases": ("row", "policy_row", "surgeon_row", "suture", "released_at", "released_by", "withdrawn_at"),
+    "policy_versions": ("row", "sha256"),
+}
+
+
+def checkpoint_json(connection: Connection, history: History) -> dict[str, Any]:
+    """Return the newest signed checkpoint and the public key that verifies it.
+
+    Raises:
+        BadSettings: The signing key cannot be read.
+        Busy: No history was begun yet.
+    """
+    note = newest_checkpoint(connection)
+    if note is None:
+        raise Busy("No history was begun yet; try again in a moment.")
+    return {"note": note, "verifier": history.key.verifier(note.partition("\n")[0])}
+
+
+def served_json(session: Session, history: History, surgeon: str, suture: str, at: datetime) -> dict[str, Any]:
+    """Return the version of a style that was served at a time, with the proof of its release and of its digest.
+
+    It hashes all leaves of the history, which takes some seconds for a million.
+
+    Raises:
+        NotFound: There is no such surgeon, or nothing was released then.
+        Busy: The release is not under a signed checkpoint yet.
+        BadSettings: The signing key cannot be read.
+        Corrupt: The history is not whole.
+    """
+    of_style = (Release.surgeon_row == find_surgeon(session, surgeon).row, Release.suture == suture)
+    standing = (Release.released_at <= at, or_(Release.withdrawn_at.is_(None), Release.withdrawn_at > at))
+    found = session.execute(
+        select(Release, PolicyVersion.sha256)
+        .join(PolicyVersion, PolicyVersion.row == Release.policy_row)
+        .where(*of_style, *standing)
+        .order_by(Release.row.desc())
+        .limit(1)
+    ).first()
+    if found is None:
+        raise NotFound("No version of this style was released at that time.")
+    release, sha256 = found
+    connection = session.connection()
+    checkpoint = checkpoint_json(connection, history)
+    keys = {"releases": str(release.row), "policy_versions": str(release.policy_row)}
+    return {
+        "surgeon": surgeon,
+        "suture": suture,
+        "at": rfc3339(at),
+        "policy": sha256,
+        "released_at": rfc3339(release.released_at),
+        "withdrawn_at": rfc3339(release.withdrawn_at),
+        "proofs": _proofs(connection, keys, checkpoint["note"]),
+        "checkpoint": checkpoint,
+    }
+
+
+def _proofs(connection: Connection, keys: dict[str, str], note: str) -> list[dict[str, Any]]:
+    """Return the proofs of the newest leaves of some rows, given by table and key."""
+    leaves = {}
+    for table, key in keys.items():
+        latest = latest_leaves(connection, table, [key]).get(key)
+        if latest is None:
+            raise Corrupt("The history has no leaf of this release.", Remedy(Action.VERIFY))
+        leaves[table] = latest
+    query = select(LEAVES.c.row, LEAVES.c.number).where(LEAVES.c.row.in_([one.row for one in leaves.values()]))
+    of_row = {row: number for row, number in connection.execute(query)}  # noqa: C416 - mypy
+    size = read_notes(note)[0].checkpoint.size
+    if any(number is None or number >= size for number in of_row.values()):
+        raise Busy("The history is not signed up to this release yet; try again in a second.")
+    hashes = _hashes(connection, size)
+    proofs = []
+    for table, latest in leaves.items():
+        (row,) = logged()[table].rows_of(connection, [keys[table]])
+        number = of_row[latest.row]
+        assert number is not None
+        proofs.append(
+            {
+                "table": table,
+                "number": number,
+                "entry": latest.entry,
+                "salt": latest.salt.hex(),
+                "disclosed": {name: as_bytes(getattr(row, name))[1:].decode() for name in DISCLOSED[table]},
+                "digests": dict(latest.digests),
+                "hashes": [one.hex() for one in inclusion_proof(hashes, number)],
+            }
+        )
+    return proofs
+
+
+def _hashes(connection: Connection, size: int) -> Sequence[bytes]:
+    """Return the hashes of the first leaves in the order of their numbers."""
+    query = select(LEAVES.c.entry).where(LEAVES.c.number < size).order_by(LEAVES.c.number)
+    hashes = [leaf_hash(entry.encode()) for entry in connection.scalars(query)]
+    if len(hashes) != size:
+        raise Corrupt("Leaves of the history are missing.", Remedy(Action.VERIFY))
+    return hashes
