@@ -40,7 +40,7 @@ from skills.client.recordings import Catalogue, Recordings
 from skills.client.transport import Awaited, Blocking, Progress, Retrying, Transport
 from skills.errors import BadSettings
 from skills.remedies import Action, Remedy
-from skills.schemas.given import Key, NewKey, Ready
+from skills.schemas.given import Key, NewKey, Ready, ServedAt, SignedCheckpoint
 
 if TYPE_CHECKING:
     from skills.client.sessions import AsyncSession, Session
@@ -102,12 +102,32 @@ class Keys(Connection):
         return await self._get(Ready, at("readyz"))
 
 
+class History(Connection):
+    """Calls about the signed history."""
+
+    @call
+    async def served_at(self, surgeon: str, suture: str, moment: datetime) -> ServedAt:
+        """Return the version of a style that was served at a moment, with proofs that need no trust in the service.
+
+        Args:
+            surgeon: The surgeon.
+            suture: The suture type.
+            moment: The moment, with a time zone.
+        """
+        return await self._get(ServedAt, at("history"), surgeon=surgeon, suture=suture, at=moment.isoformat())
+
+    @call
+    async def checkpoint(self) -> SignedCheckpoint:
+        """Return the newest signed checkpoint of the history, to be kept elsewhere."""
+        return await self._get(SignedCheckpoint, at("history", "checkpoint"))
+
+
 TIMEOUT_S = 60.0  # ours: the service reads a large recording in at most 30 s, and the request may be queued before
 ANSWER_S = 1.0  # ours: an answer takes milliseconds, and an arm must not go on for long without one
 AGAIN = Retrying()
 
 
-class Calls(Atlases, Catalogue, Recordings, Datasets, Jobs, Policies, Plans, Keys, Scores):
+class Calls(Atlases, Catalogue, Recordings, Datasets, Jobs, Policies, Plans, Keys, Scores, History):
     """All calls, and the state that they share."""
 
     def _connect(

@@ -57,7 +57,8 @@ TOKENS = (
     "NaN", "Infinity", "-Infinity", "1e400", "9" * 400, "-" + "9" * 400, '"\\ud800"', '"\\u0000"', '"a\\u0000b"', "{}",
     '{"a": 1}', '[["b"]]', f'"{CANARY}"', '"' + "x" * 5000 + '"', "1.5e308", '"; DROP TABLE jobs; --"',
 )  # fmt: skip
-CACHED = {"measured_shapes": 0}  # a request for an atlas fills this cache and changes nothing else
+# A request for an atlas fills this cache, which the history notes, and changes nothing else.
+CACHED = {"measured_shapes": 0, "history": 0, "history_checkpoints": 0}
 FREE_TEXT = {
     "owner",
     "reason",

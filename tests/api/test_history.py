@@ -76,6 +76,9 @@ def test_a_proof_that_was_changed_anywhere_is_refused(trained: Service):
 def test_the_newest_checkpoint_is_signed_by_the_key_that_is_named(trained: Service):
     sign_history(trained.app.state.database, None)
     head = trained.http.get("/history/checkpoint").json()
+    assert trained.client.checkpoint() == head
+    served_now = trained.client.served_at("kestrel", "simple-running", now())
+    assert served_now["policy"] == trained.client.policy("kestrel", "simple-running")["sha256"]
     size, _ = root_in(head["note"], head["verifier"])
     assert size > 0
 

@@ -132,6 +132,7 @@ WORDS: dict[str, Any] = {
         "rotation_xyzw": (0, 0, 0, 1),
         "suture_points": [],
         "owner": "me",
+        "moment": datetime(2026, 1, 31, 12, tzinfo=UTC),
     },
     **{
         "name": "n",

@@ -197,10 +197,11 @@ def test_a_run_that_touches_ends_before_the_obstacle():
     assert walk(blind, path, start, steady).touched is None
 
 
-def test_the_example_of_the_page_runs():
+def test_the_examples_of_the_page_run():
     page = (Path(__file__).parents[2] / "docs" / "scenes.md").read_text()
-    (block,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     names: dict[str, Any] = {}
-    exec(compile(block, "scenes.md", "exec"), names)
+    for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
+        exec(compile(block, "scenes.md", "exec"), names)
     assert names["certificate"].every_action_optimal
     assert 0.5 < names["odds"].finishes[names["path"].start] < 1
+    assert 6 < names["tissue"].above_mm([20, 20, 5]) <= 6.5

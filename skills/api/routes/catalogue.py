@@ -61,7 +61,9 @@ def get_surgeon(surgeon: Slug, db: Db, give: Giving) -> Response:
 def erase_surgeon(surgeon: Slug, db: Db, jobs: Jobs, actor: Actor, if_match: Condition = None) -> None:
     """Erase a surgeon and everything derived from their data, permanently."""
     with db.reading() as session:
-        recordings = erasure.erased_with(session, catalogue.find_surgeon(session, surgeon))
+        found = catalogue.find_surgeon(session, surgeon)
+        refuse_changed(surgeon_json(found), if_match)
+        recordings = erasure.erased_with(session, found)
     drop_contents(db, recordings)
     with db.writing() as session:
         if if_match:

@@ -237,6 +237,7 @@ def withdraw_demo(
     dropped: erasure.Dropped = []
     with db.reading() as session:
         found = demos.find_demo(session, demo)
+        refuse_changed(demo_json(found), if_match)
         surgeon, erased = found.surgeon.slug, erasure.erased_with(session, found.surgeon, found) if erase else []
     drop_contents(db, erased)
     with db.writing(None if erase else [locks.surgeon(surgeon)]) as session:
