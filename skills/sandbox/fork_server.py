@@ -132,7 +132,10 @@ def _serve(
             act: Callable[[], None] = key.data
             act()
             continue
-        request, files, _, _ = socket.recv_fds(control, MAX_REQUEST_BYTES, 4)
+        try:
+            request, files, _, _ = socket.recv_fds(control, MAX_REQUEST_BYTES, 4)
+        except ConnectionResetError:  # the asker ended before it read what it was told
+            return
         if not request:
             return
         child = _fork(json.loads(request), inherited, *files)

@@ -2,7 +2,9 @@
 
 import json
 import os
+import selectors
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -17,7 +19,8 @@ from typing import IO, Any
 import pytest
 
 from skills.errors import Busy, Unanswered
-from skills.sandbox import ProcessLimits
+from skills.sandbox import ProcessLimits, fork_server
+from skills.sandbox.containment import Place
 from skills.sandbox.forked import ForkServer, layers_held
 from tests.measured import peak_mib
 from tests.waiting import alive, children, crowded, until
@@ -271,3 +274,11 @@ def test_it_ends_with_its_asker(tmp_path):
     until(lambda: not alive(int(told.read_text())))
     until(lambda: not alive(forked))
     until(lambda: not list(tmp_path.glob("suture-skills-*")))
+
+
+def test_an_asker_that_goes_without_reading_what_it_was_told_ends_it_without_a_word():
+    asker, control = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with control, selectors.DefaultSelector() as events:
+        control.send(b"ready")
+        asker.close()  # the kernel tells the other side of it as a reset connection
+        fork_server._serve(control, events, {}, fork_server._Inherited(Place("", ()), (), 0))
