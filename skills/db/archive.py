@@ -21,7 +21,7 @@ from zipfile import ZIP_STORED, ZipFile
 from sqlalchemy import Column, Connection, MetaData, Table, insert, select, text
 
 from skills.db import Base, now, rfc3339
-from skills.db.history import KINDS, kind_of
+from skills.db.logged_rows import KINDS, kind_of
 from skills.db.models import ParsedChunk, ParsedRecording
 from skills.db.service_tables import Executor, SignIn
 from skills.db.session import revision_of, revisions, upgrade

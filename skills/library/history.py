@@ -23,14 +23,16 @@ from sqlalchemy import Connection, exists, select, text
 
 from skills.db import in_parts
 from skills.db.history import (
-    CACHES,
     CHECKPOINTS,
     LEAVES,
     REMOVE,
-    ROWS_AT_ONCE,
     SCHEMA,
     History,
     Latest,
+)
+from skills.db.logged_rows import (
+    CACHES,
+    ROWS_AT_ONCE,
     Logged,
     commitment_to,
     logged,

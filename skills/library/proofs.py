@@ -12,7 +12,8 @@ from sqlalchemy import Connection, or_, select
 from sqlalchemy.orm import Session
 
 from skills.db import rfc3339
-from skills.db.history import LEAVES, History, as_bytes, latest_leaves, logged
+from skills.db.history import LEAVES, History, latest_leaves
+from skills.db.logged_rows import as_bytes, logged
 from skills.db.models import PolicyVersion, Release
 from skills.errors import Busy, Corrupt, NotFound
 from skills.library.catalogue import find_surgeon

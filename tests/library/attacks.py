@@ -17,18 +17,15 @@ from sqlalchemy.exc import IntegrityError
 from skills.db import now
 from skills.db.history import (
     ADD,
-    CACHES,
     CHECKPOINTS,
     LEAVES,
     REMOVE,
     History,
     Latest,
-    commitment_to,
-    digests_of,
     latest_leaves,
-    logged,
     new_leaf,
 )
+from skills.db.logged_rows import CACHES, commitment_to, digests_of, logged
 from skills.db.session import Database
 from skills.library.history import Finding, Verified, verify_history
 from skills.packing import canonical

@@ -13,7 +13,8 @@ import pytest
 from sqlalchemy import Connection, func, select, text, update
 
 from skills.db import Base, now
-from skills.db.history import CHECKPOINTS, COLUMNS_NOT_LOGGED, LEAVES, NOT_LOGGED, logged, take_notes
+from skills.db.history import CHECKPOINTS, LEAVES, take_notes
+from skills.db.logged_rows import COLUMNS_NOT_LOGGED, NOT_LOGGED, logged
 from skills.db.models import Release
 from skills.db.service_tables import Job
 from skills.db.session import Database

@@ -190,7 +190,7 @@ REFUSED: dict[str, Attempt] = {
     "list the root": _by(lambda prey: os.listdir("/"), RIGHTS),
     "list a folder of another": _by(lambda prey: os.listdir(prey.writable), FILES, RIGHTS),
     "see that a file exists": _by(lambda prey: os.stat(prey.secret), FILES),
-    "write to /tmp": _by(lambda prey: _write("/tmp/hostile"), FILES, RIGHTS),
+    "write to /tmp": _by(lambda prey: _write(os.path.join(os.sep, "tmp", "hostile")), FILES, RIGHTS),
     "write to /dev/shm": _by(lambda prey: _write("/dev/shm/hostile"), FILES, RIGHTS, everywhere=False),
     "write to a folder of its user": _by(lambda prey: _write(f"{prey.writable}/hostile"), FILES, RIGHTS),
     "write to the working folder": _by(lambda prey: _write("hostile"), FILES, RIGHTS),

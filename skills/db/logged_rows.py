@@ -1,0 +1,248 @@
+"""The rows that the history logs: which tables and columns, each as the bytes that its digest covers.
+
+Everything is logged but what `NOT_LOGGED` and `COLUMNS_NOT_LOGGED` name with a reason. Triggers, indexes and
+constraints are logged as if each of them were a row.
+"""
+
+import hashlib
+import json
+from collections import namedtuple
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from functools import cache, cached_property
+from json.encoder import encode_basestring_ascii
+from typing import Any
+
+from sqlalchemy import (
+    JSON,
+    BigInteger,
+    Boolean,
+    Column,
+    ColumnElement,
+    Connection,
+    Dialect,
+    Double,
+    Float,
+    Integer,
+    LargeBinary,
+    MetaData,
+    String,
+    Table,
+    select,
+    text,
+    tuple_,
+)
+from sqlalchemy.types import NullType, TypeEngine
+
+from skills.db import Base, Moment
+from skills.db.packed import Packed
+from skills.packing import canonical, sha256
+
+DIGEST_BYTES = 16
+ROWS_AT_ONCE = 200
+
+OF_A_RUN = "the state of running processes, replaced every second"
+IN_PIECES = "the row that the pieces belong to has their digest, which `skills verify` computes again"
+SWEPT = "what the sweep has yet to delete, and nobody sees; `skills verify` finds one that names an existing row"
+NOT_LOGGED = {
+    "executors": OF_A_RUN,
+    "sign_ins": "browser sessions, which end within a day; what is done in one is an event",
+    "retraining_styles": "the progress of a batch; the versions and releases that it made are logged",
+    "loose_chunks": SWEPT,
+    "erased_surgeons": SWEPT,
+    "recording_chunks": IN_PIECES,
+    "parsed_chunks": IN_PIECES,
+    "dataset_chunks": IN_PIECES,
+    "history": "the history itself",
+    "history_checkpoints": "the history itself",
+}
+CACHES = ("measured_shapes", "parsed_recordings")  # logged, but anybody may delete their rows at any time
+COLUMNS_NOT_LOGGED = {
+    ("jobs", "progress"): OF_A_RUN,
+    ("jobs", "attempt"): OF_A_RUN,
+    ("jobs", "told_at"): OF_A_RUN,
+    ("jobs", "started_at"): OF_A_RUN,
+}
+
+# ---- rows as they are stored -----------------------------------------------------------------------------------------
+
+KINDS: dict[str, TypeEngine[Any]] = {
+    "bytes": LargeBinary(),
+    "json": JSON(none_as_null=True),
+    "moment": Moment(),
+    "truth": Boolean(),
+    "plain": NullType(),  # text and numbers, which all drivers and JSON represent alike
+}
+PLAIN = (String, Integer, BigInteger, Float, Double)
+
+
+def kind_of(column: Column[Any]) -> str:
+    """Return the kind of a column, a key of `KINDS`, which decides how its values are represented elsewhere."""
+    if isinstance(column.type, Packed | LargeBinary):
+        return "bytes"
+    for kind, types in (("json", JSON), ("moment", Moment), ("truth", Boolean), ("plain", PLAIN)):
+        if isinstance(column.type, types):
+            return kind
+    raise AssertionError(f"no raw form of {column}")
+
+
+@dataclass(frozen=True)
+class Logged:
+    """A logged table with raw columns: serialised values stay bytes."""
+
+    raw: Table
+    keys: tuple[str, ...]
+
+    @cached_property
+    def columns(self) -> tuple[str, ...]:
+        """The names of the logged columns."""
+        return tuple(column.name for column in self.raw.columns)
+
+    @cached_property
+    def key_columns(self) -> list[Column[Any]]:
+        """The columns of the primary key."""
+        return [self.raw.c[name] for name in self.keys]
+
+    @cached_property
+    def row(self) -> Callable[..., Any]:
+        """The class of a row as `changed_rows` returns it, with the logged columns."""
+        return namedtuple("row", self.columns)
+
+    @cache  # noqa: B019 - a few dialects and tables in a process
+    def readers(self, dialect: Dialect) -> list[Callable[[Any], Any] | None]:
+        """Return the conversion of each column from its form in `changed_rows`."""
+        if dialect.name == "sqlite":
+            return [column.type.dialect_impl(dialect).result_processor(dialect, None) for column in self.raw.columns]
+        return [_FROM_JSON.get(kind_of(self._mapped.c[name])) or self._number(name) for name in self.columns]
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """The quoted names of the columns."""
+        return tuple(f'"{name}"' for name in self.columns)
+
+    @cached_property
+    def of_bytes(self) -> tuple[int, ...]:
+        """The positions of the columns of bytes."""
+        return tuple(at for at, name in enumerate(self.columns) if kind_of(self._mapped.c[name]) == "bytes")
+
+    def _number(self, name: str) -> Callable[[Any], Any] | None:
+        return _float if isinstance(self._mapped.c[name].type, Float) else None
+
+    @property
+    def _mapped(self) -> Table:
+        return Base.metadata.tables[self.raw.name]
+
+    def key_of(self, row: Any) -> str:
+        """Return the key of a row as text."""
+        return "/".join(str(getattr(row, name)) for name in self.keys)
+
+    def firsts_of(self, keys: Iterable[str]) -> list[Any]:
+        """Return the values with which some keys begin; few other rows share them, and all indexes begin with them."""
+        return sorted({key if self.of_text else int(key.partition("/")[0]) for key in keys})
+
+    @cached_property
+    def of_text(self) -> bool:
+        """Whether keys are texts."""
+        return isinstance(self._mapped.c[self.keys[0]].type, String)
+
+    def rows_of(self, connection: Connection, keys: Sequence[str]) -> Iterator[Any]:
+        """Yield the rows with some keys, of those that exist."""
+        for at in range(0, len(keys), ROWS_AT_ONCE):
+            some = frozenset(keys[at : at + ROWS_AT_ONCE])
+            rows = connection.execute(select(self.raw).where(self.key_columns[0].in_(self.firsts_of(some))))
+            yield from (row for row in rows if self.key_of(row) in some)
+
+    def after(self, key: Sequence[Any]) -> ColumnElement[bool]:
+        """Return the condition of the rows whose keys come after a key, given as its values."""
+        return tuple_(*self.key_columns) > tuple_(*key)
+
+    def pages(self, connection: Connection) -> Iterator[list[Any]]:
+        """Yield all rows in the order of their keys, some at a time."""
+        query = select(self.raw).order_by(*self.key_columns).limit(ROWS_AT_ONCE)
+        page = list(connection.execute(query))
+        while page:
+            yield page
+            last = [getattr(page[-1], name) for name in self.keys]
+            page = list(connection.execute(query.where(self.after(last))))
+
+
+def _float(value: Any) -> Any:
+    return None if value is None else float(value)
+
+
+_FROM_JSON: dict[str, Callable[[Any], Any]] = {  # as PostgreSQL writes them; in JSON the float 1.0 is 1
+    "moment": lambda value: None if value is None else datetime.fromisoformat(value).astimezone(UTC),
+}
+
+
+@cache
+def logged() -> Mapping[str, Logged]:
+    """Return the logged tables by name, each after those that it refers to."""
+    return {table.name: _logged(table) for table in Base.metadata.sorted_tables if table.name not in NOT_LOGGED}
+
+
+def _logged(table: Table) -> Logged:
+    columns = [one for one in table.columns if (table.name, one.name) not in COLUMNS_NOT_LOGGED]
+    raw = Table(table.name, MetaData(), *(Column(one.name, KINDS[kind_of(one)]) for one in columns))
+    return Logged(raw, tuple(one.name for one in table.primary_key))
+
+
+def digests_of(names: Sequence[str], values: Sequence[Any], salt: bytes) -> dict[str, str]:
+    """Return the salted digests of a row's columns in hex, by name."""
+    return {
+        name: hashlib.sha256(salt + name.encode() + as_bytes(value)).hexdigest()[: 2 * DIGEST_BYTES]
+        for name, value in zip(names, values, strict=True)
+    }
+
+
+encode = json.JSONEncoder(separators=(",", ":")).encode
+
+
+def as_bytes(value: Any) -> bytes:
+    """Return the bytes that a value is digested by, equal on both back ends; the order in JSON objects counts."""
+    if isinstance(value, str):
+        return b"\0json" + encode_basestring_ascii(value).encode()
+    if value is None:
+        return b"\0none"
+    if isinstance(value, bytes):
+        return b"\0bytes" + value
+    if isinstance(value, datetime):
+        return b"\0moment" + value.isoformat().encode()
+    if type(value) is int:
+        return b"\0json%d" % value  # as the encoder does, which is slow for numbers
+    return b"\0json" + encode(value).encode()
+
+
+def commitment_to(digests: Mapping[str, str]) -> str:
+    """Return the digest that stands for a row in the log."""
+    return sha256(canonical(dict(digests)))
+
+
+# ---- the database's schema, logged as if each of its objects were a row --------------------------------------------
+
+_OBJECTS = {
+    "sqlite": "SELECT type || ' ' || name, sql FROM sqlite_master WHERE type IN ('trigger', 'index', 'table', 'view') "
+    "AND name NOT LIKE 'sqlite_%' AND name <> 'alembic_version' AND sql IS NOT NULL",
+    "postgresql": """
+        SELECT 'trigger ' || c.relname || ' ' || t.tgname, pg_get_triggerdef(t.oid) || ' ' || t.tgenabled::text
+          FROM pg_trigger t JOIN pg_class c ON c.oid = t.tgrelid
+         WHERE NOT t.tgisinternal AND c.relnamespace = current_schema()::regnamespace
+        UNION ALL
+        SELECT 'function ' || p.proname, pg_get_functiondef(p.oid)
+          FROM pg_proc p WHERE p.pronamespace = current_schema()::regnamespace AND p.proname LIKE 'skills%'
+        UNION ALL
+        SELECT 'constraint ' || c.relname || ' ' || n.conname, pg_get_constraintdef(n.oid)
+          FROM pg_constraint n JOIN pg_class c ON c.oid = n.conrelid
+         WHERE n.connamespace = current_schema()::regnamespace AND c.relname = ANY(:tables)
+        UNION ALL
+        SELECT 'index ' || indexname, indexdef FROM pg_indexes
+         WHERE schemaname = current_schema() AND tablename = ANY(:tables)""",
+}
+
+
+def schema_of(connection: Connection) -> dict[str, str]:
+    """Return the definitions of triggers, functions, constraints, indexes and (on SQLite) tables, by kind and name."""
+    kind = connection.dialect.name
+    given = {"tables": list(Base.metadata.tables)} if kind == "postgresql" else {}
+    return {name: sql for name, sql in connection.execute(text(_OBJECTS[kind]), given)}  # noqa: C416 - mypy
