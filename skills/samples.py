@@ -1,15 +1,17 @@
-"""Loading of recordings into a service: the sample surgeons, and folders of the JIGSAWS data set.
+"""Loading of recordings into a service: the sample surgeons, and folders of the JIGSAWS data set; and its evaluation.
 
 A JIGSAWS folder is sent trial by trial: a recording each, its surgeon, and the hand-offs proposed in it. The data set
 is available on request from its authors and is not part of this project. Sending it again changes nothing, because a
 recording is identified by its bytes and a demonstration by its part of the recording. An error is recorded for its
 trial, and the others continue.
+
+`evaluate_hand_offs` reads such a folder without a service, and compares the proposed hand-offs with the transcribed.
 """
 
 import io
 import re
 import tomllib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib import resources
@@ -18,9 +20,10 @@ from tempfile import TemporaryDirectory
 from typing import IO
 
 from skills.client import Client, Problem
-from skills.errors import BadInput, SkillsError
+from skills.demonstration.segments import Agreement, agreement
+from skills.errors import BadInput, BadRecording, SkillsError
 from skills.formats.archive import pack
-from skills.formats.jigsaws import Skill, Trial, meta_line, trials
+from skills.formats.jigsaws import Skill, Trial, meta_line, read_jigsaws, trials
 from skills.remedies import did_you_mean
 from skills.schemas.given import Demonstration, Recording
 from skills.seeds.recordings import sample_recordings
@@ -192,3 +195,74 @@ def _packed(trial: Trial) -> Iterator[Path]:
         with path.open("wb") as out:
             pack(members, out)
         yield path
+
+
+@dataclass(frozen=True)
+class Evaluated:
+    """The proposed hand-offs of one task, compared with the transcribed ones.
+
+    Attributes:
+        task: Name of the task.
+        trials: Number of trials that were read.
+        left_out: Number of trials that cannot be read, such as empty files.
+        proposed: Number of proposals, of both hands; the transcriptions were not used.
+        transcribed: Number of hand-offs in the transcriptions; None if no trial has one.
+        precision: Share of the proposals that are transcribed; None likewise, or without a proposal.
+        recall: Share of the transcribed hand-offs that are proposed; None likewise.
+        brier: Mean squared difference between a proposal's confidence and 1 if transcribed, else 0; None likewise.
+    """
+
+    task: str
+    trials: int
+    left_out: int
+    proposed: int
+    transcribed: int | None
+    precision: float | None
+    recall: float | None
+    brier: float | None
+
+    @property
+    def a_trial(self) -> float:
+        """Proposals per trial."""
+        return self.proposed / max(self.trials, 1)
+
+
+def evaluate_hand_offs(found: Iterable[Trial]) -> list[Evaluated]:
+    """Compare proposed with transcribed hand-offs, task by task; precision and recall only of trials with both.
+
+    Args:
+        found: The trials, from `find_trials`.
+    """
+    by_task: dict[str, list[tuple[bool, Agreement | None]]] = {}
+    for trial in found:
+        by_task.setdefault(trial.task, []).append((trial.transcription is not None, _agreement(trial)))
+    return [_evaluated(task, rows) for task, rows in by_task.items()]
+
+
+def _agreement(trial: Trial) -> Agreement | None:
+    """Compare one trial; None if it cannot be read."""
+    try:
+        with trial.kinematics.open("rb") as file:
+            transcription = "" if trial.transcription is None else trial.transcription.read_text(errors="replace")
+            return agreement(read_jigsaws(file, transcription))
+    except BadRecording:
+        return None
+
+
+def _evaluated(task: str, rows: Sequence[tuple[bool, Agreement | None]]) -> Evaluated:
+    read = [one for _, one in rows if one is not None]
+    both = [one for has_labels, one in rows if one is not None and has_labels]
+    proposed, labelled, matched = (
+        sum(getattr(one, name) for one in both) for name in ("proposed", "labelled", "matched")
+    )
+    missed = [(confidence - is_matched) ** 2 for one in both for confidence, is_matched in one.confident]
+    return Evaluated(
+        task=task,
+        trials=len(read),
+        left_out=len(rows) - len(read),
+        proposed=sum(one.proposed for one in read),
+        transcribed=labelled if both else None,
+        precision=matched / proposed if proposed else None,
+        recall=matched / labelled if labelled else None,
+        brier=sum(missed) / len(missed) if missed else None,
+    )

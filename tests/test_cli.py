@@ -10,6 +10,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -466,6 +467,19 @@ def test_a_jigsaws_folder_is_stored_with_one_command(skills, tmp_path: Path) -> 
     }
 
 
+def test_proposed_hand_offs_are_compared_with_the_transcribed_ones(skills, tmp_path: Path) -> None:
+    root = trials.folder(tmp_path / "jigsaws")
+    (root / "Suturing" / "kinematics" / "AllGestures" / "Suturing_C003.txt").write_bytes(b"")
+    code, said = skills("jigsaws", "evaluate", str(root), "--json")
+    (one,) = json.loads(said)
+    assert code == 0
+    assert (one["task"], one["trials"], one["left_out"], one["transcribed"]) == ("Suturing", 2, 1, 2)
+    assert one["recall"] * one["transcribed"] == pytest.approx(one["precision"] * one["proposed"])
+    assert one["brier"] is None, "both jaws move at once, so that no transfer gives a confidence"
+    _, said = skills("jigsaws", "evaluate", str(root))
+    assert "transcribed" in said and "Suturing" in said
+
+
 def test_a_trial_that_is_refused_does_not_stop_the_others(skills, tmp_path: Path) -> None:
     root = trials.folder(tmp_path)
     bad = root / "Suturing" / "kinematics" / "AllGestures" / "Suturing_B001.txt"
@@ -546,6 +560,22 @@ def test_every_command_of_the_interface_is_there_and_speaks_to_programs() -> Non
         assert {(group, name) for name in names.split()} <= set(every)
     silent = {path for path, command in every.items() if not any("--json" in one.opts for one in command.params)}
     assert silent == {("serve",), ("worker",)}, "they answer nothing"
+
+
+def test_the_version_is_printed(skills) -> None:
+    assert skills("--version") == (0, f"{version('suture-skills')}\n")
+
+
+@pytest.mark.parametrize("words", [(), ("serve",), ("policy",), ("policy", "show")])
+def test_minus_h_is_help(words: tuple[str, ...], skills) -> None:
+    code, said = skills(*words, "-h")
+    assert (code, said) == skills(*words, "--help")
+    assert (code, "Usage" in said) == (0, True)
+
+
+def test_an_address_on_the_command_line_is_checked_like_the_setting(skills) -> None:
+    code, said = skills("serve", "--host", "0.0.0.0")
+    assert (code, "keys must not be sent unencrypted" in said) == (1, True)
 
 
 HEAVY = {  # pydantic is not among them: typer itself uses it to parse arguments

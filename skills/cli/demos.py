@@ -324,3 +324,25 @@ def jigsaws_add(
                 err.print(f"{one['trial']}: {problem}", style="red", markup=False, soft_wrap=True)
     if any(one["problems"] for one in done):
         raise typer.Exit(1)
+
+
+@jigsaws.command("evaluate")
+@refusing
+def jigsaws_evaluate(
+    folder: Annotated[Path, typer.Argument(help="A folder with TASK/kinematics/AllGestures/*.txt.", file_okay=False)],
+    task: Annotated[list[str] | None, typer.Option(help="Only this task, such as Suturing; repeatable.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Compare the hand-offs proposed from both hands' motion with the transcribed ones; nothing is stored."""
+    from rich.progress import track
+
+    from skills.samples import evaluate_hand_offs, find_trials
+
+    found = find_trials(folder, task or ())
+    read = track(found, "reading", console=err, transient=True, disable=not err.is_terminal)
+    rows = evaluate_hand_offs(read)
+    if as_json:
+        print_json([asdict(row) for row in rows])
+        return
+    columns = ("task", "trials", "left_out", "proposed", "a_trial", "transcribed", "precision", "recall", "brier")
+    show([{**asdict(row), "a_trial": round(row.a_trial, 1)} for row in rows], False, columns)

@@ -18,6 +18,7 @@ import numpy as np
 
 from skills.arrays import Floats, frozen
 from skills.demonstration.partner import Partner, PartnerMotion, in_base, partner_along, partner_at
+from skills.demonstration.pauses import Pause, clutched, is_driven, undriven
 from skills.demonstration.recording import (
     BaseFrame,
     Format,
@@ -29,7 +30,7 @@ from skills.demonstration.recording import (
     base_frames,
     recorded_motion,
 )
-from skills.demonstration.segments import Pause, Segment, clutched, is_driven, propose_segments, undriven
+from skills.demonstration.segments import Segment, propose_segments
 from skills.errors import BadSegment, JointsDisagree, NotMetres
 
 __all__ = [

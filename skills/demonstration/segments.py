@@ -1,11 +1,6 @@
-"""Segments: the hand-offs of a recording, labelled or detected, and the pauses in it.
+"""Segments: the hand-offs of a recording, labelled or detected.
 
     Recording --propose_segments--> Segments: the start of A1, the transition to A2, the end of A2, and the reasons
-
-**Pauses.** The arm is not driven while the clutch is pressed or teleoperation does not follow. With the clutch down the
-surgeon repositions the masters while the PSM stands still or is pushed a little: its motion then was not demonstrated.
-A quick tap of the pedal is a command to the console and no pause. Pauses are in the recording's own nanoseconds, both
-ends included.
 
 **Labels.** Stages of a recorder's tags and gestures of JIGSAWS name hand-offs:
 
@@ -16,11 +11,13 @@ The paper says that its tasks generalise the gestures of JIGSAWS; that A1 is G6 
 reading (Fig. 3). A G8 after the G4 is made by the other hand and belongs to the next stitch.
 
 **Proposals.** A segment's times are a proposal: the surgeon decides, and `cut_demo` takes any other times. All of it is
-ours; the paper cut by hand. Of three methods the first that applies is used:
+ours; the paper cut by hand. Of four methods the first that applies is used:
 
 * *named*: stages of a recorder's tags, or gestures of JIGSAWS, if they name a hand-off;
+* *transfer*: the last movement in which the jaw holds a needle before it gives it to another arm's (`transfers`). Used
+  if such a transfer between any two arms was found;
 * *jaw*: an interval in which the jaw holds something, from the first movement in it to the last. Within one hold the
-  hand may rest for `HELD_PAUSE_S`. Used if the jaw was recorded and moved by `JAW_RANGE_RAD`, even if it finds nothing;
+  hand may rest for `HELD_PAUSE_S`. Used if the jaw was recorded and opened and closed, even if it finds nothing;
 * *motion*: an interval of movement between rests. If the jaw was not recorded but the wrist was, a hand-off ends with a
   turn in place: the paper found that the orientation does not change in A1, and A2 is a turn. If there is no such turn
   either, every movement that is long enough is proposed.
@@ -34,19 +31,18 @@ recording's other candidates is hand-work (M1, M2): steadying tissue, reaching.
 """
 
 from bisect import bisect_left, bisect_right
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import islice, pairwise
 from typing import Literal
 
 import numpy as np
 
-from skills.arrays import Flags, Floats, Ints
+from skills.arrays import Flags, Floats
 from skills.demonstration.movement import (
     TURNING_RAD_S,
     Movement,
     Span,
-    covered,
     inside,
     movement_of,
     offset,
@@ -54,120 +50,10 @@ from skills.demonstration.movement import (
     spans_of,
 )
 from skills.demonstration.partner import partner_at
-from skills.demonstration.recording import BaseFrame, Label, Motion, Recording, Signal, base_frames
-from skills.fields import computed_field, schema
-
-Cause = Literal["clutch", "not following"]
-Nanoseconds = tuple[int, int]
-FOREVER_NS = int(np.iinfo(np.int64).max)
-
-
-@dataclass(frozen=True)
-class Pause:
-    """An interval in which the arm was not driven, in seconds from a demonstration's first sample, and its cause."""
-
-    start_s: float
-    end_s: float
-    cause: Cause
-
-
-def press_times(clutch: Signal) -> list[tuple[int, int | None]]:
-    """Return the presses of a pedal, without quick taps (2).
-
-    Args:
-        clutch: State of the pedal over time: 0 released, 1 pressed, 2 a quick tap.
-
-    Returns:
-        The times in ns at which the pedal went down and up again; None for the second if it never went up.
-    """
-    presses: list[tuple[int, int | None]] = []
-    down_ns: int | None = None
-    for stamp_ns, value in zip(clutch.stamps_ns.tolist(), clutch.values.tolist(), strict=True):
-        if value == 1 and down_ns is None:
-            down_ns = stamp_ns
-        elif value == 0 and down_ns is not None:
-            presses.append((down_ns, stamp_ns))
-            down_ns = None
-    if down_ns is not None:
-        presses.append((down_ns, None))
-    return presses
-
-
-def clutched(recording: Recording) -> list[Nanoseconds]:
-    """Return the intervals in which the clutch was down, in ns; the end is `FOREVER_NS` if it never went up again."""
-    if recording.clutch is None:
-        return []
-    return [(down_ns, FOREVER_NS if up_ns is None else up_ns) for down_ns, up_ns in press_times(recording.clutch)]
-
-
-def not_following(recording: Recording, arm: str) -> list[Nanoseconds]:
-    """Return the intervals in which no teleoperation drove the arm.
-
-    If no teleoperation ever reports that it follows, nothing is known, because another program may have driven the arm:
-    there are no intervals then. Before its first message a teleoperation is assumed to have followed.
-
-    Args:
-        recording: The recording.
-        arm: Name of the arm, such as "PSM2".
-
-    Returns:
-        Start and end of each interval in ns; the end is `FOREVER_NS` if the arm was not driven again.
-    """
-    told = [signal for name, signal in recording.following if name.rsplit("_", 1)[-1] == arm and len(signal.values)]
-    if not any((signal.values == 1).any() for signal in told):
-        return []
-    stamps_ns = np.unique(np.concatenate([signal.stamps_ns for signal in told]))
-    stopped = np.all([_says_no(signal, stamps_ns) for signal in told], axis=0)
-    edges = np.diff(np.concatenate(([False], stopped, [False])).astype(np.int8))
-    until_ns = np.append(stamps_ns, FOREVER_NS)
-    spans = zip(np.flatnonzero(edges == 1), np.flatnonzero(edges == -1), strict=True)
-    return [(int(stamps_ns[a]), int(until_ns[b])) for a, b in spans]
-
-
-def undriven(recording: Recording, arm: str) -> list[tuple[int, int, Cause]]:
-    """Return the intervals in which the arm was not driven, disjoint and in order of time.
-
-    Args:
-        recording: The recording.
-        arm: Name of the arm, such as "PSM2".
-
-    Returns:
-        Start and end of each interval in ns, and its cause: "clutch" if the pedal was pressed in any part of it.
-    """
-    clutch: list[tuple[int, int, Cause]] = [(a, b, "clutch") for a, b in clutched(recording)]
-    stopped: list[tuple[int, int, Cause]] = [(a, b, "not following") for a, b in not_following(recording, arm)]
-    joined: list[tuple[int, int, Cause]] = []
-    for start, end, cause in sorted(clutch + stopped):
-        if joined and start <= joined[-1][1]:
-            before = joined.pop()
-            both: Cause = "clutch" if "clutch" in (cause, before[2]) else "not following"
-            joined.append((before[0], max(end, before[1]), both))
-        else:
-            joined.append((start, end, cause))
-    return joined
-
-
-def is_driven(stamps_ns: Ints, pauses: list[tuple[int, int, Cause]]) -> Flags:
-    """Return for each sample whether the arm was driven.
-
-    Args:
-        stamps_ns: Time of each sample, shape (T,), increasing.
-        pauses: Intervals in which the arm was not driven, as `undriven` returns them.
-
-    Returns:
-        Flags of shape (T,).
-    """
-    # The shape is given because without pauses the list is empty.
-    bounds_ns = np.array([(start, end) for start, end, _ in pauses], dtype=np.int64).reshape(-1, 2)
-    firsts, ends = np.searchsorted(stamps_ns, bounds_ns[:, 0]), np.searchsorted(stamps_ns, bounds_ns[:, 1], "right")
-    return ~covered(len(stamps_ns), firsts, ends)
-
-
-def _says_no(following: Signal, stamps_ns: Ints) -> Flags:
-    """Return for each stamp, (T,), whether the last message of a teleoperation was that it does not follow."""
-    last = np.searchsorted(following.stamps_ns, stamps_ns, side="right") - 1
-    return np.asarray((last >= 0) & (following.values[last] != 1))
-
+from skills.demonstration.pauses import undriven
+from skills.demonstration.recording import BaseFrame, Label, Motion, Recording, base_frames
+from skills.demonstration.transfers import REGRIP_S, Transfer, closed_jaw, find_transfers
+from skills.fields import Fraction, computed_field, schema
 
 FOLLOWS_NS = 5_000_000_000  # an A2 that begins later than 5 s after the end of A1 belongs to another hand-off
 MOST = 200  # per recording; more are a mistake, and for each the motion has to be analysed
@@ -239,19 +125,18 @@ PAUSE_S = 1.5  # a shorter rest is hesitation, not the end of a pass
 HELD_PAUSE_S = 3.0  # the same while the jaw holds something: the pass does not end before the release
 STROKE_PAUSE_S = 0.6  # the same if hand-offs are found by a turn in place: gripping the needle takes longer
 PAUSED_SHARE = 0.5  # a rest in which the arm was not driven for this share does not end a pass, however long it is
-REGRIP_S = 0.3  # a shorter opening of the jaw is a new grip, not a release
 SHORTEST_S = 0.5
 SHORTEST_MM = 3.0
 SMALL_SHARE = 0.35  # of the upper quartile of the candidates' extents: smaller ones are hand-work
-JAW_RANGE_RAD = 0.2  # a jaw that moves less never opened
 SMALLEST_TURN_RAD = 0.15  # 9 degrees: a last turn by less is an unsteady wrist
 A2_RAD = 0.35  # 20 degrees in place: far more than an unsteady wrist, less than any necessary realignment
 A1_SHARE = 1 / 3  # of the turn in place: a hand that reaches for the needle also turns, but on the way
 PROPOSALS_LIMIT = 1000  # of one arm
 OVERLAP_LIMIT = 3
+SHARED = 0.5  # of the shorter of a label and a proposal that are the same hand-off
 RELEASE_S = 3.0  # longest time from the last movement to the release, and to the other arm's grip
 
-FoundBy = Literal["stage", "gesture", "jaw", "motion"]
+FoundBy = Literal["stage", "gesture", "transfer", "jaw", "motion"]
 Spans = Floats  # of shape (K, 2): start and end of each
 
 
@@ -265,8 +150,9 @@ class Segment:
         start_s: Start of A1: the tip moves off with the needle.
         end_s: End of A2: the end of the arm's last movement before it releases the needle.
         handover_s: Transition from A1 to A2: the tip comes to rest.
-        found_by: The source of the proposal: stage, gesture, jaw or motion.
+        found_by: The source of the proposal: stage, gesture, transfer, jaw or motion.
         reasons: The reasons in words, the most important first.
+        confidence: Probability that the needle was given to another arm at its end; null unless found by a transfer.
     """
 
     arm: str
@@ -275,6 +161,7 @@ class Segment:
     handover_s: float
     found_by: str
     reasons: tuple[str, ...]
+    confidence: Fraction | None = None
 
     @computed_field  # type: ignore[prop-decorator]
     @property
@@ -350,12 +237,57 @@ def _proposed(heard: "_Heard", motion: Motion) -> tuple[Segment, ...]:
     named = _named_passes(seen, heard.named[motion.arm])
     if named:
         return tuple(_named(seen, one) for one in named[:PROPOSALS_LIMIT])
+    if heard.transfers and seen.holding is not None:
+        given = {one.released_s: one for one in heard.transfers if one.giver == motion.arm}
+        return tuple(_given(seen, span, one) for span, one in _last_held(seen, given)[:PROPOSALS_LIMIT])
     if seen.holding is not None:
         held = _without_hand_work(seen, _held(seen, seen.holding))
         return tuple(_told(seen, span, "jaw") for span in held[:PROPOSALS_LIMIT])
     turned = [span for span in _strokes(seen) if _ends_with_a2(seen, span)]
     spans = turned or [span for span in _bridged(_listed(seen.moving), PAUSE_S, seen) if _is_a_pass(seen, span)]
     return tuple(_told(seen, span, "motion") for span in _without_hand_work(seen, spans)[:PROPOSALS_LIMIT])
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Proposals of a recording compared with its labels, which were not shown to the proposals.
+
+    Attributes:
+        proposed: Number of proposals, of all arms.
+        labelled: Number of labelled hand-offs.
+        matched: Number of pairs of one proposal and one label that share `SHARED` of the shorter, of one arm.
+        confident: Confidence of each proposal, and whether it was matched; without those that have none.
+    """
+
+    proposed: int
+    labelled: int
+    matched: int
+    confident: tuple[tuple[float, bool], ...]
+
+
+def agreement(recording: Recording) -> Agreement:
+    """Compare the proposals that are made without labels with the labelled hand-offs.
+
+    Args:
+        recording: A recording; without labels, none of its proposals is matched.
+    """
+    labelled = [one for one in propose_by_arm(recording) if one.found_by in ("stage", "gesture")]
+    proposed = propose_by_arm(replace(recording, labels=()))
+    left, matched = list(labelled), []
+    for one in proposed:
+        same = next((label for label in left if label.arm == one.arm and _shared(label, one) >= SHARED), None)
+        matched.append(same is not None)
+        if same is not None:
+            left.remove(same)
+    pairs = zip(proposed, matched, strict=True)
+    confident = tuple((one.confidence, is_matched) for one, is_matched in pairs if one.confidence is not None)
+    return Agreement(len(proposed), len(labelled), sum(matched), confident)
+
+
+def _shared(one: Segment, other: Segment) -> float:
+    """Return the common time of two segments as a share of the shorter one."""
+    common_s = min(one.end_s, other.end_s) - max(one.start_s, other.start_s)
+    return common_s / max(min(one.end_s - one.start_s, other.end_s - other.start_s), 1e-9)
 
 
 def arrival(movement: Movement, start_s: float, end_s: float) -> float:
@@ -390,13 +322,16 @@ class _Heard:
     recording: Recording
     named: dict[str, list[Named]]  # by arm
     holding: dict[str, Spans | None]
+    transfers: tuple[Transfer, ...]
 
 
 def _heard(recording: Recording) -> _Heard:
     named: dict[str, list[Named]] = {arm: [] for arm in recording.arms}
     for one in named_hand_offs(recording.labels):
         named[_whose(recording, one)].append(one)
-    return _Heard(recording, named, {arm: _holding(recording, arm) for arm in recording.arms})
+    closed = {arm: closed_jaw(recording, arm) for arm in recording.arms}
+    holding = {arm: None if spans is None else _spans(spans) for arm, spans in closed.items()}
+    return _Heard(recording, named, holding, find_transfers(recording, closed, base_frames(recording)))
 
 
 def _look(heard: _Heard, motion: Motion) -> _Seen:
@@ -445,6 +380,18 @@ def _held(seen: _Seen, holding: Spans) -> list[Span]:
         for group in _bridged(_within(seen.moving, hold), HELD_PAUSE_S, seen)
     ]
     return [span for span in spans if _is_a_pass(seen, span)]
+
+
+def _last_held(seen: _Seen, given: Mapping[float, Transfer]) -> list[tuple[Span, Transfer]]:
+    """Find the last movement before each transfer that the arm makes with the needle, by the time of its release."""
+    assert seen.holding is not None
+    found = []
+    for hold in _listed(seen.holding):
+        if (transfer := given.get(hold[1])) is not None:
+            groups = _bridged(_within(seen.moving, hold), HELD_PAUSE_S, seen)
+            passes = [span for span in (_exact(seen, group) for group in groups) if _is_a_pass(seen, span)]
+            found += [(span, transfer) for span in passes[-1:]]
+    return found
 
 
 def _strokes(seen: _Seen) -> list[Span]:
@@ -499,15 +446,6 @@ def _ends_with_a2(seen: _Seen, span: Span) -> bool:
     return after >= A2_RAD and before <= A1_SHARE * after
 
 
-def _holding(recording: Recording, arm: str) -> Spans | None:
-    """Return the intervals in which the jaw is closed: below the middle of its range; None if that is unknown."""
-    jaw = recording.jaw_of(arm)
-    if jaw is None or len(jaw.values) == 0 or np.ptp(jaw.values) < JAW_RANGE_RAD:
-        return None
-    middle = (float(jaw.values.min()) + float(jaw.values.max())) / 2.0
-    return _spans(_bridged(spans_of(recording.seconds(jaw.stamps_ns), jaw.values < middle), REGRIP_S))
-
-
 def _bridged(spans: list[Span], pause_s: float, seen: _Seen | None = None) -> list[Span]:
     """Join neighbours whose gap is shorter than `pause_s`, or in whose gap the arm was mostly not driven."""
     joined: list[Span] = []
@@ -549,6 +487,15 @@ def _told(seen: _Seen, span: Span, found_by: FoundBy) -> Segment:
     what = "the tip moves with the jaw closed" if found_by == "jaw" else "the tip moves"
     reasons = [what, *_pauses(seen, span), *_grip(seen, span), *_a2(seen, span, handover), *_taken(seen, span)]
     return _segment(seen, span, handover, found_by, reasons)
+
+
+def _given(seen: _Seen, span: Span, transfer: Transfer) -> Segment:
+    """Return the movement before a transfer as a proposal, with its reasons."""
+    told = _told(seen, span, "jaw")
+    both_s = max(0.0, transfer.released_s - transfer.taken_s)
+    words = f"{transfer.taker} takes the needle: both jaws are closed for {both_s:.1f} s, and the tips keep together"
+    reasons = (*told.reasons, words)
+    return replace(told, found_by="transfer", reasons=reasons, confidence=round(transfer.confidence, 4))
 
 
 def _named(seen: _Seen, one: Named) -> Segment:

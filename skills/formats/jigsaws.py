@@ -173,6 +173,9 @@ def _meta_of(home: Path, task: str) -> Mapping[str, RatedTrial]:
 
 def _table(file: BinaryIO) -> Floats:
     """Return the numbers, shape (T, 76)."""
+    if not file.read(1):
+        raise UnreadableRecording("The kinematics file is empty.")
+    file.seek(0)
     try:
         table = np.loadtxt(file, dtype=np.float64, comments=None, ndmin=2, max_rows=ROWS + 1, encoding="utf-8")
     except (ValueError, UnicodeDecodeError) as error:

@@ -27,6 +27,7 @@ import numpy as np
 from skills import errors, packing
 from skills.compiled import check_kept, kept_in, make_ready
 from skills.demonstration.identification import ArmIdentification, Identification
+from skills.demonstration.pauses import press_times
 from skills.demonstration.recording import (
     BaseFrame,
     Column,
@@ -39,7 +40,7 @@ from skills.demonstration.recording import (
     base_frames,
     equal_samples,
 )
-from skills.demonstration.segments import Segment, press_times, propose_by_arm
+from skills.demonstration.segments import Segment, propose_by_arm
 from skills.errors import BadInput, SkillsError, TooLarge, Unanswered, UnknownFormat, UnreadableRecording
 from skills.fields import as_json
 from skills.formats import read_recording, write_mcap
@@ -50,7 +51,7 @@ from skills.sandbox import ProcessLimits
 from skills.sandbox.forked import ForkServer, Turns
 from skills.schemas import recordings as described
 
-READER_VERSION = 1  # raised when equal bytes give another `Told`, so that cached ones are decoded again
+READER_VERSION = 2  # raised when equal bytes give another `Told`, so that cached ones are decoded again
 MOST = 200  # entries of each list of unlimited length; `counts` has the full numbers of segments and labels
 
 

@@ -190,7 +190,7 @@ def test_proposed_hand_offs_can_be_sent_back_as_a_cut_request(here: Service):
     assert len(mine) == len(truths)
     for segment in mine:
         assert segment["start_s"] < segment["handover_s"] < segment["end_s"]
-        assert (segment["found_by"], segment["reason"]) == ("jaw", "; ".join(segment["reasons"]))
+        assert (segment["found_by"], segment["reason"]) == ("transfer", "; ".join(segment["reasons"]))
     corrected = {"arm": mine[0]["arm"], "start_s": mine[0]["start_s"] + 0.5, "end_s": mine[0]["end_s"]}
     demo = here.client.cut_demo(about["id"], **KESTREL, **corrected)
     assert demo["start_s"] == pytest.approx(corrected["start_s"], abs=0.011)

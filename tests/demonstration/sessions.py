@@ -59,7 +59,7 @@ class Truth:
 
 
 @dataclass
-class _Arm:
+class Arm:
     """One arm's script: times and the values from each time on, connected by minimum-jerk movements."""
 
     at_s: list[float] = field(default_factory=lambda: [0.0])
@@ -106,15 +106,15 @@ def session(kind: Kind) -> tuple[Recording, list[Truth]]:
     """Return a recording, and the true times of its hand-offs."""
     rng = np.random.default_rng(kind.seed)
     a, m, truths, presses = _script(kind, rng)
-    seconds = _stamps(a.at_s[-1], kind.rate_hz, rng)
+    seconds = stamps_of(a.at_s[-1], kind.rate_hz, rng)
     stamps_ns = EPOCH_NS + np.rint(seconds * 1e9).astype(np.int64)
     motions, jaws = [], []
     for arm, script in ((A, a), (M, m)):
         tip, turn, jaw = script.play(seconds)
-        tip = tip + _unsteady(seconds, kind, rng)
-        rotation = _turned(turn + rng.normal(0, 0.003 if kind.noisy else 0.001, turn.shape)) if kind.wrist else None
+        tip = tip + unsteady(seconds, kind, rng)
+        rotation = turned(turn + rng.normal(0, 0.003 if kind.noisy else 0.001, turn.shape)) if kind.wrist else None
         if arm == A or kind.both_arms:
-            motions += [_local(arm, stamps_ns, tip, rotation), _in_camera(arm, stamps_ns, tip, rotation)]
+            motions += [local(arm, stamps_ns, tip, rotation), in_camera(arm, stamps_ns, tip, rotation)]
             jaws.append((arm, Signal(stamps_ns, jaw + rng.normal(0, 0.01, len(jaw)))))
     truths = [Truth(*(t - seconds[0] for t in (one.start_s, one.handover_s, one.end_s))) for one in truths]
     events = [(0.0, 0.0), *((t, v) for down, up in presses for t, v in ((down, 1.0), (up, 0.0)))]
@@ -123,8 +123,8 @@ def session(kind: Kind) -> tuple[Recording, list[Truth]]:
     return replace(value, jaws=tuple(jaws) if kind.jaw else ()), truths
 
 
-def _script(kind: Kind, rng: np.random.Generator) -> tuple[_Arm, _Arm, list[Truth], list[tuple[float, float]]]:
-    a, m = _Arm(), _Arm()
+def _script(kind: Kind, rng: np.random.Generator) -> tuple[Arm, Arm, list[Truth], list[tuple[float, float]]]:
+    a, m = Arm(), Arm()
     exit_mm = np.array([-15.0, 45.0, -125.0])
     a.place_mm.append(exit_mm + _mm(0, 0, 25.0))
     m.place_mm.append(exit_mm + _mm(-30.0, 0, 10))
@@ -144,7 +144,7 @@ def _script(kind: Kind, rng: np.random.Generator) -> tuple[_Arm, _Arm, list[Trut
     return a, m, truths, presses
 
 
-def _hand_work(a: _Arm, m: _Arm, exit_mm, now: float, presses: list, rng: np.random.Generator) -> float:
+def _hand_work(a: Arm, m: Arm, exit_mm, now: float, presses: list, rng: np.random.Generator) -> float:
     """Perform M1 and M2: the needle comes through, PSM_A reaches for it."""
     pushed = now + rng.uniform(2.5, 6)
     m.go(m.at_s[-1] + 0.1, jaw=SHUT)
@@ -179,7 +179,7 @@ def _hand_work(a: _Arm, m: _Arm, exit_mm, now: float, presses: list, rng: np.ran
 
 
 def _pass(
-    a: _Arm, m: _Arm, exit_mm, now: float, presses: list, kind: Kind, rng: np.random.Generator
+    a: Arm, m: Arm, exit_mm, now: float, presses: list, kind: Kind, rng: np.random.Generator
 ) -> tuple[float, Truth]:
     now += 0.3
     a.go(now, jaw=SHUT)
@@ -221,7 +221,7 @@ def _pass(
     return now, Truth(start, handover, end)
 
 
-def _back(a: _Arm, m: _Arm, exit_mm, now: float, rng: np.random.Generator) -> float:
+def _back(a: Arm, m: Arm, exit_mm, now: float, rng: np.random.Generator) -> float:
     """Go back to wait next to the wound, rotating back on the way."""
     a.wait(now := now + rng.uniform(0.75, 1.5))
     m.wait(now)
@@ -248,7 +248,7 @@ def _curve(points: np.ndarray) -> np.ndarray:
     return np.stack([np.interp(even, length, axis) for axis in dense.T], axis=1)
 
 
-def _stamps(duration_s: float, rate_hz: float, rng: np.random.Generator) -> np.ndarray:
+def stamps_of(duration_s: float, rate_hz: float, rng: np.random.Generator) -> np.ndarray:
     """Return timestamps with jitter of a twentieth of a step and a few samples lost."""
     count = int(duration_s * rate_hz)
     kept = np.ones(count, bool)
@@ -257,7 +257,7 @@ def _stamps(duration_s: float, rate_hz: float, rng: np.random.Generator) -> np.n
     return ((np.arange(count) + rng.uniform(0, 0.05, count)) / rate_hz)[kept]
 
 
-def _unsteady(seconds: np.ndarray, kind: Kind, rng: np.random.Generator) -> np.ndarray:
+def unsteady(seconds: np.ndarray, kind: Kind, rng: np.random.Generator) -> np.ndarray:
     """Return tremor of 8 to 12 Hz, slow drift and the encoders' noise, (T, 3) mm."""
     rates, phases = rng.uniform(8, 12, (2, 3)), rng.uniform(0, 2 * np.pi, (2, 3))
     shaking = kind.tremor_mm * np.sin(2 * np.pi * rates * seconds[:, None, None] + phases).mean(axis=1)
@@ -266,7 +266,7 @@ def _unsteady(seconds: np.ndarray, kind: Kind, rng: np.random.Generator) -> np.n
     return shaking + drifting + rng.normal(0, kind.noise_mm, shaking.shape)
 
 
-def _turned(vector: np.ndarray) -> np.ndarray:
+def turned(vector: np.ndarray) -> np.ndarray:
     """Rotate the tool-down orientation by rotation vectors, (T, 3), to quaternions, (T, 4)."""
     angle = np.linalg.norm(vector, axis=1, keepdims=True)
     axis = vector / np.maximum(angle, 1e-12)
@@ -274,7 +274,7 @@ def _turned(vector: np.ndarray) -> np.ndarray:
     return quaternion_of(matrix_of(turn) @ matrix_of(DOWN[None]))
 
 
-def _local(arm: str, stamps_ns: np.ndarray, tip_mm: np.ndarray, rotation) -> Motion:
+def local(arm: str, stamps_ns: np.ndarray, tip_mm: np.ndarray, rotation) -> Motion:
     """Return the pose relative to the arm's own base; PSM_A's base is the frame of the script."""
     turn, shift = BASES[arm]
     place = (tip_mm - shift) @ turn
@@ -282,7 +282,7 @@ def _local(arm: str, stamps_ns: np.ndarray, tip_mm: np.ndarray, rotation) -> Mot
     return Motion(arm, f"/{arm}/local/measured_cp", f"{arm}_base", stamps_ns, place, seen)
 
 
-def _in_camera(arm: str, stamps_ns: np.ndarray, tip_mm: np.ndarray, rotation) -> Motion:
+def in_camera(arm: str, stamps_ns: np.ndarray, tip_mm: np.ndarray, rotation) -> Motion:
     seen = None if rotation is None else quaternion_of(CAMERA[0] @ matrix_of(rotation))
     return Motion(arm, f"/{arm}/measured_cp", "ECM", stamps_ns, tip_mm @ CAMERA[0].T + CAMERA[1], seen)
 

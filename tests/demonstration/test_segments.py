@@ -52,9 +52,11 @@ def test_a1_gives_way_to_a2_where_the_tip_comes_to_rest():
 def test_a_proposal_says_why():
     value, _ = session(Kind(seed=1))
     first = propose_segments(value, sessions.A)[0]
-    assert first.found_by == "jaw"
+    assert first.found_by == "transfer"
+    assert first.confidence is not None and first.confidence > 0.99
     for words in ("jaw closed 0.8 s before", "turns by 60 degrees in place", "PSM1's jaw closes", "jaw opens"):
         assert words in first.reason
+    assert "PSM1 takes the needle: both jaws are closed for" in first.reason
     assert len(first.reasons) >= 5
 
 
@@ -62,7 +64,7 @@ def test_an_arm_that_both_see_in_one_frame_is_said_to_be_near():
     value, _ = session(Kind(seed=1, passes=2))
     in_camera = tuple(m for m in value.motions if "/local/" not in m.topic)
     first = propose_segments(replace(value, motions=in_camera), sessions.A)[0]
-    assert "17 mm from this tip" in first.reason, "16 by construction, and the needle wobbles while it is turned"
+    assert "16 mm from this tip" in first.reason, "16 by construction"
 
 
 def test_without_jaw_the_turn_in_place_tells_a_hand_off_from_the_way_back():

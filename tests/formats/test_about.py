@@ -41,7 +41,7 @@ def test_all_that_a_recording_has_is_told(recorded):
     assert about["tools"] == {"PSM2": "LARGE_NEEDLE_DRIVER:400006"}
     assert about["labels"] == [{"name": "insertion", "kind": "stage", "start_s": 1.0, "end_s": 3.0}]
     assert {one["arm"] for one in about["quality"]} == {"PSM1", "PSM2"}
-    assert [one["found_by"] for one in about["segments"] if one["arm"] == "PSM2"] == ["jaw", "jaw"]
+    assert [one["found_by"] for one in about["segments"] if one["arm"] == "PSM2"] == ["transfer", "transfer"]
 
 
 def test_where_an_arms_base_stands_in_the_camera_is_told(recorded):
