@@ -8,13 +8,13 @@ import re
 import sys
 from collections.abc import Sequence
 from functools import partial
-from typing import Any
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
 
 from skills.cli import comparison, datasets, demos, installation, policies, recordings
-from skills.cli.shell import err, tell
+from skills.cli.shell import err, out, tell
 from skills.remedies import did_you_mean
 
 CHOICES = re.compile(r"'([^']*)' is not one of (.+?)\.?$")
@@ -69,6 +69,7 @@ app = typer.Typer(
     cls=Commands,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
     help="Suture styles: learn, certify, serve and check. Research use only.",
 )
 for commands in (  # the order of the commands in `skills --help`
@@ -86,3 +87,20 @@ for commands in (  # the order of the commands in `skills --help`
     recordings.surgeon_commands,
 ):
     app.add_typer(commands)
+
+
+def _print_version(asked: bool) -> None:
+    if asked:
+        from skills import __version__
+
+        out.print(__version__, highlight=False)
+        raise typer.Exit
+
+
+@app.callback()
+def skills(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    """Suture styles: learn, certify, serve and check. Research use only."""

@@ -36,16 +36,22 @@ _LISTED = {
 @commands.command()
 @refusing
 def serve(
+    host: Annotated[str | None, typer.Option(help="The address to listen on; SKILLS_HOST by default.")] = None,
+    port: Annotated[
+        int | None, typer.Option(help="The port to listen on; SKILLS_PORT by default.", min=0, max=65535)
+    ] = None,
     samples: Annotated[bool, typer.Option(help="Load the sample surgeons and train them first.")] = False,
 ) -> None:
     """Start the service and its workers; stop both with Ctrl-C."""
     from skills.settings import settings
 
-    settings().check_address()  # before anything is imported or changed
+    given = {name: value for name, value in (("host", host), ("port", port)) if value is not None}
+    wanted = settings().model_copy(update=given)
+    wanted.check_address()  # before anything is imported or changed
     gc.disable()  # imports create no garbage, and looking for it takes a fifth of the start
     from skills.serving import serve as run
 
-    run(settings(), samples=samples)
+    run(wanted, samples=samples)
 
 
 @commands.command()

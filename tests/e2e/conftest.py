@@ -39,14 +39,15 @@ class Service:
         self.environment = {
             **{k: v for k, v in os.environ.items() if not k.startswith("SKILLS_")},
             "SKILLS_DATABASE_URL": f"sqlite:///{self.database}",
-            "SKILLS_PORT": str(self.port),
             "SKILLS_WORKERS": "1",
             **{f"SKILLS_{name.upper()}": str(value) for name, value in settings.items()},
         }
         self.process: subprocess.Popen[bytes] | None = None
 
     def launch(self) -> None:
-        self.process = subprocess.Popen([sys.executable, "-m", "skills", "serve"], env=self.environment)
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "skills", "serve", "--port", str(self.port)], env=self.environment
+        )
 
     def start(self) -> None:
         self.launch()
