@@ -369,6 +369,15 @@ def _add_all(
         raise typer.Exit(1)
 
 
+@recordings.command("list")
+@refusing
+def recording_list(as_json: AsJson = False) -> None:
+    """List recordings, the newest first."""
+    with service() as client:
+        found = client.recordings()
+    show(found, as_json, ("id", "format", "duration_s", "arms", "segments", "demos"))
+
+
 @recordings.command("show")
 @refusing
 def recording_show(

@@ -308,6 +308,8 @@ def cell(value: Any) -> str:
         return ""
     if isinstance(value, float):
         return str(round(value, 6))
+    if isinstance(value, list):
+        return ", ".join(map(cell, value))
     return f"{value:%Y-%m-%d %H:%M:%SZ}" if isinstance(value, datetime) else str(value)
 
 

@@ -7,7 +7,16 @@ from typing import Any, Literal
 from skills.client.connection import Connection, at, call, given
 from skills.client.transport import Progress
 from skills.schemas import DemoOutcome, Handedness, OutcomeAsked, SkillLevel
-from skills.schemas.given import Demonstration, DemoPath, Recording, RecordingPreview, RewardMap, Surgeon, SutureType
+from skills.schemas.given import (
+    Demonstration,
+    DemoPath,
+    Recording,
+    RecordingPreview,
+    RecordingSummary,
+    RewardMap,
+    Surgeon,
+    SutureType,
+)
 
 
 class Catalogue(Connection):
@@ -133,6 +142,11 @@ class Recordings(Connection):
         }
         path = at("recordings", "preview")
         return await self._upload(RecordingPreview, path, recording, media_type, progress, query)
+
+    @call
+    async def recordings(self) -> list[RecordingSummary]:
+        """List recordings, the newest first."""
+        return await self._all(RecordingSummary, at("recordings"))
 
     @call
     async def recording(self, recording: str) -> Recording:

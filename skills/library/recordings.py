@@ -506,6 +506,26 @@ def recording_json(row: StoredRecording) -> dict[str, Any]:
     }
 
 
+def summary_json(row: StoredRecording, demos: int) -> dict[str, Any]:
+    """Return a recording's JSON in a list.
+
+    Args:
+        row: The recording.
+        demos: Number of its active demonstrations.
+    """
+    return {
+        "id": row.sha256,
+        "sha256": row.sha256,
+        "size_bytes": row.size_bytes,
+        "format": row.format,
+        "duration_s": row.about["duration_s"],
+        "arms": sorted({motion["arm"] for motion in row.about["motions"]}),
+        "segments": len(row.about["segments"]),
+        "demos": demos,
+        "created_at": rfc3339(row.created_at),
+    }
+
+
 def packed_content(recording_sha256: str, size_bytes: int, reading: dict[str, Any], told: Told) -> Entry | None:
     """Serialise the content of a recording; None if it takes more bytes than are kept of one.
 

@@ -41,6 +41,7 @@ from skills.schemas.recordings import (
     DemoPath,
     Recording,
     RecordingPreview,
+    RecordingSummary,
     RewardMap,
     SuturePoints,
 )
@@ -73,6 +74,7 @@ __all__ = [
     "Ready",
     "Recording",
     "RecordingPreview",
+    "RecordingSummary",
     "RetrainedStyle",
     "Retraining",
     "RewardMap",

@@ -191,6 +191,20 @@ class Recording(Described):
     created_at: datetime
 
 
+class RecordingSummary(Given):
+    """A recording in a list."""
+
+    id: Sha256
+    sha256: Sha256
+    size_bytes: Count
+    format: str
+    duration_s: float
+    arms: list[str]
+    segments: Count = Field(description="Number of proposed hand-offs.")
+    demos: Count = Field(description="Number of active demonstrations cut out of it.")
+    created_at: datetime
+
+
 @stored_schema
 @dataclass(frozen=True)
 class PreviewedQuality:

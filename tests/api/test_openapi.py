@@ -19,7 +19,8 @@ OPERATIONS = {
     "get_job", "get_joints_plot", "get_path", "get_picture", "get_plan", "get_playback", "get_policy", "get_pose_style",
     "get_policy_card", "get_policy_version", "get_policy_version_card", "get_recording", "get_report",
     "get_retraining", "get_reward_map", "get_surgeon", "get_suture_type", "get_trajectory", "get_version",
-    "list_all_keys", "list_demos", "list_jobs", "list_policies", "list_surgeons", "list_suture_types",
+    "list_all_keys", "list_demos", "list_jobs", "list_policies", "list_recordings",
+    "list_surgeons", "list_suture_types",
     "list_versions", "make_key", "make_plan", "mark_demo", "metrics", "newest_head", "next_action", "play",
     "preview_recording",
     "put_surgeon", "put_suture_type",
@@ -72,7 +73,7 @@ def test_every_model_of_ours_names_its_fields():
 
 def test_every_list_is_paged_in_the_same_way():
     lists = [call for method, _, call in operations() if method == "GET" and "Link" in str(call["responses"]["200"])]
-    assert len(lists) == 8
+    assert len(lists) == 9
     for call in lists:
         names = {one["name"] for one in call["parameters"]}
         assert {"limit", "cursor", "if-none-match"} <= names

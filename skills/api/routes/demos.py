@@ -32,14 +32,24 @@ from skills.api.routes.policies import Accept
 from skills.db.models import StoredRewardMap
 from skills.errors import BadInput, Conflict, NotFound
 from skills.formats import BYTES, MEDIA_TYPES
-from skills.library import demos, erasure, locks, recordings, scores
+from skills.library import demos, erasure, locks, overview, recordings, scores
 from skills.library.atlas import CONFOUNDED, DISTANCE, MOST, SESSIONS, atlas_of, atlases
 from skills.library.catalogue import find_suture_type
 from skills.library.demos import demo_json, path_json, reward_map_json
 from skills.library.recordings import recording_json
 from skills.library.sweep import drop_contents, sweep_erased
 from skills.schemas import OutcomeAsked
-from skills.schemas.given import Atlas, Demonstration, DemoPath, Page, Recording, RecordingPreview, RewardMap, Score
+from skills.schemas.given import (
+    Atlas,
+    Demonstration,
+    DemoPath,
+    Page,
+    Recording,
+    RecordingPreview,
+    RecordingSummary,
+    RewardMap,
+    Score,
+)
 from skills.schemas.requests import COUNT, DIGEST, SLUG, DemoIn, OutcomeIn, ScoreIn, SlugField, TableIn
 from skills.settings import MEBIBYTE
 
@@ -95,6 +105,15 @@ def preview_recording(upload: Incoming, asked: Annotated[TableIn, Query()], read
 def upload_demo(upload: Incoming, asked: Annotated[DemoUpload, Query()], db: Db, read: Tell, actor: Actor) -> Response:
     """Store a recording and one demonstration of it, both or neither."""
     return _stored(demos.upload_demo(db, upload.read_as(asked.said), asked, actor, read))
+
+
+@router.get("/recordings", dependencies=[needs("reader")], **gives_page(Page[RecordingSummary], 410))
+def list_recordings(db: Db, give: Giving, limit: Limit = 50, cursor: RowCursor = None) -> Response:
+    """List recordings, the newest first."""
+    with db.reading() as session:
+        found = overview.newest_recordings(session, cursor, limit)
+        written = [recordings.summary_json(row, cut) for row, cut in found]
+        return give.page(written, limit, found[-1][0].row if found else None)
 
 
 @router.get("/recordings/{recording}", dependencies=[needs("reader")], **gives(Recording, 404))
