@@ -16,7 +16,8 @@ export SKILLS_TEST_BENCHMARKS ?= $(abspath $(wildcard ../shared/benchmarks))
 .PHONY: demo test serve bench faults nightly mutants deep lint lock wheelhouse fixture clean
 
 # uv where it is present, venv and pip otherwise; either way the same versions, checked by their hashes. One package,
-# movement-primitives, comes as source: setuptools is there first, and without Cython it is built with no compiler.
+# movement-primitives, comes as source: setuptools is there first, and it is built before Cython, a need of python-fcl, is
+# installed, so with no compiler.
 SETUPTOOLS := sed -n '/^setuptools==/,/[^\\]$$/p' requirements.lock
 
 # `make demo WHEELHOUSE=build/wheelhouse` takes everything from that folder, and asks no network.

@@ -33,9 +33,10 @@ SPACING_MM = (6.0, 0.0, 0.0)  # between suture points, along the wound
 N_POINTS = 5
 SAMPLE_PSM_M = {  # invented, and the plan says so: the approach and the base of PSM_M
     "approach": [-0.94, 0.10, -0.33],
-    "base": {"position_mm": [160.0, 20.0, 20.0], "rotation_xyzw": [0.0, 0.300706, 0.0, 0.953717]},  # 35 degrees about y
+    "base": {"position_mm": [160.0, 20.0, 20.0], "rotation_xyzw": [0.0, 0.0, 0.382683, 0.92388]},  # 45 degrees about z
     "source": "invented for the samples",
 }
+SAMPLE_TISSUE_MM = -165.0  # invented too: some centimetres below the samples' paths
 REAL_STYLE = ("recorded-psm2", "simple-running")
 # its motion ends near the limit of the insertion joint, which 5 mm cells exceed
 REAL_GRID = ("--grid", "fit", "--cell-mm", "2.5")
@@ -131,7 +132,7 @@ def check_style(client: Client, surgeon: str, suture: str, report: Table) -> tup
     policy = client.policy(surgeon, suture)
     laps.append(time.monotonic())
     followed = client.rollout(surgeon, suture, policy.start_mm)
-    plan = client.plan(surgeon, suture, suture_points(policy), psm_m=SAMPLE_PSM_M)
+    plan = client.plan(surgeon, suture, suture_points(policy), psm_m=SAMPLE_PSM_M, tissue_mm=SAMPLE_TISSUE_MM)
     laps.append(time.monotonic())
     playback = played(client, plan.id)
     laps.append(time.monotonic())

@@ -70,6 +70,11 @@ class Action(Enum):
         command="Export it as such: --no-handoff, or plan again with --approach and --base",
         python="Request its bag with handoff='none', or plan again with psm_m",
     )
+    NAME_TISSUE = Words(
+        http="Plan again with tissue_mm, its height, or with a scene that has tissue.",
+        command="Plan again with --tissue, its height in mm, or with --obstacles, a file that has tissue",
+        python="Plan again with tissue_mm, its height, or with a scene that has tissue",
+    )
     NAME_SEGMENT = Words(
         http="Name one with segment=N, or take the whole recording with segment=whole.",
         command="Name one: --segment N, or take the whole recording: --segment whole",

@@ -42,6 +42,7 @@ class Need:
 
 
 NEEDS = {
+    "fcl": Need("python-fcl is", "`make` installs the locked packages", lambda: find_spec("fcl")),
     "browser": Need("the page's browser is", "apt-get install chromium", chromium),
     "recordings": Need(
         "the real recordings are",

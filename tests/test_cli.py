@@ -187,8 +187,8 @@ def test_a_plan_is_played_drawn_exported_and_its_bag_verified(
     monkeypatch.setattr(film, "FRAMES_PER_PASS", 4)
     assert skills("seed")[0] == 0
     assert skills("train", *STYLE, "--release")[0] == 0
-    base = "160,20,20,0,0.300705799504273,0,0.953716950748227"
-    both = ("--approach", "-0.94,0.10,-0.33", "--base", base)
+    base = "160,20,20,0,0,0.38268343236509,0.923879532511287"
+    both = ("--approach", "-0.94,0.10,-0.33", "--base", base, "--tissue=-170")
     code, said = skills("plan", *STYLE, "--point", "5,55,-120", *both, "--rate-hz", "100", "--json")
     assert code == 0, said
     plan = json.loads(said)["id"]

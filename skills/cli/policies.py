@@ -452,6 +452,10 @@ def plan(
         Path | None,
         typer.Option(help="JSON file of tissue and obstacles for the verdict, as --scene of train; else the policy's."),
     ] = None,
+    tissue: Annotated[
+        float | None,
+        typer.Option(help="Height of level tissue in the arm's frame, mm; without tissue nothing is exported."),
+    ] = None,
     rate_hz: Annotated[float, typer.Option(help="Samples per second, 100 to 200.")] = 200.0,
     approach: Annotated[str | None, typer.Option(help="PSM_M's approach direction, as x,y,z.")] = None,
     base: Annotated[
@@ -499,6 +503,7 @@ def plan(
             orientation=orientation,
             a2=a2,
             scene=None if obstacles is None else read_scene(obstacles),
+            tissue_mm=tissue,
         )
     show(made, as_json, ("id", "arm", "frame", "orientation", "trajectory.duration_s"))
     if not as_json:

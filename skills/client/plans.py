@@ -38,6 +38,7 @@ class Plans(Connection):
         orientation: Literal["recorded", "constant"] | None = None,
         a2: Literal["recorded", "paper"] | None = None,
         scene: Mapping[str, Any] | None = None,
+        tissue_mm: float | None = None,
     ) -> Plan:
         """Stack a style at suture points.
 
@@ -62,6 +63,7 @@ class Plans(Connection):
             orientation: "recorded" turns the jaw as the surgeon did, "constant" holds it as in the first sample.
             a2: "recorded" ends in the demonstrated hand-off, "paper" across PSM_M's approach.
             scene: Tissue and obstacles for the verdict, as `Scene.as_json` writes them; default: the policy's scene.
+            tissue_mm: Height of level tissue in the arm's frame; a motion without tissue is not exported.
 
         Raises:
             Problem: Of kind "no-hand-off" if neither `psm_m` nor the demonstration gives the pose of PSM_M, and
@@ -74,6 +76,7 @@ class Plans(Connection):
             **{"starts_mm": None if starts_mm is None else [None if s is None else list(s) for s in starts_mm]},
             **{"speed_mm_s": speed_mm_s, "rate_hz": rate_hz, "tip_offset_mm": tip_offset_mm},
             **{"realignment": realignment, "handoff": handoff, "orientation": orientation, "a2": a2, "scene": scene},
+            **{"tissue_mm": tissue_mm},
         }
         return await self._ask(Plan, "POST", at("plans"), given(body))
 

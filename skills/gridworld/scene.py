@@ -157,6 +157,12 @@ class Tissue:
         """Whether it is a plane."""
         return len(self.heights_mm) == len(self.heights_mm[0]) == 1
 
+    @property
+    def steep(self) -> float:
+        """The most by which a height above the surface can exceed the distance from it, 1 for a plane."""
+        slopes = [np.abs(np.diff(self.heights_mm, axis=axis)).max(initial=0.0) / self.step_mm for axis in (0, 1)]
+        return float(np.sqrt(1 + slopes[0] ** 2 + slopes[1] ** 2))
+
     def from_lines_mm(self, a_mm: Floats, b_mm: Floats, within_mm: float) -> Floats:
         """Return lower bounds on the distances of straight lines between points, (..., 3), from the tissue, (...,).
 
@@ -172,8 +178,7 @@ class Tissue:
         if self.flat:
             return np.asarray(np.minimum(self.above_mm(a_mm), self.above_mm(b_mm)))
         heights, normal = np.array(self.heights_mm), np.array(self.normal) / np.linalg.norm(self.normal)
-        slopes = [np.abs(np.diff(heights, axis=axis)).max(initial=0.0) / self.step_mm for axis in (0, 1)]
-        steep = float(np.sqrt(1 + slopes[0] ** 2 + slopes[1] ** 2))
+        steep = self.steep
         # Only the part of a line that is not far above the highest point of the tissue can be near it.
         top, up_a, up_b = heights.max() + within_mm * steep, *((end - self.at_mm) @ normal for end in (a_mm, b_mm))
         with np.errstate(divide="ignore", invalid="ignore"):

@@ -20,7 +20,7 @@ from skills.demonstration.partner import Partner
 from skills.errors import BadPlan, BadSpeed, NoApproach, NoHandOff
 from skills.formats.suture_points import PARSE, SuturePoints, suture_points
 from skills.gridworld.grid import refuse_metres
-from skills.gridworld.scene import Scene
+from skills.gridworld.scene import Scene, Tissue
 from skills.kinematics import DEFAULT_INSTRUMENT
 from skills.learning.policy import Policy
 from skills.library import locks, policies
@@ -89,7 +89,7 @@ def plan_sutures(database: Database, request: PlanIn, actor: str) -> tuple[Plan,
         a2=request.a2,
     )
     learnt_in = None if followed.surroundings is None else followed.surroundings.scene
-    plan = replace(plan, scene=learnt_in if request.scene is None else request.scene.value)
+    plan = replace(plan, scene=_scene(request, plan.frame, learnt_in))
     trajectory = trajectory_of(plan)
     identity = plan_identity(sha, plan)
     about = describe_plan(plan, trajectory, learnt_in)
@@ -105,6 +105,27 @@ def plan_sutures(database: Database, request: PlanIn, actor: str) -> tuple[Plan,
         record_event(session, actor, "plan", "plan", identity, policy.surgeon)
         session.flush()
         return stored, True
+
+
+def _scene(request: PlanIn, frame: str, learnt_in: Scene | None) -> Scene | None:
+    """Return the scene that the motion is compared with, with the stated height of its tissue.
+
+    Raises:
+        BadPlan: The tissue is stated twice, or its height seems to be in metres.
+    """
+    scene = learnt_in if request.scene is None else request.scene.value
+    if request.tissue_mm is None:
+        return scene
+    if request.scene is not None and request.scene.tissue is not None:
+        raise BadPlan("The request has tissue_mm, and its scene has tissue.", "Omit one of them.")
+    if abs(request.tissue_mm) < 1.0:
+        raise BadPlan(
+            f"Tissue at a height of {request.tissue_mm:g} mm is at the remote centre; this seems to be in metres.",
+            f"Give {1000 * request.tissue_mm:g} mm.",
+            tissue_mm=request.tissue_mm,
+        )
+    level = Tissue.plane((0.0, 0.0, request.tissue_mm), (0.0, 0.0, 1.0))
+    return Scene(frame, tissue=level) if scene is None else replace(scene, tissue=level)
 
 
 def hand_of(version: PolicyVersion) -> Demo:
@@ -303,7 +324,9 @@ def plan_in_words(about: dict[str, Any]) -> str:
 def _scene_in_words(scene: dict[str, Any] | None) -> str:
     """Return the sentences on the scene of a described plan, also of an older one, which has none."""
     if scene is None:
-        return "No scene was stated, so nothing is checked against tissue; the simulator's pad lies below every motion."
+        return "Tissue: not given, so nothing is checked against it, and this motion is not exported."
+    if scene["scene"].get("tissue") is None:
+        return "Tissue: not given. It is checked against the stated obstacles, and this motion is not exported."
     if scene["learnt_sha256"] is None:
         return "It is checked against the stated scene, of which its policy knows nothing."
     if not scene["differs"]:

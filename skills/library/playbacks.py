@@ -37,7 +37,7 @@ from skills.remedies import Action, Remedy
 from skills.settings import Settings
 from skills.verification.monte_carlo import DoubtSettings, doubt
 from skills.verification.playback import Pictures
-from skills.verification.scene_clearance import SceneClearance, clearance_of
+from skills.verification.scene_clearance import NEEDLE, SceneClearance, clearance_of, flat_tissue_mm
 from skills.verification.verdict import SCENE, Failure, judge
 
 Level = Literal["good", "caution", "bad"]
@@ -111,7 +111,7 @@ def _percent(part: float | None) -> str:
     return f"{100 * part:.1f} %"
 
 
-CHECK_VERSION = 1  # part of the job's identity: raise it when verdicts change, so that plans can be played again
+CHECK_VERSION = 2  # part of the job's identity: raise it when verdicts change, so that plans can be played again
 
 
 def request_playback(session: Session, plan_sha256: str, actor: str, settings: Settings) -> tuple[Job, bool]:
@@ -144,13 +144,17 @@ def check_playback(
     measured = play(trajectory, timeout_s=settings.playback_timeout_s, memory_bytes=settings.playback_memory_bytes)
     approach_m = None if plan.psm_m is None else plan.psm_m.approach
     beside = None if plan.scene is None else clearance_of(trajectory, plan.scene)
-    verdict = judge(measured, trajectory, approach_m=approach_m, beside=beside)
+    # The simulator's pad lies below the motion wherever that goes, so it is no tissue and no gate.
+    verdict = judge(measured, trajectory, approach_m=approach_m, beside=beside, pad_is_tissue=False)
+    tissue = plan.scene is not None and plan.scene.tissue is not None
+    top_mm = flat_tissue_mm(trajectory, beside.report) if tissue and beside is not None else None
     varied = DoubtSettings(tip_errors_mm=tuple(request["tip_errors_mm"]))
-    doubted = doubt(trajectory, approach_m=approach_m, pad_top_mm=float(measured.pad_mm[2]), settings=varied)
+    doubted = doubt(trajectory, approach_m=approach_m, pad_top_mm=top_mm, settings=varied)
     report = _finite(asdict(verdict)) | {
         "doubt": _finite(asdict(doubted)),
         "failure_in_words": failure_in_words(verdict.failure, beside),
         "scene": None if beside is None else _finite(asdict(beside.report)),
+        "tissue": "judged" if tissue else "not given",
         "plan": request["plan"],
         "trajectory": trajectory_digest(trajectory),
         "policy": policy,
@@ -177,9 +181,10 @@ def check_playback(
 
 def failure_in_words(failure: Failure | None, beside: SceneClearance | None) -> str | None:
     """Return a verdict's failure as a sentence; one beside a scene also names the nearest parts."""
-    if failure is None or beside is None or failure.quantity != SCENE or not beside.report.nearest:
+    near = [] if beside is None else [one for one in beside.report.nearest if one.body != NEEDLE]
+    if failure is None or failure.quantity != SCENE or not near:
         return None if failure is None else str(failure)
-    return f"{failure} Nearest: {beside.report.nearest[0]}."
+    return f"{failure} Nearest: {near[0]}."
 
 
 def find_playback(session: Session, playback_sha256: str) -> StoredPlayback:

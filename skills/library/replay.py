@@ -182,16 +182,24 @@ def cleared(
         handoff: "none" accepts a plan without a hand-off.
 
     Raises:
-        Conflict: Consent does not cover training and export; the plan has no hand-off, and `handoff` is not "none"; its
+        Conflict: Consent does not cover training and export; the plan has no hand-off, and `handoff` is not "none"; it
+            states no tissue; its
             orientation is constant where the surgeon's turned by more than allowed; the
             demonstration was withdrawn; another policy than the plan's is released, or none; the plan was not played,
-            is not feasible, or not certain enough.
+            its verdict is of an older version, which did not judge the arms' outer bodies; it is not feasible, or not
+            certain enough.
         Corrupt: The stored verdict does not match its digest.
     """
     policy = plan.policy
     consent.require(policies.followable(policy).surgeon, "export")
     if handoff != "none" and planned(plan).psm_m is None:
         raise Conflict("This plan has no hand-off: no PSM_M, no A2.", Remedy(Action.EXPORT_A1_ALONE))
+    scene = planned(plan).scene
+    if scene is None or scene.tissue is None:
+        raise Conflict(
+            "This plan states no tissue, so nothing was compared with it: tissue: not given.",
+            Remedy(Action.NAME_TISSUE),
+        )
     _check_departure(planned(plan), plan, constant_turn_deg)
     for what in policy.objections:
         raise Conflict(f"The demonstration that this plan depends on {what}; plan with another policy.")
@@ -212,6 +220,10 @@ def cleared(
     if not (played.feasible and played.report["feasible"] is True):
         raise Conflict(
             f"The simulator found this plan infeasible: {played.report['failure_in_words']} Change the plan."
+        )
+    if played.report.get("bodies") is None:
+        raise Conflict(
+            "The arms' outer bodies were not judged when this plan was played.", Remedy(Action.PLAY, plan=plan.sha256)
         )
     check_doubt(played.report, tip_error_mm=tip_error_mm, lower_bound=lower_bound)
     return played

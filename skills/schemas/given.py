@@ -109,6 +109,7 @@ class Verdict(PlaybackReport):
         policy: The policy version that the plan follows.
         frame: Frame of the plan.
         scene: Distances from the plan's scene; null: it has none, so nothing was compared with tissue.
+        tissue: Whether the motion was compared with tissue; null in older verdicts.
     """
 
     failure_in_words: str | None
@@ -118,6 +119,7 @@ class Verdict(PlaybackReport):
     policy: PolicyName
     frame: str
     scene: SceneReport | None = None
+    tissue: Literal["judged", "not given"] | None = None
 
 
 class Sources(Given):

@@ -541,6 +541,11 @@ class PlanIn(Schema):
         description="Tissue and obstacles in the frame of the arm, against which the verdict compares the motion. Left "
         "out, it is the scene that the policy was learnt in.",
     )
+    tissue_mm: Coordinate | None = Field(
+        default=None,
+        description="Height of level tissue, along z of the arm's frame: it is that of the scene. No motion is "
+        "exported without tissue, of this, of the scene, or of the policy's.",
+    )
     realignment: StrictBool = Field(
         default=True, description="false plans A1 alone, without A2's turn; handoff 'none' is the way to say so now."
     )

@@ -18,7 +18,8 @@ Both are bounds, so nothing is missed between the measurements.
 
 **Needle.** PSM_A holds the needle from the first sample to the hand-off. If PSM_M's place is known, it holds the needle
 from there until PSM_A is where the next pass begins. M1 and M2, where the needle goes through tissue, are done by hand
-by a surgeon. So the needle's distance from the pad is reported but is not a gate of any verdict.
+by a surgeon. So the needle's distance from the simulator's pad is reported but is not a gate of any verdict; that from
+stated tissue is one while PSM_A holds it (`skills.verification.scene_clearance`).
 
 The catch is computed in closed form and for many slightly wrong hand-offs at once. Symbols: the needle is an arc of
 radius r that leaves PSM_A's grip in direction u and bends towards t, so after the angle phi it is at r (t (1 - cos phi)
@@ -290,6 +291,26 @@ def needle_poses(trajectory: Trajectory, at: Ints) -> tuple[Floats, Floats]:
     place[away] = tip + np.einsum("fij,fj->fi", turned, place_then - tip_then)
     rotation[away] = turned @ rotation_then
     return place, rotation
+
+
+def needle_arc_mm(trajectory: Trajectory, at: Ints) -> Floats:
+    """Return points along the needle's wire in PSM_A's jaws at some samples, mm, shape (F, 49, 3)."""
+    place, rotation = _in_jaws_of_psm_a(trajectory, at)
+    return np.asarray(place[:, None] + np.einsum("fij,kj->fki", rotation, _ARC_MM))
+
+
+def needle_travel_mm(trajectory: Trajectory) -> Floats:
+    """Return upper bounds on the distance that any point of the needle in PSM_A's jaws moves to the next sample.
+
+    Returns:
+        Millimetres, shape (T - 1,).
+    """
+    tool, moved = instrument_of(trajectory.instrument), np.abs(np.diff(trajectory.joints, axis=0))
+    wrist = np.abs(trajectory.joints[:, INSERTION] - tool.wrist_offset_mm)
+    reach = float(np.hypot(HELD_MM, np.linalg.norm(_ARC_MM, axis=1).max()) + RADIUS_MM)
+    deep = np.maximum(wrist[1:], wrist[:-1]) + WRIST_MM + reach
+    turned = (moved[:, 0] + moved[:, 1]) * deep + (moved[:, 3] + moved[:, 4]) * (WRIST_MM + reach)
+    return np.asarray(turned + moved[:, 2] + moved[:, 5] * reach)
 
 
 def needle_to_pad_mm(trajectory: Trajectory, at: Ints, pad_mm: Floats) -> Floats:

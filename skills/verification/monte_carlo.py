@@ -16,8 +16,8 @@ A *variation* of a pass draws three errors, independently of one another and of 
   through the grip.
 
 A variation is *clear* if every checked pose of the pass keeps to the playback's limits: joints, cannula, pad, and the
-other arm, if its place is known; fingers may touch fingers at the hand-off itself. Speeds are not judged: a plan made
-for the shifted point has its own.
+other arm with its outer bodies, if its place is known; fingers may touch fingers at the hand-off itself. Speeds are not
+judged: a plan made for the shifted point has its own.
 
 The needle is *caught* if its arc crosses the plane in which PSM_M's fingers close, at the end of A2, within the sector
 that they sweep, with needle to spare on both sides of them, and its tangent there is within the stated angle of their
@@ -32,7 +32,7 @@ The paper has its arms exactly in place; all of this is ours, except the two mea
 """
 
 from dataclasses import dataclass, field, replace
-from math import isfinite, pi, radians, sqrt
+from math import inf, isfinite, pi, radians, sqrt
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -45,6 +45,7 @@ from skills.learning.slip import wilson
 from skills.planning.handoff import OPEN_RAD, hand_off
 from skills.planning.motion_laws import Pose
 from skills.planning.trajectory import A2, Trajectory
+from skills.verification.bodies import too_near
 from skills.verification.clearance import (
     FINGERS,
     HandOff,
@@ -167,7 +168,7 @@ class PlannedPass:
     Attributes:
         arms: PSM_A and, if its place is known, PSM_M.
         phase: Phase of each sample, shape (S,).
-        pad_top_mm: Height of the pad's top in the PSM_A base frame.
+        pad_top_mm: Height of the pad's top in the PSM_A base frame; -inf: there is no pad.
         taking: The recorded pose in which PSM_M takes the needle, in that frame; None: that of the paper's A2.
     """
 
@@ -241,7 +242,8 @@ def spoiled(scene: PlannedPass, drawn: Drawn, tip_errors_mm: Floats, limits: Lim
         limits: The playback's limits, which are applied.
 
     Returns:
-        For each of `ON_THE_WAY` whether it occurs, shape (E, N); without "arms" if PSM_M is not in the scene.
+        For each of `ON_THE_WAY` whether it occurs, shape (E, N); without "arms" and "bodies" if PSM_M is not in the
+        scene, and without "pad" if there is no pad.
     """
     chunks = [slice(k, k + _CHUNK) for k in range(0, len(drawn.shift_mm), _CHUNK)]
     found = [_spoiled(scene, drawn.at(chunk), tip_errors_mm[:, None], limits) for chunk in chunks]
@@ -266,13 +268,15 @@ def _spoiled(scene: PlannedPass, drawn: Drawn, errors: Floats, limits: Limits) -
         "limits": ~((margin >= limits.joint_margin - _ROUND_OFF) & (insertion >= limits.insertion_mm)),
     }
     found = {name: np.broadcast_to(wrong, (len(errors), count)) for name, wrong in of_joints.items()}
-    found["pad"] = ~(np.minimum.reduce(raised) >= limits.clearance_pad_mm)
+    if scene.pad_top_mm > -inf:
+        found["pad"] = ~(np.minimum.reduce(raised) >= limits.clearance_pad_mm)
     if len(links) == 2:
         apart, handing_over = offsets[0] - offsets[1], np.concatenate([scene.handing_over] * count)
         # Only the difference of the offsets matters between the arms, so one of them is moved by it.
         moved = [links[0].moved(np.repeat(error * apart, samples, axis=0)) for error in errors]
         between = np.array([_least(_apart(one, links[1], handing_over), count) for one in moved])
         found["arms"] = ~(between >= limits.clearance_psm_m_mm)
+        found["bodies"] = too_near(scene.arms, joints, apart, errors[:, 0], limits.clearance_bodies_mm)
     return found
 
 
@@ -289,7 +293,7 @@ def _least(values: Floats, count: int) -> Floats:
 
 
 CALIBRATED_MM, UNCALIBRATED_MM = 0.65, 3.0
-ON_THE_WAY, AT_THE_END = ("reach", "limits", "pad", "arms"), ("place", "angle")
+ON_THE_WAY, AT_THE_END = ("reach", "limits", "pad", "arms", "bodies"), ("place", "angle")
 
 
 @schema
@@ -351,7 +355,8 @@ class Faults:
         reach: A joint of either arm beyond its limits.
         limits: The same, or nearer to the limits than the playback allows, or a wrist inside the cannula.
         pad: An arm too near the pad.
-        arms: The arms too near each other.
+        arms: The arms' tools too near each other.
+        bodies: Their outer bodies too near each other, or to the other arm's tool.
         place: The needle not between PSM_M's fingers.
         angle: The needle at a wrong angle there, or not there at all.
     """
@@ -360,6 +365,7 @@ class Faults:
     limits: Count | None = None
     pad: Count | None = None
     arms: Count | None = None
+    bodies: Count | None = None
     place: Count | None = None
     angle: Count | None = None
 
@@ -408,7 +414,7 @@ def doubt(
     trajectory: Trajectory,
     *,
     approach_m: ArrayLike | None,
-    pad_top_mm: float,
+    pad_top_mm: float | None,
     seed: int = 0,
     settings: DoubtSettings | None = None,
     limits: Limits | None = None,
@@ -419,7 +425,8 @@ def doubt(
         trajectory: The planned motion, with PSM_M's if its place is known.
         approach_m: PSM_M's approach in the PSM_A base frame, shape (3,); None if it is not known. Not used if the
             trajectory has PSM_M or its recorded pose: then the last pose of that arm counts.
-        pad_top_mm: Height of the pad's top in the PSM_A base frame; the pad is assumed to be infinite.
+        pad_top_mm: Height of the pad's top in the PSM_A base frame; the pad is assumed to be infinite. None: there is
+            no pad, and nothing is compared with one.
         seed: Seed of the random numbers.
         settings: The errors to draw, and the conditions of a catch.
         limits: The playback's limits.
@@ -431,17 +438,18 @@ def doubt(
         BadInput: The pad's height is not finite, or a jaw's last pose is not turned to `approach_m`.
         BadSettings: The seed is negative.
     """
-    if not isfinite(pad_top_mm):
+    if pad_top_mm is not None and not isfinite(pad_top_mm):
         raise BadInput("The pad's height must be a number; give it in mm in the PSM base frame.", pad_top_mm=pad_top_mm)
     if seed < 0:
         raise BadSettings("A seed must be 0 or more.", seed=seed)
     varied, allowed = settings or DoubtSettings(), limits or Limits()
-    scenes = [scene_of(trajectory, k, float(pad_top_mm), varied.opening_rad) for k in range(trajectory.passes)]
+    top_mm = -inf if pad_top_mm is None else float(pad_top_mm)
+    scenes = [scene_of(trajectory, k, top_mm, varied.opening_rad) for k in range(trajectory.passes)]
     thin = [looked_at(scene, varied.stretches) for scene in scenes]
     found = [_wrong(scene, number, approach_m, varied, allowed, seed) for number, scene in enumerate(thin)]
     return Doubt(
         seed=seed,
-        pad_top_mm=float(pad_top_mm),
+        pad_top_mm=None if pad_top_mm is None else top_mm,
         with_psm_m=trajectory.psm_m is not None,
         hand_offs=sum("place" in wrong for wrong in found),
         looked_at=tuple(len(scene.phase) for scene in thin),

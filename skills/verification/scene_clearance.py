@@ -1,36 +1,47 @@
-"""Distances of a planned motion from a scene: both arms' tools, along the whole motion, in closed form.
+"""Distances of a planned motion from a scene: both arms with their outer bodies, and the needle, in closed form.
 
-    Trajectory, Scene --clearance_of--> SceneReport, and the least distance at every sample
+    Trajectory, Scene --clearance_of--> SceneReport, and the least distances at every sample
 
-The tools are the capsules of `skills.verification.clearance.links_of`, the scene is that of `skills.gridworld.scene`: a
-link's distance from a box or a capsule is exact, that from a height map a lower bound. The distances are computed at
-samples between which no link moves further than `LOOK_MM`; from one to the next, no distance is less than the mean of
-both minus half of that way, and this bound is what is judged. So nothing is missed in between.
+The tools are the capsules of `skills.verification.clearance.links_of`, the arms' outer bodies those of
+`skills.verification.bodies`, the scene is that of `skills.gridworld.scene`: a capsule's distance from a box or another
+capsule is exact, that from a height map a lower bound. The distances are computed at samples between which nothing
+moves further than `LOOK_MM`, or `LOOK_BODIES_MM`; from one to the next, no distance is less than the mean of both minus
+half of that way, and this bound is what is judged. So nothing is missed in between.
 
 The margin of a scene stands for the tool's size in the grid world, where the tip is a point. Here it is a distance that
 must be kept, if it is larger than `SceneReport.limit_mm` would be without it. A scene's capsules are the other arm, so
-they are not compared with PSM_M. The needle and the arms' parts outside of the patient are not compared either.
+they are not compared with PSM_M. Tissue has no edge, so it is compared with the parts that are above it alone: tools,
+cannula and its mount, insertion axis and carriage.
+
+**Needle.** While PSM_A holds the needle, in A1 and A2, no part of it may be inside the tissue. It enters and leaves by
+the surgeon's hand, before A1 and after A2 (M1, M2): so at the beginning of A1 it may be inside, until it is out for the
+first time. In a transfer to a further pass it is the surgeon's, and not judged.
 """
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
+from math import nan
 
 import numpy as np
 
-from skills.arrays import Floats, Ints, xyz
+from skills.arrays import Flags, Floats, Ints, xyz
 from skills.fields import Count, Figure, Point, schema
 from skills.gridworld.scene import Scene
 from skills.kinematics import matrix_of
 from skills.planning.handoff import HOLDING_RAD, OPEN_RAD
-from skills.planning.motion_laws import PHASES
+from skills.planning.motion_laws import A2, PHASES, TRANSFER
 from skills.planning.trajectory import Trajectory
+from skills.verification.bodies import ABOVE_TISSUE, TOOL, moved_mm, names_of, parts_of, radii_of
 from skills.verification.clearance import (
     FINGER_REACH_MM,
     FINGERS,
+    NEEDLE_THICK_MM,
     RADII_MM,
     Links,
     links_of,
+    needle_arc_mm,
+    needle_travel_mm,
     openings,
     psm_m_poses,
     travel_mm,
@@ -39,6 +50,8 @@ from skills.verification.playback import CLEARANCE_SEEN_MM, LINKS, PSM_A, PSM_M
 
 LEAST_MM = 1.0  # ours, as of the pad: the error of a calibrated arm (0.65 mm) and half as much again
 LOOK_MM = 0.25  # ours: a distance that is judged is at most half of this too small, for that reason
+LOOK_BODIES_MM = 2.0  # ours: the same for the outer bodies, whose own margin is larger
+NEEDLE, ARC, TISSUE = "needle", "arc", "tissue"
 # PSM_M's jaw comes open and closes on the needle, at times that a trajectory does not state: its fingers, 2.2 mm thick,
 # move by 1.1 mm at their tips from one opening to the next, so nothing passes between two of them.
 JAWS_RAD = np.linspace(HOLDING_RAD, OPEN_RAD, 5).tolist()
@@ -50,8 +63,8 @@ class NearestToScene:
     """The least distance of an arm's tool from a part of the scene.
 
     Attributes:
-        body: The arm.
-        link: Its link, by its name in the URDF.
+        body: The arm, or "needle".
+        link: Its link, by its name in the URDF, or its outer body.
         part: tissue, or box or capsule with its index, such as "box 0".
         least_mm: The distance; negative inside.
         sample: The sample.
@@ -87,11 +100,14 @@ class SceneReport:
 
     Attributes:
         limit_mm: The distance that must be kept: 1 mm, or the margin of the scene if that is larger.
-        at_least_mm: Lower bound on the distance of both tools from the scene along the whole motion; null if none came
+        at_least_mm: Lower bound on the distance of both arms from the scene along the whole motion; null if none came
             within `seen_within_mm`.
         seen_within_mm: Greater distances are not distinguished.
         looks: Number of samples at which distances were computed.
         nearest: The least distance of each arm from each part within `seen_within_mm`, the least first.
+        bodies: Whether the arms' outer bodies were compared too; false in older reports.
+        needle_at_least_mm: Lower bound on the needle's distance from the tissue where it is judged, negative inside;
+            null if there is no tissue, or it never came within `seen_within_mm`.
     """
 
     limit_mm: float
@@ -99,14 +115,20 @@ class SceneReport:
     seen_within_mm: float
     looks: Count
     nearest: tuple[NearestToScene, ...]
+    bodies: bool = False
+    needle_at_least_mm: Figure = None
 
 
 @dataclass(frozen=True, eq=False)
 class SceneClearance:
-    """The report, and the lower bound on the distance from each sample until the next look, (T,)."""
+    """The report, and lower bounds on the distances from each sample until the next look, of both arms and the needle.
+
+    Both are of shape (T,). The needle's is infinite where it is not judged.
+    """
 
     report: SceneReport
     at_least_mm: Floats
+    needle_mm: Floats
 
 
 def clearance_of(trajectory: Trajectory, scene: Scene) -> SceneClearance:
@@ -122,17 +144,27 @@ def clearance_of(trajectory: Trajectory, scene: Scene) -> SceneClearance:
     at_least, looked = np.full(len(trajectory), np.inf), np.zeros(len(trajectory), bool)
     nearest: list[tuple[float, NearestToScene]] = []
     for body in (PSM_A, PSM_M) if trajectory.psm_m is not None else (PSM_A,):
-        way = _way_mm(trajectory, body)
-        looks = _looks(way)
-        of_parts = dict(_from_parts(_links(trajectory, body, looks), scene, body))
-        seen = np.min([np.full((len(looks), len(LINKS)), np.inf), *of_parts.values()], axis=0)
-        ahead = np.diff(way[looks], axis=0, append=way[looks[-1:]])
-        after = np.concatenate([seen[1:], seen[-1:]])
-        at_least[looks] = np.minimum(at_least[looks], np.minimum(seen, (seen + after - ahead) / 2).min(axis=1))
-        looked[looks] = True
-        nearest += [_nearest(trajectory, body, part, looks, apart) for part, apart in of_parts.items()]
+        for group in (_tool(trajectory, body), _bodies(trajectory, body)):
+            looks = _looks(group.way_mm, group.look_mm)
+            of_parts = dict(_from_parts(group, looks, scene, body))
+            seen = np.min([np.full((len(looks), len(group.names)), np.inf), *of_parts.values()], axis=0)
+            at_least[looks] = np.minimum(at_least[looks], _until_next(seen, group.way_mm[looks]))
+            looked[looks] = True
+            nearest += [
+                _nearest(trajectory, (body, group.names), part, looks, apart) for part, apart in of_parts.items()
+            ]
+    needle = np.full(len(trajectory), np.inf)
+    if scene.tissue is not None:
+        way = _way(needle_travel_mm(trajectory)[:, None])
+        begins = np.flatnonzero(np.diff(trajectory.phase) | np.diff(trajectory.pass_index)) + 1
+        looks = np.unique(np.concatenate([_looks(way, LOOK_MM), begins - 1, begins]))
+        above = scene.tissue.above_mm(needle_arc_mm(trajectory, looks)).min(axis=1)[:, None]
+        apart = np.where(above > 0, above / scene.tissue.steep, above) - NEEDLE_THICK_MM / 2
+        needle[looks] = _until_next(apart, way[looks])
+        needle[_by_hand(trajectory, needle)] = np.inf
+        nearest.append(_nearest(trajectory, (NEEDLE, (ARC,)), TISSUE, looks, apart))
     nearest.sort(key=lambda pair: float(np.nan_to_num(pair[0], nan=-np.inf)))
-    least = float(at_least.min())
+    least, least_of_needle = float(at_least.min()), float(needle.min())
     return SceneClearance(
         SceneReport(
             limit_mm=max(LEAST_MM, scene.margin_mm),
@@ -140,9 +172,60 @@ def clearance_of(trajectory: Trajectory, scene: Scene) -> SceneClearance:
             seen_within_mm=CLEARANCE_SEEN_MM,
             looks=int(np.count_nonzero(looked)),
             nearest=tuple(one for apart, one in nearest if not apart >= CLEARANCE_SEEN_MM),
+            bodies=True,
+            needle_at_least_mm=None if least_of_needle >= CLEARANCE_SEEN_MM else least_of_needle,
         ),
         at_least,
+        needle,
     )
+
+
+@dataclass(frozen=True, eq=False)
+class _Group:
+    """Capsules of an arm that are compared together: the tool, with each opening of its jaw, or the outer bodies.
+
+    Attributes:
+        names: Their names.
+        radii_mm: Their radii, shape (L,).
+        way_mm: Greatest distance that each can have moved since the first sample, shape (T, L).
+        look_mm: The distances are computed at samples between which none moves further.
+        axes: Return their axes at some samples, one or more times, each of shape (C, L, 3).
+        above_tissue: Which of them are compared with tissue, shape (L,).
+    """
+
+    names: tuple[str, ...]
+    radii_mm: Floats
+    way_mm: Floats
+    look_mm: float
+    axes: Callable[[Ints], tuple[Links, ...]]
+    above_tissue: Flags
+
+
+def _tool(trajectory: Trajectory, body: str) -> _Group:
+    m = trajectory.psm_m
+    if body == PSM_A or m is None:
+        steps = travel_mm(trajectory.joints, trajectory.instrument)
+        steps[:, FINGERS] += FINGER_REACH_MM * np.abs(np.diff(openings(trajectory)))[:, None]
+    else:
+        steps = travel_mm(m.joints, m.instrument)
+    every = np.ones(len(LINKS), bool)
+    return _Group(LINKS, RADII_MM, _way(steps), LOOK_MM, partial(_links, trajectory, body), every)
+
+
+def _bodies(trajectory: Trajectory, body: str) -> _Group:
+    m = trajectory.psm_m
+    mine = body == PSM_A or m is None
+    joints, tool = (trajectory.joints, trajectory.instrument) if mine or m is None else (m.joints, m.instrument)
+    names = names_of(tool)[: -len(TOOL)]
+    way = _way(moved_mm(joints[:-1], joints[1:], tool)[:, : len(names)])
+
+    def axes(at: Ints) -> tuple[Links, ...]:
+        parts = parts_of(joints[at], tool)
+        links = Links(parts.begin_mm[:, : len(names)], parts.end_mm[:, : len(names)])
+        return (links if mine or m is None else links.seen_from(matrix_of(m.base_xyzw[None])[0], m.base_mm),)
+
+    above = np.isin(names, ABOVE_TISSUE)
+    return _Group(names, radii_of(tool)[: len(names)], way, LOOK_BODIES_MM, axes, above)
 
 
 def _links(trajectory: Trajectory, body: str, at: Ints) -> tuple[Links, ...]:
@@ -154,51 +237,94 @@ def _links(trajectory: Trajectory, body: str, at: Ints) -> tuple[Links, ...]:
     return tuple(links_of(m.joints[at], m.instrument, jaw).seen_from(base, m.base_mm) for jaw in JAWS_RAD)
 
 
-def _way_mm(trajectory: Trajectory, body: str) -> Floats:
-    """Return the greatest distance that each link of an arm can have moved since the first sample, (T, 4)."""
-    m = trajectory.psm_m
-    if body == PSM_A or m is None:
-        steps = travel_mm(trajectory.joints, trajectory.instrument)
-        steps[:, FINGERS] += FINGER_REACH_MM * np.abs(np.diff(openings(trajectory)))[:, None]
-    else:
-        steps = travel_mm(m.joints, m.instrument)
-    return np.concatenate([np.zeros((1, len(LINKS))), np.cumsum(steps, axis=0)])
+def _way(steps_mm: Floats) -> Floats:
+    """Return the distances since the first sample, (T, L), of those from each sample to the next."""
+    return np.concatenate([np.zeros((1, steps_mm.shape[1])), np.cumsum(steps_mm, axis=0)])
 
 
-def _looks(way_mm: Floats) -> Ints:
-    """Return the samples to look at: the first and the last, and as few as keep every link's way below `LOOK_MM`.
+def _looks(way_mm: Floats, look_mm: float) -> Ints:
+    """Return the samples to look at: the first and the last, and as few as keep every way below `look_mm`.
 
     Where a single step is longer, both of its samples are looked at.
     """
-    looks = [0]
-    for sample in range(1, len(way_mm)):
-        if (way_mm[sample] - way_mm[looks[-1]]).max() > LOOK_MM and sample - 1 > looks[-1]:
-            looks.append(sample - 1)
-    return np.unique([*looks, len(way_mm) - 1])
+    looks, last = [0], len(way_mm) - 1
+    # Within any such number of samples every way ends beyond `look_mm`, so no more of them are compared at once.
+    while looks[-1] < last:
+        begin, reach = looks[-1], 64
+        while True:
+            beyond = ~((way_mm[begin + 1 : begin + reach + 1] - way_mm[begin]).max(axis=1) <= look_mm)
+            if beyond.any() or begin + reach >= last:
+                break
+            reach *= 2
+        looks.append(max(begin + int(np.argmax(beyond)), begin + 1) if beyond.any() else last)
+    return np.array(looks)
 
 
-def _from_parts(links: tuple[Links, ...], scene: Scene, body: str) -> Iterator[tuple[str, Floats]]:
-    """Yield each part of a scene with the distances of an arm's links from it, (C, 4)."""
+def _until_next(seen_mm: Floats, way_mm: Floats) -> Floats:
+    """Return lower bounds on the distances, (C, L), from each look until the next, of their least, (C,)."""
+    ahead = np.diff(way_mm, axis=0, append=way_mm[-1:])
+    after = np.concatenate([seen_mm[1:], seen_mm[-1:]])
+    return np.asarray(np.minimum(seen_mm, (seen_mm + after - ahead) / 2).min(axis=1))
+
+
+def _from_parts(group: _Group, looks: Ints, scene: Scene, body: str) -> Iterator[tuple[str, Floats]]:
+    """Yield each part of a scene with the distances of an arm's capsules from it, (C, L)."""
+    axes = group.axes(looks)
     parts: list[tuple[str, Callable[[Floats, Floats], Floats]]] = []
     if scene.tissue is not None:
-        parts.append(("tissue", partial(scene.tissue.from_lines_mm, within_mm=CLEARANCE_SEEN_MM + RADII_MM.max())))
+        within_mm = CLEARANCE_SEEN_MM + group.radii_mm.max()
+        parts.append((TISSUE, partial(scene.tissue.from_lines_mm, within_mm=within_mm)))
     parts += [(f"box {k}", box.from_lines_mm) for k, box in enumerate(scene.boxes)]
     if body == PSM_A:
         parts += [(f"capsule {k}", capsule.from_lines_mm) for k, capsule in enumerate(scene.capsules)]
     for part, from_lines_mm in parts:
-        yield part, np.min([from_lines_mm(one.begin_mm, one.end_mm) for one in links], axis=0) - RADII_MM
+        if part == TISSUE:
+            apart = np.full((len(looks), len(group.names)), np.inf)
+            some = group.above_tissue
+            apart[:, some] = np.min([from_lines_mm(a.begin_mm[:, some], a.end_mm[:, some]) for a in axes], axis=0)
+        else:
+            apart = np.min([from_lines_mm(one.begin_mm, one.end_mm) for one in axes], axis=0)
+        yield part, apart - group.radii_mm
+
+
+def _by_hand(trajectory: Trajectory, needle_mm: Floats) -> Flags:
+    """Mark the samples, (T,), at which the needle may be in tissue: see the head of this file."""
+    may = (trajectory.phase == TRANSFER) & (trajectory.pass_index > 0)
+    for number in range(trajectory.passes):
+        coming = np.flatnonzero((trajectory.pass_index == number) & (trajectory.phase != A2) & ~may)
+        looked = needle_mm[coming]
+        out = np.isnan(looked) | ((looked >= 0) & (looked < np.inf))  # NaN is judged
+        may[coming[: int(np.argmax(out)) if out.any() else len(coming)]] = True
+    return np.asarray(may)
+
+
+def flat_tissue_mm(trajectory: Trajectory, report: SceneReport) -> float:
+    """Return the height of level tissue as far below the lowest place of both tools as the scene's is from them.
+
+    Of level tissue it is the height itself; the estimate of success varies a motion above it.
+    """
+    every = np.arange(len(trajectory))
+    arms = (PSM_A, PSM_M) if trajectory.psm_m is not None else (PSM_A,)
+    lowest = min(
+        float((np.minimum(one.begin_mm[..., 2], one.end_mm[..., 2]) - RADII_MM).min())
+        for body in arms
+        for one in _links(trajectory, body, every)
+    )
+    apart = [one.least_mm for one in report.nearest if one.part == TISSUE and one.link in LINKS]
+    return lowest - min((nan if one is None else one for one in apart), default=CLEARANCE_SEEN_MM)
 
 
 def _nearest(
-    trajectory: Trajectory, body: str, part: str, looks: Ints, apart_mm: Floats
+    trajectory: Trajectory, whose: tuple[str, tuple[str, ...]], part: str, looks: Ints, apart_mm: Floats
 ) -> tuple[float, NearestToScene]:
-    """Return the least distance of an arm from a part, NaN before all, and where it is."""
+    """Return the least distance of an arm or the needle from a part, NaN before all, and where it is."""
+    body, names = whose
     look, link = np.unravel_index(int(np.nan_to_num(apart_mm, nan=-np.inf).argmin()), apart_mm.shape)
     sample, least = int(looks[look]), float(apart_mm[look, link])
-    tip = trajectory.tip_mm[sample] if body == PSM_A else psm_m_poses(trajectory, looks[look : look + 1])[0][0]
+    tip = psm_m_poses(trajectory, looks[look : look + 1])[0][0] if body == PSM_M else trajectory.tip_mm[sample]
     return least, NearestToScene(
         body=body,
-        link=LINKS[link],
+        link=names[link],
         part=part,
         least_mm=least,
         sample=sample,

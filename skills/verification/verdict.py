@@ -15,7 +15,8 @@ evidence of the hardware's accuracy. PSM_M is in the kinematic pass alone.
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from math import inf
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -37,6 +38,7 @@ from skills.kinematics import (
 from skills.planning.handoff import HOLDING_RAD
 from skills.planning.motion_laws import A2, PHASES, TRANSFER
 from skills.planning.trajectory import Trajectory, joint_ratios
+from skills.verification.bodies import BodiesClearance, BodiesReport, bodies_clearance
 from skills.verification.clearance import FINGER_REACH_MM, Bounds, needle_to_pad_mm, openings, psm_m_poses
 from skills.verification.playback import CLEARANCE_SEEN_MM, PAD, PSM_A, PSM_M, Playback
 from skills.verification.scene_clearance import SceneClearance
@@ -153,6 +155,8 @@ class Limits:
         clearance_pad_mm: Least distance of either arm from the pad: the error of a calibrated arm (0.65 mm) and half as
             much again. Below 0 an arm may press into it, up to `contact_n`.
         clearance_psm_m_mm: Least distance between the arms; their fingers may be nearer at the hand-off itself.
+        clearance_bodies_mm: Least distance between the arms' outer bodies, which are larger than the arms: a step of
+            the registration between the two bases.
         contact_n: Greatest force between arm and pad: a light touch. The motors could press with twenty times as much.
         contact_effort: Greatest effort of any motor while in contact, as a part of its limit: a motor at its limit no
             longer holds the arm in its commanded place.
@@ -169,6 +173,7 @@ class Limits:
     alignment_deg: float = 0.1
     clearance_pad_mm: float = 1.0
     clearance_psm_m_mm: float = 0.5
+    clearance_bodies_mm: float = 2.0
     contact_n: float = 1.0
     contact_effort: float = 0.95
 
@@ -220,6 +225,7 @@ def first_failure(
     trajectory: Trajectory,
     limits: Limits,
     beside: SceneClearance | None = None,
+    outer: BodiesClearance | None = None,
 ) -> Failure | None:
     """Return the earliest sample at which a gate is broken; of several gates broken there, the first listed.
 
@@ -229,13 +235,18 @@ def first_failure(
         trajectory: The trajectory that was played.
         limits: The limits of the gates.
         beside: The motion's distances from a scene; None: they are no gate.
+        outer: The distances of the arms' outer bodies; None: they are no gate.
 
     Returns:
         The failure, or None if every sample passes every gate.
     """
     gates = [*_gates(figures, playback, trajectory, limits)]
+    if outer is not None:
+        pair = "outer bodies" if outer.first is None else str(outer.first)
+        gates.append(_Gate(f"clearance of {pair}", "mm", outer.at_least_mm, outer.report.limit_mm, at_least=True))
     if beside is not None:
         gates.append(_Gate(SCENE, "mm", beside.at_least_mm, beside.report.limit_mm, at_least=True))
+        gates.append(_Gate("distance of the needle from the tissue", "mm", beside.needle_mm, 0.0, at_least=True))
     broken = [(sample, gate) for gate in gates if (sample := gate.broken()) is not None]
     if not broken:
         return None
@@ -410,7 +421,7 @@ class PlaybackReport:
     range, and the peak ratios are PSM_A's; `arms` has every joint of both. `clearance_pad_mm` is of either arm. Between
     two measurements a pair of links can have come nearer by `moved_between_looks_mm`, which the gates take into
     account. `peak_effort_ratio` is over the complete servo pass, `peak_contact_effort_ratio` over the samples in which
-    the arm touches the pad.
+    the arm touches the pad. `bodies` compares the arms' outer bodies; null: not judged, as in older verdicts.
     """
 
     feasible: bool
@@ -450,6 +461,7 @@ class PlaybackReport:
     engine: str
     files: Mapping[str, Sha256]
     settings: Limits
+    bodies: BodiesReport | None = field(default=None, kw_only=True)
 
 
 def judge(
@@ -459,6 +471,7 @@ def judge(
     *,
     approach_m: ArrayLike | None = None,
     beside: SceneClearance | None = None,
+    pad_is_tissue: bool = True,
 ) -> PlaybackReport:
     """Compare the measurements with the intended motion and with the limits.
 
@@ -469,7 +482,9 @@ def judge(
         approach_m: PSM_M's approach in the PSM_A base frame, shape (3,), if it is known and PSM_M is not in the scene;
             if PSM_M is in the scene, its own pose counts, and otherwise the recorded one of the trajectory.
         beside: The trajectory's distances from tissue and obstacles, as `clearance_of` computes them; None: nothing is
-            compared with them. The simulator's pad lies below the motion wherever that goes, so it is no tissue.
+            compared with them.
+        pad_is_tissue: Whether the simulator's pad is where tissue is. By default it lies below the motion, wherever
+            that goes: then false, and its clearance is reported, but is no gate.
 
     Returns:
         The verdict and its figures.
@@ -480,7 +495,9 @@ def judge(
     _check_same(playback, trajectory)
     limits = settings or Limits()
     figures = figures_of(playback, trajectory)
-    failure = first_failure(figures, playback, trajectory, limits, beside)
+    outer = bodies_clearance(trajectory, limits.clearance_bodies_mm)
+    gated = limits if pad_is_tissue else replace(limits, clearance_pad_mm=-inf)
+    failure = first_failure(figures, playback, trajectory, gated, beside, outer)
     psm_a = figures.arms[0]
     with_m = trajectory.psm_m is not None
     touching = figures.effort[~(playback.contact_n <= 0)]  # negated, so that NaN counts as contact
@@ -523,6 +540,7 @@ def judge(
         engine=playback.engine,
         files=dict(playback.files),
         settings=limits,
+        bodies=outer.report,
     )
 
 

@@ -36,7 +36,7 @@ SOUND: dict[tuple[str, str], Any] = {
         "starts_mm": [[0.0, 50.0, -120.0]], "arm": "PSM", "frame": "PSM_base", "instrument": "400006",
         "speed_mm_s": 20.0, "rate_hz": 150.0, "tip_offset_mm": 0.0, "psm_m": {
             "approach": [-0.94, 0.1, -0.33], "instrument": "400006", "enters": "start", "source": "invented",
-            "base": {"position_mm": [160.0, 20.0, 20.0], "rotation_xyzw": [0.0, 0.3, 0.0, 0.95]},
+            "base": {"position_mm": [160.0, 20.0, 20.0], "rotation_xyzw": [0.0, 0.0, 0.38, 0.92]},
         },
     },
     ("PUT", "/demos/{demo}/outcome"): {"outcome": "failure", "reason": "It fell."},

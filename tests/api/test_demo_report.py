@@ -20,7 +20,7 @@ from tests.demonstration import sessions
 from tests.library import cases
 
 PAGE = {"Accept": "text/html"}
-BASE_MM, BASE_XYZW = [160.0, 20.0, 20.0], [0.0, 0.3007057995, 0.0, 0.9537169507]  # PSM1's in PSM2's, invented
+BASE_MM, BASE_XYZW = [160.0, 20.0, 20.0], [0.0, 0.0, 0.3826834324, 0.9238795325]  # PSM1's in PSM2's, invented
 NUMBERS = (
     "duration_s", "samples", "rate_hz", "longest_gap_s", "duplicate_stamps", "path_length_mm", "extent_mm",
     "speed_median_mm_s", "speed_peak_mm_s", "jerk_rms_mm_s3", "log_dimensionless_jerk", "spectral_arc_length",

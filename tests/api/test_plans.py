@@ -126,7 +126,7 @@ def test_a_headline_is_good_only_if_the_stated_arm_error_allows_it(tmp_path: Pat
 # ---- PSM_M, starts and time -------------------------------------------------------------------------------------
 
 APPROACH = [-0.94, 0.10, -0.33]
-BASE = {"position_mm": [160.0, 20.0, 20.0], "rotation_xyzw": [0.0, 0.3007057995, 0.0, 0.9537169507]}  # 35 degrees
+BASE = {"position_mm": [160.0, 20.0, 20.0], "rotation_xyzw": [0.0, 0.0, 0.3826834324, 0.9238795325]}  # 45 degrees
 
 
 def test_psm_m_moves_if_its_base_is_given_and_the_plan_names_its_sources(still: Service):

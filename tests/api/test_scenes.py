@@ -190,7 +190,7 @@ def test_a_plan_far_from_its_scene_is_feasible_and_states_the_distance(trained: 
 def test_a_plan_without_a_scene_says_that_no_tissue_is_checked(trained: Service):
     made = planned(trained)
     assert made["scene"] is None
-    assert "nothing is checked against tissue" in made["in_words"]
+    assert "Tissue: not given, so nothing is checked against it" in made["in_words"]
     stated = planned(trained, scene=FREE.as_json())
     assert (stated["scene"]["learnt_sha256"], stated["scene"]["differs"]) == (None, [])
     assert "of which its policy knows nothing" in stated["in_words"]

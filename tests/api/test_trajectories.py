@@ -25,7 +25,8 @@ def plan(service: Service, *points: list[float], **asked: object) -> dict:
     """Plan passes; unless PSM_M is given they have no hand-off."""
     if "psm_m" not in asked:
         asked = {"handoff": "none"} | asked
-    return service.client.plan(**KESTREL, suture_points=[{"position_mm": p} for p in points], **asked)
+    points_of = [{"position_mm": p} for p in points]
+    return service.client.plan(**KESTREL, suture_points=points_of, **({"tissue_mm": -170.0} | asked))
 
 
 def play(service: Service, made: dict) -> dict:

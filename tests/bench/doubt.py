@@ -13,9 +13,9 @@ from tests.bench.timing import best_s, in_turn
 ROUNDS = 3
 ALLOWED_S = 60.0
 PAD_TOP_MM = -150.0
-TILT_RAD = np.radians(35)
+TURN_RAD = np.radians(45)
 PSM_M = PsmM(
-    (-0.94, 0.10, -0.33), (160.0, 20.0, 20.0), (0.0, float(np.sin(TILT_RAD / 2)), 0.0, float(np.cos(TILT_RAD / 2)))
+    (-0.94, 0.10, -0.33), (160.0, 20.0, 20.0), (0.0, 0.0, float(np.sin(TURN_RAD / 2)), float(np.cos(TURN_RAD / 2)))
 )
 PATH_MM = np.array([[-10, 55, -135], [-20, 60, -130], [-15, 60, -125], [-10, 55, -120], [0, 55, -120], [5, 55, -125]])
 

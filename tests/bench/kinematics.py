@@ -11,8 +11,8 @@ from tests.planning.motions import PSM_M, hand_off
 
 POSES = 12_000
 ROUNDS = 9
-TILT_RAD = np.radians(35.0)
-BESIDE = PsmM(PSM_M, (160.0, 20.0, 20.0), (0.0, float(np.sin(TILT_RAD / 2)), 0.0, float(np.cos(TILT_RAD / 2))))
+TURN_RAD = np.radians(45.0)
+BESIDE = PsmM(PSM_M, (160.0, 20.0, 20.0), (0.0, 0.0, float(np.sin(TURN_RAD / 2)), float(np.cos(TURN_RAD / 2))))
 MOST_US = 2.0  # per pose, as the motion specification requires
 
 

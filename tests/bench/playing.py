@@ -18,8 +18,8 @@ from tests.planning.motions import PSM_M, hand_off
 
 PASSES, RATE_HZ = 20, 240.0
 ROUNDS = 3
-LEANING = np.radians(35.0)
-BESIDE = PsmM(PSM_M, (160.0, 20.0, 20.0), (0.0, float(np.sin(LEANING / 2)), 0.0, float(np.cos(LEANING / 2))))
+TURNED = np.radians(45.0)
+BESIDE = PsmM(PSM_M, (160.0, 20.0, 20.0), (0.0, 0.0, float(np.sin(TURNED / 2)), float(np.cos(TURNED / 2))))
 
 
 def stacked(passes: int = PASSES, rate_hz: float = RATE_HZ) -> Trajectory:

@@ -294,7 +294,7 @@ def _about(axis: int, angle: float) -> np.ndarray:
 
 
 # Each arm's base in PSM_A's base frame, and PSM_A's in the camera's frame.
-BASES = {A: (np.eye(3), np.zeros(3)), M: (_about(1, np.radians(35)), np.array([-160.0, 20.0, 20.0]))}
+BASES = {A: (np.eye(3), np.zeros(3)), M: (_about(2, np.radians(-45)), np.array([-160.0, 20.0, 20.0]))}
 CAMERA = (_about(0, 2.0) @ _about(2, 0.7), np.array([30.0, -40.0, 180.0]))
 
 

@@ -138,7 +138,8 @@ def train(database: Database, surgeon: str = "kestrel", **asked: Any) -> PolicyV
 
 
 def add_plan(database: Database, surgeon: str = "kestrel", **asked: Any) -> Plan:
-    """Plan one pass; unless PSM_M is given it has no hand-off."""
+    """Plan one pass above level tissue; unless PSM_M is given it has no hand-off."""
+    asked = {"tissue_mm": -170.0} | asked
     if "psm_m" not in asked:
         asked = {"handoff": "none"} | asked
     return plan_sutures(

@@ -17,7 +17,7 @@ from skills.formats.verify import check_bag
 from skills.library import releases, replay
 from skills.library.catalogue import find_surgeon, put_surgeon
 from skills.library.demos import withdraw_demo
-from skills.library.plans import find_plan, plan_sutures, trajectory_of
+from skills.library.plans import find_plan, plan_in_words, plan_sutures, trajectory_of
 from skills.library.playbacks import trajectory_digest
 from skills.library.policies import find_version
 from skills.library.replay import check_doubt, cleared, replay_bag
@@ -57,7 +57,7 @@ def judged(database: Database, plan: Plan, *, feasible: bool = True, digest: str
     words = None if feasible else "Pass 0, A1, sample 3 (0.015 s): clearance to the pad is -2 mm, the limit is 1."
     with database.reading() as session:
         digest_of_it = trajectory_digest(trajectory_of(find_plan(session, plan.sha256).plan))
-    told = {"feasible": feasible, "failure_in_words": words, "trajectory": digest_of_it}
+    told = {"feasible": feasible, "failure_in_words": words, "trajectory": digest_of_it, "bodies": {"arms": []}}
     report = told | doubt(0.97) | more
     identity = digest or sha256(canonical([plan.sha256, report]))
     with database.writing() as session:
@@ -117,6 +117,40 @@ def test_a_bag_without_a_hand_off_is_given_only_on_request(database: Database, p
     both = cases.add_plan(database, psm_m={"approach": (-0.94, 0.1, -0.33)})
     judged(database, both)
     gate(database, both, handoff=None)
+
+
+def test_a_motion_that_was_compared_with_no_tissue_is_not_exported(database: Database, plan: Plan):
+    without = cases.add_plan(database, tissue_mm=None)
+    judged(database, without)
+    with pytest.raises(Conflict, match=r"tissue: not given. Plan again with tissue_mm"):
+        gate(database, without)
+    assert "Tissue: not given" in plan_in_words(without.about)
+    box = {"frame": "PSM_base", "boxes": [{"low_mm": (90.0, 0.0, 0.0), "high_mm": (95.0, 1.0, 1.0)}]}
+    obstacles = cases.add_plan(database, tissue_mm=None, scene=box)
+    judged(database, obstacles)
+    with pytest.raises(Conflict, match="tissue: not given"):
+        gate(database, obstacles)
+    level = cases.add_plan(database, scene=box)
+    assert level.plan.scene is not None
+    assert (len(level.plan.scene.boxes), level.plan.scene.tissue.at_mm) == (1, (0.0, 0.0, -170.0))
+    judged(database, level)
+    gate(database, level)
+
+
+def test_tissue_is_stated_once_and_in_millimetres(database: Database, plan: Plan):
+    level = {"at_mm": (0.0, 0.0, -160.0), "normal": (0.0, 0.0, 1.0), "along": (1.0, 0.0, 0.0)}
+    with pytest.raises(BadPlan, match="has tissue_mm, and its scene has tissue"):
+        cases.add_plan(database, scene={"frame": "PSM_base", "tissue": level})
+    with pytest.raises(BadPlan, match=r"seems to be in metres. Give -170 mm"):
+        cases.add_plan(database, tissue_mm=-0.17)
+
+
+def test_a_verdict_of_a_version_that_judged_no_bodies_opens_no_bag(database: Database, plan: Plan):
+    judged(database, plan, bodies=None)
+    with pytest.raises(Conflict, match=r"outer bodies were not judged when this plan was played. Play it"):
+        gate(database, plan)
+    judged(database, plan)
+    gate(database, plan)
 
 
 def test_only_a_plan_that_follows_the_released_policy_is_replayed(database: Database, plan: Plan):
@@ -251,11 +285,12 @@ def samples(database: Database, plan: Plan, pass_index: int | None = None) -> li
 def test_both_arms_have_a_bag_and_a_pass_alone_is_a_part_of_the_whole(database: Database):
     cases.add_demo(database)
     cases.train(database, release=True)
-    half = math.radians(35) / 2
-    base = {"position_mm": (160.0, 20.0, 20.0), "rotation_xyzw": (0.0, math.sin(half), 0.0, math.cos(half))}
+    half = math.radians(45) / 2
+    base = {"position_mm": (160.0, 20.0, 20.0), "rotation_xyzw": (0.0, 0.0, math.sin(half), math.cos(half))}
     beside = {"approach": (-0.94, 0.10, -0.33), "base": base}
     points = [{"position_mm": (5.0, 55.0, -125.0)}, {"position_mm": (8.0, 55.0, -125.0)}]
     asked = {"surgeon": "kestrel", "suture": cases.SUTURE, "suture_points": points, "psm_m": beside}
+    asked["tissue_mm"] = -170.0
     plan, _ = plan_sutures(database, PlanIn(**asked, speed_mm_s=60.0, rate_hz=100.0), "test")
     judged(database, plan)
     (psm1, whole), (psm2, beside_it) = samples(database, plan)

@@ -90,7 +90,8 @@ def test_wherever_its_base_is_its_tip_is_at_the_same_place(dx, dy, dz, tilt_deg)
 
 def test_of_the_two_ways_round_it_takes_the_one_with_less_roll():
     # A base rotated by half a turn about its own axis needs the other way, and then rolls of the same size.
-    turned = PsmM(PSM_M, BESIDE.base_mm, (BESIDE.base_xyzw[1], 0.0, BESIDE.base_xyzw[3], 0.0))
+    x, y, z, w = BESIDE.base_xyzw
+    turned = PsmM(PSM_M, BESIDE.base_mm, (y, -x, w, -z))
     one, other = planned(1), planned(1, turned)
     assert np.abs(one.psm_m.joints[:, 3]).max() <= np.pi / 2
     np.testing.assert_allclose(np.abs(one.psm_m.joints[:, 3]), np.abs(other.psm_m.joints[:, 3]), atol=1e-9)

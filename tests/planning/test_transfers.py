@@ -20,7 +20,7 @@ from skills.planning.trajectory import (
 )
 from tests.planning.motions import HAND_OFF_MM, PSM_M, hand_off
 
-BESIDE = PsmM(PSM_M, (160.0, 20.0, 20.0), (0.0, float(np.sin(np.radians(17.5))), 0.0, float(np.cos(np.radians(17.5)))))
+BESIDE = PsmM(PSM_M, (160.0, 20.0, 20.0), (0.0, 0.0, float(np.sin(np.radians(22.5))), float(np.cos(np.radians(22.5)))))
 GOAL_MM = HAND_OFF_MM[-1]
 
 

@@ -21,8 +21,8 @@ from skills.verification.clearance import needle_poses, psm_m_poses
 from tests.planning.motions import PSM_M, hand_off, small_trajectory
 
 needs_simulator = pytest.mark.needs("simulator")
-TILT = np.radians(35) / 2
-BESIDE = PsmM(PSM_M, (160.0, 20.0, 20.0), (0.0, float(np.sin(TILT)), 0.0, float(np.cos(TILT))))  # invented
+HALF = np.radians(45) / 2
+BESIDE = PsmM(PSM_M, (160.0, 20.0, 20.0), (0.0, 0.0, float(np.sin(HALF)), float(np.cos(HALF))))  # invented
 PAD_TOP_MM = -150.0
 
 

@@ -21,8 +21,8 @@ from tests.planning.motions import PSM_M, hand_off, ideal_playback, small_trajec
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-TILT = np.radians(35) / 2
-BESIDE = PsmM(PSM_M, (160.0, 20.0, 20.0), (0.0, float(np.sin(TILT)), 0.0, float(np.cos(TILT))))  # invented
+HALF = np.radians(45) / 2
+BESIDE = PsmM(PSM_M, (160.0, 20.0, 20.0), (0.0, 0.0, float(np.sin(HALF)), float(np.cos(HALF))))  # invented
 FEASIBLE = {
     "failure": None,
     "failure_in_words": None,

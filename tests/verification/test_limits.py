@@ -26,6 +26,7 @@ def test_the_limits_are_those_that_the_documents_state():
         "alignment_deg": 0.1,
         "clearance_pad_mm": 1.0,
         "clearance_psm_m_mm": 0.5,
+        "clearance_bodies_mm": 2.0,
         "contact_n": 1.0,
         "contact_effort": 0.95,
     }

@@ -30,7 +30,7 @@ from tests.verification.test_catch import APPROACH, OPENING_RAD, PLANNED
 
 PAD_TOP_MM = -150.0  # 5 mm under the lowest finger tips
 BASE_MM = (160.0, 20.0, 20.0)
-BASE_XYZW = (0.0, float(np.sin(np.radians(17.5))), 0.0, float(np.cos(np.radians(17.5))))
+BASE_XYZW = (0.0, 0.0, float(np.sin(np.radians(22.5))), float(np.cos(np.radians(22.5))))
 PSM_M = PsmM(APPROACH, BASE_MM, BASE_XYZW)
 PATH_MM = np.array([[-10, 55, -135], [-20, 60, -130], [-10, 55, -120], [5, 55, -125]], dtype=float)
 NO_DOUBT = DoubtSettings(variations=40, tip_errors_mm=(0.0,), suture_point_mm=0.0, needle_rad=0.0)
@@ -326,7 +326,9 @@ def test_what_is_drawn_is_even_about_nothing_and_within_its_bounds():
 # ---- invalid numbers -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["joint_margin", "insertion_mm", "clearance_pad_mm", "clearance_psm_m_mm"])
+@pytest.mark.parametrize(
+    "name", ["joint_margin", "insertion_mm", "clearance_pad_mm", "clearance_psm_m_mm", "clearance_bodies_mm"]
+)
 def test_a_limit_that_is_not_a_number_is_kept_by_no_variation(name):
     found = judged(BESIDE, settings=NO_DOUBT, limits=Limits(**{name: nan}))
     assert (under(found).plan.count, under(found).passes[0].clear.count) == (0, 0)
@@ -336,8 +338,8 @@ def test_joints_that_are_not_numbers_go_wrong_everywhere():
     whole = scene_of(BESIDE, 0, PAD_TOP_MM, OPENING_RAD)
     drawn = replace(draw(0, 0, 3, 5.0, 0.0), shift_mm=np.array([[0.0, 0, 0], [nan, 0, 0], [0, 0, 0]]))
     wrong = monte_carlo.spoiled(looked_at(whole, 5), drawn, np.array([0.0]), Limits())
-    assert list(wrong) == ["reach", "limits", "pad", "arms"]
-    assert [one[0].tolist() for one in wrong.values()] == [[False, True, False]] * 4
+    assert list(wrong) == ["reach", "limits", "pad", "arms", "bodies"]
+    assert [one[0].tolist() for one in wrong.values()] == [[False, True, False]] * 5
 
 
 def test_doubts_that_cannot_be_meant_are_refused():

@@ -1,15 +1,26 @@
 """Distances of a motion from a scene, against every sample and link one by one; and the verdict that they give."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from skills.gridworld.scene import Box, Capsule, Scene, Tissue
 from skills.kinematics import matrix_of
 from skills.planning.handoff import HOLDING_RAD, OPEN_RAD
-from skills.planning.trajectory import A1
-from skills.verification.clearance import RADII_MM, links_of, openings, travel_mm
+from skills.planning.trajectory import A1, A2
+from skills.verification.bodies import parts_of, radii_of
+from skills.verification.clearance import (
+    RADII_MM,
+    RADIUS_MM,
+    links_of,
+    needle_arc_mm,
+    needle_travel_mm,
+    openings,
+    travel_mm,
+)
 from skills.verification.playback import PSM_A, PSM_M
-from skills.verification.scene_clearance import LOOK_MM, clearance_of
+from skills.verification.scene_clearance import LOOK_BODIES_MM, LOOK_MM, clearance_of
 from skills.verification.verdict import SCENE, judge
 from tests.planning.motions import ideal_playback
 from tests.verification.test_playback import TRAJECTORY, beside, with_psm_m
@@ -27,7 +38,10 @@ def below(by_mm: float, **more) -> Scene:
 
 def test_the_distance_from_a_plane_is_that_of_the_lowest_link():
     report = clearance_of(TRAJECTORY, below(3.0)).report
-    (nearest,) = report.nearest
+    nearest, needle = report.nearest
+    assert (needle.body, needle.part) == ("needle", "tissue")
+    arc = needle_arc_mm(TRAJECTORY, np.arange(len(TRAJECTORY)))
+    assert needle.least_mm == pytest.approx(arc[..., 2].min() - RADIUS_MM - (LOWEST.min() - 3.0), abs=LOOK_MM)
     assert (nearest.body, nearest.part) == (PSM_A, "tissue")
     assert "finger" in nearest.link
     assert nearest.least_mm == pytest.approx(3.0, abs=LOOK_MM / 2)
@@ -116,3 +130,71 @@ def test_an_empty_scene_and_a_far_one_are_free():
         near = clearance_of(TRAJECTORY, scene)
         assert (near.report.nearest, near.report.at_least_mm) == ((), None)
         assert judge(ideal_playback(TRAJECTORY), TRAJECTORY, beside=near).feasible
+
+
+# ---- the outer bodies and the needle -------------------------------------------------------------------------------
+
+
+def test_a_box_beside_the_arm_outside_of_the_patient_is_found_and_named():
+    """A stand next to the insertion axis, whose radius is 60 mm, 40 mm behind the tool; the tool is far from it."""
+    stand = Scene("PSM2_base", boxes=(Box((62.0, -60.0, 200.0), (100.0, -20.0, 400.0)),))
+    found = clearance_of(TRAJECTORY, stand)
+    assert found.report.bodies
+    nearest = found.report.nearest[0]
+    assert (nearest.body, nearest.part) == (PSM_A, "box 0")
+    assert nearest.link in ("insertion axis", "carriage", "bars")
+    every = parts_of(TRAJECTORY.joints, TRAJECTORY.instrument)
+    radii = radii_of(TRAJECTORY.instrument)
+    least = min(
+        (stand.boxes[0].from_lines_mm(every.begin_mm[:, k], every.end_mm[:, k]) - radii[k]).min() for k in range(10)
+    )
+    assert least - LOOK_BODIES_MM <= found.at_least_mm.min() <= least + 1e-9
+
+
+def test_the_base_below_the_height_of_the_tissue_is_beside_the_table():
+    high = Scene("PSM2_base", tissue=Tissue.plane((0.0, 0.0, float(LOWEST.min()) - 3.0), (0.0, 0.0, 1.0)))
+    found = clearance_of(TRAJECTORY, high).report
+    assert {one.link for one in found.nearest} <= {"finger_1", "finger_2", "wrist_pitch_link", "roll_link", "arc"}
+
+
+def needle_into(by_mm: float, phases: tuple[int, ...], first: int = 0) -> Scene:
+    """Return flat tissue that the needle enters by some depth at its lowest place in some phases."""
+    at = np.flatnonzero(np.isin(TRAJECTORY.phase, phases))[first:]
+    lowest = float(needle_arc_mm(TRAJECTORY, at)[..., 2].min()) - RADIUS_MM
+    return Scene("PSM2_base", tissue=Tissue.plane((0.0, 0.0, lowest + by_mm), (0.0, 0.0, 1.0)))
+
+
+def test_no_sample_of_the_needle_is_lower_than_the_bound_says():
+    scene = needle_into(-2.0, (A1, A2))
+    found = clearance_of(TRAJECTORY, scene)
+    judged = np.isin(TRAJECTORY.phase, (A1, A2))
+    every = scene.tissue.above_mm(needle_arc_mm(TRAJECTORY, np.arange(len(TRAJECTORY)))).min(axis=1) - RADIUS_MM
+    assert found.report.needle_at_least_mm <= every[judged].min() == pytest.approx(2.0)
+    assert found.report.needle_at_least_mm >= 2.0 - float(needle_travel_mm(TRAJECTORY).max()) - LOOK_MM
+    steps = np.linalg.norm(np.diff(needle_arc_mm(TRAJECTORY, np.arange(len(TRAJECTORY))), axis=0), axis=2).max(axis=1)
+    same = np.diff(TRAJECTORY.pass_index) == 0
+    assert (steps[same] <= needle_travel_mm(TRAJECTORY)[same] + 1e-9).all()
+
+
+def test_a_needle_that_dips_into_the_tissue_while_it_is_carried_is_refused():
+    """PSM_A rises at first, and dips 4 mm later on; the fingers are let into the tissue, the needle is not."""
+    heights = needle_arc_mm(TRAJECTORY, np.arange(len(TRAJECTORY)))[..., 2].min(axis=1) - RADIUS_MM
+    top = float(heights[TRAJECTORY.phase == A2].max()) + 0.5
+    found = clearance_of(TRAJECTORY, Scene("PSM2_base", tissue=Tissue.plane((0.0, 0.0, top), (0.0, 0.0, 1.0))))
+    apart = replace(found, at_least_mm=np.full(len(TRAJECTORY), 10.0))
+    report = judge(ideal_playback(TRAJECTORY), TRAJECTORY, beside=apart)
+    assert report.failure.quantity == "distance of the needle from the tissue"
+    assert (report.failure.limit, report.failure.value < 0) == (0.0, True)
+
+
+def test_at_the_beginning_of_a_pass_the_needle_may_be_where_the_hand_left_it():
+    heights = needle_arc_mm(TRAJECTORY, np.arange(len(TRAJECTORY)))[..., 2].min(axis=1) - RADIUS_MM
+    a1 = np.flatnonzero((TRAJECTORY.phase == A1) & (TRAJECTORY.pass_index == 0))
+    top = float(heights[a1[0]]) + 2.0
+    inside = heights < top
+    leaves = a1[np.argmax(~inside[a1])]
+    assert inside[a1[0]]
+    assert not inside[leaves]
+    found = clearance_of(TRAJECTORY, Scene("PSM2_base", tissue=Tissue.plane((0.0, 0.0, top), (0.0, 0.0, 1.0))))
+    assert np.isinf(found.needle_mm[a1[0] : leaves]).all()
+    assert (found.needle_mm[: leaves + 1] >= 0).all()

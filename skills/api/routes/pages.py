@@ -31,7 +31,7 @@ from skills.settings import MEBIBYTE
 STATUS: dict[type[Exception], int] = {errors.Erased: 410, errors.Conflict: 409, errors.BadPath: 422}
 LOST: tuple[type[Exception], ...] = (errors.NotFound, RequestValidationError, *STATUS)
 PSM_M_FROM_GOAL_MM = (155.0, -35.0, 145.0)  # ours, assumed: the base of the samples' PSM_M relative to their goal
-PSM_M_TURN = "0, 0.300706, 0, 0.953717"  # 35 degrees about y
+PSM_M_TURN = "0, 0, 0.382683, 0.92388"  # 45 degrees about z: the arms stand away from each other, and do not collide
 FOR_GOOD = "public, max-age=31536000, immutable"
 
 Words = Annotated[str, Query(max_length=200)]

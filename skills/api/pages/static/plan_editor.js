@@ -187,7 +187,7 @@ function psmM() {
 
 form.addEventListener("submit", async (event) => {
   event.preventDefault();
-  const { arm, frame, instrument, speed_mm_s: speed, tip_offset_mm: offset, handoff, orientation, a2 } = form.elements;
+  const { arm, frame, instrument, speed_mm_s: speed, tip_offset_mm: offset, handoff, orientation, a2, tissue_mm: tissue } = form.elements;
   const button = form.querySelector("button:not([type])");
   const said = get("plan-said");
   said.className = "said";
@@ -198,7 +198,8 @@ form.addEventListener("submit", async (event) => {
       surgeon: form.dataset.surgeon, suture: form.dataset.suture, version: Number(form.dataset.version),
       suture_points: points.map((point) => ({ position_mm: point.at, rotation_xyzw: rotation(point) })),
       arm: arm.value || null, frame: frame.value || null, instrument: instrument.value || null,
-      speed_mm_s: Number(speed.value), tip_offset_mm: Number(offset.value), orientation: orientation.value || null, a2: a2.value || null, ...(handoff.value === "none" ? { handoff: "none" } : { psm_m: psmM() }),
+      speed_mm_s: Number(speed.value), tip_offset_mm: Number(offset.value), orientation: orientation.value || null, a2: a2.value || null,
+      ...(tissue.value && { tissue_mm: Number(tissue.value) }), ...(handoff.value === "none" ? { handoff: "none" } : { psm_m: psmM() }),
     });
     location.assign(`${root}/pages/plans/${plan.id}`);
   } catch (problem) {
