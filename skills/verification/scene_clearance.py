@@ -5,8 +5,9 @@
 The tools are the capsules of `skills.verification.clearance.links_of`, the arms' outer bodies those of
 `skills.verification.bodies`, the scene is that of `skills.gridworld.scene`: a capsule's distance from a box or another
 capsule is exact, that from a height map a lower bound. The distances are computed at samples between which nothing
-moves further than `LOOK_MM`, or `LOOK_BODIES_MM`; from one to the next, no distance is less than the mean of both minus
-half of that way, and this bound is what is judged. So nothing is missed in between.
+moves further than `LOOK_MM`, or `LOOK_BODIES_MM`, where something is near, and further apart elsewhere; from one to the
+next, no distance is less than the mean of both minus half of that way, and this bound is what is judged. So nothing is
+missed in between.
 
 The margin of a scene stands for the tool's size in the grid world, where the tip is a point. Here it is a distance that
 must be kept, if it is larger than `SceneReport.limit_mm` would be without it. A scene's capsules are the other arm, so
@@ -18,7 +19,7 @@ the surgeon's hand, before A1 and after A2 (M1, M2): so at the beginning of A1 i
 first time. In a transfer to a further pass it is the surgeon's, and not judged.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from math import nan
@@ -27,7 +28,7 @@ import numpy as np
 
 from skills.arrays import Flags, Floats, Ints, xyz
 from skills.fields import Count, Figure, Point, schema
-from skills.gridworld.scene import Scene
+from skills.gridworld.scene import Scene, Tissue
 from skills.kinematics import matrix_of
 from skills.planning.handoff import HOLDING_RAD, OPEN_RAD
 from skills.planning.motion_laws import A2, PHASES, TRANSFER
@@ -51,6 +52,7 @@ from skills.verification.playback import CLEARANCE_SEEN_MM, LINKS, PSM_A, PSM_M
 LEAST_MM = 1.0  # ours, as of the pad: the error of a calibrated arm (0.65 mm) and half as much again
 LOOK_MM = 0.25  # ours: a distance that is judged is at most half of this too small, for that reason
 LOOK_BODIES_MM = 2.0  # ours: the same for the outer bodies, whose own margin is larger
+COARSER = 16  # ours: distances are computed this much further apart where nothing is near
 NEEDLE, ARC, TISSUE = "needle", "arc", "tissue"
 # PSM_M's jaw comes open and closes on the needle, at times that a trajectory does not state: its fingers, 2.2 mm thick,
 # move by 1.1 mm at their tips from one opening to the next, so nothing passes between two of them.
@@ -142,13 +144,14 @@ def clearance_of(trajectory: Trajectory, scene: Scene) -> SceneClearance:
         The distances.
     """
     at_least, looked = np.full(len(trajectory), np.inf), np.zeros(len(trajectory), bool)
+    limit_mm = max(LEAST_MM, scene.margin_mm)
     nearest: list[tuple[float, NearestToScene]] = []
     for body in (PSM_A, PSM_M) if trajectory.psm_m is not None else (PSM_A,):
         for group in (_tool(trajectory, body), _bodies(trajectory, body)):
-            looks = _looks(group.way_mm, group.look_mm)
-            of_parts = dict(_from_parts(group, looks, scene, body))
-            seen = np.min([np.full((len(looks), len(group.names)), np.inf), *of_parts.values()], axis=0)
-            at_least[looks] = np.minimum(at_least[looks], _until_next(seen, group.way_mm[looks]))
+            distances = partial(_from_parts, group, scene, body)
+            looks, of_parts = _looked_at(distances, group.way_mm, group.look_mm, limit_mm)
+            bounds = [_until_next(apart, group.way_mm[looks]) for apart in of_parts.values()]
+            at_least[looks] = np.min([at_least[looks], *bounds], axis=0)
             looked[looks] = True
             nearest += [
                 _nearest(trajectory, (body, group.names), part, looks, apart) for part, apart in of_parts.items()
@@ -157,9 +160,9 @@ def clearance_of(trajectory: Trajectory, scene: Scene) -> SceneClearance:
     if scene.tissue is not None:
         way = _way(needle_travel_mm(trajectory)[:, None])
         begins = np.flatnonzero(np.diff(trajectory.phase) | np.diff(trajectory.pass_index)) + 1
-        looks = np.unique(np.concatenate([_looks(way, LOOK_MM), begins - 1, begins]))
-        above = scene.tissue.above_mm(needle_arc_mm(trajectory, looks)).min(axis=1)[:, None]
-        apart = np.where(above > 0, above / scene.tissue.steep, above) - NEEDLE_THICK_MM / 2
+        ends = np.concatenate([begins - 1, begins])
+        looks, seen = _looked_at(partial(_of_needle, trajectory, scene.tissue), way, LOOK_MM, 0.0, ends)
+        apart = seen[TISSUE]
         needle[looks] = _until_next(apart, way[looks])
         needle[_by_hand(trajectory, needle)] = np.inf
         nearest.append(_nearest(trajectory, (NEEDLE, (ARC,)), TISSUE, looks, apart))
@@ -167,7 +170,7 @@ def clearance_of(trajectory: Trajectory, scene: Scene) -> SceneClearance:
     least, least_of_needle = float(at_least.min()), float(needle.min())
     return SceneClearance(
         SceneReport(
-            limit_mm=max(LEAST_MM, scene.margin_mm),
+            limit_mm=limit_mm,
             at_least_mm=None if least >= CLEARANCE_SEEN_MM else least,
             seen_within_mm=CLEARANCE_SEEN_MM,
             looks=int(np.count_nonzero(looked)),
@@ -260,6 +263,45 @@ def _looks(way_mm: Floats, look_mm: float) -> Ints:
     return np.array(looks)
 
 
+def _looked_at(
+    distances: Callable[[Ints], dict[str, Floats]],
+    way_mm: Floats,
+    look_mm: float,
+    limit_mm: float,
+    also: Ints | None = None,
+) -> tuple[Ints, dict[str, Floats]]:
+    """Return the samples to look at, (C,), and there the distances from each part of a scene, (C, L).
+
+    The first ones are `COARSER` times as far apart as `look_mm`. Then those between two of them are added wherever a
+    part could be nearer than the limit, or than it is anywhere else.
+
+    Args:
+        distances: Return the distances from each part at some samples.
+        way_mm: Greatest distance that each of L things can have moved since the first sample, (T, L).
+        look_mm: Where something is near, the samples are no further apart.
+        limit_mm: The distance that must be kept.
+        also: Samples to look at in any case.
+    """
+    looks = _looks(way_mm, COARSER * look_mm)
+    looks = looks if also is None else np.unique(np.concatenate([looks, also]))
+    of_parts = distances(looks)
+    while of_parts:
+        way = way_mm[looks]
+        wide = (np.diff(looks) > 1) & ~(np.diff(way, axis=0).max(axis=1) <= look_mm)
+        near = np.zeros_like(wide)
+        for apart in of_parts.values():
+            known = min(CLEARANCE_SEEN_MM, max(limit_mm, float(np.nan_to_num(apart, nan=-np.inf).min())))
+            near |= wide & ~(_until_next(apart, way)[:-1] >= known)
+        gaps = np.flatnonzero(near)
+        if not len(gaps):
+            break
+        more = (looks[gaps] + looks[gaps + 1]) // 2
+        at = np.searchsorted(looks, more)
+        looks, new = np.insert(looks, at, more), distances(more)
+        of_parts = {part: np.insert(apart, at, new[part], axis=0) for part, apart in of_parts.items()}
+    return looks, of_parts
+
+
 def _until_next(seen_mm: Floats, way_mm: Floats) -> Floats:
     """Return lower bounds on the distances, (C, L), from each look until the next, of their least, (C,)."""
     ahead = np.diff(way_mm, axis=0, append=way_mm[-1:])
@@ -267,9 +309,9 @@ def _until_next(seen_mm: Floats, way_mm: Floats) -> Floats:
     return np.asarray(np.minimum(seen_mm, (seen_mm + after - ahead) / 2).min(axis=1))
 
 
-def _from_parts(group: _Group, looks: Ints, scene: Scene, body: str) -> Iterator[tuple[str, Floats]]:
-    """Yield each part of a scene with the distances of an arm's capsules from it, (C, L)."""
-    axes = group.axes(looks)
+def _from_parts(group: _Group, scene: Scene, body: str, at: Ints) -> dict[str, Floats]:
+    """Return the distances of an arm's capsules from each part of a scene at some samples, (C, L)."""
+    axes, found = group.axes(at), {}
     parts: list[tuple[str, Callable[[Floats, Floats], Floats]]] = []
     if scene.tissue is not None:
         within_mm = CLEARANCE_SEEN_MM + group.radii_mm.max()
@@ -278,13 +320,17 @@ def _from_parts(group: _Group, looks: Ints, scene: Scene, body: str) -> Iterator
     if body == PSM_A:
         parts += [(f"capsule {k}", capsule.from_lines_mm) for k, capsule in enumerate(scene.capsules)]
     for part, from_lines_mm in parts:
-        if part == TISSUE:
-            apart = np.full((len(looks), len(group.names)), np.inf)
-            some = group.above_tissue
-            apart[:, some] = np.min([from_lines_mm(a.begin_mm[:, some], a.end_mm[:, some]) for a in axes], axis=0)
-        else:
-            apart = np.min([from_lines_mm(one.begin_mm, one.end_mm) for one in axes], axis=0)
-        yield part, apart - group.radii_mm
+        some = group.above_tissue if part == TISSUE else np.ones(len(group.names), bool)
+        apart = np.full((len(at), len(group.names)), np.inf)
+        apart[:, some] = np.min([from_lines_mm(a.begin_mm[:, some], a.end_mm[:, some]) for a in axes], axis=0)
+        found[part] = apart - group.radii_mm
+    return found
+
+
+def _of_needle(trajectory: Trajectory, tissue: Tissue, at: Ints) -> dict[str, Floats]:
+    """Return lower bounds on the distances of the needle in PSM_A's jaws from tissue, (C, 1)."""
+    above = tissue.above_mm(needle_arc_mm(trajectory, at)).min(axis=1)[:, None]
+    return {TISSUE: np.where(above > 0, above / tissue.steep, above) - NEEDLE_THICK_MM / 2}
 
 
 def _by_hand(trajectory: Trajectory, needle_mm: Floats) -> Flags:
