@@ -42,7 +42,6 @@ class Need:
 
 
 NEEDS = {
-    "fcl": Need("python-fcl is", "`make` installs the locked packages", lambda: find_spec("fcl")),
     "browser": Need("the page's browser is", "apt-get install chromium", chromium),
     "recordings": Need(
         "the real recordings are",
@@ -73,6 +72,7 @@ NEEDS = {
     "simulator": Need(
         "PyBullet is", "it has a wheel for Python 3.11 on Linux, x86_64, only", lambda: find_spec("pybullet")
     ),
+    "fcl": Need("python-fcl is", "`make` installs the locked packages", lambda: find_spec("fcl")),
     "deep": Need("the extra `deep` is", "make deep", lambda: all(find_spec(name) for name in NEEDED)),
     "lerobot": Need(
         "LeRobot is",
