@@ -5,6 +5,9 @@
 The hashes are those of RFC 6962: a leaf is SHA-256(0x00 || entry), a node SHA-256(0x01 || left || right). A checkpoint
 is the text of the C2SP specification tlog-checkpoint (the log's origin, the number of leaves, the root), signed as a
 C2SP signed note with Ed25519, so that tools for other transparency logs can verify it.
+
+The inner hashes are kept in tiles of the C2SP specification tlog-tiles: tile n of level l has the hashes of the 256
+complete subtrees 256 n to 256 n + 255 of 256**l leaves each, and the root of the tile is one hash of level l + 1.
 """
 
 import base64
@@ -12,7 +15,7 @@ import binascii
 import hashlib
 import hmac
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -24,6 +27,8 @@ if TYPE_CHECKING:
 
 ED25519 = b"\x01"  # the signature type of a signed note
 KEY_ID_BYTES, SEED_BYTES, HASH_BYTES = 4, 32, 32
+TILE_HEIGHT = 8  # of the specification tlog-tiles
+TILE_WIDTH = 1 << TILE_HEIGHT
 KEY_NAME = "suture-skills"  # in the text of a secret key, which may sign several logs
 
 
@@ -76,19 +81,69 @@ def root_of(leaves: Iterable[bytes]) -> bytes:
     return tree.root
 
 
-def inclusion_proof(leaves: Sequence[bytes], index: int) -> list[bytes]:
+# ---- proofs from the hashes of complete subtrees ---------------------------------------------------------------------
+
+# The hash of the complete subtree of 2**height leaves that is the index-th of its height, counted from the left.
+Node = Callable[[int, int], bytes]
+# The hashes begin to end of the complete subtrees of 2**(8 level) leaves, all of one tile.
+Tiles = Callable[[int, int, int], Sequence[bytes]]
+
+
+def node_from(tiles: Tiles) -> Node:
+    """Return the hashes of complete subtrees, computed from tiles, each of which may be read several times."""
+
+    def node(height: int, index: int) -> bytes:
+        level, rest = divmod(height, TILE_HEIGHT)
+        return root_of(tiles(level, index << rest, index + 1 << rest))
+
+    return node
+
+
+def inclusion_proof(size: int, index: int, node: Node) -> list[bytes]:
     """Return the hashes beside the path from a leaf to the root, from the leaf upwards (RFC 6962, 2.1.1).
 
     Args:
-        leaves: The leaf hashes of the whole tree.
-        index: Which of them.
+        size: The number of leaves of the whole tree.
+        index: Of the leaf.
+        node: The hashes of complete subtrees; it is called for at most log2(size)**2 of them.
     """
-    if len(leaves) <= 1:
-        return []
-    half = 1 << (len(leaves) - 1).bit_length() - 1
-    if index < half:
-        return [*inclusion_proof(leaves[:half], index), root_of(leaves[half:])]
-    return [*inclusion_proof(leaves[half:], index - half), root_of(leaves[:half])]
+    assert 0 <= index < size
+    begin, end, proof = 0, size, list[bytes]()
+    while end - begin > 1:
+        middle = begin + _half(end - begin)
+        if index < middle:
+            proof.append(_root_between(middle, end, node))
+            end = middle
+        else:
+            proof.append(_root_between(begin, middle, node))
+            begin = middle
+    return proof[::-1]
+
+
+def _root_between(begin: int, end: int, node: Node) -> bytes:
+    size = end - begin
+    if size.bit_count() == 1:
+        return node(size.bit_length() - 1, begin // size)
+    middle = begin + _half(size)
+    return node_hash(_root_between(begin, middle, node), _root_between(middle, end, node))
+
+
+def _half(size: int) -> int:
+    """Return the number of leaves of the left half: the largest power of two below the size."""
+    return 1 << (size - 1).bit_length() - 1
+
+
+def proven_root(leaf: bytes, index: int, size: int, proof: Sequence[bytes]) -> bytes | None:
+    """Return the root of the tree in which a proof puts a leaf; None where the proof has too many or too few hashes."""
+    beside, last = iter(proof), size - 1
+    while last > 0:
+        if index % 2 == 1 or index < last:  # otherwise it is the last of its height, and has nothing beside it
+            other = next(beside, None)
+            if other is None:
+                return None
+            leaf = node_hash(other, leaf) if index % 2 == 1 else node_hash(leaf, other)
+        index, last = index // 2, last // 2
+    return leaf if next(beside, None) is None else None
 
 
 # ---- checkpoints -----------------------------------------------------------------------------------------------------

@@ -8,12 +8,15 @@ from hypothesis import strategies as some
 
 from skills.errors import Corrupt
 from skills.transparency import (
+    TILE_WIDTH,
     Checkpoint,
     SigningKey,
     Tree,
     inclusion_proof,
     leaf_hash,
+    node_from,
     node_hash,
+    proven_root,
     read_notes,
     root_of,
 )
@@ -68,13 +71,36 @@ def test_every_leaf_is_proven_and_no_other_entry(size: int, data: some.DataObjec
     leaves = [leaf_hash(entry.encode()) for entry in entries]
     number = data.draw(some.integers(0, size - 1))
     note = KEY.sign(Checkpoint(ORIGIN, size, root_of(leaves)))
-    proof = inclusion_proof(leaves, number)
+    proof = inclusion_proof(size, number, lambda height, at: by_definition(leaves[at << height : at + 1 << height]))
+    assert proven_root(leaves[number], number, size, proof) == root_of(leaves)
+    assert proven_root(leaves[number], number, size, [*proof, proof[0] if proof else b""]) is None
     check_inclusion(entries[number], number, proof, note, KEY.verifier(ORIGIN))
     with pytest.raises(AssertionError):
         check_inclusion("another", number, proof, note, KEY.verifier(ORIGIN))
     if size > 1:
         with pytest.raises(AssertionError):
             check_inclusion(entries[number], (number + 1) % size, proof, note, KEY.verifier(ORIGIN))
+
+
+def test_a_proof_of_a_large_tree_comes_from_a_few_tiles():
+    leaves = [leaf_hash(b"%d" % number) for number in range(70_000)]
+    levels, read = [leaves], set[tuple[int, int]]()
+    while len(levels[-1]) >= TILE_WIDTH:
+        full = range(0, len(levels[-1]) - TILE_WIDTH + 1, TILE_WIDTH)
+        levels.append([root_of(levels[-1][at : at + TILE_WIDTH]) for at in full])
+
+    def tiles(level: int, begin: int, end: int) -> list[bytes]:
+        assert begin // TILE_WIDTH == (end - 1) // TILE_WIDTH and end <= len(levels[level])
+        read.add((level, begin // TILE_WIDTH))
+        return levels[level][begin:end]
+
+    root = root_of(leaves)
+    for number in (0, 255, 256, 65_535, 65_536, 69_887, 69_888, 69_999):
+        read.clear()
+        proof = inclusion_proof(len(leaves), number, node_from(tiles))
+        assert proven_root(leaves[number], number, len(leaves), proof) == root
+        assert proven_root(leaves[number - 1], number, len(leaves), proof) != root
+        assert len(read) <= 5
 
 
 def test_a_signed_checkpoint_is_read_back_and_checked_by_others():

@@ -7,6 +7,7 @@ service_tables   the tables of the service: jobs, workers, keys, sign-ins, the a
 session          opening the database; sessions and their errors; a full and a failed disk; migrations
 packed           values in one column, and the archive format that they are stored in
 history          the log of all changes, written with them
+tiles            the inner hashes of its tree, stored by 256
 row_visibility   rules that restrict a caller's queries to some surgeons
 changes          a cache, and change detection for caches, without reading a table
 archive          backups

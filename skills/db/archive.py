@@ -25,6 +25,7 @@ from skills.db.logged_rows import KINDS, kind_of
 from skills.db.models import ParsedChunk, ParsedRecording
 from skills.db.service_tables import Executor, SignIn
 from skills.db.session import revision_of, revisions, upgrade
+from skills.db.tiles import Tile
 from skills.errors import Conflict, Corrupt, UnknownFormat
 from skills.remedies import Action, Remedy
 
@@ -35,6 +36,7 @@ CUT_OFF = "its end is missing or damaged, as in a truncated file"
 PIECE_BYTES = 1 << 20
 LEFT_OUT = {
     *(Executor.__tablename__, SignIn.__tablename__),  # running workers and browser sessions: gone after a restore
+    Tile.__tablename__,  # computed again from the leaves of the history
     *(ParsedRecording.__tablename__, ParsedChunk.__tablename__),  # a cache: decoded again from the recordings' bytes
 }
 ROWS_AT_ONCE = 500

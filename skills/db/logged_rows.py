@@ -56,6 +56,7 @@ NOT_LOGGED = {
     "dataset_chunks": IN_PIECES,
     "history": "the history itself",
     "history_checkpoints": "the history itself",
+    "history_tiles": "hashes of the history, which `skills verify` computes again",
 }
 CACHES = ("measured_shapes", "parsed_recordings")  # logged, but anybody may delete their rows at any time
 COLUMNS_NOT_LOGGED = {

@@ -41,7 +41,7 @@ EVERYBODYS = {"everybodys": True}  # the execution option of a query that must s
 # Tables without a rule; a test checks that every other table has one.
 OF_NOBODY = (
     *("erasures", "suture_types", "calibrations", "executors", "events", "keys", "key_surgeons", "sign_ins"),
-    *("recording_uploads", "loose_chunks", "erased_surgeons", "history", "history_checkpoints"),
+    *("recording_uploads", "loose_chunks", "erased_surgeons", "history", "history_checkpoints", "history_tiles"),
 )
 INSIDE = (
     *(Demonstration, PolicyVersion, Plan, StoredPlayback, RecordingUpload, StyleToRetrain),

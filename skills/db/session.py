@@ -49,6 +49,7 @@ from sqlalchemy.pool import ConnectionPoolEntry
 
 from skills.db.history import FORGET_NOTES, NOTING, NOTING_CONNECTION, History
 from skills.db.row_visibility import ONLY, Only
+from skills.db.tiles import fill_tiles
 from skills.errors import BadSettings, Busy, Conflict, Corrupt, DatabaseUnusable, SkillsError, StorageFull
 from skills.remedies import Action, Remedy
 from skills.settings import settings
@@ -163,6 +164,7 @@ class Database:
             if before != revisions()[0]:
                 self.history.settle(connection)
                 self.history.log_schema(connection)
+                fill_tiles(connection)
             connection.commit()
 
     def forget(self) -> None:

@@ -29,6 +29,7 @@ from skills.db.archive import Manifest
 from skills.db.models import SUCCESS, Demonstration, Erasure, PolicyVersion, Release, StoredRecording, Surgeon
 from skills.db.service_tables import Event, Job, Key, record_event
 from skills.db.session import Database
+from skills.db.tiles import fill_tiles
 from skills.errors import Conflict, Corrupt
 from skills.library.catalogue import put_surgeon, salted
 from skills.library.demos import MARKS, mark_demo, withdraw_demo
@@ -197,6 +198,7 @@ def restore(database: Database, source: Path, erasures: Erasures = NOTHING, told
             archive.load(file, manifest, session.connection(), told)
             told("history")
             database.history.go_on_after_restore(session.connection())
+            fill_tiles(session.connection())
             told("erasures")
             restored = _end_again(session, manifest, erasures)
             session.execute(update(Job).where(Job.state.in_(ACTIVE), Job.kind != BATCH).values(told_at=None))

@@ -14,6 +14,7 @@ import logging
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 from math import inf
 from pathlib import Path
 from time import monotonic
@@ -39,8 +40,9 @@ from skills.db.logged_rows import (
     schema_of,
 )
 from skills.db.session import Database
+from skills.db.tiles import TILES, fill_tiles, full_tiles
 from skills.errors import BadSettings, Corrupt, SkillsError
-from skills.transparency import Note, Tree, leaf_hash, read_notes
+from skills.transparency import TILE_WIDTH, Note, Tree, leaf_hash, read_notes, root_of
 
 SIGNING_LOCK = 0x5C112  # ours: the number of the advisory lock under which one process at a time signs
 SIGNING_S = 0.5  # ours: a worker must write its heartbeat meanwhile
@@ -99,7 +101,10 @@ def _sign_some(database: Database) -> str | None:
             mine = connection.scalar(text("SELECT pg_try_advisory_xact_lock(:lock)"), {"lock": SIGNING_LOCK})
             if not mine:
                 return None
-        return database.history.sign(connection)
+        note = database.history.sign(connection)
+        if note is not None:
+            fill_tiles(connection)
+        return note
 
 
 def append_checkpoint(file: Path, note: str) -> None:
@@ -194,6 +199,8 @@ def verify_history(
             yield name, f"its leaf {leaf.row} of the history was not written by the service: the seal is wrong"
         done.leaves += 1
     yield from _wrong_roots(read.hashes, signed)
+    size = max((note.checkpoint.size for _, note in signed), default=0)
+    yield from islice(_wrong_tiles(connection, read.hashes, size), NAMED)
     yield from _wrong_rows(connection, read, done)
 
 
@@ -260,6 +267,30 @@ def _wrong_roots(hashes: dict[int, bytes], signed: Sequence[tuple[str, Note]]) -
     beyond = [number for number in hashes if number >= size]
     for number in beyond[:NAMED]:
         yield f"leaf {number}", "it has a number, and no signed checkpoint covers it"
+
+
+def _wrong_tiles(connection: Connection, hashes: dict[int, bytes], size: int) -> Iterator[Finding]:
+    """Yield the tiles that are not of the leaves, that are missing, or that are of leaves that nobody signed."""
+    below = [hashes.get(number) for number in range(size)]
+    unknown = {(level, number) for level, number in connection.execute(select(TILES.c.level, TILES.c.number))}
+    for level, full in full_tiles(size):
+        roots: list[bytes | None] = []
+        for number in range(full):
+            of_tile = [one for one in below[number * TILE_WIDTH : (number + 1) * TILE_WIDTH] if one is not None]
+            if len(of_tile) < TILE_WIDTH:  # leaves are missing, which is named elsewhere
+                roots.append(None)
+                continue
+            this = (TILES.c.level == level, TILES.c.number == number)
+            stored = connection.execute(select(TILES.c.root, TILES.c.hashes).where(*this)).first()
+            roots.append(root_of(of_tile))
+            if stored is None:
+                yield f"history_tiles {level}/{number}", "it is missing"
+            elif tuple(stored) != (roots[-1], b"".join(of_tile)):
+                yield f"history_tiles {level}/{number}", "its hashes are not those of the leaves"
+        unknown -= {(level, number) for number in range(full)}
+        below = roots
+    for level, number in sorted(unknown):
+        yield f"history_tiles {level}/{number}", "no signed checkpoint covers its leaves"
 
 
 def _wrong_rows(connection: Connection, read: _Log, done: Verified) -> Iterator[Finding]:

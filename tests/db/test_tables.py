@@ -51,7 +51,7 @@ FREE = {
     "surgeons", "suture_types", "jobs", "retraining_styles", "executors", "keys", "key_surgeons", "sign_ins",
     "measured_shapes", "loose_chunks", "erased_surgeons",
 }  # fmt: skip
-THE_HISTORY = {"history", "history_checkpoints"}  # see `test_history.py`
+THE_HISTORY = {"history", "history_checkpoints", "history_tiles"}  # see `test_history.py`
 
 
 @pytest.fixture(scope="module", params=backends.BACKENDS)

@@ -10,29 +10,34 @@ from datetime import timedelta
 from pathlib import Path
 
 import pytest
-from sqlalchemy import Connection, func, select, text, update
+from alembic import command
+from sqlalchemy import Connection, func, insert, select, text, update
+from sqlalchemy.orm import Session
 
 from skills.db import Base, now
 from skills.db.history import CHECKPOINTS, LEAVES, take_notes
 from skills.db.logged_rows import COLUMNS_NOT_LOGGED, NOT_LOGGED, logged
-from skills.db.models import Release
+from skills.db.models import Release, Surgeon
 from skills.db.service_tables import Job
 from skills.db.session import Database
+from skills.db.tiles import TILES, stored_tiles
 from skills.errors import BadSettings, Corrupt
 from skills.library import erasure, locks, recordings, sweep
 from skills.library.catalogue import find_surgeon, put_surgeon
 from skills.library.erasure import erase_surgeon
 from skills.library.history import Verified, append_checkpoint, newest_checkpoint, sign_history, verify_history
 from skills.library.inspection import inspect_installation
+from skills.library.proofs import served_json
 from skills.library.recordings import stored_recording
 from skills.library.releases import withdraw
 from skills.settings import Settings
-from skills.transparency import SigningKey, inclusion_proof, leaf_hash, read_notes
+from skills.transparency import SigningKey, inclusion_proof, leaf_hash, node_from, read_notes
 from tests import backends
 from tests.db.test_tables import FROZEN, WITHDRAWABLE, fill
-from tests.independent_history import check_inclusion
+from tests.independent_history import check_disclosed, check_inclusion
 from tests.library import cases
 from tests.library.attacks import cover_up, found, random_edit, sign_again, tampering
+from tests.migrations.test_migrations import go
 
 SURGEONS = logged()["surgeons"].raw
 
@@ -475,9 +480,9 @@ def test_proofs_are_checked_offline_and_stay_valid_after_an_erasure(database: Da
         connection = session.connection()
         note = newest_checkpoint(connection) or ""
         leaves = connection.execute(select(LEAVES.c.number, LEAVES.c.entry).order_by(LEAVES.c.number)).all()
+        node = node_from(stored_tiles(connection))
+        proofs = {number: inclusion_proof(len(leaves), number, node) for number, _ in leaves}
         verifier = database.history.key.verifier(note.partition("\n")[0])
-    hashes = [leaf_hash(entry.encode()) for _, entry in leaves]
-    proofs = {number: inclusion_proof(hashes, number) for number, _ in leaves}
     with database.writing() as session:
         erase_surgeon(session, "kestrel", "test")
     sign_history(database, None)
@@ -489,6 +494,77 @@ def test_proofs_are_checked_offline_and_stay_valid_after_an_erasure(database: Da
     for number, proof in proofs.items():
         check_inclusion(after[number], number, proof, note, verifier)
     assert wrong_in(database) == []
+
+
+# ---- tiles
+
+TILE_EDITS = [
+    "UPDATE history_tiles SET root = {blob} WHERE number = 1",
+    "UPDATE history_tiles SET hashes = {blob} WHERE number = 1",
+    "DELETE FROM history_tiles WHERE number = 1",
+    "UPDATE history_tiles SET number = 7 WHERE number = 1",
+    "INSERT INTO history_tiles SELECT 1, 0, root, hashes FROM history_tiles WHERE number = 0",
+]
+TILES_IN_ORDER = select(TILES).order_by(TILES.c.level, TILES.c.number)
+
+
+def add_cranes(database: Database, count: int, name: str = "crane") -> None:
+    with database.writing(()) as session:
+        session.execute(
+            insert(Surgeon), [{"slug": f"{name}-{number}", "subject": f"{name}-{number}"} for number in range(count)]
+        )
+
+
+def test_tiles_are_written_as_they_fill_and_every_change_of_one_is_found(database: Database):
+    for name in ("crane", "egret", "swift"):
+        add_cranes(database, 300, name)
+        sign_history(database, None)
+        with database.reading() as session:
+            tiles = session.execute(TILES_IN_ORDER).all()
+            leaves = session.scalars(select(LEAVES.c.entry).order_by(LEAVES.c.number)).all()
+        assert [(tile.level, tile.number) for tile in tiles] == [(0, number) for number in range(len(leaves) // 256)]
+        hashes = [leaf_hash(entry.encode()) for entry in leaves[: len(tiles) * 256]]
+        assert b"".join(tile.hashes for tile in tiles) == b"".join(hashes)
+    assert wrong_in(database) == []
+    for statement in TILE_EDITS:
+        with tampering(database) as connection:
+            edit = statement.format(blob=BLOB[connection.dialect.name])
+            assert connection.exec_driver_sql(edit).rowcount == 1
+            names = [name for name, _ in found(connection, database.history)]
+        assert names and all(name.startswith("history_tiles ") for name in names), statement
+
+
+def test_no_proof_is_given_from_tiles_or_leaves_that_were_changed(database: Database):
+    cases.add_demo(database)
+    add_cranes(database, 300)
+    cases.train(database, release=True)
+    sign_history(database, None)
+    asked = ("kestrel", cases.SUTURE, now())
+    with database.reading() as session:
+        given = served_json(session, database.history, *asked)
+    for proof in given["proofs"]:
+        check_disclosed(proof, given["checkpoint"]["note"], given["checkpoint"]["verifier"])
+    for edit in (
+        "UPDATE history_tiles SET root = {blob}, hashes = {blob}",
+        "DELETE FROM history_tiles",
+        "DELETE FROM history WHERE number = (SELECT max(number) FROM history WHERE table_name = 'jobs')",
+    ):
+        with tampering(database) as connection, Session(connection) as session:
+            connection.exec_driver_sql(edit.format(blob=BLOB[connection.dialect.name]))
+            with pytest.raises(Corrupt, match="proves nothing"):
+                served_json(session, database.history, *asked)
+
+
+def test_tiles_of_an_older_database_are_written_by_its_migration(database: Database):
+    add_cranes(database, 300)
+    sign_history(database, None)
+    with database.reading() as session:
+        before = session.execute(TILES_IN_ORDER).all()
+    go(database, command.downgrade, "0016")
+    database.migrate()
+    with database.reading() as session:
+        assert session.execute(TILES_IN_ORDER).all() == before
+    assert len(before) >= 1 and wrong_in(database) == []
 
 
 def test_changes_of_a_row_follow_each_other_in_the_history(database: Database):

@@ -29,7 +29,7 @@ from tests.planning.motions import ideal_playback
 ALIKE = {"suture_types", "measured_shapes", "calibrations", "loose_chunks", "erased_surgeons", "executors"} | {
     *("keys", "key_surgeons", "sign_ins"),
 }
-LOGS = {"events", "erasures", "history", "history_checkpoints"}  # every change adds to them
+LOGS = {"events", "erasures", "history", "history_checkpoints", "history_tiles"}  # every change adds to them
 
 
 def rows(database: Database) -> dict[str, list[tuple[Any, ...]]]:

@@ -35,7 +35,7 @@ from tests.waiting import END_S
 
 KEPT = sorted(folder.name for folder in RELEASES.iterdir() if folder.is_dir())
 # The downgrade to the first version removes these; the upgrade fills one of them again, from the events.
-HISTORY = {"history", "history_checkpoints"}  # begun anew by every migration from before it; verified below
+HISTORY = {"history", "history_checkpoints", "history_tiles"}  # begun anew by migrations from before; verified below
 ADDED_LATER = {
     "retraining_styles", "playback_pictures", "keys", "key_surgeons", "sign_ins", "recording_uploads",
     "measured_shapes", "calibrations", "policy_demonstrations", "recording_surgeons",
