@@ -7,6 +7,7 @@
     │   ├── BadSettings         a learner, grid or request with impossible settings
     │   ├── BadPlan             a plan or trajectory that the arm cannot follow
     │   ├── AmbiguousDigest     a digest prefix that several objects share
+    │   ├── BadSignature        a signature by another key, or of other bytes
     │   └── BadBag              a replay bag that does not match its plan and its verdict
     ├── WrongHost               the request was sent to a name that is not one of this service
     ├── NotSignedIn             the request has no valid credentials
@@ -304,6 +305,10 @@ class NoMotion(BadPlan):
 
 
 # ---- replay -----------------------------------------------------------------------------------------------------
+
+
+class BadSignature(BadInput):
+    """A signature is of another key, or of other bytes: what it should cover must not be trusted."""
 
 
 class BadBag(BadInput):

@@ -168,21 +168,63 @@ class Note:
 
     checkpoint: Checkpoint
     signatures: tuple[tuple[str, bytes, bytes], ...]
+    text: str
 
     def signed_by(self, public: bytes) -> bool:
         """Return whether an Ed25519 public key signed it under the log's name."""
-        from cryptography.exceptions import InvalidSignature
-        from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
-
         name = self.checkpoint.origin
         for signer, number, signature in self.signatures:
             if (signer, number) == (name, key_id(name, public)):
-                try:
-                    Ed25519PublicKey.from_public_bytes(public).verify(signature, str(self.checkpoint).encode())
-                except InvalidSignature:
-                    return False
-                return True
+                return PublicKey(name, public).signed(str(self.checkpoint).encode(), signature)
         return False
+
+
+@dataclass(frozen=True)
+class PublicKey:
+    """The public key of an installation, under the name of its log: it verifies checkpoints and signed statements."""
+
+    origin: str
+    key: bytes
+
+    @classmethod
+    def read(cls, text: str) -> "PublicKey":
+        """Read a key from the text that `str()` returns.
+
+        Raises:
+            Corrupt: It is not such a text, or was changed.
+        """
+        try:
+            origin, number, encoded = text.strip().split("+", 2)
+            kind_and_key = base64.b64decode(encoded, validate=True)
+            key = cls(origin, kind_and_key[1:])
+            if (kind_and_key[:1], len(key.key), number) != (ED25519, HASH_BYTES, key.number):
+                raise ValueError
+        except ValueError as error:
+            raise Corrupt(
+                "This is not the public key of a service, or it was changed.",
+                "Ask the service for it: its `GET /history/checkpoint` gives it as `verifier`.",
+            ) from error
+        return key
+
+    def __str__(self) -> str:
+        """Return the key as text, in the usual form for verifiers of signed notes."""
+        return f"{self.origin}+{self.number}+{base64.b64encode(ED25519 + self.key).decode()}"
+
+    @property
+    def number(self) -> str:
+        """The number by which signatures name this key, in hex."""
+        return key_id(self.origin, self.key).hex()
+
+    def signed(self, message: bytes, signature: bytes) -> bool:
+        """Return whether a signature is of exactly this message."""
+        from cryptography.exceptions import InvalidSignature
+        from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
+
+        try:
+            Ed25519PublicKey.from_public_bytes(self.key).verify(signature, message)
+        except InvalidSignature:
+            return False
+        return True
 
 
 _NOTE = re.compile(
@@ -216,7 +258,7 @@ def _note(found: re.Match[str]) -> Note:
             continue  # a line that no key of ours wrote
         signatures.append((name, said[:KEY_ID_BYTES], said[KEY_ID_BYTES:]))
     root = base64.b64decode(found["root"])
-    return Note(Checkpoint(found["origin"], int(found["size"]), root), tuple(signatures))
+    return Note(Checkpoint(found["origin"], int(found["size"]), root), tuple(signatures), found[0])
 
 
 def key_id(name: str, public: bytes) -> bytes:
@@ -277,13 +319,17 @@ class SigningKey:
 
     def verifier(self, origin: str) -> str:
         """Return the public key for a log as text, in the usual form for verifiers of signed notes."""
-        return f"{origin}+{key_id(origin, self.public).hex()}+{base64.b64encode(ED25519 + self.public).decode()}"
+        return str(PublicKey(origin, self.public))
 
     def sign(self, checkpoint: Checkpoint) -> str:
         """Return the checkpoint as a signed note."""
         text = str(checkpoint)
-        signature = key_id(checkpoint.origin, self.public) + self._private.sign(text.encode())
+        signature = key_id(checkpoint.origin, self.public) + self.signature_of(text.encode())
         return f"{text}\n\u2014 {checkpoint.origin} {base64.b64encode(signature).decode()}\n"
+
+    def signature_of(self, message: bytes) -> bytes:
+        """Return the signature of a message, 64 bytes, the same each time."""
+        return self._private.sign(message)
 
     def seal_of(self, origin: str) -> "Seal":
         """Return the seal of one log."""

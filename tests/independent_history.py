@@ -48,6 +48,20 @@ def check_inclusion(entry: str, number: int, proof: list[bytes], note: str, veri
     assert node == root, "the entry is not under the checkpoint"
 
 
+def check_envelope(envelope: bytes, verifier: str) -> dict[str, Any]:
+    """Return the in-toto Statement in a DSSE envelope, after checking its signature by a verifier's key."""
+    said = json.loads(envelope)
+    name, number, encoded = verifier.split("+", 2)
+    kind, payload = said["payloadType"].encode(), base64.b64decode(said["payload"])
+    covered = b"DSSEv1 " + b" ".join([str(len(kind)).encode(), kind, str(len(payload)).encode(), payload])
+    (signature,) = [one["sig"] for one in said["signatures"] if one["keyid"] == number]
+    Ed25519PublicKey.from_public_bytes(base64.b64decode(encoded)[1:]).verify(base64.b64decode(signature), covered)
+    statement: dict[str, Any] = json.loads(payload)
+    assert statement["_type"] == "https://in-toto.io/Statement/v1"
+    assert statement["predicate"].get("checkpoint", name).partition("\n")[0] == name
+    return statement
+
+
 def check_disclosed(proof: dict[str, Any], note: str, verifier: str) -> dict[str, Any]:
     """Return the disclosed columns of a row, after checking them down to a signed checkpoint."""
     salt, values = bytes.fromhex(proof["salt"]), {}

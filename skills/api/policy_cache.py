@@ -21,13 +21,16 @@ from skills.api.authorisation import Needs
 from skills.api.responses import KEPT_BYTES, Body, Encoded, answer, negotiate
 from skills.db.changes import Kept, Unasked, changes_of
 from skills.db.session import Database
-from skills.errors import SkillsError, UnknownFormat
+from skills.errors import Busy, SkillsError, UnknownFormat
 from skills.library import consent, integrity, policies
+from skills.library.history import sign_history
 from skills.library.releases import STANDS
+from skills.library.signatures import first_head
 
-Style = tuple[str, str, str]  # surgeon, suture type, and media type of the response, or `POSES`
+Style = tuple[str, str, str]  # surgeon, suture type, and media type of the response, or `POSES`, or `SIGNATURE`
 
 POSES = "pose-style"  # the response is the pose style, as JSON
+SIGNATURE = "signature"  # the response is the signature of the others
 USUAL = frozenset({b"accept", b"if-none-match"})
 READ = USUAL | {b"if-match"}
 LONGEST = 500  # a longer header is left to the route
@@ -108,7 +111,19 @@ class PolicyCache:
         return known.body
 
     def _look(self, key: Style) -> Known:
-        """Read the tables, all within one transaction."""
+        """Read the tables, and where a signature needs it sign the history before.
+
+        Raises:
+            Busy: The history cannot be signed now.
+        """
+        for _ in range(2):
+            if (known := self._seen(key)) is not None:
+                return known
+            sign_history(self._database, None)
+        raise Busy("The history is not signed up to this release yet; try again in a second.")
+
+    def _seen(self, key: Style) -> Known | None:
+        """Read the tables, all within one transaction; None where the release is under no signed checkpoint yet."""
         surgeon, suture, media_type = key
         with self._database.reading() as session:
             release = session.execute(STANDS, {"surgeon": surgeon, "suture": suture}).first()
@@ -117,7 +132,13 @@ class PolicyCache:
                 return Known(known.body, known.release, known.last_day, None)
             served = policies.policy_of(session, surgeon, suture)
             assert release is not None, "both look at the same state"
-            if media_type == POSES:
+            if media_type == SIGNATURE:
+                rows = [("releases", served.release.row), ("policy_versions", served.policy.row)]
+                head = first_head(session.connection(), self._database.history, rows)
+                if head is None:
+                    return None
+                body = self._encoded.signature(served, head, self._database.history)
+            elif media_type == POSES:
                 body = self._encoded.pose_style(served.policy)
             else:
                 body = self._encoded.policy(served.policy, served.release, media_type)

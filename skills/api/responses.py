@@ -32,6 +32,7 @@ from sqlalchemy.orm import Session
 from starlette.types import Send
 
 from skills.db.changes import Changes, Kept
+from skills.db.history import History
 from skills.db.models import PolicyVersion, Release
 from skills.db.service_tables import Job
 from skills.db.session import Database
@@ -40,10 +41,13 @@ from skills.formats import BYTES
 from skills.library import policies
 from skills.library.integrity import covered, learnt
 from skills.library.jobs import ACTIVE, find_job, find_jobs, job_json
+from skills.library.policies import Served
 from skills.library.pose_styles import pose_style_json, poses_of
 from skills.library.recordings import damaged
 from skills.library.releases import outcomes_of
+from skills.library.signatures import sign_files
 from skills.settings import MEBIBYTE, Settings
+from skills.transparency import Note
 
 Condition = Annotated[str | None, Header(max_length=2000)]
 PIECE_BYTES = 64 << 10  # written at once; at most two of them are buffered for a slow client
@@ -194,6 +198,27 @@ class Encoded:
             body = Body(content, JSON, tag_of(content))
             self._kept.put(key, body)
         return body
+
+    def signature(self, served: Served, head: Note, history: History) -> Body:
+        """Return the signature of the responses of a released policy, each as it is sent; they are encoded for it.
+
+        Args:
+            served: The policy and its release.
+            head: A checkpoint of the history that covers both.
+            history: The history, with the key.
+        """
+        policy, release = served.policy, served.release
+        bodies = {
+            "policy.json": self.policy(policy, release, JSON),
+            "policy-version.json": self.policy(policy, None, JSON),
+            "policy.npz": self.policy(policy, release, NPZ),
+        }
+        if policy.poses is not None:
+            bodies["pose-style.json"] = self.pose_style(policy)
+        digests = {name: body.etag.strip('"') for name, body in bodies.items()}
+        facts = {"surgeon": policy.surgeon.slug, "suture": policy.suture, "version": policy.version}
+        content = sign_files(history, head, digests, kind="policy", policy=policy.sha256, **facts)
+        return Body(content, JSON, tag_of(content))
 
     def policies(self) -> set[str]:
         """Return the digests of the policies with cached responses."""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from skills.cli.shell import AsJson, about_path, err, out, print_json, refusing, service, show
+from skills.cli.shell import KEY, AsJson, err, files, out, print_json, read_key, refusing, service, show
 from skills.errors import SkillsError
 
 commands = typer.Typer()
@@ -96,7 +96,7 @@ def backup(to: Annotated[Path, typer.Argument(help="A new file.", dir_okay=False
     from skills.library.backup import back_up
     from skills.settings import settings
 
-    with closing(Database(settings().database_url)) as database, _telling("backing up") as told, _files():
+    with closing(Database(settings().database_url)) as database, _telling("backing up") as told, files():
         manifest = back_up(database, to, told)
     rows, size, taken = sum(table.rows for table in manifest.tables), to.stat().st_size, manifest.created_at
     sentence = f"{to}: {rows} rows, {size / 1e6:.1f} MB, the state of {taken}."
@@ -126,7 +126,7 @@ def restore(
     from skills.library import backup as library
     from skills.settings import settings
 
-    with _files():
+    with files():
         if check:
             manifest = library.check_backup(source)
             rows, taken = sum(table.rows for table in manifest.tables), manifest.created_at
@@ -170,7 +170,7 @@ def erasures(
     from skills.library.backup import keep_erasures
     from skills.settings import settings
 
-    with closing(Database(settings().database_url)) as database, _files():
+    with closing(Database(settings().database_url)) as database, files():
         listed = keep_erasures(database, to)
     surgeons, demos = len(listed.surgeons), len(listed.demos)
     others = {kind: len(names) for kind, names in listed.ended.items() if kind != "demonstrations"}
@@ -197,6 +197,10 @@ def verify(
             dir_okay=False,
         ),
     ] = None,
+    key: Annotated[
+        str | None,
+        typer.Option(help=KEY),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Check every digest, reference and leaf of the history of this installation, or one replay bag.
@@ -206,7 +210,7 @@ def verify(
     if bag is not None:
         from skills.formats.verify import verify_bag
 
-        lines = list(verify_bag(bag))
+        lines = list(verify_bag(bag, None if key is None else read_key(key)))
         _say("\n".join(lines), as_json, whole=True, checked=lines)
         return
     from skills.db.session import Database
@@ -222,7 +226,7 @@ def verify(
         confined_reader(settings()) as reader,
         _telling("verifying") as told,
     ):
-        with _files():
+        with files():
             kept = settings().checkpoints
             head = head or (kept if kept is not None and kept.exists() else None)
             heads = [] if head is None else read_notes(head.read_text())
@@ -241,6 +245,21 @@ def verify(
             err.print(f"{what}: {why}", style="red", markup=False, soft_wrap=True)
     if wrong:
         raise typer.Exit(1)
+
+
+@commands.command("public-key")
+@refusing
+def public_key(
+    to: Annotated[Path | None, typer.Argument(help="A file to write it to as well.", dir_okay=False)] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Print the public key of the service, which verifies bags, policies, cards and the history offline."""
+    with service() as client:
+        key = client.checkpoint().verifier
+    if to is not None:
+        with files():
+            to.write_text(f"{key}\n")
+    _say(key, as_json, key=key)
 
 
 @commands.command()
@@ -289,15 +308,6 @@ def _telling(doing: str) -> Iterator[Callable[[str], None]]:
     """Show a status line on stderr, and yield a callback that updates it."""
     with err.status(doing) as status:
         yield lambda what: status.update(f"{doing} {what}")
-
-
-@contextmanager
-def _files() -> Iterator[None]:
-    """Convert an OSError about a path from the command line into a `SkillsError` with advice."""
-    try:
-        yield
-    except OSError as error:
-        raise SkillsError(f"{error.filename or 'The file'}: {error.strerror}.", *about_path(error)) from error
 
 
 if TYPE_CHECKING:

@@ -1,5 +1,6 @@
 """Commands of training, jobs, policies and plans: from a demonstration to the bag that a robot replays."""
 
+import hashlib
 import json
 import time
 from math import degrees, nan
@@ -9,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from skills.cli.shell import (
+    KEY,
     AsJson,
     OfSurgeon,
     OfSuture,
@@ -17,17 +19,19 @@ from skills.cli.shell import (
     bar,
     cell,
     err,
+    files,
     finished,
     numbers,
     out,
     print_json,
+    read_key,
     refusing,
     result_of,
     service,
     show,
     triple,
 )
-from skills.errors import BadInput, Conflict
+from skills.errors import BadInput, BadSignature, Conflict
 
 if TYPE_CHECKING:
     from skills.client import Client
@@ -401,6 +405,52 @@ def policy_card(
         print_json({"file": to, "size_bytes": to.stat().st_size})
     else:
         out.print(f"{to}: {to.stat().st_size / 1e6:.1f} MB. Research use only.", soft_wrap=True)
+
+
+@policies.command("signature")
+@refusing
+def policy_signature(
+    surgeon: Surgeon,
+    suture: Suture,
+    to: Annotated[Path, typer.Argument(help="The file to write, such as policy.dsse.", dir_okay=False)],
+    card_of: Annotated[int | None, typer.Option("--card", help="Sign the card of this version instead.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Write the service's signature of the released policy: of its JSON, its arrays and its pose style."""
+    with service() as client:
+        client.save_signature(surgeon, suture, to, card_of)
+    if as_json:
+        print_json({"file": to, "size_bytes": to.stat().st_size})
+    else:
+        out.print(f"{to}: check a file with `skills policy verify FILE {to.name} --key KEY`.", soft_wrap=True)
+
+
+@policies.command("verify")
+@refusing
+def policy_verify(
+    file: Annotated[Path, typer.Argument(help="A policy, its arrays, its pose style or a card.", dir_okay=False)],
+    signature: Annotated[Path, typer.Argument(help="The service's signature of it.", dir_okay=False)],
+    key: Annotated[str, typer.Option(help=KEY)],
+    as_json: AsJson = False,
+) -> None:
+    """Check offline that the service with this key signed exactly this file, and print what it said of it."""
+    from skills.attestation import read_envelope
+
+    with files():
+        content, envelope = file.read_bytes(), read_envelope(signature.read_bytes())
+    statement = envelope.statement_by(read_key(key))
+    digest = hashlib.sha256(content).hexdigest()
+    name = next((name for name, covered in statement.subjects.items() if covered == digest), None)
+    if name is None:
+        raise BadSignature(
+            f"{file.name} is none of the files that were signed: it was changed, or is of another version.",
+            "Get the file and its signature again from the service.",
+        )
+    if as_json:
+        print_json({"file": file, "signed_as": name, **statement.facts})
+        return
+    said = ", ".join(f"{fact} {value}" for fact, value in statement.facts.items() if fact != "checkpoint")
+    out.print(f"{file}: signed as {name} ({said}).", soft_wrap=True, markup=False)
 
 
 @commands.command()

@@ -97,6 +97,7 @@ if TYPE_CHECKING:
     from skills.client import Client, Progress
     from skills.schemas.given import Job
     from skills.settings import Settings
+    from skills.transparency import PublicKey
 
 out = Console(highlight=False, width=None if sys.stdout.isatty() else 160)  # in a pipe, wide enough not to wrap digests
 err = Console(stderr=True, highlight=False)
@@ -226,6 +227,26 @@ def about_path(error: OSError) -> list[str]:
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return ["The disk is full; make room, or name a path on another disk."]
     return []
+
+
+@contextmanager
+def files() -> Iterator[None]:
+    """Convert an OSError about a path from the command line into a `SkillsError` with advice."""
+    try:
+        yield
+    except OSError as error:
+        raise SkillsError(f"{error.filename or 'The file'}: {error.strerror}.", *about_path(error)) from error
+
+
+KEY = "The public key of the service that signed it, or a file with the key, as `skills public-key` prints it."
+
+
+def read_key(key: str) -> "PublicKey":
+    """Read a public key from the text of an option, or from the file that it names."""
+    from skills.transparency import PublicKey
+
+    with files():
+        return PublicKey.read(key if key.count("+") >= 2 and not Path(key).exists() else Path(key).read_text())
 
 
 def _problem(error: SkillsError, detail: str) -> dict[str, Any]:

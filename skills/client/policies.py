@@ -40,6 +40,7 @@ from skills.schemas.given import (
     Retraining,
     Rollout,
     Score,
+    SignedEnvelope,
     Version,
 )
 
@@ -344,6 +345,17 @@ class Policies(Connection):
     async def policy_card(self, surgeon: str, suture: str, version: int) -> PolicyCard:
         """Return the card of a version: data, learner, figures, limits, and the digests of all that it rests on."""
         return await self._get(PolicyCard, at("policies", surgeon, suture, "versions", version, "card"))
+
+    @call
+    async def policy_signature(self, surgeon: str, suture: str) -> SignedEnvelope:
+        """Return the service's signature of the files of the released policy: its JSON, arrays and pose style."""
+        return await self._get(SignedEnvelope, at("policies", surgeon, suture, "signature"))
+
+    @call
+    async def save_signature(self, surgeon: str, suture: str, to: Path, card_of: int | None = None) -> Path:
+        """Write the service's signature of the released policy to a file, or that of the card of a version."""
+        path = ("signature",) if card_of is None else ("versions", card_of, "card", "signature")
+        return await self._save(at("policies", surgeon, suture, *path), to, None, accept=JSON)
 
     @call
     async def save_policy_card(self, surgeon: str, suture: str, version: int, to: Path) -> Path:

@@ -1,14 +1,15 @@
-"""Offline verification of a replay bag, from its bytes alone: `skills verify FILE.zip`.
+"""Offline verification of a replay bag, from its bytes alone: `skills verify FILE.zip --key KEY`.
 
     zip --verify_bag--> the checks that passed, one line each; the first failed check raises `BadBag`
 
 The checksums must be complete and correct, the JSON papers must refer to one plan, and each arm's setpoints must be the
 ones that `replay_bag` writes: they are read by the walker, which verifies every checksum of an MCAP file, then compared
-with the closed-form kinematics and the limits of the instrument, and finally written again and compared byte for byte.
+with the closed-form kinematics and the limits of the instrument, and written again and compared byte for byte. Ranges,
+speeds and accelerations of the joints must be those of the verdict.
 
-So a verified bag was exported by this project, and the arm can follow it. Whether the robot's frames, tool and
-surroundings are those of the plan is not verified: `docs/replay.md`. Data that are not played, such as the papers' text
-and the indexes of an MCAP file, are covered only by the checksums, which detect damage but not manipulation.
+So a verified bag has the form that this project writes, and the arm can follow it. Whether the robot's frames, tool
+and surroundings are those of the plan is not verified: `docs/replay.md`. The checksums detect damage, and not somebody
+who computes them again; the signature of the service does, for whoever has its public key (`--key`).
 """
 
 import hashlib
@@ -21,7 +22,8 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from skills.arrays import Floats, Ints
-from skills.errors import BadBag, UnknownInstrument
+from skills.attestation import Statement, read_envelope
+from skills.errors import BadBag, Corrupt, UnknownInstrument
 from skills.formats.archive import Archive, shown
 from skills.formats.bag_folder import METADATA
 from skills.formats.mcap.cdr import WANTED_POSE, Columns, Decoder, Wanted, fields_of
@@ -31,12 +33,18 @@ from skills.formats.topics import JOINT_STATE, POSE
 from skills.formats.writer import DEFINITIONS, Written, metadata_of
 from skills.kinematics import INSERTION, JOINTS, angle_between, forward, instrument_of, joint_margins, matrix_of
 from skills.packing import canonical, sha256
+from skills.planning.trajectory import joint_ratios
+from skills.transparency import PublicKey, read_notes
 
 PLAN, VERDICT, POLICY, README = "plan.json", "verdict.json", "policy.json", "README.txt"
 PAPERS = (PLAN, VERDICT, POLICY, README)
+SIGNATURE = "signature.dsse"  # a bag of an older version has none
+BOUND = ("plan", "verdict", "policy", "trajectory")  # digests in the signed statement
 SAMPLES_LIMIT = 2_000_000  # per arm: 200 passes of 50 s at 200 Hz
 FORM_MM, FORM_RAD = 1e-6, 1e-6  # round-off is 1e-13; a joint that is off by a millionth of its range is found
 GOAL_MM = 1e-3  # an exported pass ends within 1e-9 of its path's end
+JUDGED = ("lowest", "highest", "peak_speed_ratio", "peak_acceleration_ratio")  # of each joint, in the verdict
+JUDGED_OFF = 1e-6  # rad, mm, or a part of a limit; metres in the bag leave 1e-9
 SPEED_RATIO = 1.000001  # a tolerance of 1e-6 for round-off, as in the playback's verdict
 
 _UNTYPED = MessageSchema("", "", b"")
@@ -44,32 +52,42 @@ _SUM = re.compile(r"([0-9a-f]{64})  (\S+)")
 _JOINTS = Wanted(("position", "velocity"))
 
 
-def verify_bag(path: Path) -> list[str]:
+def verify_bag(path: Path, key: PublicKey | None = None) -> list[str]:
     """Verify a replay bag, and return the checks that passed as text.
+
+    Args:
+        path: The file.
+        key: The public key of the service that must have signed it. Without it a signature is not verified.
 
     Raises:
         BadBag: It must not be played; the message has the reason.
+        BadSignature: Another key signed it, or it was changed since.
         UnreadableRecording: The archive or a file in it is damaged or dangerous.
     """
     with path.open("rb") as file:
-        return check_bag(file)
+        return check_bag(file, key)
 
 
-def check_bag(file: BinaryIO) -> list[str]:
+def check_bag(file: BinaryIO, key: PublicKey | None = None) -> list[str]:
     """Verify a replay bag in an open file; see `verify_bag`."""
     archive = Archive(file)
     arms = _arms_in(archive.names)
-    _check_sums(archive)
+    sums = _check_sums(archive)
+    signed, statement = _check_signature(archive, sums, key)
     plan, verdict, policy = (_paper(archive, name) for name in (PLAN, VERDICT, POLICY))
     _check_papers(plan, verdict, policy)
+    _check_statement(statement, plan, verdict)
     motions = [_read_arm(archive, name, plan) for name in arms]
     _check_roles(motions, plan)
+    for motion in motions:
+        _check_judged(motion, verdict["report"])
     return [
         f"{len(archive.names)} files, and {SUMS} has the right checksum of each other file.",
         f"Plan {plan['sha256'][:12]}, the feasible verdict {verdict['sha256'][:12]} and policy {policy['sha256'][:12]} "
         "belong together.",
         *(_told(motion) for motion in motions),
         *([] if plan.get("psm_m") else ["It has no hand-off: no PSM_M, no A2."]),
+        signed,
     ]
 
 
@@ -80,7 +98,7 @@ def _arms_in(names: list[str]) -> list[str]:
     """Return the arms, PSM_A and optionally PSM_M, and refuse any file besides their folders and the papers."""
     arms = [name for name in CRTK_ARMS if f"{name}/{name}.mcap" in names]
     expected = {SUMS, *PAPERS} | {f"{name}/{file}" for name in arms for file in (METADATA, f"{name}.mcap")}
-    missing, extra = sorted(expected - set(names)), sorted(set(names) - expected)
+    missing, extra = sorted(expected - set(names)), sorted(set(names) - expected - {SIGNATURE})
     if not 1 <= len(arms) <= 2:
         raise BadBag(
             f"A bag for replay has one folder for each of one or two arms; this has {len(arms)}. Export it again."
@@ -91,7 +109,8 @@ def _arms_in(names: list[str]) -> list[str]:
     return arms
 
 
-def _check_sums(archive: Archive) -> None:
+def _check_sums(archive: Archive) -> dict[str, str]:
+    """Return the SHA-256 of each file, in hex by name, after comparing it with the file."""
     lines = [_SUM.fullmatch(line) for line in archive.text(SUMS).splitlines()]
     said = {line[2]: line[1] for line in lines if line is not None}
     if None in lines or len(said) != len(lines) or set(said) != {*archive.names} - {SUMS}:
@@ -102,6 +121,40 @@ def _check_sums(archive: Archive) -> None:
                 raise BadBag(
                     f"{name} does not match its checksum in {SUMS}: it was changed or damaged. Export it again."
                 )
+    return said
+
+
+def _check_signature(archive: Archive, sums: dict[str, str], key: PublicKey | None) -> tuple[str, Statement | None]:
+    """Check that the signature covers exactly the other files; return a sentence about it, and what was signed."""
+    covered = {name: digest for name, digest in sums.items() if name != SIGNATURE}
+    if SIGNATURE not in sums:
+        if key is not None:
+            raise BadBag(f"The bag has no {SIGNATURE}: it is of an older version, or it was removed. Export it again.")
+        return f"UNSIGNED: it has no {SIGNATURE}, and anybody could have written it.", None
+    try:
+        envelope = read_envelope(archive.text(SIGNATURE).encode())
+        statement = envelope.statement if key is None else envelope.statement_by(key)
+        head = read_notes(statement.facts["checkpoint"])[0]
+    except (Corrupt, LookupError, TypeError) as error:
+        raise BadBag(f"{SIGNATURE} cannot be read. Export the bag again.") from error
+    if statement.subjects != covered:
+        raise BadBag(f"{SIGNATURE} is of other files than the bag has: they were changed. Export it again.")
+    if key is None:
+        return f"SIGNATURE NOT VERIFIED, of the key {envelope.signers}: give the public key of the service.", statement
+    if not head.signed_by(key.key):
+        raise BadBag(f"The checkpoint in {SIGNATURE} is not of the key that signed it. Export the bag again.")
+    size, root = head.checkpoint.size, head.checkpoint.root.hex()
+    return f"Signed with the key {key.number}, under the history of {size} leaves with the root {root[:12]}.", statement
+
+
+def _check_statement(statement: Statement | None, plan: dict[str, Any], verdict: dict[str, Any]) -> None:
+    """Check that what was signed is about this plan, its verdict, its policy and the motion that was judged."""
+    if statement is None:
+        return
+    said = {name: statement.facts.get(name) for name in ("kind", *BOUND)}
+    here = ("replay-bag", plan["sha256"], verdict["sha256"], verdict["policy"], verdict["report"].get("trajectory"))
+    if said != dict(zip(said, here, strict=True)):
+        raise BadBag(f"{SIGNATURE} is about another plan, verdict, policy or motion. Export the bag again.")
 
 
 def _digest(file: BinaryIO) -> str:
@@ -387,6 +440,34 @@ def _check_roles(motions: list[ArmMotion], plan: dict[str, Any]) -> None:
         raise BadBag(f"{psm_a.name} ends {off_mm:.3g} mm from the end of the motion in {PLAN}. It must not be played.")
     if any(not np.array_equal(motion.stamps_ns, psm_a.stamps_ns) for motion in motions):
         raise BadBag("The two arms have different stamps; they would not move together. Export the bag again.")
+
+
+def _check_judged(motion: ArmMotion, report: dict[str, Any]) -> None:
+    """Check the accelerations, and that the joints' ranges, speeds and accelerations are those that were judged.
+
+    A single pass must stay within those of the whole plan. Reports of older versions have none.
+    """
+    joints = _in_mm(motion.joints)
+    all_one = np.zeros(len(joints), np.int64)  # as the verdict has it: neither arm may jump between passes
+    speed, acceleration = joint_ratios(joints, all_one, motion.rate_hz, motion.instrument)
+    _first("accelerates beyond its limit", motion, acceleration <= SPEED_RATIO)
+    if report.get("arms") is None:
+        return
+    try:
+        (said,) = [one["joints"] for one in report["arms"] if one["name"] == motion.role]
+        judged = np.array([[joint[name] for joint in said] for name in JUDGED], dtype=np.float64)
+        here = np.stack([joints.min(axis=0), joints.max(axis=0), speed.max(axis=0), acceleration.max(axis=0)])
+        off = (here - judged) * np.array([[-1.0], [1.0], [1.0], [1.0]])  # above 0: beyond what was judged
+    except (LookupError, TypeError, ValueError) as error:
+        raise BadBag(f"{VERDICT} has a missing or invalid field. Export the bag again.") from error
+    within = off <= JUDGED_OFF if motion.pass_index is not None else np.abs(off) <= JUDGED_OFF
+    if not within.all():
+        figure, joint = (int(index) for index in np.argwhere(~within)[0])
+        raise BadBag(
+            f"{motion.name} is not the motion that was judged: of {JOINTS[joint]}, {JUDGED[figure]} is "
+            f"{here[figure, joint]:g}, and {VERDICT} has {judged[figure, joint]:g}. It must not be played.",
+            joint=JOINTS[joint],
+        )
 
 
 def _told(motion: ArmMotion) -> str:

@@ -47,6 +47,7 @@ from skills.schemas.policies import (
     CardCombined,
     CardCoverage,
     CardDemonstration,
+    CardHistory,
     CardLearner,
     CardLimits,
     CardLineage,
@@ -65,6 +66,7 @@ from skills.schemas.policies import (
     StartShares,
     TipErrors,
 )
+from skills.transparency import Note
 from skills.verification.monte_carlo import CALIBRATED_MM, UNCALIBRATED_MM
 
 FORMAT = 1  # of the JSON: raise it when a field is removed or changes its meaning
@@ -83,6 +85,12 @@ class Card:
     path: GridPath
     coverage: Coverage
     combined: Combined | None
+
+    def under(self, head: Note) -> "Card":
+        """Return the card with a checkpoint of the history on it."""
+        signed = head.checkpoint
+        history = CardHistory(origin=signed.origin, size=signed.size, root=signed.root.hex(), note=head.text)
+        return replace(self, facts=self.facts.model_copy(update={"history": history}))
 
     def written(self) -> dict[str, Any]:
         """Return the facts as plain values for JSON."""

@@ -11,7 +11,7 @@ from sqlalchemy import Connection, or_, select
 from sqlalchemy.orm import Session
 
 from skills.db import rfc3339
-from skills.db.history import LEAVES, History, latest_leaves
+from skills.db.history import LEAVES, History, Latest, latest_leaves
 from skills.db.logged_rows import as_bytes, logged
 from skills.db.models import PolicyVersion, Release
 from skills.db.tiles import stored_tiles
@@ -19,7 +19,7 @@ from skills.errors import Busy, Corrupt, NotFound
 from skills.library.catalogue import find_surgeon
 from skills.library.history import newest_checkpoint
 from skills.remedies import Action, Remedy
-from skills.transparency import inclusion_proof, leaf_hash, node_from, proven_root, read_notes
+from skills.transparency import Checkpoint, inclusion_proof, leaf_hash, node_from, proven_root, read_notes
 
 DISCLOSED = {  # of the rows that a proof is about; the digests of their other columns reveal nothing without a guess
     "releases": ("row", "policy_row", "surgeon_row", "suture", "released_at", "released_by", "withdrawn_at"),
@@ -78,6 +78,32 @@ def served_json(session: Session, history: History, surgeon: str, suture: str, a
     }
 
 
+def logged_leaf(connection: Connection, table: str, key: str) -> tuple[Latest, int | None]:
+    """Return the newest leaf of a row and its number, None if no checkpoint covers it.
+
+    Raises:
+        Corrupt: The row is not as the leaf says, or has none.
+    """
+    latest = latest_leaves(connection, table, [key]).get(key)
+    rows = list(logged()[table].rows_of(connection, [key]))
+    if latest is None or len(rows) != 1 or not latest.matches(logged()[table].columns, rows[0]):
+        raise Corrupt(f"A row of {table} is not as the history has it, so nothing is signed.", Remedy(Action.VERIFY))
+    number: int | None = connection.scalar(select(LEAVES.c.number).where(LEAVES.c.row == latest.row))
+    return latest, number
+
+
+def covered_leaf(connection: Connection, latest: Latest, number: int, signed: Checkpoint) -> list[bytes]:
+    """Return the hashes that prove a leaf under a checkpoint (RFC 6962).
+
+    Raises:
+        Corrupt: They do not lead to its root.
+    """
+    hashes = inclusion_proof(signed.size, number, node_from(stored_tiles(connection)))
+    if proven_root(leaf_hash(latest.entry.encode()), number, signed.size, hashes) != signed.root:
+        raise Corrupt("The history is not as it was signed, so it proves nothing.", Remedy(Action.VERIFY))
+    return hashes
+
+
 def _proofs(connection: Connection, keys: dict[str, str], note: str) -> list[dict[str, Any]]:
     """Return the proofs of the newest leaves of some rows, given by table and key."""
     leaves = {}
@@ -89,18 +115,14 @@ def _proofs(connection: Connection, keys: dict[str, str], note: str) -> list[dic
     query = select(LEAVES.c.row, LEAVES.c.number).where(LEAVES.c.row.in_([one.row for one in leaves.values()]))
     of_row = {row: number for row, number in connection.execute(query)}  # noqa: C416 - mypy
     signed = read_notes(note)[0].checkpoint
-    size = signed.size
-    if any(number is None or number >= size for number in of_row.values()):
+    if any(number is None or number >= signed.size for number in of_row.values()):
         raise Busy("The history is not signed up to this release yet; try again in a second.")
-    node = node_from(stored_tiles(connection))
     proofs = []
     for table, latest in leaves.items():
         (row,) = logged()[table].rows_of(connection, [keys[table]])
         number = of_row[latest.row]
         assert number is not None
-        hashes = inclusion_proof(size, number, node)
-        if proven_root(leaf_hash(latest.entry.encode()), number, size, hashes) != signed.root:
-            raise Corrupt("The history is not as it was signed, so it proves nothing.", Remedy(Action.VERIFY))
+        hashes = covered_leaf(connection, latest, number, signed)
         proofs.append(
             {
                 "table": table,

@@ -3,9 +3,11 @@
     plan --cleared--> feasible playback --replay_bag--> zip: a folder for each arm, the plan, the verdict, the policy
     plan, recorded replay --compare_with_plan--> distances between the planned and the recorded tip path
 
-The bag holds neither the time nor the place of its export: the same plan gives the same bytes.
+The bag holds neither the time nor the place of its export: the same plan gives the same bytes. It is signed under the
+first checkpoint of the history that covers its verdict.
 """
 
+import hashlib
 import json
 from typing import Any, Literal
 
@@ -27,9 +29,9 @@ from skills.formats.replay_bag import (
     rows_of_pass,
     seal,
 )
-from skills.formats.verify import PLAN, POLICY, README, VERDICT
+from skills.formats.verify import PLAN, POLICY, README, SIGNATURE, VERDICT
 from skills.learning.evaluation import TIE_BREAK, dtw
-from skills.library import consent, policies, releases
+from skills.library import consent, policies, releases, signatures
 from skills.library.demos import find_demo
 from skills.library.integrity import learnt, learnt_in, planned
 from skills.library.plans import describe_plan, find_plan, plan_in_words, trajectory_of
@@ -39,6 +41,7 @@ from skills.packing import canonical, sha256
 from skills.planning.plan import CONSTANT_TURN_DEG, SuturePlan, departure_of
 from skills.planning.trajectory import Trajectory
 from skills.remedies import Action, Remedy
+from skills.transparency import Note
 
 POINTS = 1000  # ours, for either path: one every 0.25 mm of a long pass, and 24 MB to align the two
 
@@ -125,7 +128,9 @@ def replay_bag(
         Conflict: The plan must not be replayed, see `cleared`; the playback checked other samples than those that would
             be exported; or consent was withdrawn during the export.
         BadPlan: The plan has no such pass.
-        Corrupt: A stored plan, policy or verdict does not match its digest.
+        Corrupt: A stored plan, policy or verdict does not match its digest, or is not as the history has it.
+        Busy: The history cannot be signed now.
+        BadSettings: The signing key cannot be read.
     """
     asked = {"tip_error_mm": tip_error_mm, "lower_bound": lower_bound, "constant_turn_deg": constant_turn_deg}
     with database.reading() as session:
@@ -135,6 +140,7 @@ def replay_bag(
         learnt(policy)
         trajectory = trajectory_of(plan)
         papers = {PLAN: _plan(row, trajectory), VERDICT: _verdict(row, verdict), POLICY: _policy(policy)}
+        rows = (("plans", row.row), ("playbacks", verdict.row), ("policy_versions", policy.row))
     # The samples are computed anew; an older version may have computed and checked others.
     if trajectory_digest(trajectory) != papers[VERDICT]["report"].get("trajectory"):
         raise Conflict(
@@ -149,9 +155,20 @@ def replay_bag(
         pass_index=pass_index,
     )
     members = {name: _written(paper) for name, paper in papers.items()}
-    members[README] = _readme(papers[PLAN], arms).encode()
+    head = signatures.head_over(database, rows)
+    members[README] = _readme(papers[PLAN], arms, head).encode()
     for arm in arms:
         members |= folder_of(arm, row.sha256)
+    members[SIGNATURE] = signatures.sign_files(
+        database.history,
+        head,
+        {name: hashlib.sha256(data).hexdigest() for name, data in members.items()},
+        kind="replay-bag",
+        plan=row.sha256,
+        verdict=papers[VERDICT]["sha256"],
+        policy=papers[POLICY]["sha256"],
+        trajectory=papers[VERDICT]["report"]["trajectory"],
+    )
     bag = seal(members)
     with database.reading() as session:  # again: consent or release may have changed while the bag was composed
         again = find_plan(session, row.sha256)
@@ -321,7 +338,7 @@ def _written(paper: dict[str, Any]) -> bytes:
     return json.dumps(paper, indent=2, sort_keys=True, allow_nan=False).encode() + b"\n"
 
 
-def _readme(plan: dict[str, Any], arms: tuple[ArmMotion, ...]) -> str:
+def _readme(plan: dict[str, Any], arms: tuple[ArmMotion, ...], head: Note) -> str:
     """Return the text of the bag's README: its contents, and the figures of each arm to check before it moves."""
     about = [
         f"A needle hand-off for replay: plan {plan['sha256']},",
@@ -330,8 +347,10 @@ def _readme(plan: dict[str, Any], arms: tuple[ArmMotion, ...]) -> str:
         "",
         USE,
         "",
-        "1. `skills verify FILE.zip` first; `sha256sum -c SHA256SUMS` in the unpacked folder checks the files alone.",
+        f"1. `skills verify FILE.zip --key KEY` first, with the public key of the service that wrote {SIGNATURE}.",
         "2. Then follow docs/replay.md of suture-skills from its beginning: a simulator before a robot.",
+        "",
+        f"History {head.checkpoint.origin}: {head.checkpoint.size} leaves, root {head.checkpoint.root.hex()}",
     ]
     if plan["orientation"] == "assumed tool-down":
         about += [

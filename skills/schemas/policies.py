@@ -745,6 +745,15 @@ class Citation(Given):
     bibtex: str
 
 
+class CardHistory(Given):
+    """The first signed checkpoint of the history that covers the version; its root proves the version."""
+
+    origin: str = Field(description="The name of the log.")
+    size: Count = Field(description="The number of its leaves.")
+    root: Sha256 = Field(description="The root of their tree.")
+    note: str = Field(description="The checkpoint as a C2SP signed note.")
+
+
 class PolicyCard(Given):
     """The policy card of one policy version, to attach to a paper; as `text/html` a document with its pictures.
 
@@ -772,3 +781,4 @@ class PolicyCard(Given):
     limits: CardLimits
     lineage: CardLineage
     citation: Citation
+    history: CardHistory | None = Field(default=None, description="Null in the cards of older versions.")

@@ -152,7 +152,8 @@ def test_without_psm_ms_place_there_is_no_bag_for_it():
     arms = arms_of(trajectory(other=False), arm="PSM2", frame=FRAME, jaw_rad=0.1)
     assert [one.name for one in arms] == ["PSM2"]
     lines = checked(papers(trajectory(other=False)) | folder_of(arms[0], "1" * 64))
-    assert len(lines) == 4 and lines[-1] == "It has no hand-off: no PSM_M, no A2."
+    assert len(lines) == 5 and lines[3] == "It has no hand-off: no PSM_M, no A2."
+    assert lines[4].startswith("UNSIGNED")
     with pytest.raises(BadBag, match="PSM_M is in the bag and not in"):
         checked(papers(trajectory()) | folder_of(arms[0], "1" * 64))
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from sqlalchemy import select, update
 
 from skills.db.models import Plan, StoredPlayback
 from skills.db.session import Database
@@ -17,14 +18,18 @@ from skills.formats.verify import check_bag
 from skills.library import releases, replay
 from skills.library.catalogue import find_surgeon, put_surgeon
 from skills.library.demos import withdraw_demo
+from skills.library.history import newest_checkpoint, sign_history
 from skills.library.plans import find_plan, plan_in_words, plan_sutures, trajectory_of
 from skills.library.playbacks import trajectory_digest
 from skills.library.policies import find_version
 from skills.library.replay import check_doubt, cleared, replay_bag
 from skills.packing import canonical, sha256
 from skills.schemas.requests import PlanIn
+from skills.transparency import PublicKey, read_notes
 from skills.verification.playback import Playback, link_pairs
+from tests.independent_history import check_envelope
 from tests.library import cases
+from tests.library.attacks import tampering
 
 ASKED: dict[str, Any] = {"tip_error_mm": 0.65, "lower_bound": 0.9}
 OF_A1_ALONE: dict[str, Any] = ASKED | {"handoff": "none"}
@@ -258,6 +263,38 @@ def test_the_bag_is_complete_deterministic_and_holds_the_plans_samples(database:
         replay_bag(database, plan.sha256, **OF_A1_ALONE)
 
 
+def test_the_bag_is_signed_under_the_first_checkpoint_that_covers_its_verdict(database: Database, plan: Plan):
+    judged(database, plan)
+    data = replay_bag(database, plan.sha256, **OF_A1_ALONE)
+    with database.reading() as session:
+        note = newest_checkpoint(session.connection()) or ""  # the export has signed the history
+    head = read_notes(note)[0].checkpoint
+    key = PublicKey(head.origin, database.history.key.public)
+    line = check_bag(io.BytesIO(data), key)[-1]
+    assert f"the history of {head.size} leaves with the root {head.root.hex()[:12]}" in line
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        assert f"{head.size} leaves, root {head.root.hex()}" in archive.read("README.txt").decode()
+        assert check_envelope(archive.read("signature.dsse"), str(key))["predicate"]["checkpoint"] == note
+    cases.add_surgeon(database, "heron")
+    sign_history(database, None)
+    assert replay_bag(database, plan.sha256, **OF_A1_ALONE) == data
+
+
+def test_a_verdict_that_was_written_past_the_service_makes_no_bag(database: Database, plan: Plan):
+    """Its digest agrees, as of somebody who knows the code; the history does not have it."""
+    judged(database, plan, feasible=False)
+    with database.reading() as session:
+        row = session.scalars(select(StoredPlayback)).one()
+    report = row.report | {"feasible": True}
+    with tampering(database) as connection:
+        values = {"feasible": True, "report": report, "sha256": sha256(canonical([plan.sha256, report]))}
+        connection.execute(update(StoredPlayback).values(**values))
+        connection.commit()
+    assert gate(database, plan) == values["sha256"]
+    with pytest.raises(Corrupt, match="A row of playbacks is not as the history has it"):
+        replay_bag(database, plan.sha256, **OF_A1_ALONE)
+
+
 def papers_say_whose_it_is_and_how_far_it_goes(data: bytes, plan: Plan) -> None:
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         papers = {name: json.loads(archive.read(name)) for name in archive.namelist() if name.endswith(".json")}
@@ -279,7 +316,7 @@ def papers_say_whose_it_is_and_how_far_it_goes(data: bytes, plan: Plan) -> None:
 def samples(database: Database, plan: Plan, pass_index: int | None = None) -> list[tuple[str, int]]:
     """Check a bag, and count each arm's samples."""
     lines = check_bag(io.BytesIO(replay_bag(database, plan.sha256, pass_index=pass_index, **OF_A1_ALONE)))
-    return [(line.split()[0], int(line.split()[3])) for line in lines[2:]]
+    return [(line.split()[0], int(line.split()[3])) for line in lines[2:-1]]
 
 
 def test_both_arms_have_a_bag_and_a_pass_alone_is_a_part_of_the_whole(database: Database):

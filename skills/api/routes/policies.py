@@ -4,6 +4,8 @@ A retraining is a batch of styles. A policy card is the JSON or HTML description
 values only.
 """
 
+import hashlib
+from collections.abc import Callable
 from functools import partial
 from typing import Annotated, Any, Literal
 
@@ -26,7 +28,7 @@ from skills.api.dependencies import (
 from skills.api.openapi import ends, gives, gives_page, gives_stream, router_of, says, starts_job
 from skills.api.pages import HTML, standalone_headers, wants_page
 from skills.api.pages.drawings import card_page
-from skills.api.policy_cache import POSES, PolicyCache
+from skills.api.policy_cache import POSES, SIGNATURE, PolicyCache
 from skills.api.responses import (
     JSON,
     NPZ,
@@ -44,6 +46,7 @@ from skills.api.responses import (
     tag_of,
 )
 from skills.api.sessions import Sessions
+from skills.db.models import PolicyVersion
 from skills.db.session import Database
 from skills.errors import PreconditionFailed
 from skills.learning.policy import next_step
@@ -57,6 +60,7 @@ from skills.library.policies import summary_json, version_json
 from skills.library.pose_styles import about_next, poses_of
 from skills.library.releases import outcomes_of, outcomes_of_styles
 from skills.library.retraining import find_retraining, list_styles, request_retraining, retrained_json
+from skills.library.signatures import head_over, sign_files
 from skills.library.training import near_limits, odds_limits, request_training
 from skills.schemas.given import (
     Job,
@@ -69,10 +73,12 @@ from skills.schemas.given import (
     PoseStyle,
     Retraining,
     Rollout,
+    SignedEnvelope,
 )
 from skills.schemas.given import Version as GivenVersion
 from skills.schemas.requests import JOB, SLUG, NextIn, RetrainingIn, RolloutIn, TrainingIn
 from skills.settings import MEBIBYTE
+from skills.transparency import read_notes
 
 job_router = router_of(route_class=Strict, tags=["jobs"], max_body_size=MEBIBYTE)
 
@@ -247,6 +253,20 @@ async def get_pose_style(
 
 
 @router.get(
+    "/policies/{surgeon}/{suture}/signature", dependencies=[needs("reader")], **gives(SignedEnvelope, 404, 410, 412)
+)
+async def get_policy_signature(
+    surgeon: Slug, suture: Slug, request: Request, if_none_match: Condition = None, if_match: Condition = None
+) -> Response:
+    """Return this service's signature of the style's released policy: of its JSON, its arrays and its pose style.
+
+    The policy itself has the same bytes with or without it. `skills policy verify` checks a file offline.
+    """
+    served: PolicyCache = request.app.state.served
+    return answer(await served.body(surgeon, suture, SIGNATURE), if_none_match, if_match)
+
+
+@router.get(
     "/policies/{surgeon}/{suture}/versions", dependencies=[needs("reader")], **gives_page(Page[GivenVersion], 404, 410)
 )
 def list_versions(
@@ -396,9 +416,25 @@ def get_policy_card(
     It states whether the version is released now and what rests on it, so its ETag changes with these.
     """
     as_page = wants_page(accept, "A policy card")
-    with db.reading() as session:
-        card = card_of(session, policies.find_version(session, surgeon, suture, version))
+    card = _card(db, lambda session: policies.find_version(session, surgeon, suture, version))
     return _answer(card, as_page, if_none_match)
+
+
+@card_router.get(
+    "/policies/{surgeon}/{suture}/versions/{version}/card/signature",
+    dependencies=[needs("reader")],
+    **gives(SignedEnvelope, 404, 410),
+)
+def get_policy_card_signature(surgeon: Slug, suture: Slug, version: Version, db: Db, give: Giving) -> Response:
+    """Return this service's signature of the policy card of a version as it is now: of its JSON and of its page."""
+    card = _card(db, lambda session: policies.find_version(session, surgeon, suture, version))
+    assert card.facts.history is not None
+    (head,) = read_notes(card.facts.history.note)
+    files = {"card.json": _content(card, as_page=False), "card.html": _content(card, as_page=True)}
+    digests = {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
+    policy = card.facts.policy.sha256
+    facts = {"surgeon": surgeon, "suture": suture, "version": version, "policy": policy}
+    return give.bytes(sign_files(db.history, head, digests, kind="card", **facts), JSON)
 
 
 @card_router.get(
@@ -411,13 +447,22 @@ def get_policy_version_card(
 ) -> Response:
     """Return the policy card of a version by the digest under which it is cited."""
     as_page = wants_page(accept, "A policy card")
+    return _answer(_card(db, lambda session: policies.find_by_digest(session, policy)), as_page, if_none_match)
+
+
+def _card(db: Database, find: Callable[[Session], PolicyVersion]) -> Card:
     with db.reading() as session:
-        card = card_of(session, policies.find_by_digest(session, policy))
-    return _answer(card, as_page, if_none_match)
+        version = find(session)
+        card, row = card_of(session, version), version.row
+    return card.under(head_over(db, [("policy_versions", row)]))
+
+
+def _content(card: Card, *, as_page: bool) -> bytes:
+    return card_page(card).encode() if as_page else json_of(card.written(), indented=True)
 
 
 def _answer(card: Card, as_page: bool, if_none_match: str | None) -> Response:
-    content = card_page(card).encode() if as_page else json_of(card.written(), indented=True)
+    content = _content(card, as_page=as_page)
     tag, told = tag_of(content), card.facts.policy
     name = f"{told.surgeon}-{told.suture}-v{told.version}-card.{'html' if as_page else 'json'}"
     headers = {
