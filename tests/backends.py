@@ -28,12 +28,17 @@ BACKENDS = ("sqlite", "postgresql")  # as parameters of a test: by day `tests.by
 
 def fresh(backend: str, folder: Path) -> str:
     """Create an empty migrated database, and return its URL."""
-    name = uuid.uuid4().hex[:12]
+    return copy_of("migrated", _migrate, backend, folder)
+
+
+def copy_of(name: str, fill: Callable[[str], None], backend: str, folder: Path) -> str:
+    """Copy a database that a function of its URL has filled once in a run, and return the URL of the copy."""
+    new = uuid.uuid4().hex[:12]
     if backend == "sqlite":
-        shutil.copy(migrated_file(), folder / f"{name}.sqlite")
-        return f"sqlite:///{folder / name}.sqlite"
-    on_server(f"CREATE DATABASE d{name} TEMPLATE {migrated_template()}")
-    return server_url(f"d{name}")
+        shutil.copy(template(name, fill), folder / f"{new}.sqlite")
+        return f"sqlite:///{folder / new}.sqlite"
+    on_server(f"CREATE DATABASE d{new} TEMPLATE {_template_on_server(name, fill)}")
+    return server_url(f"d{new}")
 
 
 def blank(backend: str, folder: Path) -> str:
@@ -51,12 +56,12 @@ def drop(url: str) -> None:
         on_server(f"DROP DATABASE IF EXISTS {make_url(url).database} WITH (FORCE)")
 
 
-@cache
 def migrated_file() -> Path:
     """Return the file of a migrated database; it is created once in a run."""
     return template("migrated", _migrate)
 
 
+@cache
 def template(name: str, fill: Callable[[str], None]) -> Path:
     """Return a SQLite file to copy, which is created once in a run by a function of the URL of a new file.
 
@@ -73,15 +78,13 @@ def template(name: str, fill: Callable[[str], None]) -> Path:
 
 
 @cache
-def migrated_template() -> str:
-    """Return the name of a migrated database on the server; it is created once in a run."""
-
+def _template_on_server(name: str, fill: Callable[[str], None]) -> str:
     def make(_folder: Path) -> None:
-        on_server("CREATE DATABASE migrated")
-        _migrate(server_url("migrated"))
+        on_server(f"CREATE DATABASE {name}")
+        fill(server_url(name))
 
-    shared("postgresql-template", make)
-    return "migrated"
+    shared(f"postgresql-{name}", make)
+    return name
 
 
 def on_server(statement: str) -> None:

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from hypothesis import settings as hypothesis_settings
@@ -24,6 +24,7 @@ FIRST = ("tests/e2e/", "tests/test_", "tests/jobs/", "tests/library/", "tests/ap
 WAITING = 3  # the first three start processes and wait
 LEFT = pytest.StashKey[list[str]]()
 GARBAGE = 50_000  # objects, some 10 MB
+STATEMENTS = 2000  # more than all tests of a process have; SQLAlchemy's own limit is 500 for each database
 
 # No deadlines, because on a busy machine an example may take any time. By day every run has the same examples, so it is
 # red only for a change; `make nightly` searches at random, with 100 examples in the place of 30.
@@ -84,6 +85,31 @@ def shared_fork_server(reading_server: "ForkServer") -> Iterator[object]:
     yield own
     for module in modules:
         module.confined_reader = own
+
+
+@pytest.fixture(scope="session", autouse=True)
+def shared_statements() -> Iterator[None]:
+    """Let all databases of one kind in a process share their compiled statements, as those of one service do.
+
+    Otherwise each test compiles its statements again for its own database, a fifth of the time of `tests/library`. Two
+    dialects of one class are equal here, because SQLAlchemy looks statements up by the dialect.
+    """
+    from sqlalchemy import create_engine
+    from sqlalchemy.dialects.postgresql.psycopg import PGDialect_psycopg
+    from sqlalchemy.dialects.sqlite.pysqlite import SQLiteDialect_pysqlite
+    from sqlalchemy.util import LRUCache
+
+    statements: LRUCache[object, object] = LRUCache(STATEMENTS)
+
+    def sharing(*about: Any, **how: Any) -> Any:
+        return create_engine(*about, execution_options={"compiled_cache": statements}, **how)
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr("skills.db.session.create_engine", sharing)
+        for dialect in (PGDialect_psycopg, SQLiteDialect_pysqlite):
+            patched.setattr(dialect, "__eq__", lambda one, other: type(one) is type(other))
+            patched.setattr(dialect, "__hash__", lambda one: hash(type(one)))
+        yield
 
 
 @pytest.fixture

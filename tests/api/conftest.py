@@ -10,8 +10,13 @@ from tests.api.service import Service, copy_of_trained, serving
 @pytest.fixture
 def service(tmp_path: Path) -> Iterator[Service]:
     """Yield a service without surgeons."""
-    with serving(backends.fresh("sqlite", tmp_path)) as service:
+    with serving(backends.copy_of("served", _serve, "sqlite", tmp_path)) as service:
         yield service
+
+
+def _serve(url: str) -> None:
+    with serving(url):
+        """It has stored the catalogue of suture types."""
 
 
 @pytest.fixture

@@ -1,6 +1,5 @@
 """An installation with a pose style."""
 
-import shutil
 from pathlib import Path
 
 from tests import backends
@@ -9,16 +8,8 @@ from tests.library.test_pose_styles import turning
 
 
 def of_pose_style(backend: str, folder: Path) -> str:
-    """Return the URL of a database in which kestrel's pose style has a released version, and one that is not.
-
-    On SQLite it is a copy; the first one is created once in a run.
-    """
-    if backend == "sqlite":
-        shutil.copy(backends.template("posed", _learn), folder / "posed.sqlite")
-        return f"sqlite:///{folder / 'posed.sqlite'}"
-    url = backends.fresh(backend, folder)
-    _learn(url)
-    return url
+    """Copy a database in which kestrel's pose style has a released version, and one that is not; return its URL."""
+    return backends.copy_of("posed", _learn, backend, folder)
 
 
 def _learn(url: str) -> None:

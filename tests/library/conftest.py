@@ -1,4 +1,5 @@
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -11,9 +12,14 @@ from tests.library import cases
 @pytest.fixture(params=backends.BACKENDS)
 def database(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Database]:
     """Yield a new database with the catalogue and kestrel, on either back end."""
-    url = backends.fresh(request.param, tmp_path)
+    url = backends.copy_of("kestrels", _add_kestrel, request.param, tmp_path)
     database = Database(url)
-    cases.add_surgeon(database)
     yield database
     database.close()
     backends.drop(url)
+
+
+def _add_kestrel(url: str) -> None:
+    with closing(Database(url)) as database:
+        database.migrate()
+        cases.add_surgeon(database)
