@@ -2,9 +2,11 @@ import gc
 import signal
 import subprocess
 import sys
+import tempfile
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -85,6 +87,28 @@ def shared_fork_server(reading_server: "ForkServer") -> Iterator[object]:
     yield own
     for module in modules:
         module.confined_reader = own
+
+
+@pytest.fixture(scope="session", autouse=True)
+def shared_simulator() -> Iterator[None]:
+    """Let the simulators of a process be forks of one server, which imports PyBullet once for 90 tests.
+
+    `tests/sandbox` calls functions in new interpreters, and so do the services that tests start.
+    """
+    from skills import packing
+    from skills.sandbox.forked import ForkServer
+    from skills.simulation import player
+
+    with closing(ForkServer("skills.simulation.scene", *(("pybullet",) if find_spec("pybullet") else ()))) as server:
+
+        def call(target: str, request: object, *, classes: Any, **how: Any) -> Any:
+            with tempfile.TemporaryFile() as given:
+                packing.write(given, request, classes)
+                return server.call(target, given, classes=classes, **how)
+
+        with pytest.MonkeyPatch.context() as patched:
+            patched.setattr(player, "call_alone", call)
+            yield
 
 
 @pytest.fixture(scope="session", autouse=True)
