@@ -1,4 +1,6 @@
 import gc
+import json
+import os
 import signal
 import subprocess
 import sys
@@ -6,9 +8,10 @@ import tempfile
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
+from copy import deepcopy
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import pytest
 from hypothesis import settings as hypothesis_settings
@@ -26,6 +29,7 @@ FIRST = ("tests/e2e/", "tests/test_", "tests/jobs/", "tests/library/", "tests/ap
 WAITING = 3  # the first three start processes and wait
 LEFT = pytest.StashKey[list[str]]()
 GARBAGE = 50_000  # objects, some 10 MB
+SMALL_BYTES = 100_000
 STATEMENTS = 2000  # more than all tests of a process have; SQLAlchemy's own limit is 500 for each database
 
 # No deadlines, because on a busy machine an example may take any time. By day every run has the same examples, so it is
@@ -68,18 +72,32 @@ def reading_server() -> Iterator["ForkServer"]:
 
 @pytest.fixture(scope="session", autouse=True)
 def shared_fork_server(reading_server: "ForkServer") -> Iterator[object]:
-    """Let all applications and verifications of a process share its fork server."""
+    """Let all applications and verifications of a process share its fork server.
+
+    It reads a small file once: most of the tests upload the same hand-off.
+    """
     from skills.api import app as application
     from skills.library import recordings
 
     own = application.confined_reader
+    read: dict[tuple[object, ...], Any] = {}
+
+    def call(target: str, given: BinaryIO, **how: Any) -> Any:
+        if given.seek(0, os.SEEK_END) > SMALL_BYTES:
+            return reading_server.call(target, given, **how)
+        given.seek(0)
+        asked = (target, given.read(), json.dumps(how["arguments"]), how["limits"], how["returns"])
+        if asked not in read:
+            read[asked] = reading_server.call(target, given, **how)
+        return deepcopy(read[asked])
 
     @contextmanager
     def shared(settings: Settings) -> Iterator["ConfinedReader"]:
         reader = own(settings)
-        reader.server = reading_server
         reading_server.start()
-        yield reader
+        with pytest.MonkeyPatch.context() as patched:
+            patched.setattr(reader.server, "call", call)
+            yield reader
 
     modules = (application, recordings)  # the commands import it from the last one
     for module in modules:
