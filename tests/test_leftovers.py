@@ -38,6 +38,7 @@ def is_gone(folder: Path) -> bool:
     return not alive(int(pid)) and not Path(place).exists()
 
 
+@pytest.mark.nightly  # a run of pytest in a run of pytest
 def test_a_run_with_leftovers_fails_and_names_the_test(tmp_path: Path, monkeypatch):
     monkeypatch.setenv("TESTS_GRACE_S", "0.5")
     run = start(tmp_path, 0.0)

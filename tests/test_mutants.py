@@ -69,6 +69,7 @@ def test_every_explanation_is_of_a_mutant_that_exists():
     assert all(EQUIVALENT.values())
 
 
+@pytest.mark.nightly  # a run of pytest in a run of pytest
 @pytest.mark.parametrize(("new", "status"), [(b"1 + 1 == 2", 0), (b"1 + 1 == 3", 1)])
 def test_a_fork_tells_how_its_tests_ended(new, status, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """The tree is a folder with one test; the process of the fork never returns here."""

@@ -32,7 +32,8 @@ def test_a_need_that_does_not_exist_is_refused(monkeypatch: pytest.MonkeyPatch):
         required()
 
 
-@pytest.mark.parametrize(("require", "code"), [("", 0), pytest.param("browser", 1, marks=pytest.mark.nightly)])
+@pytest.mark.nightly  # runs of pytest in a run of pytest
+@pytest.mark.parametrize(("require", "code"), [("", 0), ("browser", 1)])
 def test_without_a_browser_the_last_line_says_how_to_get_it_and_ci_fails(require: str, code: int):
     environment = {**os.environ, "PATH": "/nowhere", "TESTS_REQUIRE": require}
     command = [sys.executable, "-m", "pytest", "-n", "0", OF_THE_PAGE]

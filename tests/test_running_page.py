@@ -76,6 +76,14 @@ def agrees(runner: Any, policy: Policy, states: NDArray[np.int64]) -> None:
             assert runner.next(here, phase) == (step.phase, step.action, step.done), (state, phase)
 
 
+IN_JSON = [(name, "json") for name in WALKS]
+IN_OTHER_FORMS = [  # by day of one walk
+    pytest.param(name, form, marks=[pytest.mark.nightly] * (number > 0))
+    for number, name in enumerate(WALKS)
+    for form in ("live", "npz")
+]
+
+
 @pytest.fixture
 def loaded(monkeypatch: pytest.MonkeyPatch) -> Callable[[Policy, str], Any]:
     """Return a function that writes a policy as the service does, and reads it as the page does."""
@@ -91,13 +99,12 @@ def loaded(monkeypatch: pytest.MonkeyPatch) -> Callable[[Policy, str], Any]:
     return load
 
 
-@pytest.mark.parametrize("form", ["json", "live", "npz"])
 @pytest.mark.parametrize(
     "rule",
     [{}, {"phased": False}, {"join_share": 0.5}, {"join_share": 1.0}],
     ids=["phase", "cell", "joining half", "joining the start"],
 )
-@pytest.mark.parametrize("name", WALKS)
+@pytest.mark.parametrize(("name", "form"), [*IN_JSON, *IN_OTHER_FORMS])
 def test_the_runner_acts_as_the_service_in_every_state_and_phase(loaded, name, rule, form):
     policy = learnt(name, **rule)
     runner = loaded(policy, form)

@@ -112,6 +112,7 @@ def test_without_the_extra_tables_are_learnt_and_networks_name_their_needs():
     assert "make deep" in refused and "suture-skills[deep]" in refused
 
 
+@pytest.mark.nightly  # by day tests/test_architecture lets skills/deep alone import it
 def test_neither_the_service_nor_a_worker_nor_the_client_loads_torch():
     code = (
         "import sys, skills.api.app, skills.library, skills.jobs.worker, skills.client, skills.deep\n"

@@ -1,4 +1,4 @@
-"""`make demo`: with one style and one suture point by day, as a new user runs it at night."""
+"""`make demo`: with one style, one suture point and no film by day, as a new user runs it at night."""
 
 import os
 import re
@@ -19,6 +19,7 @@ from skills import demo
 every = demo.load_samples
 demo.load_samples = lambda client: [one for one in every(client) if one.surgeon in {FEW}][:1]
 demo.N_POINTS = 1
+demo.save_film = lambda *_: None
 raise SystemExit(demo.main())
 """
 
@@ -55,6 +56,8 @@ def test_the_demo_does_the_main_job_and_exits_with_0(
     assert len(list(pictures.glob("*-playback.png"))) >= len(styles)
     begins = {".png": b"\x89PNG", ".gif": b"GIF89a", ".mp4": b"\0\0\0"}
     assert all(picture.read_bytes().startswith(begins[picture.suffix]) for picture in pictures.iterdir())
+    if how is not AS_IT_IS:
+        return
     drawn = [
         f"kestrel-simple-running-{kind}" for kind in ("animation.mp4", "animation.gif", "joints.png", "clearance.png")
     ]

@@ -279,6 +279,7 @@ def test_a_batch_is_started_and_watched(tab: Watched) -> None:
     tab.shoot("batch")
 
 
+BY_DAY = "phone-dark"  # with one 3-D view
 BY_NIGHT = [pytest.param(name, marks=pytest.mark.nightly) for name in ("desk-light", "desk-dark", "phone-light")]
 PAGES = {
     "style": f"/pages/styles/{STYLE}",
@@ -302,12 +303,14 @@ def pages(url: str, client: Client) -> dict[str, str]:
     return PAGES | {"recording": f"/pages/recordings/{demo.recording}", "plan": f"/pages/plans/{plan.sha256}"}
 
 
-@pytest.mark.parametrize("name", ["phone-dark", *BY_NIGHT])
+@pytest.mark.parametrize("name", [BY_DAY, *BY_NIGHT])
 def test_every_page_fits_its_window_and_says_what_it_is_for(
     browser: Browser, url: str, pages: dict[str, str], name: str
 ) -> None:
-    with visiting(browser, url, phone="phone" in name, dark="dark" in name) as tab:
+    how = {"phone": "phone" in name, "dark": "dark" in name}
+    with visiting(browser, url, **how) as seen, visiting(browser, url, **how, view=name != BY_DAY) as flat:
         for which, path in pages.items():
+            tab = seen if which in DRAWN else flat
             tab.open(path)
             if which in DRAWN:
                 expect(tab.page.locator(DRAWN[which])).to_have_attribute("data-drawn", "true")

@@ -50,6 +50,7 @@ def test_killed_and_stopped_workers_are_replaced_and_jobs_have_one_result(empty_
         assert len(house.executors()) <= 1  # the killed one, until it is forgotten
 
 
+@pytest.mark.nightly  # 11 s of waiting; by day tests/e2e stops a service and its worker
 def test_a_worker_goes_when_its_parent_is_gone(empty_house: House):
     """The real child with the real library is started by a process that is then killed."""
     parent = subprocess.Popen(

@@ -23,6 +23,7 @@ print(kept, resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 """
 
 
+@pytest.mark.nightly  # 2 s of processor time for a setting that nothing else changes
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="a C library other than glibc")
 def test_arrays_of_megabytes_cost_no_pages_the_second_time():
     run = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True, check=True, timeout=END_S)

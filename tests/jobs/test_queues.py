@@ -58,6 +58,7 @@ def test_pictures_of_a_worker_that_died_are_drawn_by_another(empty_house: House)
         assert house.noted("wrote", row) == [house.job(row).result["by"]] != [first]
 
 
+@pytest.mark.nightly  # 4 s of processor time; by day pictures hold nothing up
 def test_a_worker_that_is_told_to_go_does_not_stay_for_pictures(empty_house: House, held: Path):
     house = empty_house
     with house.workers(1) as workers:

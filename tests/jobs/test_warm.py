@@ -26,6 +26,7 @@ def touched():
 """
 
 
+@pytest.mark.nightly  # slow if it fails, not wrong
 def test_a_worker_warms_up_first_so_its_job_loads_and_compiles_nothing():
     code = "from skills.jobs.worker import _library\n_library()\nfinish()\nwarm = touched()\nlearn()\n"
     each = told(start(WARM + code + "dtw(path.tip_mm, path.tip_mm[::-1])\ntell(warm=warm, after=touched())"))
@@ -33,6 +34,7 @@ def test_a_worker_warms_up_first_so_its_job_loads_and_compiles_nothing():
     assert sum(each["after"].values()) >= 3
 
 
+@pytest.mark.nightly  # slow if it fails, not wrong
 def test_a_server_warms_up_what_a_rollout_calls():
     asked = "dtw(path.tip_mm, path.tip_mm[::-1])\npalette_of(path.tip_mm)\n"
     asked += "next_pose(TWO_POSES, TWO_POSES.tip_mm[1], TWO_POSES.rotation_xyzw[0], None, TubeLimits())\n"

@@ -96,6 +96,7 @@ def test_without_a_writable_folder_every_process_compiles_and_logs_it(read_only)
     assert "every process compiles them again; set NUMBA_CACHE_DIR" in alone["logged"]
 
 
+@pytest.mark.nightly  # it compiles
 def test_every_loop_compiles_one_signature_for_all_number_types():
     # Two processes that compile a loop for two signatures at once can store one's code under the other's name: numba
     # gives both files the same name. This once made a process learn with alpha 0 for 0.5, and report that as settled.

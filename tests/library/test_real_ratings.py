@@ -50,11 +50,12 @@ def jigsaws(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     shutil.rmtree(folder)
 
 
+@pytest.mark.nightly  # 8 s; by day `test_calibrations` refuses a synthetic cohort
 @pytest.mark.parametrize(
     ("task", "left_out"),
     [
         ("Knot_Tying", "without a kinematics file: Knot_Tying_G004."),
-        pytest.param("Needle_Passing", "unrated: Needle_Passing_B005, Needle_Passing_F002", marks=pytest.mark.nightly),
+        ("Needle_Passing", "unrated: Needle_Passing_B005, Needle_Passing_F002"),
     ],
 )
 def test_a_user_is_refused_with_the_figures_and_nothing_is_stored(

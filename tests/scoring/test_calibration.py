@@ -79,7 +79,7 @@ def test_with_labels_shuffled_many_times() -> None:
 
 
 def test_chance_is_told_where_nothing_shows() -> None:
-    found = validate(cohort(3, told=0.0), permutations=40)
+    found = validate(cohort(3, told=0.0), permutations=20)
     print(found)
     assert found.chance.rho_p > 0.05
     assert found.all_figures.rho < found.chance.rho_95
@@ -137,11 +137,11 @@ HOPELESS = ("nothing", "surgeon", "duration", "shared")
 
 
 def test_models_of_nothing_and_of_the_duration_alone_are_refused() -> None:
-    assert sum(accepted(kind, 1) for kind in HOPELESS) == 0
+    assert sum(accepted(kind, 1) for kind in ("surgeon", "shared")) == 0  # the most deceptive; all of them at night
 
 
 def test_a_model_that_truly_predicts_is_accepted() -> None:
-    assert accepted("smoothness", 2) == 2
+    assert accepted("smoothness", 1) == 1
 
 
 @pytest.mark.nightly

@@ -146,6 +146,7 @@ def test_where_surfaces_are_close_every_sample_is_looked_at():
     assert low.clearances_mm[near].min() == low.clearances_mm.min()
 
 
+@pytest.mark.nightly  # by day rows of two passes
 @needs_simulator
 def test_a_long_row_of_passes_has_a_pad_under_all_of_it():
     far = time_parametrise([hand_off(-25.0 * k, with_a2=False) for k in range(6)], rate_hz=20.0, speed_mm_s=40.0)
