@@ -45,6 +45,7 @@ def pytest_configure(config: pytest.Config) -> None:
         config.stash[GUARD] = leftovers.begin()
         if getattr(config.option, "numprocesses", None):
             compile_loops()
+            compile_tests()
         signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C: everything started is cleaned up
 
 
@@ -58,6 +59,14 @@ def compile_loops() -> None:
             )
             subprocess.run([sys.executable, "-c", code], check=True, cwd=PACKAGE.parent)
             return
+
+
+def compile_tests() -> None:
+    """Compile the tests once if none is compiled, as in CI, before every process of the run compiles all of them."""
+    tests = Path(__file__).parent
+    if not sys.dont_write_bytecode and not any(tests.glob("__pycache__/test_*-pytest-*.pyc")):
+        command = [sys.executable, "-m", "pytest", "-n", "0", "--collect-only", "-qq"]
+        subprocess.run(command, cwd=tests.parent, stdout=subprocess.DEVNULL)
 
 
 @pytest.fixture(scope="session")
