@@ -41,6 +41,12 @@ def copy_of(name: str, fill: Callable[[str], None], backend: str, folder: Path) 
     return server_url(f"d{new}")
 
 
+def place(file: Path) -> str:
+    """Put an empty migrated SQLite database at a path, and return its URL."""
+    shutil.copy(migrated_file(), file)
+    return f"sqlite:///{file}"
+
+
 def blank(backend: str, folder: Path) -> str:
     """Create a database without any table, and return its URL."""
     name = uuid.uuid4().hex[:12]
@@ -73,6 +79,7 @@ def template(name: str, fill: Callable[[str], None]) -> Path:
         filled, copied = (sqlite3.connect(folder / f"{one}.sqlite") for one in ("filled", name))
         with closing(filled), closing(copied):
             filled.backup(copied)
+        (folder / f"{name}.sqlite").chmod(0o600)
 
     return shared(f"template-{name}", make) / f"{name}.sqlite"
 

@@ -31,6 +31,7 @@ from skills.library.catalogue import put_surgeon
 from skills.seeds.recordings import sample_recordings
 from skills.settings import Settings, settings
 from skills.simulation import film
+from tests import backends
 from tests.formats import bags, lerobots, trials, videos
 from tests.library import cases, exports
 
@@ -40,7 +41,7 @@ STYLE = ("wren", "simple-running")
 @pytest.fixture
 def with_worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Yield a function that runs a command on a separate database and returns its exit code and its output."""
-    monkeypatch.setenv("SKILLS_DATABASE_URL", f"sqlite:///{tmp_path / 'skills.sqlite'}")
+    monkeypatch.setenv("SKILLS_DATABASE_URL", backends.place(tmp_path / "skills.sqlite"))
     monkeypatch.setenv("SKILLS_WORKERS", "1")  # tests/jobs has several
     monkeypatch.delenv("SKILLS_SERVER", raising=False)
     settings.cache_clear()
@@ -123,8 +124,7 @@ def test_videos_of_the_users_own_dataset_are_exported_with_the_recordings(skills
     assert sorted(one.name for one in tmp_path.iterdir() if one.is_dir()) == ["dataset", "theirs"]
 
 
-def test_from_a_bag_folder_to_a_released_policy_and_a_plan(with_worker, tmp_path: Path) -> None:
-    skills = with_worker
+def test_from_a_bag_folder_to_a_released_policy_and_a_plan(skills, tmp_path: Path) -> None:
     bag = tmp_path / "rosbag2"
     bag.mkdir()
     (bag / "recording.mcap").write_bytes(next(s for s in sample_recordings() if s.surgeon == "wren").data)
@@ -178,6 +178,12 @@ def test_from_a_bag_folder_to_a_released_policy_and_a_plan(with_worker, tmp_path
     assert skills("erase", "wren", "--yes")[0] == 0
     code, said = skills("train", *STYLE)
     assert (code, "erased permanently" in said) == (1, True)
+
+
+def test_a_command_trains_with_a_worker_process_of_its_own(with_worker) -> None:
+    assert with_worker("seed")[0] == 0
+    code, said = with_worker("train", *STYLE, "--release", "--json")
+    assert (code, json.loads(said)["result"]["released"]) == (0, True), said
 
 
 def test_a_plan_is_played_drawn_exported_and_its_bag_verified(
@@ -613,6 +619,7 @@ def completed(line: str, **settings: str) -> tuple[list[str], str]:
 
 def test_tab_proposes_the_surgeons_and_sutures_that_there_are(skills, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr("skills.cli.shell.LIMIT_S", 60.0)
+    (tmp_path / "skills.sqlite").unlink()
     assert complete_surgeons("") == [], "there is no database yet"
     assert not (tmp_path / "skills.sqlite").exists()
     for name in ("kestrel", "kite", "wren"):

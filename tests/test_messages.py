@@ -18,6 +18,7 @@ from skills.remedies import Action, Door, Remedy, did_you_mean, read_remedies
 from skills.schemas.requests import in_words
 from skills.seeds.recordings import sample_recordings
 from skills.settings import settings
+from tests import backends
 from tests.library import cases
 
 ROOT = Path(skills.__file__).parent
@@ -144,7 +145,7 @@ def door(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Client]:
     """Yield the client of a separate service; the commands use the same database."""
     from skills.cli.shell import connect
 
-    monkeypatch.setenv("SKILLS_DATABASE_URL", f"sqlite:///{tmp_path / 'skills.sqlite'}")
+    monkeypatch.setenv("SKILLS_DATABASE_URL", backends.place(tmp_path / "skills.sqlite"))
     monkeypatch.delenv("SKILLS_SERVER", raising=False)
     settings.cache_clear()
     with connect(settings()) as client:

@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 from skills.cli import app
 from skills.seeds.recordings import sample_recordings
 from skills.settings import settings
+from tests import backends
 from tests.library import rated
 
 STYLE = ("--surgeon", "kestrel", "--suture", "simple-running")
@@ -19,7 +20,7 @@ Run = Callable[..., tuple[int, str]]
 @pytest.fixture
 def skills(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Run]:
     """Yield a function that runs a command on a separate database and returns its exit code and its output."""
-    monkeypatch.setenv("SKILLS_DATABASE_URL", f"sqlite:///{tmp_path / 'skills.sqlite'}")
+    monkeypatch.setenv("SKILLS_DATABASE_URL", backends.place(tmp_path / "skills.sqlite"))
     monkeypatch.delenv("SKILLS_SERVER", raising=False)
     settings.cache_clear()
 

@@ -13,6 +13,7 @@ import httpx2 as httpx
 import pytest
 
 from skills.client import Client
+from tests import backends
 from tests.waiting import END_S, until
 
 WORKER, FORK_SERVER = "skills.jobs.worker", "skills.sandbox.fork_server"
@@ -36,6 +37,7 @@ class Service:
             self.port = free.getsockname()[1]
         self.url = f"http://127.0.0.1:{self.port}"
         self.database = folder / "skills.sqlite"
+        backends.place(self.database)
         self.environment = {
             **{k: v for k, v in os.environ.items() if not k.startswith("SKILLS_")},
             "SKILLS_DATABASE_URL": f"sqlite:///{self.database}",
