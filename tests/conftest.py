@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import pytest
 from hypothesis import settings as hypothesis_settings
 
-from skills.settings import Settings
+from skills.settings import Settings, settings
 from tests import by_day, leftovers
 from tests.needs import need, required
 
@@ -161,6 +161,15 @@ def shared_statements() -> Iterator[None]:
             patched.setattr(dialect, "__eq__", lambda one, other: type(one) is type(other))
             patched.setattr(dialect, "__hash__", lambda one: hash(type(one)))
         yield
+
+
+@pytest.fixture(scope="module", autouse=True)
+def forgotten() -> None:
+    """Let no file of tests find in this process's caches the settings or the policies of another."""
+    from skills.library import integrity
+
+    settings.cache_clear()
+    integrity.forget(integrity.remembered())
 
 
 @pytest.fixture

@@ -1,10 +1,11 @@
 """Lists, filters and conditional requests."""
 
 import re
+from collections.abc import Iterator
 
 import pytest
 
-from tests.api.service import CSV, GOAL_MM, KESTREL, POLICY, Service, assert_problem
+from tests.api.service import CSV, GOAL_MM, KESTREL, POLICY, Service, assert_problem, copy_of_trained, serving
 from tests.library import cases
 
 
@@ -74,15 +75,20 @@ def test_a_release_that_was_overtaken_is_not_withdrawn_unseen(trained: Service):
 # ---- lists ------------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def many(trained: Service) -> Service:
-    """Return a service with five surgeons and three demonstrations of kestrel, one of them withdrawn."""
+@pytest.fixture(scope="module")
+def many(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
+    """Yield a service with five surgeons and three demonstrations of kestrel, one withdrawn, for tests that read."""
+    with serving(copy_of_trained(tmp_path_factory.mktemp("many"))) as service:
+        fill(service)
+        yield service
+
+
+def fill(trained: Service) -> None:
     for slug in ("heron", "kestrel-2", "plover", "wren"):
         trained.client.put_surgeon(slug, skill_level="novice" if slug == "wren" else "intermediate")
     for shift in (1.0, 2.0):
         trained.client.add_demo(cases.hand_off((0.0, 0.0, shift)), media_type=CSV, **KESTREL)
     trained.client.withdraw_demo(trained.client.demos()[0]["id"])
-    return trained
 
 
 def ids(service: Service, address: str, name: str = "id") -> list[str]:

@@ -87,6 +87,7 @@ def page(without) -> Page:
     return Page((without[0] / "index.html").read_text())
 
 
+@pytest.mark.nightly  # of one report, which takes 8 s of processor time
 def test_without_the_papers_data_the_report_draws_the_sample_and_says_so(without):
     to, code, printed, said = without
     assert code == 0, printed + said
@@ -97,6 +98,7 @@ def test_without_the_papers_data_the_report_draws_the_sample_and_says_so(without
     assert "DTW (mm)" in printed
 
 
+@pytest.mark.nightly  # of one report, which takes 8 s of processor time
 def test_the_page_has_every_figure_and_names_command_seed_and_tolerance(without, page):
     assert page.sections == [*FIGURES, "table-1", "rivals"]
     assert len(page.alts) == len(PICTURES) and all(page.alts)
@@ -105,6 +107,7 @@ def test_the_page_has_every_figure_and_names_command_seed_and_tolerance(without,
     assert made == [" ".join(QUICK)] * len(SECTIONS)
 
 
+@pytest.mark.nightly  # of one report, which takes 8 s of processor time
 def test_the_page_is_self_contained(without, page):
     assert not {"script", "link", "iframe", "object", "embed", "form", "base"} & set(page.tags)
     assert all(re.match(r"data:image/png;base64,|#", address) for address in page.addresses)
@@ -113,6 +116,7 @@ def test_the_page_is_self_contained(without, page):
         assert way_out not in text
 
 
+@pytest.mark.nightly  # of one report, which takes 8 s of processor time
 def test_the_numbers_of_the_page_are_those_of_the_core(page):
     path = sample_source().path
     head, *rows = page.tables["fig-8-sample"]
@@ -127,6 +131,7 @@ def test_the_numbers_of_the_page_are_those_of_the_core(page):
     assert page.tables["seeds-sample"][3][1:] == ["2", "1", "2", "2"]  # with the phase both seeds learn one table
 
 
+@pytest.mark.nightly  # of one report, which takes 8 s of processor time
 def test_the_pages_rmse_is_a_thousand_times_the_printed_one(page):
     assert [row[1:3] for row in page.tables["rmse"][1:]] == [
         ["0.0044", "4.432"],
@@ -135,6 +140,7 @@ def test_the_pages_rmse_is_a_thousand_times_the_printed_one(page):
     ]
 
 
+@pytest.mark.nightly  # of one report, which takes 8 s of processor time
 def test_the_page_says_how_policy_and_rivals_fare_with_slips(page):
     head, *rows = page.tables["rivals-sample"]
     assert head[:3] == ["slip", "by", "follow (%)"]
@@ -165,6 +171,7 @@ def test_the_same_command_twice_gives_the_same_numbers_and_pictures(without, tmp
         assert (tmp_path / file.name).read_bytes() == file.read_bytes(), file.name
 
 
+@pytest.mark.nightly  # of one report, which takes 8 s of processor time
 def test_programs_get_the_tables_as_json(without):
     tables = {table["name"]: table for table in json.loads((without[0] / "numbers.json").read_text())}
     assert {"fig-5-sample", "seeds-sample", "table-1-sample", "ranges-sample", "rivals-sample", "rmse"} <= set(tables)

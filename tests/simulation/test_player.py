@@ -208,7 +208,7 @@ def test_importing_the_simulators_package_does_not_need_pybullet():
 
 
 def faulty(fault: str) -> Playback:
-    return play(TRAJECTORY, target=f"tests.simulation.faults:{fault}", timeout_s=20.0)
+    return play(TRAJECTORY, target=f"tests.simulation.faults:{fault}")
 
 
 def test_a_sound_answer_is_taken_whoever_gives_it():
