@@ -202,7 +202,7 @@ class PublicKey:
         except ValueError as error:
             raise Corrupt(
                 "This is not the public key of a service, or it was changed.",
-                "Ask the service for it: its `GET /history/checkpoint` gives it as `verifier`.",
+                "Get it again from the service, which gives it with the newest checkpoint of its history.",
             ) from error
         return key
 

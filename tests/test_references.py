@@ -53,7 +53,10 @@ ELSEWHERE = {  # other libraries, columns and JSON, by the first part of the nam
     ),
 }
 ALSO_ELSEWHERE = {"policy.model_dump", "report.path_states"}  # pydantic's and JSON's, beginning as names of ours do
-SUFFIXES = {"c", "csv", "json", "jsonl", "lock", "md", "parquet", "py", "sqlite", "toml", "txt", "urdf", "yaml", "zip"}
+SUFFIXES = {
+    *("c", "csv", "dsse", "json", "jsonl", "lock", "md", "parquet", "py", "sqlite", "toml", "txt", "urdf", "yaml"),
+    "zip",
+}
 
 
 @dataclass(frozen=True)

@@ -352,6 +352,13 @@ class Policies(Connection):
         return await self._get(SignedEnvelope, at("policies", surgeon, suture, "signature"))
 
     @call
+    async def policy_card_signature(self, surgeon: str, suture: str, version: int) -> SignedEnvelope:
+        """Return the service's signature of the card of a version as it is now, as JSON and as a page."""
+        return await self._get(
+            SignedEnvelope, at("policies", surgeon, suture, "versions", version, "card", "signature")
+        )
+
+    @call
     async def save_signature(self, surgeon: str, suture: str, to: Path, card_of: int | None = None) -> Path:
         """Write the service's signature of the released policy to a file, or that of the card of a version."""
         path = ("signature",) if card_of is None else ("versions", card_of, "card", "signature")
