@@ -338,7 +338,7 @@ def fill(folder: Path) -> None:
             cases.hand_off((2.5, 0.0, 0.0)), surgeon="linnet", suture="simple-running", **failed
         )
         place = {"position_mm": (5.0, 55.0, -125.0)}
-        plan = installation.client.plan("kestrel", "simple-running", [place], handoff="none")
+        plan = installation.client.plan("kestrel", "simple-running", [place], handoff="none", tissue_mm=-170.0)
         (folder / "plan.txt").write_text(plan["id"] if isinstance(plan, dict) else plan.id)
     sample = next(one for one in sample_recordings() if one.surgeon == "wren").data
     table = cases.hand_off()

@@ -91,7 +91,7 @@ def main() -> None:
             service.train(release=True)
             service.http.get(POLICY)
         with tracing("suture point to replay bag"), serving(url, replay_lower_bound=0.0) as service:
-            plan = service.client.plan(**KESTREL, suture_points=[GOAL_MM], handoff="none")
+            plan = service.client.plan(**KESTREL, suture_points=[GOAL_MM], handoff="none", tissue_mm=-170.0)
             service.client.play(plan["id"])
             service.work()
             service.http.get(f"/plans/{plan['id']}/trajectory?handoff=none", headers={"Accept": "application/zip"})

@@ -61,6 +61,6 @@ def _tell(url: str) -> None:
         service.work()
         client.train(**KESTREL, learner={"kind": "value-iteration"}, release=True)
         service.work()
-        plan = client.plan(**KESTREL, suture_points=[{"position_mm": GOAL_MM}], handoff="none")
+        plan = client.plan(**KESTREL, suture_points=[{"position_mm": GOAL_MM}], handoff="none", tissue_mm=-170.0)
         client.play(plan["sha256"])
         service.work()
