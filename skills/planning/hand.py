@@ -6,11 +6,11 @@ A fitted path (`skills.planning.path_fit`) has a clock: the times of the demonst
 tempo of a pass are those recorded at the same time, and not at the nearest place: where a path crosses itself, or the
 hand turns at rest, nearness decides nothing. All of this is ours; the paper holds the orientation.
 
-* The hand rests before its first sample and after its last. Orientation and jaw are averaged by the Hann window that
-  takes the tremor out of the path (`TREMOR_S`), over a time that is longer by half a window on both sides. The tip on
-  the fitted path is averaged by half the window, since the path has been already; without that it would change its
-  speed from point to point. So a pass begins and ends at rest, at the first and the last recorded pose exactly. In
-  bends the tip leaves the path by `Hand.deviation_mm`.
+* The hand rests before its first sample and after its last. Tip, orientation and jaw are averaged by the Hann window
+  that takes the tremor out of the path (`TREMOR_S`), over a time that is longer by half a window on both sides. The
+  path has been averaged already, but without that the tip would change its speed from point to point, and jerk more
+  than the surgeon's. So a pass begins and ends at rest, at the first and the last recorded pose exactly. In bends the
+  tip leaves the path by `Hand.deviation_mm`.
 * Before the demonstration is joined nothing was recorded: the tip goes along the path's approach at the mean speed of
   what follows, and the jaw is held as it was where the path joins.
 * A pause of the hand remains one, also one in which the arm was not driven.
@@ -129,7 +129,7 @@ def hand_along(demo: Demo, fitted: FittedPath, *, turning: bool) -> Hand:
     times = times[(times >= clock_s[0]) & (times <= clock_s[-1])]
     recorded_s = np.maximum(times, joins_s)  # during the approach the jaw is as where the path joins
     points = np.arange(len(fitted.tip_mm), dtype=np.float64)
-    grid_s, tip_mm = _calm(times, _at(np.interp(times, clock_s, places), points, fitted.tip_mm), TREMOR_S / 2)
+    grid_s, tip_mm = _calm(times, _at(np.interp(times, clock_s, places), points, fitted.tip_mm), TREMOR_S)
     turned, opened = None, None
     if turning and demo.rotation_xyzw is not None:
         _, turned = _calm(times, _at(recorded_s, demo.stamps_s, same_signs(demo.rotation_xyzw)), TREMOR_S)

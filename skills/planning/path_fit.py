@@ -207,8 +207,10 @@ def _guide(followed: Rollout, demonstrated: Trace, start_mm: Floats | None) -> t
         tip = _blended(tip[::-1], goal, over_mm)[::-1]
     of_visit = np.concatenate((np.arange(joined + 1), visits[part], [last]))
     seconds = demonstrated.seconds[part]
-    # A hand at its own start moves off when the surgeon did; elsewhere the clock begins where the path joins.
-    joins_s = 0.0 if start_mm is None else float(seconds[0]) if len(part) else demonstrated.end_s
+    # A hand at its own start moves off when the surgeon did; elsewhere, or if the rollout leaves out a loop, the clock
+    # begins where the path joins.
+    whole = start_mm is None and joined == 0 and last + 1 == len(demonstrated.path.states)
+    joins_s = 0.0 if whole else float(seconds[0]) if len(part) else demonstrated.end_s
     clock_s = np.concatenate((np.full(joined + 1, joins_s), seconds, [demonstrated.end_s]))
     return np.concatenate((approach, tip, goal[None])), of_visit, clock_s
 

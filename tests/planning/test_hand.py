@@ -16,7 +16,7 @@ from skills.errors import BadPlan, Unreachable
 from skills.gridworld.grid import PAPER_GRID, choose_grid, discretize
 from skills.gridworld.reward import sparse_reward
 from skills.kinematics import POINTING_DOWN, angle_between, matrix_of, quaternion_of
-from skills.learning.policy import Policy, learn_tabular
+from skills.learning.policy import Policy, Rollout, learn_tabular
 from skills.learning.pose_style import learn_pose_style
 from skills.learning.q_learning import PhaseQLearning
 from skills.learning.slip import replay
@@ -27,6 +27,7 @@ from skills.planning.plan import SuturePoint, departure_of, driven_pass, stack
 from skills.planning.trajectory import A1, A2, Trajectory, time_parametrise
 from skills.verification.clearance import openings
 from skills.verification.monte_carlo import DoubtSettings, doubt
+from tests.planning.test_path_fit import shipped
 
 TURN_RAD = np.radians(60)
 QUARTER_ABOUT_Z = (0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5))
@@ -168,6 +169,40 @@ def test_orientation_turns_with_its_suture_point():
         (one.hand.tip_mm - point.position_mm) @ turned.T, abs=1e-9
     )
     assert other.tip_mm[-1] == pytest.approx(point.position_mm)
+
+
+def log_dimensionless_jerk(seconds, tip_mm):
+    """Return the smoothness of a motion at 100 samples a second: 0 is none, and a greater number is smoother."""
+    even = np.linspace(seconds[0], seconds[-1], int((seconds[-1] - seconds[0]) * 100))
+    tip = np.stack([np.interp(even, seconds, axis) for axis in tip_mm.T], axis=1)
+    step = even[1] - even[0]
+    peak = np.linalg.norm(np.diff(tip, axis=0), axis=1).max() / step
+    jerk = np.diff(tip, 3, axis=0) / step**3
+    return -np.log((jerk**2).sum() * step * (even[-1] - even[0]) ** 3 / peak**2)
+
+
+@pytest.mark.parametrize("name", ["kestrel-simple-running", "heron-simple-running", "wren-simple-running"])
+def test_it_is_no_less_smooth_than_the_surgeons_motion_without_tremor(name):
+    demo, policy = shipped(name, 0)
+    (only,) = stack(policy, [SuturePoint(tuple(demo.tip_mm[-1].tolist()))], demo=demo).passes
+    calm = smoothed_tip(demo.stamps_s, demo.tip_mm, TREMOR_S)
+    assert log_dimensionless_jerk(only.hand.seconds, only.hand.tip_mm) >= log_dimensionless_jerk(*calm)
+
+
+def test_a_rollout_that_leaves_out_a_loop_loses_no_time_for_it():
+    """The hand goes 5 mm out and back in 4 s, then 20 mm up in 2 s; the rollout goes up at once."""
+    seconds = np.arange(0, 6.001, 0.02)
+    out = stroke(seconds, 0, 2) - stroke(seconds, 2, 4)
+    tip = np.array([0.0, 50.0, -140.0]) + np.stack((5 * out, 0 * out, 20 * stroke(seconds, 4, 6)), axis=1)
+    demo = Demo("PSM2", "/t", "PSM2_base", 0.0, 6.0, seconds, tip)
+    path = discretize(tip, PAPER_GRID)
+    assert path.states[0] == path.states[2]
+    directly = path.states[2:]
+    fitted = fit_to_demo(Rollout(path, directly, np.zeros(len(directly), np.int64), True), trace(demo, path))
+    hand = hand_along(demo, fitted, turning=False)
+    assert hand.duration_s < 2.5
+    slow = speeds(hand.tip_mm) / np.diff(hand.seconds) < 0.5  # mm/s
+    assert np.diff(hand.seconds)[slow].sum() < 0.6
 
 
 def test_a_start_off_the_path_approaches_with_the_jaw_it_joins_with():
