@@ -126,7 +126,8 @@ CLASSIC = ArmConstants(
     acceleration=_ACCELERATION,
     effort=_EFFORT,
 )
-# For the Si only the limits of the first three joints are published; the others are assumed to be the Classic's.
+# For the Si the limits and efforts of the first three joints are published; roll and wrist are the tool's, whose two
+# generations have the same. The speeds and accelerations are assumed to be the Classic's.
 SI = ArmConstants(
     name="PSM Si",
     remote_centre_mm=482.6,
@@ -134,7 +135,7 @@ SI = ArmConstants(
     upper=(2.964, 1.301, 290.0, radians(260), radians(80), radians(80)),
     speed=_SPEED,
     acceleration=_ACCELERATION,
-    effort=_EFFORT,
+    effort=(17.0845, 17.0845, 40.9063, *_EFFORT[3:]),
 )
 
 DEFAULT_INSTRUMENT = "400006"

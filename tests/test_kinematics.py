@@ -10,6 +10,7 @@ from skills.kinematics import (
     INSTRUMENTS,
     JAW_TIP_MM,
     POINTING_DOWN,
+    SI,
     WRIST_MM,
     angle_between,
     axes_of,
@@ -166,3 +167,9 @@ def test_quaternions_and_matrices_say_the_same_and_change_smoothly():
     np.testing.assert_allclose(matrix_of(quaternions), rotation, atol=1e-14)
     np.testing.assert_allclose(quaternion_of(POINTING_DOWN[None])[0], [0.5**0.5, 0.5**0.5, 0, 0], atol=1e-15)
     assert (np.einsum("ti,ti->t", quaternions[1:], quaternions[:-1]) >= 0).all()
+
+
+def test_the_si_has_its_own_efforts():
+    """PSM_Si.json has ftmax 17.0845 Nm, 17.0845 Nm and 40.9063 N; LARGE_NEEDLE_DRIVER_420006.json the other three."""
+    assert SI.effort == (17.0845, 17.0845, 40.9063, 0.33, 0.25, 0.20)
+    assert CLASSIC.effort[:3] == (3.316, 3.316, 9.878)

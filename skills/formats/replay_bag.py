@@ -20,7 +20,7 @@ import io
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from math import radians
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -31,6 +31,7 @@ from skills.formats.archive import pack
 from skills.formats.writer import Message, bag_folder
 from skills.kinematics import INSERTION, JOINTS, forward, instrument_of, quaternion_of
 from skills.planning.handoff import OPEN_RAD
+from skills.planning.motion_laws import PHASES
 from skills.planning.trajectory import Trajectory
 
 CRTK_ARMS = ("PSM1", "PSM2", "PSM3")  # the names that `dvrk_bag_replay.py -a` accepts
@@ -231,6 +232,41 @@ def notes_of(motion: ArmMotion, plan_sha256: str) -> dict[str, str]:
         "rate_hz": repr(motion.rate_hz),
         "use": "research use only",
     }
+
+
+def timetable(trajectory: Trajectory, arms: tuple[ArmMotion, ...]) -> list[dict[str, Any]]:
+    """Return the passes of a bag on the one clock of its setpoints, for a program or a person that executes it.
+
+    For each pass: its index, the first and the last stamp of each of its phases, and `hand_over`: the stamp at which
+    the arms are where the needle is handed over, and the jaws to move there, in this order, before the next stamp is
+    sent. None without PSM_M. No setpoint moves these jaws: whoever sees the needle decides.
+
+    Args:
+        trajectory: The one that the bag is made of.
+        arms: What `arms_of` made of it.
+    """
+    rows = rows_of_pass(trajectory, arms[0].pass_index)
+    stamps_ns, number, phase = arms[0].stamps_ns, trajectory.pass_index[rows], trajectory.phase[rows]
+    jaws = [
+        {"arm": arm.name, "jaw_rad": to} for arm, to in zip(arms[::-1], (JAW_CLOSED_RAD, 2 * OPEN_RAD), strict=False)
+    ]
+    found = []
+    for one in np.unique(number).tolist():
+        parts = [(name, stamps_ns[(number == one) & (phase == k)]) for k, name in enumerate(PHASES)]
+        found.append(
+            {
+                "pass": one,
+                "phases": [
+                    {"phase": name, "from_ns": int(part[0]), "to_ns": int(part[-1])}
+                    for name, part in parts
+                    if len(part)
+                ],
+                "hand_over": None
+                if len(arms) == 1
+                else {"at_ns": int(stamps_ns[number == one][-1]), "jaws_in_order": jaws},
+            }
+        )
+    return found
 
 
 def seal(members: Mapping[str, bytes]) -> bytes:

@@ -37,7 +37,8 @@ from skills.planning.trajectory import joint_ratios
 from skills.transparency import PublicKey, read_notes
 
 PLAN, VERDICT, POLICY, README = "plan.json", "verdict.json", "policy.json", "README.txt"
-PAPERS = (PLAN, VERDICT, POLICY, README)
+EXECUTOR = "executor.json"  # the timetable
+PAPERS = (PLAN, VERDICT, POLICY, README, EXECUTOR)
 SIGNATURE = "signature.dsse"  # a bag of an older version has none
 BOUND = ("plan", "verdict", "policy", "trajectory")  # digests in the signed statement
 SAMPLES_LIMIT = 2_000_000  # per arm: 200 passes of 50 s at 200 Hz
@@ -79,6 +80,7 @@ def check_bag(file: BinaryIO, key: PublicKey | None = None) -> list[str]:
     _check_statement(statement, plan, verdict)
     motions = [_read_arm(archive, name, plan) for name in arms]
     _check_roles(motions, plan)
+    _check_timetable(_paper(archive, EXECUTOR), plan, motions)
     for motion in motions:
         _check_judged(motion, verdict["report"])
     return [
@@ -189,6 +191,19 @@ def _check_papers(plan: dict[str, Any], verdict: dict[str, Any], policy: dict[st
             raise BadBag(f"{VERDICT} does not match its digest. Export the bag again.")
     except (LookupError, TypeError, ValueError) as error:
         raise BadBag(f"{PLAN}, {VERDICT} or {POLICY} has a missing or invalid field. Export the bag again.") from error
+
+
+def _check_timetable(paper: dict[str, Any], plan: dict[str, Any], motions: list[ArmMotion]) -> None:
+    """Check that the timetable is this plan's, and that both arms have a setpoint at every one of its stamps."""
+    try:
+        parts = [part for one in paper["passes"] for part in one["phases"]]
+        stamps = [part[end] for part in parts for end in ("from_ns", "to_ns")]
+        stamps += [one["hand_over"]["at_ns"] for one in paper["passes"] if one["hand_over"] is not None]
+        known = all(np.isin(stamps, motion.stamps_ns).all() for motion in motions)
+        if paper["plan"] != plan["sha256"] or not stamps or not known:
+            raise BadBag(f"{EXECUTOR} is not the timetable of this bag. Export the bag again.")
+    except (LookupError, TypeError, ValueError) as error:
+        raise BadBag(f"{EXECUTOR} has a missing or invalid field. Export the bag again.") from error
 
 
 # ---- one arm ----------------------------------------------------------------------------------------------------

@@ -4,8 +4,8 @@
 
 Files have profile ros2, CDR messages with ros2msg schemas, and zstd chunks with checksums. Positions are written in
 metres, angles in radians, stamps in whole nanoseconds; the log time of a message is its stamp. The same messages give
-the same bytes with the same version of the mcap library. `metadata.yaml` is of version 9, which ROS 2 Jazzy writes and
-reads.
+the same bytes with the same version of the mcap library. `metadata.yaml` is of version 5, the newest that ROS 2 Humble
+reads; Jazzy, which writes version 9, reads it too.
 
 A CDR message is a header of four bytes (little-endian), then every number aligned to its own size, counted from the end
 of that header; a string is its length including the terminating zero, then its bytes (OMG CDR; ROS 2 design,
@@ -82,14 +82,6 @@ int32[] buttons
     BOOL: "bool data\n",
     FLOAT64: "float64 data\n",
     STRING: "string data\n",
-}
-HASHES = {  # type description hashes (REP 2016) of ROS 2 Jazzy
-    POSE: "RIHS01_10f3786d7d40fd2b54367835614bff85d4ad3b5dab62bf8bca0cc232d73b4cd8",
-    JOINT_STATE: "RIHS01_a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e",
-    JOY: "RIHS01_0d356c79cad3401e35ffeb75a96a96e08be3ef896b8b83841d73e890989372c5",
-    BOOL: "RIHS01_feb91e995ff9ebd09c0cb3d2aed18b11077585839fb5db80193b62d74528f6c9",
-    FLOAT64: "RIHS01_705ba9c3d1a09df43737eb67095534de36fd426c0587779bda2bc51fe790182a",
-    STRING: "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18",
 }
 
 
@@ -366,7 +358,10 @@ def _samples(signal: Signal) -> Iterator[tuple[int, float]]:
 
 
 def metadata_of(written: Written, file: str) -> bytes:
-    """Return the metadata.yaml of a bag with one file, as ROS 2 Jazzy writes it (version 9)."""
+    """Return the metadata.yaml of a bag with one file, as ROS 2 Humble writes it (version 5).
+
+    In versions 4 to 8 the profiles are a text that has YAML in it, and Humble refuses the list of version 9.
+    """
     start_ns, count = written.first_ns or 0, sum(written.counts.values())
     duration_ns = written.last_ns - start_ns
     topics_with_count = "".join(
@@ -375,13 +370,12 @@ def metadata_of(written: Written, file: str) -> bytes:
         name: {topic}
         type: {kind}
         serialization_format: cdr
-        {_QOS}: []
-        type_description_hash: {HASHES[kind]}
+        {_QOS}: ""
       message_count: {messages_on}"""
         for (topic, kind), messages_on in written.counts.items()
     )
     return f"""rosbag2_bagfile_information:
-  version: 9
+  version: 5
   storage_identifier: mcap
   duration:
     nanoseconds: {duration_ns}
@@ -400,6 +394,4 @@ def metadata_of(written: Written, file: str) -> bytes:
       duration:
         nanoseconds: {duration_ns}
       message_count: {count}
-  custom_data: ~
-  ros_distro: jazzy
 """.encode()

@@ -28,8 +28,9 @@ from skills.formats.replay_bag import (
     held_jaw_rad,
     rows_of_pass,
     seal,
+    timetable,
 )
-from skills.formats.verify import PLAN, POLICY, README, SIGNATURE, VERDICT
+from skills.formats.verify import EXECUTOR, PLAN, POLICY, README, SIGNATURE, VERDICT
 from skills.learning.evaluation import TIE_BREAK, dtw
 from skills.library import consent, policies, releases, signatures
 from skills.library.demos import find_demo
@@ -99,6 +100,10 @@ LIMITS = (
     "Certified on its grid alone: coverage and grid_certificate list the checks. They do not cover the arm's "
     "accuracy, of tissue, or of another arm, frame or instrument than these."
 )
+BY_HAND = (
+    "A surgeon inserts the needle and takes it again by hand (M1, M2), and closes PSM_A's jaw on it. Send no setpoint "
+    "of the pass before that is done."
+)
 USE = "Research use only; not a medical device. Never replay it on or near a person."
 
 
@@ -155,6 +160,9 @@ def replay_bag(
         pass_index=pass_index,
     )
     members = {name: _written(paper) for name, paper in papers.items()}
+    members[EXECUTOR] = _written(
+        {"use": USE, "plan": row.sha256, "before_each_pass": BY_HAND, "passes": timetable(trajectory, arms)}
+    )
     head = signatures.head_over(database, rows)
     members[README] = _readme(papers[PLAN], arms, head).encode()
     for arm in arms:

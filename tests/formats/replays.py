@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from skills.formats.replay_bag import ArmMotion, arms_of, folder_of, seal
+from skills.formats.replay_bag import ArmMotion, arms_of, folder_of, seal, timetable
 from skills.formats.verify import check_bag
 from skills.kinematics import forward, quaternion_of
 from skills.packing import canonical, sha256
@@ -76,7 +76,9 @@ def papers(made: Trajectory, **changes: Any) -> dict[str, bytes]:
         "report": report,
     } | changes.get("verdict", {})
     policy = {"version": 3, "sha256": "2" * 64} | changes.get("policy", {})
-    files = {"plan.json": plan, "verdict.json": verdict, "policy.json": policy}
+    arms = arms_of(made, arm="PSM2", frame=FRAME, other="PSM1", jaw_rad=0.1)
+    executor = {"plan": "1" * 64, "passes": timetable(made, arms)} | changes.get("executor", {})
+    files = {"plan.json": plan, "verdict.json": verdict, "policy.json": policy, "executor.json": executor}
     return {name: json.dumps(paper).encode() for name, paper in files.items()} | {"README.txt": b"Read me.\n"}
 
 
@@ -85,7 +87,8 @@ def members(pass_index: int | None = None) -> dict[str, bytes]:
     """Return the files of a complete bag, without their checksums."""
     arms = arms_of(trajectory(), arm="PSM2", frame=FRAME, other="PSM1", jaw_rad=0.1, pass_index=pass_index)
     folders = [folder_of(arm, "1" * 64) for arm in arms]
-    return papers(trajectory()) | folders[0] | folders[1]
+    executor = {"plan": "1" * 64, "passes": timetable(trajectory(), arms)}
+    return papers(trajectory(), executor=executor) | folders[0] | folders[1]
 
 
 def arm(name: str = "PSM2") -> ArmMotion:

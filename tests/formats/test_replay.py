@@ -22,6 +22,7 @@ from skills.formats.replay_bag import (
     held_jaw_rad,
     notes_of,
     seal,
+    timetable,
     velocities_of,
 )
 from skills.kinematics import forward
@@ -123,6 +124,24 @@ def test_the_same_trajectory_gives_the_same_bytes():
         folder_of(one, "1" * 64) for one in arms_of(trajectory(), arm="PSM2", frame=FRAME, other="PSM1", jaw_rad=0.1)
     ]
     assert seal(papers(trajectory()) | again[0] | again[1]) == seal(members())
+
+
+def test_the_timetable_has_every_phase_and_hand_over_on_one_clock():
+    """Two passes of 81 samples at 200 Hz, 60 of A1 and 21 of A2, a second apart; stamps begin at 1 s."""
+    arms = arms_of(trajectory(), arm="PSM2", frame=FRAME, other="PSM1", jaw_rad=0.1)
+    first, second = timetable(trajectory(), arms)
+    assert first["phases"] == [
+        {"phase": "A1", "from_ns": 1_000_000_000, "to_ns": 1_295_000_000},
+        {"phase": "A2", "from_ns": 1_300_000_000, "to_ns": 1_400_000_000},
+    ]
+    assert first["hand_over"]["at_ns"] == 1_400_000_000
+    assert second["phases"][0]["from_ns"] == 2_405_000_000
+    # the arm that takes the needle closes on it before the other lets go
+    assert [one["arm"] for one in first["hand_over"]["jaws_in_order"]] == ["PSM1", "PSM2"]
+    taking, leaving = (one["jaw_rad"] for one in first["hand_over"]["jaws_in_order"])
+    assert taking < 0 < leaving
+    alone = arms_of(trajectory(), arm="PSM2", frame=FRAME, other="PSM1", jaw_rad=0.1, pass_index=1)
+    assert timetable(trajectory(), alone) == [second]
 
 
 def test_sha256sum_itself_reads_the_checksums(tmp_path):

@@ -33,7 +33,7 @@ def test_a_whole_bag_is_found_right_and_told_of(tmp_path):
     path = tmp_path / "bag.zip"
     path.write_bytes(seal(members()))
     lines = verify_bag(path)
-    assert lines[0].startswith("9 files")
+    assert lines[0].startswith("10 files")
     assert lines[2].startswith("PSM1 (PSM_M, 420006): 162 samples in 1.80 s")
     assert lines[3].startswith("PSM2 (PSM_A, 400006): 162 samples in 1.80 s")
     low, high = trajectory().tip_mm.min(axis=0), trajectory().tip_mm.max(axis=0)
@@ -290,6 +290,10 @@ def test_a_file_without_checksums_is_found(monkeypatch):
         ({"plan": {"psm_m": {"base_mm": [0, 0, 0], "instrument": "400006"}}}, "with another instrument"),
         ({"plan": {"psm_m": {"base_mm": None}}}, "PSM_M is in the bag and not in"),
         ({"plan": {"psm_m": True}}, "has a missing or invalid field"),
+        ({"executor": {"plan": "5" * 64}}, "executor.json is not the timetable of this bag"),
+        ({"executor": {"passes": []}}, "executor.json is not the timetable of this bag"),
+        ({"executor": {"passes": [{"phases": [{"from_ns": 1}], "hand_over": None}]}}, "has a missing or invalid field"),
+        ({"executor": {"passes": [{"phases": [], "hand_over": {"at_ns": 7}}]}}, "is not the timetable of this bag"),
     ],
 )
 def test_papers_that_do_not_belong_together_are_found(changes, words):

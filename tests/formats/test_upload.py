@@ -16,7 +16,7 @@ from mcap.writer import CompressionType, Writer
 from skills.errors import BadInput, UnreadableRecording
 from skills.formats import read_recording, write_mcap
 from skills.formats.upload import find_bag, lighten, ready_to_send, topics_of
-from skills.formats.writer import DEFINITIONS, HASHES, Message, messages_of, write_bag, write_messages
+from skills.formats.writer import DEFINITIONS, Message, messages_of, write_bag, write_messages
 from tests.formats.bags import START_NS, STEP_NS, assert_same, recording
 from tests.formats.others import db3, rosbag1
 
@@ -28,7 +28,6 @@ TAGS = {"stages": [{"name": "A1", "start": {"cpu_ts": START_NS}, "end": {"cpu_ts
 @pytest.fixture(autouse=True)
 def pictures_can_be_written(monkeypatch):
     monkeypatch.setitem(DEFINITIONS, PICTURE, "uint8[] data\n")
-    monkeypatch.setitem(HASHES, PICTURE, "")
 
 
 def with_pictures(said, size=100_000):
