@@ -28,13 +28,15 @@ from skills.db.service_tables import Job, record_event
 from skills.db.session import Database
 from skills.errors import BadPlan, Conflict, NotDrawnYet
 from skills.library import jobs, releases
-from skills.library.integrity import find_by_digest, planned
+from skills.library.integrity import find_by_digest, learnt, planned
 from skills.library.jobs import PICTURES, PicturesRequest, PlaybackRequest
-from skills.library.plans import find_plan, hands_over, plan_in_words, psm_m_moves, trajectory_of
+from skills.library.plans import find_plan, hand_of, hands_over, plan_in_words, psm_m_moves, trajectory_of
 from skills.packing import canonical, sha256
 from skills.planning.trajectory import Trajectory
 from skills.remedies import Action, Remedy
 from skills.settings import Settings
+from skills.verification.asked import asked_of
+from skills.verification.intent import compare
 from skills.verification.monte_carlo import DoubtSettings, doubt
 from skills.verification.playback import Pictures
 from skills.verification.scene_clearance import NEEDLE, SceneClearance, clearance_of, flat_tissue_mm
@@ -111,7 +113,7 @@ def _percent(part: float | None) -> str:
     return f"{100 * part:.1f} %"
 
 
-CHECK_VERSION = 2  # part of the job's identity: raise it when verdicts change, so that plans can be played again
+CHECK_VERSION = 3  # part of the job's identity: raise it when verdicts change, so that plans can be played again
 
 
 def request_playback(session: Session, plan_sha256: str, actor: str, settings: Settings) -> tuple[Job, bool]:
@@ -139,13 +141,15 @@ def check_playback(
     with database.reading() as session:
         stored = find_plan(session, request["plan"])
         plan, policy = planned(stored), {"version": stored.policy.version, "sha256": stored.policy.sha256}
+        asked = asked_of(plan, learnt(stored.policy), None if plan.path == "cell centres" else hand_of(stored.policy))
     check_frame(plan.frame)
     trajectory = trajectory_of(plan)
     measured = play(trajectory, timeout_s=settings.playback_timeout_s, memory_bytes=settings.playback_memory_bytes)
     approach_m = None if plan.psm_m is None else plan.psm_m.approach
     beside = None if plan.scene is None else clearance_of(trajectory, plan.scene)
+    intent = compare(asked, trajectory, measured.joints)
     # The simulator's pad lies below the motion wherever that goes, so it is no tissue and no gate.
-    verdict = judge(measured, trajectory, approach_m=approach_m, beside=beside, pad_is_tissue=False)
+    verdict = judge(measured, trajectory, approach_m=approach_m, beside=beside, pad_is_tissue=False, intent=intent)
     tissue = plan.scene is not None and plan.scene.tissue is not None
     top_mm = flat_tissue_mm(trajectory, beside.report) if tissue and beside is not None else None
     varied = DoubtSettings(tip_errors_mm=tuple(request["tip_errors_mm"]))

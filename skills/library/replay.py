@@ -211,8 +211,8 @@ def cleared(
             states no tissue; its
             orientation is constant where the surgeon's turned by more than allowed; the
             demonstration was withdrawn; another policy than the plan's is released, or none; the plan was not played,
-            its verdict is of an older version, which did not judge the arms' outer bodies; it is not feasible, or not
-            certain enough.
+            its verdict is of an older version, which did not judge the arms' outer bodies or
+            did not compare the motion with what was asked; it is not feasible, or not certain enough.
         Corrupt: The stored verdict does not match its digest.
     """
     policy = plan.policy
@@ -249,6 +249,11 @@ def cleared(
     if played.report.get("bodies") is None:
         raise Conflict(
             "The arms' outer bodies were not judged when this plan was played.", Remedy(Action.PLAY, plan=plan.sha256)
+        )
+    if played.report.get("intent") is None:
+        raise Conflict(
+            "An older version played this plan and did not compare the motion with what was asked.",
+            Remedy(Action.PLAY, plan=plan.sha256),
         )
     check_doubt(played.report, tip_error_mm=tip_error_mm, lower_bound=lower_bound)
     return played

@@ -97,7 +97,7 @@ __all__ = [
 
 
 @stored_schema
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Verdict(PlaybackReport):
     """The verdict and its figures; peak ratios and margins are PSM_A's, `arms` has all joints.
 

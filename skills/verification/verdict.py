@@ -6,8 +6,9 @@
 The figures are arrays with one row per sample, which are gated and reported. A gate is one number per sample that must
 not exceed its limit, or must not fall below it. NaN passes no gate.
 
-`judge` compares the simulator's measurements (`Playback`) with the intended motion (`Trajectory`). All of this is ours;
-the paper played its plans on the robot.
+`judge` compares the simulator's measurements (`Playback`) with the intended motion (`Trajectory`), and with what was
+asked if its deviations from that are given (`skills.verification.intent`). All of this is ours; the paper played its
+plans on the robot.
 
 A feasible verdict means that the geometry is right and free. In free space the servo's error and efforts depend on the
 simulator's gains and masses, not on the robot's, so they guard against mistakes of ours and in contact; they are no
@@ -40,6 +41,7 @@ from skills.planning.motion_laws import A2, PHASES, TRANSFER
 from skills.planning.trajectory import Trajectory, joint_ratios
 from skills.verification.bodies import BodiesClearance, BodiesReport, bodies_clearance
 from skills.verification.clearance import FINGER_REACH_MM, Bounds, needle_to_pad_mm, openings, psm_m_poses
+from skills.verification.intent import LIMITS, Comparison, Deviation
 from skills.verification.playback import CLEARANCE_SEEN_MM, PAD, PSM_A, PSM_M, Playback
 from skills.verification.scene_clearance import SceneClearance
 
@@ -226,6 +228,7 @@ def first_failure(
     limits: Limits,
     beside: SceneClearance | None = None,
     outer: BodiesClearance | None = None,
+    intent: Comparison | None = None,
 ) -> Failure | None:
     """Return the earliest sample at which a gate is broken; of several gates broken there, the first listed.
 
@@ -236,6 +239,7 @@ def first_failure(
         limits: The limits of the gates.
         beside: The motion's distances from a scene; None: they are no gate.
         outer: The distances of the arms' outer bodies; None: they are no gate.
+        intent: The motion's deviations from what was asked; None: they are no gate.
 
     Returns:
         The failure, or None if every sample passes every gate.
@@ -247,6 +251,8 @@ def first_failure(
     if beside is not None:
         gates.append(_Gate(SCENE, "mm", beside.at_least_mm, beside.report.limit_mm, at_least=True))
         gates.append(_Gate("distance of the needle from the tissue", "mm", beside.needle_mm, 0.0, at_least=True))
+    if intent is not None:
+        gates += [_Gate(kind, LIMITS[kind][0], values, LIMITS[kind][1]) for kind, values in intent.values.items()]
     broken = [(sample, gate) for gate in gates if (sample := gate.broken()) is not None]
     if not broken:
         return None
@@ -421,7 +427,8 @@ class PlaybackReport:
     range, and the peak ratios are PSM_A's; `arms` has every joint of both. `clearance_pad_mm` is of either arm. Between
     two measurements a pair of links can have come nearer by `moved_between_looks_mm`, which the gates take into
     account. `peak_effort_ratio` is over the complete servo pass, `peak_contact_effort_ratio` over the samples in which
-    the arm touches the pad. `bodies` compares the arms' outer bodies; null: not judged, as in older verdicts.
+    the arm touches the pad. `bodies` compares the arms' outer bodies; null: not judged, as in older verdicts. `intent`
+    has the greatest deviation of each kind from what was asked; null: not compared with it, as in those.
     """
 
     feasible: bool
@@ -462,6 +469,7 @@ class PlaybackReport:
     files: Mapping[str, Sha256]
     settings: Limits
     bodies: BodiesReport | None = field(default=None, kw_only=True)
+    intent: tuple[Deviation, ...] | None = field(default=None, kw_only=True)
 
 
 def judge(
@@ -472,8 +480,9 @@ def judge(
     approach_m: ArrayLike | None = None,
     beside: SceneClearance | None = None,
     pad_is_tissue: bool = True,
+    intent: Comparison | None = None,
 ) -> PlaybackReport:
-    """Compare the measurements with the intended motion and with the limits.
+    """Compare the measurements with the intended motion, with what was asked, and with the limits.
 
     Args:
         playback: The measurements.
@@ -485,6 +494,8 @@ def judge(
             compared with them.
         pad_is_tissue: Whether the simulator's pad is where tissue is. By default it lies below the motion, wherever
             that goes: then false, and its clearance is reported, but is no gate.
+        intent: The deviations of the motion from what was asked, as `skills.verification.intent.compare` finds them;
+            None: it is not compared with that.
 
     Returns:
         The verdict and its figures.
@@ -497,7 +508,7 @@ def judge(
     figures = figures_of(playback, trajectory)
     outer = bodies_clearance(trajectory, limits.clearance_bodies_mm)
     gated = limits if pad_is_tissue else replace(limits, clearance_pad_mm=-inf)
-    failure = first_failure(figures, playback, trajectory, gated, beside, outer)
+    failure = first_failure(figures, playback, trajectory, gated, beside, outer, intent)
     psm_a = figures.arms[0]
     with_m = trajectory.psm_m is not None
     touching = figures.effort[~(playback.contact_n <= 0)]  # negated, so that NaN counts as contact
@@ -541,6 +552,7 @@ def judge(
         files=dict(playback.files),
         settings=limits,
         bodies=outer.report,
+        intent=None if intent is None else intent.deviations,
     )
 
 

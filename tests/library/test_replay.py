@@ -62,7 +62,8 @@ def judged(database: Database, plan: Plan, *, feasible: bool = True, digest: str
     words = None if feasible else "Pass 0, A1, sample 3 (0.015 s): clearance to the pad is -2 mm, the limit is 1."
     with database.reading() as session:
         digest_of_it = trajectory_digest(trajectory_of(find_plan(session, plan.sha256).plan))
-    told = {"feasible": feasible, "failure_in_words": words, "trajectory": digest_of_it, "bodies": {"arms": []}}
+    judged_all = {"bodies": {"arms": []}, "intent": []}
+    told = {"feasible": feasible, "failure_in_words": words, "trajectory": digest_of_it} | judged_all
     report = told | doubt(0.97) | more
     identity = digest or sha256(canonical([plan.sha256, report]))
     with database.writing() as session:
@@ -113,6 +114,15 @@ def test_a_plan_is_cleared_by_its_own_newest_feasible_playback(database: Databas
     judged(database, plan, digest="1" * 64)
     with pytest.raises(Corrupt, match="verdict"):
         gate(database, plan)
+
+
+def test_a_verdict_that_knows_nothing_of_the_intent_opens_no_bag(database: Database, plan: Plan):
+    """Those of older versions compared the trajectory with itself; they stay readable."""
+    judged(database, plan, intent=None)
+    with pytest.raises(Conflict, match="did not compare the motion with what was asked"):
+        gate(database, plan)
+    judged(database, plan)
+    gate(database, plan)
 
 
 def test_a_bag_without_a_hand_off_is_given_only_on_request(database: Database, plan: Plan):
