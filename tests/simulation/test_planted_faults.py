@@ -20,16 +20,19 @@ from skills.library.catalogue import find_surgeon
 from skills.library.demos import upload_demo
 from skills.library.playbacks import find_playback, request_playback, standing_of
 from skills.packing import canonical
+from skills.planning import handoff
 from skills.planning.handoff import OtherArm
 from skills.planning.trajectory import A1, PassPath, Trajectory, time_parametrise
 from skills.schemas.requests import DemoIn, Reading
 from skills.settings import Settings
 from skills.simulation.player import play
+from skills.verification.intent import LIMITS
 from skills.verification.verdict import Limits, PlaybackReport, judge
 from tests import backends
 from tests.bench.playing import stacked
 from tests.library import cases
-from tests.planning.motions import hand_off, small_trajectory
+from tests.planning.motions import PSM_M, hand_off, small_trajectory
+from tests.verification.hands import about
 
 pytestmark = pytest.mark.needs("simulator")
 MOTION = small_trajectory(passes=2, rate_hz=60.0)
@@ -202,9 +205,25 @@ def test_the_same_plan_has_the_same_playback_in_another_database(databases):
     assert one.sha256 == other.sha256
     assert canonical(one.report) == canonical(other.report)
     assert one.report["feasible"] is True
+    assert {deviation["kind"] for deviation in one.report["intent"]} == set(LIMITS)
     assert one.report["plan"] == one.plan.sha256
     assert one.report["files"].keys() == {"psm.urdf", "suture_pad.urdf", "needle.urdf"}
     assert one.report["arms"][0]["instrument"]["arm"]["remote_centre_mm"] == 431.8
+
+
+def test_a_mistake_of_planning_is_found_by_the_service(databases, monkeypatch):
+    """A2 is planned 30 degrees off; plan and trajectory agree on it."""
+
+    def wrong(rotation, approach_m):
+        found = handoff.realign(rotation, approach_m)
+        return replace(found, rotation=about(np.array(approach_m), radians(30)) @ found.rotation)
+
+    monkeypatch.setattr("skills.planning.plan.realign", wrong)
+    database, _ = databases
+    found = played(database, cases.add_plan(database, psm_m={"approach": PSM_M})).report
+    assert (found["feasible"], found["failure"]["quantity"]) == (False, "A2 off the paper's hand-off")
+    assert found["failure"]["value"] == pytest.approx(30.0)
+    assert "A2 off the paper's hand-off is 30 deg, the limit is 0.1" in found["failure_in_words"]
 
 
 def test_a_policy_withdrawn_after_planning_is_told_with_the_playback(databases):
