@@ -632,8 +632,10 @@ def test_no_sound_plan_is_refused():
 
 @pytest.mark.nightly
 def test_of_200_sound_plans_half_near_a_limit_none_is_refused():
-    plans = list(sound_plans(seed=20, count=200))
+    drawn = list(sound_plans(seed=20, count=260))
+    near = [one for one in drawn if near_a_limit(one.trajectory)][:100]
+    plans = near + [one for one in drawn if not near_a_limit(one.trajectory)][:100]
+    assert len(plans) == 200
     assert [(k, why) for k, one in enumerate(plans) if (why := refused(one))] == []
-    assert np.mean([near_a_limit(one.trajectory) for one in plans]) >= 0.5
     assert {one.plan.a2 for one in plans} == {"recorded", "paper"}
     assert {one.plan.orientation for one in plans} == {"recorded", "demonstrated", "assumed tool-down"}
