@@ -19,7 +19,7 @@ import pytest
 
 from skills.attestation import attest, read_envelope
 from skills.errors import BadBag, BadSignature, SkillsError
-from skills.formats.replay_bag import arms_of, folder_of, seal
+from skills.formats.replay_bag import arms_of, folder_of, seal, timetable
 from skills.formats.verify import JUDGED, SIGNATURE, check_bag
 from skills.kinematics import forward, quaternion_of
 from skills.packing import canonical, sha256
@@ -284,13 +284,14 @@ def test_another_motion_than_the_judged_one_is_found_without_a_key(joint: int):
 
 def test_a_pass_alone_stays_within_the_judged_figures():
     arms = arms_of(moved(JOINTS), arm="PSM2", frame=FRAME, other="PSM1", pass_index=1)
-    bag = papers(moved(JOINTS), report=REPORT) | {
+    timed = {"passes": timetable(moved(JOINTS), arms)}
+    bag = papers(moved(JOINTS), report=REPORT, executor=timed) | {
         name: data for one in arms for name, data in folder_of(one, PLAN).items()
     }
     assert checked(bag, None)
     narrower = judged(moved(JOINTS * [1, 1, 1.01, 1, 1, 1]))
     with pytest.raises(BadBag, match=r"is not the motion that was judged: of insertion, lowest"):
-        checked(bag | papers(moved(JOINTS), report=REPORT | {"arms": narrower}), None)
+        checked(bag | papers(moved(JOINTS), report=REPORT | {"arms": narrower}, executor=timed), None)
 
 
 @pytest.mark.parametrize("arms", [3, [], [{"name": "PSM_A"}], [{"name": "PSM_A", "joints": [{}]}, {"name": "PSM_M"}]])

@@ -21,9 +21,8 @@ from skills.planning.trajectory import Trajectory, time_parametrise
 from tests.planning.motions import PSM_M
 
 MIDDLE_MM = np.array([0.0, 50.0, -135.0])
-# PSM_M's base, as in the benchmark: beside PSM_A, leaning towards it
-LEANING = np.radians(35.0)
-BASE_MM, BASE_XYZW = (160.0, 20.0, 20.0), (0.0, float(np.sin(LEANING / 2)), 0.0, float(np.cos(LEANING / 2)))
+# PSM_M's base, as in the benchmark: beside PSM_A, turned away by 45 degrees about the vertical
+BASE_MM, BASE_XYZW = (160.0, 20.0, 20.0), (0.0, 0.0, float(np.sin(np.pi / 8)), float(np.cos(np.pi / 8)))
 
 
 class Planned(NamedTuple):
