@@ -208,11 +208,10 @@ def cleared(
 
     Raises:
         Conflict: Consent does not cover training and export; the plan has no hand-off, and `handoff` is not "none"; it
-            states no tissue; its
-            orientation is constant where the surgeon's turned by more than allowed; the
+            states no tissue; its orientation is constant where the surgeon's turned by more than allowed; the
             demonstration was withdrawn; another policy than the plan's is released, or none; the plan was not played,
-            its verdict is of an older version, which did not judge the arms' outer bodies or
-            did not compare the motion with what was asked; it is not feasible, or not certain enough.
+            its verdict is of an older version, which did not judge the arms' outer bodies or did not compare the motion
+            with what was asked; it is not feasible, or not certain enough.
         Corrupt: The stored verdict does not match its digest.
     """
     policy = plan.policy
