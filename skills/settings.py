@@ -78,9 +78,10 @@ class Settings(BaseSettings):
     )  # of a learner that is not tabular: default budgets take ten minutes
     # of address space: torch reserves half of it and uses a tenth
     learning_memory_bytes: int = Field(default=6144 * MEBIBYTE, gt=0)
-    # tip error of a calibrated dVRK, under which every pass must succeed ...
-    replay_tip_error_mm: float = Field(default=0.65, ge=0)
-    # ... with this probability; samples: 0.99, with an error of 3 mm 0.28
+    # errors of the arms (docs/errors.md), under which every pass must succeed: uncalibrated, calibrated, or the JSON of
+    # a laboratory's own, or a file with it ...
+    arm_errors: str = "uncalibrated"
+    # ... with this probability
     replay_lower_bound: float = Field(default=0.95, ge=0, le=1)
     # the release gate requires that every start so near to the demonstrated one, an uncalibrated arm's error, ...
     near_radius_mm: float = Field(default=3.0, gt=0, allow_inf_nan=False)
@@ -118,6 +119,13 @@ class Settings(BaseSettings):
     key_jobs: int = Field(default=100, ge=1)  # unfinished jobs of an owner; a batch counts as one
     log_level: Literal["debug", "info", "warning", "error"] = "warning"  # "info" adds a line for each request and job
     log_format: Literal["text", "json"] = "text"
+
+    @field_validator("arm_errors")
+    @classmethod
+    def _content_of_file(cls, stated: str) -> str:
+        """Return the name or the JSON of the arms' errors as it is, and of a file the content."""
+        file = Path(stated)
+        return file.read_text() if file.suffix == ".json" else stated
 
     @field_validator("database_url")
     @classmethod

@@ -5,9 +5,11 @@ in which they are printed, and a command that names one is given this run's. `..
 """
 
 import doctest
+import json
 import re
 import shlex
 from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
@@ -17,9 +19,11 @@ from typer.testing import CliRunner
 from skills.cli import app
 from skills.seeds.recordings import sample_recordings
 from skills.settings import settings
+from tests.arms import ARMS
 from tests.e2e.conftest import running
 from tests.formats import trials
 from tests.library import rated
+from tests.library.test_arm_errors import bag as calibration_bag
 from tests.needs import need
 
 PAGE = (Path(__file__).parent.parent / "docs" / "cli.md").read_text()
@@ -37,6 +41,8 @@ def installation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[No
     (tmp_path / "hand-off.mcap").write_bytes(sample.data)
     trials.folder(tmp_path / "jigsaws")
     rated.folder(tmp_path / "rated")
+    (tmp_path / "arms.json").write_text(json.dumps(asdict(ARMS)))
+    calibration_bag(tmp_path / "arm.mcap")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("TZ", "UTC")
     with running(tmp_path) as service:

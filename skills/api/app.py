@@ -27,6 +27,7 @@ from skills.library.history import keep_signed
 from skills.library.recordings import confined_reader
 from skills.logs import request_id
 from skills.settings import Settings
+from skills.verification.errors import stated_errors
 
 DESCRIPTION = (
     "Suture styles as a service: a recorded needle hand-off of a surgeon is discretised, learnt, certified, "
@@ -40,7 +41,12 @@ NO_TELEMETRY = TelemetryConfig(tracing=False, metrics=False, logs=False, operati
 
 
 def create_app(settings: Settings) -> FastAPI:
-    """Create the application. Its start-up migrates the database and seeds the catalogue."""
+    """Create the application. Its start-up migrates the database and seeds the catalogue.
+
+    Raises:
+        BadSettings: The installation states impossible errors of its arms.
+    """
+    stated_errors(settings.arm_errors)
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:

@@ -564,6 +564,12 @@ def plan(
 @refusing
 def play(
     plan_id: PlanId,
+    errors: Annotated[
+        str | None,
+        typer.Option(
+            help="Errors of the arms: calibrated, uncalibrated, or a JSON file with your own (docs/errors.md)."
+        ),
+    ] = None,
     picture: Annotated[Path | None, typer.Option(help="Write a picture here.")] = None,
     pictures: Annotated[
         Path | None, typer.Option(help="Write the picture, a film and two plots to this folder.")
@@ -572,7 +578,7 @@ def play(
 ) -> None:
     """Play a plan in the simulator, and print the verdict; exit code 1 if it is not feasible."""
     with service(workers=1) as client:
-        playback = client.playback(result_of(finished(client, client.play(plan_id)))["playback"])
+        playback = client.playback(result_of(finished(client, client.play(plan_id, _stated(errors))))["playback"])
         if picture is not None:
             picture.write_bytes(client.picture(playback.id))
         if pictures is not None:
@@ -590,10 +596,31 @@ def play(
         out.print(playback.headline.text, markup=False, soft_wrap=True)
         for under in playback.report.doubt.under:
             least = min(one.succeeds.lower for one in under.passes)
-            error = f"tips {under.tip_error_mm:g} mm off"
-            out.print(f"{error}: every pass succeeds with a probability of at least {least:.3f} (95 %)")
+            named = (
+                f"{under.errors.name}: {under.errors.in_words}" if under.errors else f"tips {under.tip_error_mm} mm off"
+            )
+            out.print(
+                f"{named}; every pass succeeds with a probability of at least {least:.3f} (95 %)",
+                markup=False,
+                soft_wrap=True,
+            )
     if not playback.feasible:
         raise typer.Exit(1)
+
+
+def _stated(errors: str | None) -> Any:
+    """Return the errors of the arms as a request states them: a name, or the JSON of a file.
+
+    Raises:
+        BadInput: The file cannot be read, or is not JSON.
+    """
+    if errors is None or errors in ("calibrated", "uncalibrated"):
+        return errors
+    try:
+        return json.loads(Path(errors).read_bytes())
+    except (OSError, ValueError) as error:
+        why = f"The errors {errors} cannot be read as JSON: {error}."
+        raise BadInput(why, "Write calibrated, uncalibrated, or a file of `skills calibrate-arm`.") from None
 
 
 @plan_commands.command()

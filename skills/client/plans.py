@@ -135,9 +135,17 @@ class Plans(Connection):
         return await self._get(Comparison, at("plans", plan, "comparison"), demo=demo, **{"pass": pass_index})
 
     @call
-    async def play(self, plan: str) -> Job:
-        """Request the playback of a plan in the simulator."""
-        return await self._ask(Job, "POST", at("playbacks"), {"plan": plan})
+    async def play(
+        self, plan: str, errors: Literal["calibrated", "uncalibrated"] | Mapping[str, Any] | None = None
+    ) -> Job:
+        """Request the playback of a plan in the simulator.
+
+        Args:
+            plan: The plan's digest.
+            errors: The errors of the arms that are to play it: a default, or the laboratory's own as
+                `skills calibrate-arm` writes them; default: those that the installation states.
+        """
+        return await self._ask(Job, "POST", at("playbacks"), given({"plan": plan, "errors": errors}))
 
     @call
     async def playback(self, playback: str) -> Playback:

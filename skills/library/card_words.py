@@ -9,7 +9,7 @@ from skills.db.models import PolicyVersion
 from skills.demonstration.quality import times_in_words
 from skills.gridworld.domain import REACH
 from skills.schemas.policies import Citation, StartCounts
-from skills.verification.monte_carlo import CALIBRATED_MM, UNCALIBRATED_MM
+from skills.verification.errors import CALIBRATED_MM, UNCALIBRATED_MM
 
 USE = "Research use only; not a medical device. Never move an arm by it on or near a person."
 IS = [
@@ -346,9 +346,10 @@ def joint_limits(manifest: dict[str, Any], turned: bool) -> str:
 def tip_accuracy() -> str:
     """Return the sentences on the tip error to expect of a real arm."""
     return (
-        f"Not known for your arm. A mean tip error of {CALIBRATED_MM:g} mm was measured elsewhere for a "
-        f"calibrated dVRK, and plans are judged with it; an uncalibrated one may be off by {UNCALIBRATED_MM:g} "
-        "mm. docs/replay.md has the checklist before a robot moves."
+        f"Not known for your arm. Mean tip errors of {CALIBRATED_MM:g} mm were measured elsewhere for a "
+        f"calibrated dVRK, and of {UNCALIBRATED_MM:g} mm for an uncalibrated one. A plan is judged under the errors "
+        "that the laboratory states for its arms (docs/errors.md), and those of an uncalibrated arm where it states "
+        "none. docs/replay.md has the checklist before a robot moves."
     )
 
 

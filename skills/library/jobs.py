@@ -14,7 +14,7 @@ even if several workers train it. The batch ends in the same transaction as its 
 
 import secrets
 from collections.abc import Callable, Collection, Mapping, Sequence
-from typing import Any, NamedTuple, NotRequired, TypedDict, cast
+from typing import Any, Literal, NamedTuple, NotRequired, TypedDict, cast
 
 from sqlalchemy import ColumnElement, Select, Table, delete, exists, func, select, update
 from sqlalchemy.orm import Session
@@ -202,11 +202,15 @@ class PartRequest(TypedDict):
 
 
 class PlaybackRequest(TypedDict):
-    """The request of a playback's job: the plan's digest, and the mean errors of the arm's tip to judge it under."""
+    """The request of a playback's job: the plan's digest, and the stated errors of the arms to judge it under.
+
+    A job that an older version queued states none, and is judged under those of the installation.
+    """
 
     plan: str
     check_version: int
-    tip_errors_mm: list[float]
+    errors: NotRequired[dict[str, Any]]
+    stated_by: NotRequired[Literal["request", "installation"]]
 
 
 class PicturesRequest(TypedDict):

@@ -5,7 +5,7 @@
 
 The sentences about a plan and a playback are written here only, so that page, JSON, command line and bag agree. A
 headline has a level, for a colour: `good` requires that the plan hands the needle over and succeeds with enough
-certainty at the stated error of the arm. The comparisons are written so that null or NaN is never good.
+certainty under the stated errors of the arms. The comparisons are written so that null or NaN is never good.
 
 A plan may be played even if its policy was withdrawn since: a verdict moves no arm. Every playback is returned with the
 current state of the policy's release, and it is the replay bag that is refused for a policy that is not released.
@@ -36,9 +36,12 @@ from skills.planning.trajectory import Trajectory
 from skills.remedies import Action, Remedy
 from skills.settings import Settings
 from skills.verification.asked import asked_of
+from skills.verification.errors import CALLED, NAMED, ArmErrors, stated_errors
 from skills.verification.intent import compare
-from skills.verification.monte_carlo import DoubtSettings, doubt
+from skills.verification.monte_carlo import doubt
 from skills.verification.playback import Pictures
+from skills.verification.probabilities import JUDGE_VERSION
+from skills.verification.probabilities import NEEDLE as NEEDLE_ERROR
 from skills.verification.scene_clearance import NEEDLE, SceneClearance, clearance_of, flat_tissue_mm
 from skills.verification.verdict import SCENE, Failure, judge
 
@@ -46,29 +49,76 @@ Level = Literal["good", "caution", "bad"]
 MORE_OFTEN_NOT = 0.5  # a plan whose upper bound is below this fails more often than it succeeds
 
 
-def headline(
-    about: dict[str, Any], report: dict[str, Any], *, tip_error_mm: float, lower_bound: float
-) -> dict[str, Any]:
-    """Return the headline of a playback: level, text, and the probability at the stated error of the arm's tip.
+def headline(about: dict[str, Any], report: dict[str, Any], *, errors: ArmErrors, lower_bound: float) -> dict[str, Any]:
+    """Return the headline of a playback: level, text, and the probability under the stated errors of the arms.
 
     Args:
         about: The plan's description, as `describe_plan` writes it.
         report: The playback's stored report.
-        tip_error_mm: The stated mean error of the arm's tip.
+        errors: The errors that the installation states now; a playback whose request stated its own keeps those.
         lower_bound: The value that the lower bound of the entire plan's probability has to reach for the level `good`.
     """
-    judged = (report.get("doubt") or {}).get("under", [])
-    whole = next((under.get("plan") for under in judged if under["tip_error_mm"] == tip_error_mm), None)
     feasible = report.get("feasible") is True
+    try:
+        under = judged_under(report, errors)
+    except Conflict as unjudged:
+        whole, name, most, odds = None, errors.name, None, f". {unjudged.words()}"
+    else:
+        whole, name, most = under["plan"], under["errors"]["name"], costs_most(report)
+        odds = f"; {_odds(under)}{'' if most is None else f' {most}'}"
     level = _level(about, feasible, whole, lower_bound)
-    verdict = _verdict(report, feasible, whole, tip_error_mm)
+    word = _word(about, feasible, level)
+    exact = f"feasible in an exact simulation{odds}"
+    verdict = exact if feasible else report.get("failure_in_words") or "the simulator found it so."
     return {
         "level": level,
-        "word": _word(about, feasible, level),
-        "text": f"{_word(about, feasible, level)}: {verdict} {plan_in_words(about)}",
-        "tip_error_mm": tip_error_mm,
+        "word": word,
+        "text": f"{word}: {verdict} {plan_in_words(about)}",
+        "errors": name,
         "probability": whole,
+        "costs_most": most,
     }
+
+
+def judged_under(report: dict[str, Any], errors: ArmErrors) -> dict[str, Any]:
+    """Return the part of a stored report that counts: a `DoubtUnder` as JSON, under the errors stated for the arms.
+
+    These are the errors of the playback's request, or else those that the installation states now.
+
+    Raises:
+        Conflict: The first judge made the verdict, without those errors; or the installation states others since.
+    """
+    doubted = report.get("doubt") or {}
+    if not (doubted.get("version", 1) >= JUDGE_VERSION and doubted.get("under")):
+        raise Conflict(
+            "How often this plan succeeds was judged by an older version, without errors of registration and wrist; "
+            "play it again."
+        )
+    stated: dict[str, Any] = doubted["under"][0]
+    if report.get("stated_by") != "request" and stated["errors"] != asdict(errors):
+        raise Conflict(
+            f"This plan was judged with {errors_in_words(stated['errors']['name'])}, which the installation stated "
+            f"then; now it states {errors_in_words(errors.name)}. Play it again."
+        )
+    return stated
+
+
+def costs_most(report: dict[str, Any]) -> str | None:
+    """Return the sentence on the error that costs the most; None where no error was judged by itself."""
+    doubted = report.get("doubt") or {}
+    costs = doubted.get("costs") or []
+    if not costs:
+        return None
+    first, whole = costs[0], doubted["under"][0]["plan"]
+    if first["without"]["count"] <= whole["count"]:
+        return "No error by itself lowers this."
+    share = _percent(first["without"]["probability"])
+    return f"Most is lost by {error_called(first['error'])}: without it {share} of the worlds succeed."
+
+
+def error_called(error: str) -> str:
+    """Return the name of an error of a `Cost` as a phrase."""
+    return "the needle's angle in PSM_A's jaws" if error == NEEDLE_ERROR else CALLED[error]
 
 
 def _level(about: dict[str, Any], feasible: bool, whole: dict[str, Any] | None, lower_bound: float) -> Level:
@@ -91,17 +141,20 @@ def _word(about: dict[str, Any], feasible: bool, level: Level) -> str:
     return "Likely to succeed" if level == "good" else "Uncertain"
 
 
-def _verdict(report: dict[str, Any], feasible: bool, whole: dict[str, Any] | None, tip_error_mm: float) -> str:
-    if not feasible:
-        return report.get("failure_in_words") or "the simulator found it so."
-    exact = "feasible in an exact simulation"
-    if whole is None:
-        return f"{exact}; how often it succeeds with a tip error of {tip_error_mm:g} mm was not judged."
+def _odds(under: dict[str, Any]) -> str:
+    whole = under["plan"]
     return (
-        f"{exact}; with a tip error of {tip_error_mm:g} mm the complete plan succeeds in {whole['count']} of "
+        f"with {errors_in_words(under['errors']['name'])} the complete plan succeeds in {whole['count']} of "
         f"{whole['of']} worlds: {_percent(whole['probability'])} ({_percent(whole['lower'])} to "
         f"{_percent(whole['upper'])}, 95 %)."
     )
+
+
+def errors_in_words(name: str) -> str:
+    """Return the phrase for the errors of this name: a default's, or a laboratory's own."""
+    if name not in NAMED:
+        return f"the stated errors {name!r}"
+    return f"the errors of {'an' if name[0] in 'aeiou' else 'a'} {name} arm"
 
 
 def _percent(part: float | None) -> str:
@@ -116,16 +169,29 @@ def _percent(part: float | None) -> str:
 CHECK_VERSION = 3  # part of the job's identity: raise it when verdicts change, so that plans can be played again
 
 
-def request_playback(session: Session, plan_sha256: str, actor: str, settings: Settings) -> tuple[Job, bool]:
+def request_playback(
+    session: Session, plan_sha256: str, actor: str, settings: Settings, errors: ArmErrors | None = None
+) -> tuple[Job, bool]:
     """Queue the playback of a plan in the simulator; return the job, and whether it is new.
+
+    Args:
+        session: The caller's transaction.
+        plan_sha256: The plan's digest.
+        actor: The caller's name.
+        settings: The installation's settings.
+        errors: The errors of the arms that are to play it; None: those that the installation states.
 
     Raises:
         BadPlan: Its frame is not the arm's base, so the simulator would place it wrongly.
     """
     plan = find_plan(session, plan_sha256)
     check_frame(plan.about["frame"])
-    errors = sorted({*DoubtSettings().tip_errors_mm, settings.replay_tip_error_mm})
-    request: PlaybackRequest = {"plan": plan.sha256, "check_version": CHECK_VERSION, "tip_errors_mm": errors}
+    request: PlaybackRequest = {
+        "plan": plan.sha256,
+        "check_version": CHECK_VERSION,
+        "errors": asdict(stated_errors(settings.arm_errors) if errors is None else errors),
+        "stated_by": "installation" if errors is None else "request",
+    }
     return jobs.ask(session, "playback", request, plan.policy.surgeon, actor)
 
 
@@ -152,10 +218,11 @@ def check_playback(
     verdict = judge(measured, trajectory, approach_m=approach_m, beside=beside, pad_is_tissue=False, intent=intent)
     tissue = plan.scene is not None and plan.scene.tissue is not None
     top_mm = flat_tissue_mm(trajectory, beside.report) if tissue and beside is not None else None
-    varied = DoubtSettings(tip_errors_mm=tuple(request["tip_errors_mm"]))
-    doubted = doubt(trajectory, approach_m=approach_m, pad_top_mm=top_mm, settings=varied)
+    errors = ArmErrors(**request["errors"]) if "errors" in request else stated_errors(settings.arm_errors)
+    doubted = doubt(trajectory, approach_m=approach_m, pad_top_mm=top_mm, errors=errors)
     report = _finite(asdict(verdict)) | {
         "doubt": _finite(asdict(doubted)),
+        "stated_by": request.get("stated_by", "installation"),
         "failure_in_words": failure_in_words(verdict.failure, beside),
         "scene": None if beside is None else _finite(asdict(beside.report)),
         "tissue": "judged" if tissue else "not given",
@@ -197,9 +264,9 @@ def find_playback(session: Session, playback_sha256: str) -> StoredPlayback:
 
 
 def headline_of(playback: StoredPlayback, settings: Settings) -> dict[str, Any]:
-    """Return the headline of a playback at the tip error and lower bound of the installation's settings."""
-    asked = {"tip_error_mm": settings.replay_tip_error_mm, "lower_bound": settings.replay_lower_bound}
-    return headline(playback.plan.about, playback.report, **asked)
+    """Return the headline of a playback at the errors and the lower bound of the installation's settings."""
+    errors, lower_bound = stated_errors(settings.arm_errors), settings.replay_lower_bound
+    return headline(playback.plan.about, playback.report, errors=errors, lower_bound=lower_bound)
 
 
 def standing_of(session: Session, playback: StoredPlayback) -> dict[str, Any]:

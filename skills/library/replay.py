@@ -36,13 +36,14 @@ from skills.library import consent, policies, releases, signatures
 from skills.library.demos import find_demo
 from skills.library.integrity import learnt, learnt_in, planned
 from skills.library.plans import describe_plan, find_plan, plan_in_words, trajectory_of
-from skills.library.playbacks import trajectory_digest
+from skills.library.playbacks import costs_most, errors_in_words, judged_under, trajectory_digest
 from skills.library.policies import learnt_from
 from skills.packing import canonical, sha256
 from skills.planning.plan import CONSTANT_TURN_DEG, SuturePlan, departure_of
 from skills.planning.trajectory import Trajectory
 from skills.remedies import Action, Remedy
 from skills.transparency import Note
+from skills.verification.errors import ArmErrors
 
 POINTS = 1000  # ours, for either path: one every 0.25 mm of a long pass, and 24 MB to align the two
 
@@ -111,7 +112,7 @@ def replay_bag(
     database: Database,
     plan_sha256: str,
     *,
-    tip_error_mm: float,
+    errors: ArmErrors,
     lower_bound: float,
     constant_turn_deg: float = CONSTANT_TURN_DEG,
     pass_index: int | None = None,
@@ -122,7 +123,7 @@ def replay_bag(
     Args:
         database: The database with the plan.
         plan_sha256: The plan's digest.
-        tip_error_mm: The tip error under which the plan's probability of success is taken, see `check_doubt`.
+        errors: The errors of the arms that the installation states, see `check_doubt`.
         lower_bound: The least probability, by its lower bound, with which every pass has to succeed.
         constant_turn_deg: The angle by which a constant orientation may depart from the recorded one.
         pass_index: Export this pass alone, counted from 0; None: all of them.
@@ -137,7 +138,7 @@ def replay_bag(
         Busy: The history cannot be signed now.
         BadSettings: The signing key cannot be read.
     """
-    asked = {"tip_error_mm": tip_error_mm, "lower_bound": lower_bound, "constant_turn_deg": constant_turn_deg}
+    asked: dict[str, Any] = {"errors": errors, "lower_bound": lower_bound, "constant_turn_deg": constant_turn_deg}
     with database.reading() as session:
         row = find_plan(session, plan_sha256)
         verdict = cleared(session, row, handoff=handoff, **asked)
@@ -191,7 +192,7 @@ def cleared(
     session: Session,
     plan: Plan,
     *,
-    tip_error_mm: float,
+    errors: ArmErrors,
     lower_bound: float,
     constant_turn_deg: float = CONSTANT_TURN_DEG,
     handoff: Literal["none"] | None = None,
@@ -201,7 +202,7 @@ def cleared(
     Args:
         session: The caller's transaction.
         plan: The plan.
-        tip_error_mm: The tip error that is expected of the robot, see `check_doubt`.
+        errors: The errors of the arms that the installation states, see `check_doubt`.
         lower_bound: The least probability, by its lower bound, with which every pass has to succeed.
         constant_turn_deg: The angle by which a constant orientation may depart from the recorded one.
         handoff: "none" accepts a plan without a hand-off.
@@ -254,7 +255,7 @@ def cleared(
             "An older version played this plan and did not compare the motion with what was asked.",
             Remedy(Action.PLAY, plan=plan.sha256),
         )
-    check_doubt(played.report, tip_error_mm=tip_error_mm, lower_bound=lower_bound)
+    check_doubt(played.report, errors=errors, lower_bound=lower_bound)
     return played
 
 
@@ -280,28 +281,28 @@ def _check_departure(planned: SuturePlan, plan: Plan, constant_turn_deg: float) 
         )
 
 
-def check_doubt(report: dict[str, Any], *, tip_error_mm: float, lower_bound: float) -> None:
+def check_doubt(report: dict[str, Any], *, errors: ArmErrors, lower_bound: float) -> None:
     """Refuse a plan whose least certain pass succeeds too rarely when the world differs from the plan.
 
     Args:
-        report: A playback's stored report; its `doubt` is a `skills.verification.monte_carlo.Doubt` as JSON, with null
-            for NaN.
-        tip_error_mm: The tip error that is expected of the robot: one of those that were simulated.
+        report: A playback's stored report; its `doubt` is a `skills.verification.probabilities.Doubt` as JSON, with
+            null for NaN.
+        errors: The errors of the arms that the installation states; those of the playback's request come first.
         lower_bound: The value that the lower bounds of all passes have to reach.
 
     Raises:
-        Conflict: A pass does not reach it, or the plan was not simulated under this tip error.
+        Conflict: A pass does not reach it, or the plan was not judged under these errors.
     """
-    judged = (report.get("doubt") or {}).get("under", [])
-    passes = [one for under in judged if under["tip_error_mm"] == tip_error_mm for one in under["passes"]]
-    if not passes:
-        raise Conflict(f"This plan was not judged with a tip error of {tip_error_mm:g} mm; play it again.")
-    least = float(np.min(np.array([one["succeeds"]["lower"] for one in passes], dtype=np.float64)))  # null becomes NaN
+    under = judged_under(report, errors)
+    lower = np.array([one["succeeds"]["lower"] for one in under["passes"]], dtype=np.float64)  # null becomes NaN
+    least = float(np.min(lower)) if len(lower) else np.nan
     # NaN fails too: it is not >= any bound.
     if not least >= lower_bound:
+        most = costs_most(report)
         raise Conflict(
-            f"With a tip error of {tip_error_mm:g} mm a pass of this plan may succeed with a probability of only "
-            f"{least:.3f}, and {lower_bound:g} is required; move its suture points, or calibrate the robot.",
+            f"With {errors_in_words(under['errors']['name'])} a pass of this plan may succeed with a probability of "
+            f"only {least:.3f}, and {lower_bound:g} is required.{'' if most is None else f' {most}'} Register and "
+            "calibrate the arms, state their own errors, and play the plan again.",
             least=least,
             asked=lower_bound,
         )

@@ -45,7 +45,7 @@ from skills.schemas.recordings import (
     RewardMap,
     SuturePoints,
 )
-from skills.verification.monte_carlo import Doubt, Probability
+from skills.verification.probabilities import Doubt, Probability
 from skills.verification.scene_clearance import SceneReport
 from skills.verification.verdict import PlaybackReport
 
@@ -110,6 +110,7 @@ class Verdict(PlaybackReport):
         frame: Frame of the plan.
         scene: Distances from the plan's scene; null: it has none, so nothing was compared with tissue.
         tissue: Whether the motion was compared with tissue; null in older verdicts.
+        stated_by: Source of the errors of the arms, the playback's request or the installation; null in older verdicts.
     """
 
     failure_in_words: str | None
@@ -120,6 +121,7 @@ class Verdict(PlaybackReport):
     frame: str
     scene: SceneReport | None = None
     tissue: Literal["judged", "not given"] | None = None
+    stated_by: Literal["request", "installation"] | None = None
 
 
 class Sources(Given):
@@ -251,8 +253,11 @@ class Headline(Given):
     )
     word: str = Field(description="The level in a word or two.")
     text: str
-    tip_error_mm: float = Field(description="The stated mean error of the arm's tip, a setting of the installation.")
+    errors: str = Field(
+        description="Name of the errors of the arms: those of the playback's request, or else of the installation."
+    )
     probability: Probability | None = Field(description="Of the whole plan; null where it was not judged.")
+    costs_most: str | None = Field(description="The error that costs the most, in words; null where none was judged.")
 
 
 class Playback(Given):

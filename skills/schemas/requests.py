@@ -29,6 +29,7 @@ from skills.planning.plan import (
 from skills.planning.trajectory import MAX_SPEED_MM_S
 from skills.schemas import DemoOutcome, Handedness, SkillLevel
 from skills.settings import Role
+from skills.verification.errors import NAMED, ArmErrors, checked_own
 
 SLUG = r"^[a-z0-9][a-z0-9_-]{0,63}$"
 DIGEST = r"^[0-9a-f]{8,64}$"  # in full, or a prefix that no other digest has
@@ -72,6 +73,8 @@ Name = Annotated[str, Field(min_length=1, max_length=200, pattern=LINE)]
 Text = Annotated[str, Field(max_length=2000, pattern=LINES)]
 Whole = Annotated[StrictInt, Field(ge=0, le=2**31)]
 Number = Annotated[float, Field(strict=True)]  # strict, so that true is not accepted as a number
+Size = Annotated[Number, Field(ge=0, le=1000)]
+Source = Annotated[str, Field(min_length=1, max_length=600, pattern=LINE)]
 Coordinate = Annotated[Number, Field(ge=-10_000, le=10_000)]
 Point = tuple[Coordinate, Coordinate, Coordinate]
 Hysteresis = Annotated[
@@ -556,12 +559,46 @@ class PlanIn(Schema):
     )
 
 
-class PlaybackIn(Schema):
-    """A playback: the plan to play in the simulator."""
+class ErrorSources(Schema):
+    """For each size of an arm's errors its source, and the reason for its value."""
 
-    model_config = shown({"plan": "0123456789abcdef" * 4})
+    registration_mm: Source
+    registration_deg: Source
+    wrist_deg: Source
+    tip_bias_mm: Source
+    tip_noise_mm: Source
+    tip_correlation_s: Source
+
+
+class ArmErrorsIn(Schema):
+    """A laboratory's own errors of its arms, standard deviations along or about each axis (docs/errors.md)."""
+
+    name: Annotated[str, Field(min_length=1, max_length=60, pattern=LINE)]
+    registration_mm: Size = Field(description="Offset of PSM_M's base.")
+    registration_deg: Size = Field(description="Rotation of PSM_M's base about its remote centre.")
+    wrist_deg: Size = Field(description="Rotation of either arm's jaws about their hinge.")
+    tip_bias_mm: Size = Field(description="Offset of either arm that stays over a pass.")
+    tip_noise_mm: Size = Field(description="Offset of either arm that varies during a pass.")
+    tip_correlation_s: Size = Field(description="Correlation time of that noise.")
+    sources: ErrorSources
+
+
+class PlaybackIn(Schema):
+    """A playback: the plan to play in the simulator, and the errors of the arms to judge it under."""
+
+    model_config = shown({"plan": "0123456789abcdef" * 4}, {"plan": "0123456789abcdef" * 4, "errors": "calibrated"})
 
     plan: DigestField
+    errors: Literal["calibrated", "uncalibrated"] | ArmErrorsIn | None = Field(
+        default=None, description="The errors of the arms that are to play it; by default those of the installation."
+    )
+
+    @property
+    def arm_errors(self) -> ArmErrors | None:
+        """The errors as a value of the domain."""
+        if self.errors is None or isinstance(self.errors, str):
+            return None if self.errors is None else NAMED[self.errors]
+        return checked_own(ArmErrors(**self.errors.model_dump()))
 
 
 class DatasetIn(Schema):

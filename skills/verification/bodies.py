@@ -31,7 +31,7 @@ of them was compared with the manufacturer's meshes**: an arm may stand out of i
 moment of inertia shows it, such as with cables and drapes.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import hypot
 from typing import Protocol
@@ -44,6 +44,7 @@ from skills.kinematics import CLASSIC, INSERTION, SI, WRIST_MM, axes_of, instrum
 from skills.planning.motion_laws import PHASES
 from skills.planning.trajectory import Trajectory
 from skills.verification.clearance import FINGER_REACH_MM, SHAFT_RADIUS_MM
+from skills.verification.errors import Displaced
 from skills.verification.playback import CLEARANCE_SEEN_MM, PSM_A, PSM_M
 
 MARGIN_MM = 10.0  # ours: what each radius below is larger than the outline that it stands for, where one is known
@@ -440,40 +441,57 @@ class Placed(Protocol):
 
 
 def too_near(
-    arms: tuple[Placed, ...], joints: list[Floats], apart_mm: Floats, errors: Floats, limit_mm: float
+    arms: tuple[Placed, ...],
+    joints: list[Floats],
+    displaced: Sequence[Displaced],
+    limit_mm: float,
+    wanted: Flags,
 ) -> Flags:
     """Return in which variations of a pass outer bodies come nearer to each other than a limit; NaN is too near.
 
-    Only pairs that the planned distance and the greatest possible movement leave in doubt are computed.
+    Only pairs that the planned distance and the greatest possible movement leave in doubt are computed. The jaws'
+    rotation about their hinge is left out: at 3 degrees it moves a hand's end by half a millimetre.
 
     Args:
         arms: Both arms as planned in S samples.
         joints: Their joints in N variations, each of shape (N * S, 6), the samples of a variation together.
-        apart_mm: Offset of PSM_A from PSM_M at an error of 1 mm, shape (N, 3).
-        errors: The errors, shape (E,).
+        displaced: The E displacements of the arms in the N variations.
         limit_mm: The distance that must be kept.
+        wanted: The variations to judge, shape (E, N); the others are not too near.
 
     Returns:
         Flags of shape (E, N).
     """
-    samples, count = len(arms[0].joints), len(apart_mm)
-    radii = [radii_of(arm.instrument) for arm in arms]
+    samples, count = len(arms[0].joints), wanted.shape[1]
+    radii, centre = [radii_of(arm.instrument) for arm in arms], arms[1].base_mm
     planned = [_placed(arm, arm.joints) for arm in arms]
     apart = between(planned[0], radii[0], planned[1], radii[1])
     shapes = [one.reshape(count, samples, 6) for one in joints]
     moves = [moved_mm(arm.joints, q, arm.instrument) for arm, q in zip(arms, shapes, strict=True)]
-    offset = np.linalg.norm(apart_mm, axis=1)[:, None, None, None] * errors.max()
-    way = moves[0][..., :, None] + moves[1][..., None, :] + offset
-    surely = (apart + way < limit_mm).any(axis=(1, 2, 3))
-    wrong = np.tile(surely, (len(errors), 1))
-    which, sample, part, other = np.nonzero(~(apart - way >= limit_mm) & ~surely[:, None, None, None])
-    if len(which):
-        row = which * samples + sample
-        p, u = _axes(arms[0], joints[0], row, part)
-        q, v = _axes(arms[1], joints[1], row, other)
-        for number, error in enumerate(errors):
-            found = segments_apart(p + error * apart_mm[which], u, q, v) - radii[0][part] - radii[1][other]
-            wrong[number] |= np.bincount(which[~(found >= limit_mm)], minlength=count) > 0
+    way = moves[0][..., :, None] + moves[1][..., None, :]
+    ends = np.stack([planned[1].begin_mm, planned[1].end_mm])
+    lever = (np.linalg.norm(ends - centre, axis=3).max(axis=0) + moves[1]).max(axis=2)  # from PSM_M's remote centre
+    least, most = (apart - way).min(axis=(2, 3)), (apart + way).min(axis=(2, 3))
+    wrong = np.zeros((len(displaced), count), dtype=bool)
+    for number, errors in enumerate(displaced):
+        offset = np.linalg.norm(errors.tip_mm[0] - errors.tip_mm[1], axis=2)
+        offset = offset + np.linalg.norm(errors.base_mm, axis=1)[:, None] + errors.base_rad[:, None] * lever
+        surely = (most + offset < limit_mm).any(axis=1) & wanted[number]
+        wrong[number] = surely
+        # negated, so that NaN is in doubt
+        variations, at = np.nonzero(~(least - offset >= limit_mm) & (wanted[number] & ~surely)[:, None])
+        doubtful = ~(apart[at] - way[variations, at] - offset[variations, at, None, None] >= limit_mm)
+        which, part, other = np.nonzero(doubtful)
+        if len(which):
+            variation, sample = variations[which], at[which]
+            row, turn = variation * samples + sample, errors.base_turn[variation]
+            p, u = _axes(arms[0], joints[0], row, part)
+            q, v = _axes(arms[1], joints[1], row, other)
+            q, v = (np.einsum("kij,kj->ki", turn, one) for one in (q - centre, v))
+            q = q + centre + errors.base_mm[variation] + errors.tip_mm[1, variation, sample]
+            p = p + errors.tip_mm[0, variation, sample]
+            found = segments_apart(p, u, q, v) - radii[0][part] - radii[1][other]
+            wrong[number] |= np.bincount(variation[~(found >= limit_mm)], minlength=count) > 0
     return wrong
 
 

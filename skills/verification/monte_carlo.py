@@ -2,14 +2,10 @@
 
     Trajectory --doubt--> Doubt: how often each pass stays clear and its needle is caught
 
-A *variation* of a pass draws three errors, independently of one another and of other passes:
+A *variation* of a pass draws the errors of `verification.errors`, independently of one another:
 
-* Tip error. Each arm is offset from the place that its joints give, by an offset that stays over the pass, as after a
-  registration: even in all directions, normally distributed, of a mean length of 0.65 mm (a calibrated dVRK) or 3 mm
-  (an uncalibrated one): Hwang et al., "Efficiently Calibrating Cable-Driven Surgical Robots With RGBD Fiducial Sensing
-  and Recurrent Neural Networks" (arXiv:2003.08520), measured a mean tracking error of 2.96 mm, and of 0.65 mm once
-  calibrated. The arms' offsets are independent, so between the jaws it is sqrt(2) of one. Joints stay as commanded; the
-  complete arm is offset.
+* Arms. PSM_M's base, both wrists and both tips are off by errors of stated sizes (`ArmErrors`). Joints stay as
+  commanded; the arms are elsewhere than those joints say.
 * Suture point. The pass, and all that belongs to it (pad, needle, hand-off), is shifted by up to 5 mm along each axis,
   drawn uniformly. The arms' bases stay, and the joints are solved again.
 * Needle angle. The needle stands in PSM_A's jaws with an error of up to 10 degrees, drawn uniformly, about any axis
@@ -21,32 +17,48 @@ judged: a plan made for the shifted point has its own.
 
 The needle is *caught* if its arc crosses the plane in which PSM_M's fingers close, at the end of A2, within the sector
 that they sweep, with needle to spare on both sides of them, and its tangent there is within the stated angle of their
-hinge. That requires PSM_M's desired pose but not its base. Without PSM_M's approach there is no hand-off to judge.
+hinge. Where PSM_M's base is not known, its remote centre is taken to be behind its desired pose, at a usual depth.
+Without PSM_M's approach there is no hand-off to judge.
 
-Only a few samples of a pass are checked. That is enough for the pad: the jaws are turned as planned in every variation,
-so fingers and hinge are translated without rotation, and the sample in which they are nearest to the pad stays the
-same; wrist and shaft are behind them. With another offset the arms may be nearest to each other in another sample, so
-some samples all along the path are checked.
+Only a few samples of a pass are checked: those in which, as planned, an arm is nearest to the pad and to the other one,
+and some all along the path. In a variation another sample may be the nearest, by a small part of the errors.
 
-The paper has its arms exactly in place; all of this is ours, except the two measured errors.
+*Sensitivity*: the same variations are evaluated again with each error of the arms set to zero, all others drawn as
+before. The error without which most variations succeed costs the most.
+
+A pose is evaluated only where its distance in the variation without errors of the arms is less than the limit plus the
+most that these errors can move the links; elsewhere it is clear by that bound.
+
+The paper has its arms exactly in place; all of this is ours, except the sources that the errors name.
 """
 
-from dataclasses import dataclass, field, replace
-from math import inf, isfinite, pi, radians, sqrt
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from math import inf, isfinite
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from skills.arrays import Bytes, Flags, Floats, Ints
 from skills.errors import BadInput, BadSettings
-from skills.fields import Count, Figure, Fraction, schema
-from skills.kinematics import CANNULA_MM, INSERTION, forward, instrument_of, joint_margins, matrix_of, solutions_of
-from skills.learning.slip import wilson
-from skills.planning.handoff import OPEN_RAD, hand_off
+from skills.kinematics import (
+    CANNULA_MM,
+    DEFAULT_INSTRUMENT,
+    INSERTION,
+    WRIST_MM,
+    axes_of,
+    forward,
+    instrument_of,
+    joint_margins,
+    matrix_of,
+    solutions_of,
+)
+from skills.planning.handoff import HELD_MM, hand_off
 from skills.planning.motion_laws import Pose
 from skills.planning.trajectory import A2, Trajectory
 from skills.verification.bodies import too_near
 from skills.verification.clearance import (
+    FINGER_REACH_MM,
     FINGERS,
     HandOff,
     Links,
@@ -57,53 +69,22 @@ from skills.verification.clearance import (
     openings,
     travel_mm,
 )
+from skills.verification.errors import CALIBRATED, CALLED, UNCALIBRATED, ArmErrors, Displaced, Drawn, draw
+from skills.verification.probabilities import (
+    AT_THE_END,
+    JUDGE_VERSION,
+    NEEDLE,
+    Cost,
+    Doubt,
+    DoubtSettings,
+    counted,
+    share,
+)
 from skills.verification.verdict import Limits
 
-_MEAN_LENGTH = sqrt(8 / pi)  # of a vector of three standard normal numbers
 _CHUNK = 64  # variations computed at once, so that they stay in the processor's cache; the results do not depend on it
 _STILL_MM = 1e-6  # with less total travel, a pass is one stretch
 _ROUND_OFF = 1e-9  # as in `kinematics`: a joint on its limit is within it
-
-
-@dataclass(frozen=True, eq=False)
-class Drawn:
-    """Random errors, drawn from a seed, for N variations of a pass.
-
-    Attributes:
-        offset_a: PSM_A's offset at a tip error of 1 mm, shape (N, 3).
-        offset_m: PSM_M's offset, the same.
-        shift_mm: Shift of the pass from its planned place, shape (N, 3).
-        turned: Rotation of the needle about PSM_A's grip, shape (N, 3, 3).
-    """
-
-    offset_a: Floats
-    offset_m: Floats
-    shift_mm: Floats
-    turned: Floats
-
-    def at(self, chunk: slice) -> "Drawn":
-        """Return a slice of the variations."""
-        return Drawn(self.offset_a[chunk], self.offset_m[chunk], self.shift_mm[chunk], self.turned[chunk])
-
-
-def draw(seed: int, number: int, variations: int, suture_point_mm: float, needle_rad: float) -> Drawn:
-    """Draw the variations of a pass; the same arguments give the same bytes.
-
-    Args:
-        seed: Seed of the random numbers, 0 or more.
-        number: Number of the pass, which gives each pass its own random numbers.
-        variations: Number of variations, N.
-        suture_point_mm: Greatest shift of the pass along each axis.
-        needle_rad: Greatest rotation of the needle.
-    """
-    # A stream for each pass, because passes are independent of one another.
-    rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence((seed, number))))
-    offsets = rng.standard_normal((2, variations, 3)) / _MEAN_LENGTH
-    shift = rng.uniform(-suture_point_mm, suture_point_mm, (variations, 3))
-    axis = rng.standard_normal((variations, 3))
-    half = rng.uniform(-needle_rad, needle_rad, (variations, 1)) / 2
-    turns = np.sin(half) * axis / np.linalg.norm(axis, axis=1, keepdims=True)
-    return Drawn(offsets[0], offsets[1], shift, matrix_of(np.concatenate([turns, np.cos(half)], axis=1)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,6 +132,13 @@ class Planned:
         openings_rad = np.tile(self.opening_rad, len(joints) // len(self.opening_rad))
         return links_of(joints, self.instrument, openings_rad).seen_from(self.base, self.base_mm)
 
+    def poses(self, joints: Floats) -> tuple[Floats, Floats]:
+        """Return the tips, (T, 3), and rotations [n o a], (T, 3, 3), of joints in PSM_A's base frame; NaN stays NaN."""
+        shaft, wrist, rotation = axes_of(joints)
+        depth_mm = joints[:, INSERTION] - instrument_of(self.instrument).wrist_offset_mm
+        tip = depth_mm[:, None] * shaft + WRIST_MM * wrist
+        return tip @ self.base.T + self.base_mm, self.base @ rotation
+
     def margins(self, joints: Floats) -> Floats:
         """Return each joint's distance from its nearer limit as a part of its range."""
         tool = instrument_of(self.instrument)
@@ -169,12 +157,14 @@ class PlannedPass:
         arms: PSM_A and, if its place is known, PSM_M.
         phase: Phase of each sample, shape (S,).
         pad_top_mm: Height of the pad's top in the PSM_A base frame; -inf: there is no pad.
+        stamps_s: Time of each sample, shape (S,).
         taking: The recorded pose in which PSM_M takes the needle, in that frame; None: that of the paper's A2.
     """
 
     arms: tuple[Planned, ...]
     phase: Bytes
     pad_top_mm: float
+    stamps_s: Floats
     taking: Pose | None = None
 
     @property
@@ -203,7 +193,7 @@ def scene_of(trajectory: Trajectory, number: int, pad_top_mm: float, opening_rad
         arms.append(Planned(*forward(joints, other.instrument), joints, other.instrument, base, other.base_mm, opened))
     recorded = trajectory.taking
     taking = None if recorded is None else Pose(recorded.tip_mm[number], recorded.rotation[number])
-    return PlannedPass(tuple(arms), trajectory.phase[samples], pad_top_mm, taking)
+    return PlannedPass(tuple(arms), trajectory.phase[samples], pad_top_mm, trajectory.stamps_s[samples], taking)
 
 
 def looked_at(scene: PlannedPass, stretches: int) -> PlannedPass:
@@ -229,55 +219,124 @@ def looked_at(scene: PlannedPass, stretches: int) -> PlannedPass:
     spans = list(zip(begins.tolist(), ends.tolist(), strict=True))
     least = [begin + int(values[begin : end + 1].argmin()) for values in margins for begin, end in spans]
     samples = np.unique(np.concatenate([begins, ends, least]))
-    return replace(scene, arms=tuple(arm.at(samples) for arm in scene.arms), phase=scene.phase[samples])
+    arms = tuple(arm.at(samples) for arm in scene.arms)
+    return replace(scene, arms=arms, phase=scene.phase[samples], stamps_s=scene.stamps_s[samples])
 
 
-def spoiled(scene: PlannedPass, drawn: Drawn, tip_errors_mm: Floats, limits: Limits) -> dict[str, Flags]:
-    """Return the faults of N variations along the pass under E tip errors; NaN is a fault.
+def spoiled(
+    scene: PlannedPass,
+    shift_mm: Floats,
+    displaced: Sequence[Displaced],
+    limits: Limits,
+    wanted: Flags | None = None,
+) -> dict[str, Flags]:
+    """Return the faults of N variations along the pass, each with E displacements of the arms; NaN is a fault.
 
     Args:
         scene: The pass in the samples to check.
-        drawn: The N variations.
-        tip_errors_mm: Mean length of each arm's offset, shape (E,).
+        shift_mm: Shift of the pass in each variation, shape (N, 3).
+        displaced: The E displacements of the N variations.
         limits: The playback's limits, which are applied.
+        wanted: The variations to judge, shape (E, N), the others have no faults; None: all.
 
     Returns:
-        For each of `ON_THE_WAY` whether it occurs, shape (E, N); without "arms" and "bodies" if PSM_M is not in the
-        scene, and without "pad" if there is no pad.
+        For each of `ON_THE_WAY` whether it occurs, shape (E, N); without "arms" and "bodies" if PSM_M is not in
+        the scene, and without "pad" if there is no pad.
     """
-    chunks = [slice(k, k + _CHUNK) for k in range(0, len(drawn.shift_mm), _CHUNK)]
-    found = [_spoiled(scene, drawn.at(chunk), tip_errors_mm[:, None], limits) for chunk in chunks]
+    count = len(shift_mm)
+    judged = np.ones((len(displaced), count), dtype=bool) if wanted is None else wanted
+    chunks = [slice(k, k + _CHUNK) for k in range(0, count, _CHUNK)]
+    found = [
+        _spoiled(scene, shift_mm[chunk], [one.at(chunk) for one in displaced], limits, judged[:, chunk])
+        for chunk in chunks
+    ]
     return {name: np.concatenate([one[name] for one in found], axis=1) for name in found[0]}
 
 
-def _spoiled(scene: PlannedPass, drawn: Drawn, errors: Floats, limits: Limits) -> dict[str, Flags]:
-    count, samples = len(drawn.shift_mm), len(scene.phase)
-    joints = [arm.shifted(drawn.shift_mm) for arm in scene.arms]
-    links = [arm.links(q) for arm, q in zip(scene.arms, joints, strict=True)]
-    offsets = (drawn.offset_a, drawn.offset_m)
-    # Joints stay as commanded, so these faults are the same under every tip error.
+def _spoiled(
+    scene: PlannedPass, shift_mm: Floats, displaced: Sequence[Displaced], limits: Limits, wanted: Flags
+) -> dict[str, Flags]:
+    count, samples = len(shift_mm), len(scene.phase)
+    joints = [arm.shifted(shift_mm) for arm in scene.arms]
+    # Joints stay as commanded, so these faults are the same under every displacement of the arms.
     margin = np.minimum.reduce([_least(arm.margins(q), count) for arm, q in zip(scene.arms, joints, strict=True)])
     insertion = np.minimum.reduce(
         [_least(arm.insertion_mm(q), count) for arm, q in zip(scene.arms, joints, strict=True)]
     )
-    top = scene.pad_top_mm + np.repeat(drawn.shift_mm[:, 2], samples)  # the pad moves with the pass
-    above = [_least(clearance_to_pad(one, top), count) for one in links]
-    raised = [clear + errors * offset[:, 2] for clear, offset in zip(above, offsets, strict=False)]
-    of_joints = {
-        "reach": ~(margin >= -_ROUND_OFF),
-        "limits": ~((margin >= limits.joint_margin - _ROUND_OFF) & (insertion >= limits.insertion_mm)),
+    kept = {
+        "reach": margin >= -_ROUND_OFF,
+        "limits": (margin >= limits.joint_margin - _ROUND_OFF) & (insertion >= limits.insertion_mm),
     }
-    found = {name: np.broadcast_to(wrong, (len(errors), count)) for name, wrong in of_joints.items()}
+    found = {name: ~good & wanted for name, good in kept.items()}
+    top = scene.pad_top_mm + np.repeat(shift_mm[:, 2], samples)  # the pad moves with the pass
+    handing_over = np.concatenate([scene.handing_over] * count)
+    links = [arm.links(q) for arm, q in zip(scene.arms, joints, strict=True)]
+    above = [clearance_to_pad(one, top).min(axis=1) for one in links]
+    between = _apart(links[0], links[1], handing_over) if len(links) == 2 else np.full(count * samples, np.inf)
+    levers = [_lever_mm(arm, one) for arm, one in zip(scene.arms, links, strict=True)]
     if scene.pad_top_mm > -inf:
-        found["pad"] = ~(np.minimum.reduce(raised) >= limits.clearance_pad_mm)
+        found["pad"] = np.zeros_like(wanted)
     if len(links) == 2:
-        apart, handing_over = offsets[0] - offsets[1], np.concatenate([scene.handing_over] * count)
-        # Only the difference of the offsets matters between the arms, so one of them is moved by it.
-        moved = [links[0].moved(np.repeat(error * apart, samples, axis=0)) for error in errors]
-        between = np.array([_least(_apart(one, links[1], handing_over), count) for one in moved])
-        found["arms"] = ~(between >= limits.clearance_psm_m_mm)
-        found["bodies"] = too_near(scene.arms, joints, apart, errors[:, 0], limits.clearance_bodies_mm)
+        found["arms"] = np.zeros_like(wanted)
+        found["bodies"] = too_near(scene.arms, joints, displaced, limits.clearance_bodies_mm, wanted)
+    for number, errors in enumerate(displaced):
+        ways = [_at_most_mm(errors, arm, lever).ravel() for arm, lever in enumerate(levers)]
+        clear = np.minimum.reduce([one - way for one, way in zip(above, ways, strict=True)]) >= limits.clearance_pad_mm
+        clear &= between - sum(ways) >= limits.clearance_psm_m_mm
+        rows = np.flatnonzero(~clear & np.repeat(wanted[number], samples))
+        variations, at = np.divmod(rows, samples)
+        moved = [
+            _displaced(arm, Links(links[k].begin_mm[rows], links[k].end_mm[rows]), errors, k, variations, at)
+            for k, arm in enumerate(scene.arms)
+        ]
+        if "pad" in found:
+            near = np.minimum.reduce([clearance_to_pad(one, top[rows]).min(axis=1) for one in moved])
+            found["pad"][number, variations[~(near >= limits.clearance_pad_mm)]] = True
+        if len(moved) == 2:
+            near = _apart(moved[0], moved[1], handing_over[rows])
+            found["arms"][number, variations[~(near >= limits.clearance_psm_m_mm)]] = True
     return found
+
+
+def _lever_mm(arm: Planned, links: Links) -> Floats:
+    """Return the greatest distance of the links' axes from the arm's remote centre, shape (T,)."""
+    ends = np.concatenate([links.begin_mm, links.end_mm], axis=1) - arm.base_mm
+    return np.asarray(np.linalg.norm(ends, axis=2).max(axis=1))
+
+
+def _at_most_mm(errors: Displaced, arm: int, lever_mm: Floats) -> Floats:
+    """Return upper bounds on the distance by which errors move any point of an arm's links, shape (N, S)."""
+    turned = errors.jaw_rad[arm] * FINGER_REACH_MM
+    moved = np.linalg.norm(errors.tip_mm[arm], axis=2) + turned[:, None]
+    if arm == 0:
+        return np.asarray(moved)
+    lever = lever_mm.reshape(moved.shape) + turned[:, None]
+    return np.asarray(moved + np.linalg.norm(errors.base_mm, axis=1)[:, None] + errors.base_rad[:, None] * lever)
+
+
+def _displaced(arm: Planned, links: Links, errors: Displaced, number: int, variations: Ints, at: Ints) -> Links:
+    """Return the links of an arm where errors place it.
+
+    Args:
+        arm: The arm; `number` is 0 for PSM_A and 1 for PSM_M, whose base alone is displaced.
+        links: Its links in R poses, without errors.
+        errors: The displacements.
+        variations: The variation of each pose, shape (R,).
+        at: The sample of each pose, shape (R,).
+    """
+    begin, end, hinge = links.begin_mm.copy(), links.end_mm.copy(), links.end_mm[:, FINGERS.start - 1, None]
+    for ends in (begin, end):
+        ends[:, FINGERS] = hinge + _turned(errors.jaw_turn[number, variations], ends[:, FINGERS] - hinge)
+    by_mm = errors.tip_mm[number, variations, at]
+    if number == 1:
+        by_mm = by_mm + errors.base_mm[variations] + arm.base_mm
+        begin, end = (_turned(errors.base_turn[variations], ends - arm.base_mm) for ends in (begin, end))
+    return Links(begin, end).moved(by_mm)
+
+
+def _turned(turn: Floats, points: Floats) -> Floats:
+    """Rotate points, (T, K, 3), of each pose by a rotation, (T, 3, 3)."""
+    return np.asarray(points @ np.swapaxes(turn, 1, 2))
 
 
 def _apart(arm: Links, other: Links, handing_over: Flags) -> Floats:
@@ -292,129 +351,12 @@ def _least(values: Floats, count: int) -> Floats:
     return np.asarray(values.reshape(count, -1).min(axis=1))
 
 
-CALIBRATED_MM, UNCALIBRATED_MM = 0.65, 3.0
-ON_THE_WAY, AT_THE_END = ("reach", "limits", "pad", "arms", "bodies"), ("place", "angle")
-
-
-@schema
-@dataclass(frozen=True)
-class DoubtSettings:
-    """The errors to draw, and the conditions of a catch. All but the tip errors are ours; each has its reason.
-
-    Attributes:
-        variations: Variations of each pass. With 1000 the bounds are 6 % apart at a probability of a half, 0.4 % at
-            one.
-        tip_errors_mm: Mean length of each arm's offset: a calibrated and an uncalibrated dVRK.
-        suture_point_mm: Greatest error of the suture point along each axis.
-        needle_rad: Greatest rotation of the needle in PSM_A's jaws.
-        stated_rad: Greatest angle between the needle's tangent and PSM_M's hinge: the angle by which the needle itself
-            bends within jaws that are 2.2 mm wide, so they close on it as on a straight one.
-        opening_rad: Opening of each of PSM_M's fingers as it comes in.
-        stretches: Number of stretches of equal travel into which a pass is divided; some poses of each are checked
-            (`looked_at`). With 20, about 50 poses per pass, no other pose was nearer to the pad, nor by more than 0.2
-            mm to the other arm.
-    """
-
-    variations: Count = 1000
-    tip_errors_mm: tuple[float, ...] = (CALIBRATED_MM, UNCALIBRATED_MM)
-    suture_point_mm: float = 5.0
-    needle_rad: float = radians(10)
-    stated_rad: float = radians(15)
-    opening_rad: float = OPEN_RAD
-    stretches: Count = 20
-
-    def __post_init__(self) -> None:
-        if not (1 <= self.variations <= 1_000_000 and 1 <= self.stretches <= 1000 and self.tip_errors_mm):
-            raise BadSettings(
-                "The repetition in inexact worlds needs 1 to 1000000 variations, 1 to 1000 stretches and at least "
-                "one tip error."
-            )
-        for one in (*self.tip_errors_mm, self.suture_point_mm, self.needle_rad, self.stated_rad, self.opening_rad):
-            if not (isfinite(one) and one >= 0):
-                raise BadSettings("Every error size must be a finite number, 0 or more.", given=one)
-
-
-@schema
-@dataclass(frozen=True)
-class Probability:
-    """The number of successful variations, and the probability with its Wilson bounds, 95 %."""
-
-    count: Count
-    of: Count
-    probability: Fraction
-    lower: Fraction
-    upper: Fraction
-
-
-@schema
-@dataclass(frozen=True)
-class Faults:
-    """The number of variations with each fault; one variation may have several. None: the fault was not judged.
-
-    Attributes:
-        reach: A joint of either arm beyond its limits.
-        limits: The same, or nearer to the limits than the playback allows, or a wrist inside the cannula.
-        pad: An arm too near the pad.
-        arms: The arms' tools too near each other.
-        bodies: Their outer bodies too near each other, or to the other arm's tool.
-        place: The needle not between PSM_M's fingers.
-        angle: The needle at a wrong angle there, or not there at all.
-    """
-
-    reach: Count | None = None
-    limits: Count | None = None
-    pad: Count | None = None
-    arms: Count | None = None
-    bodies: Count | None = None
-    place: Count | None = None
-    angle: Count | None = None
-
-
-@schema
-@dataclass(frozen=True)
-class PassDoubt:
-    """A pass under one tip error: it succeeds if it is clear and, if there is a hand-off, the needle is caught."""
-
-    succeeds: Probability
-    clear: Probability
-    caught: Probability | None
-    faults: Faults
-
-
-@schema
-@dataclass(frozen=True)
-class TipDoubt:
-    """A plan under one tip error: every pass, and all of them one after another."""
-
-    tip_error_mm: float
-    plan: Probability
-    passes: tuple[PassDoubt, ...]
-
-
-@schema
-@dataclass(frozen=True)
-class Doubt:
-    """The result as plain numbers: the same for the same trajectory, pad, settings and seed on every machine.
-
-    `with_psm_m` is true if PSM_M's arm was in the scene; `hand_offs` is the number of passes in which a catch was
-    judged; `looked_at` has the number of checked poses of each pass.
-    """
-
-    seed: Count
-    pad_top_mm: Figure
-    with_psm_m: bool
-    hand_offs: Count
-    looked_at: tuple[int, ...]
-    under: tuple[TipDoubt, ...]
-    settings: DoubtSettings = field(default_factory=DoubtSettings)
-    limits: Limits = field(default_factory=Limits)
-
-
 def doubt(
     trajectory: Trajectory,
     *,
     approach_m: ArrayLike | None,
     pad_top_mm: float | None,
+    errors: ArmErrors = UNCALIBRATED,
     seed: int = 0,
     settings: DoubtSettings | None = None,
     limits: Limits | None = None,
@@ -427,12 +369,13 @@ def doubt(
             trajectory has PSM_M or its recorded pose: then the last pose of that arm counts.
         pad_top_mm: Height of the pad's top in the PSM_A base frame; the pad is assumed to be infinite. None: there is
             no pad, and nothing is compared with one.
+        errors: The stated errors of the arms. Those of both defaults are judged beside them.
         seed: Seed of the random numbers.
-        settings: The errors to draw, and the conditions of a catch.
+        settings: The other errors to draw, and the conditions of a catch.
         limits: The playback's limits.
 
     Returns:
-        The counts and probabilities of every pass and of the plan, under each tip error.
+        The counts and probabilities of every pass and of the plan, and the cost of each of the stated errors.
 
     Raises:
         BadInput: The pad's height is not finite, or a jaw's last pose is not turned to `approach_m`.
@@ -446,78 +389,118 @@ def doubt(
     top_mm = -inf if pad_top_mm is None else float(pad_top_mm)
     scenes = [scene_of(trajectory, k, top_mm, varied.opening_rad) for k in range(trajectory.passes)]
     thin = [looked_at(scene, varied.stretches) for scene in scenes]
-    found = [_wrong(scene, number, approach_m, varied, allowed, seed) for number, scene in enumerate(thin)]
+    under = [errors, *(one for one in (CALIBRATED, UNCALIBRATED) if one != errors)]
+    spared = [size for size in CALLED if getattr(errors, size) > 0]
+    found = [
+        _judged(scene, draws, approach_m, under, [errors.without(size) for size in spared], varied, allowed)
+        for scene, draws in zip(thin, _draws(thin, seed, varied), strict=True)
+    ]
+    whole = np.logical_and.reduce([one.succeeds for one in found])
+    costs = [Cost(size, share(~good)) for size, good in zip([*spared, NEEDLE], whole, strict=False)]
     return Doubt(
         seed=seed,
         pad_top_mm=None if pad_top_mm is None else top_mm,
         with_psm_m=trajectory.psm_m is not None,
-        hand_offs=sum("place" in wrong for wrong in found),
+        hand_offs=sum("place" in one.faults for one in found),
         looked_at=tuple(len(scene.phase) for scene in thin),
         under=tuple(
-            _under([{name: one[k] for name, one in wrong.items()} for wrong in found], error)
-            for k, error in enumerate(varied.tip_errors_mm)
+            counted([{name: one[k] for name, one in each.faults.items()} for each in found], one)
+            for k, one in enumerate(under)
         ),
         settings=varied,
         limits=allowed,
+        costs=tuple(sorted(costs, key=lambda one: -one.without.count)),
+        version=JUDGE_VERSION,
     )
+
+
+def _draws(scenes: Sequence[PlannedPass], seed: int, varied: DoubtSettings) -> list[Drawn]:
+    sizes = {"suture_point_mm": varied.suture_point_mm, "needle_rad": varied.needle_rad}
+    return [draw(seed, k, varied.variations, len(scene.phase), **sizes) for k, scene in enumerate(scenes)]
 
 
 # ---- one pass --------------------------------------------------------------------------------------------------
 
 
-def _wrong(
-    scene: PlannedPass, number: int, approach_m: ArrayLike | None, varied: DoubtSettings, limits: Limits, seed: int
-) -> dict[str, Flags]:
-    """Vary a pass and return its faults: for each fault that was judged, shape (tip errors, variations)."""
-    drawn = draw(seed, number, varied.variations, varied.suture_point_mm, varied.needle_rad)
-    errors = np.array(varied.tip_errors_mm)
-    found = spoiled(scene, drawn, errors, limits)
-    planned = _hand_off(scene, approach_m)
-    if planned is not None:
-        apart = drawn.offset_a - drawn.offset_m
-        caught = [catch(planned, drawn.turned, error * apart, varied.opening_rad) for error in errors]
-        found["place"] = np.array([~between for between, _ in caught])
-        found["angle"] = np.array([~(askew <= varied.stated_rad) for _, askew in caught])
-    return found
+@dataclass(frozen=True, eq=False)
+class _Judged:
+    """A pass in N variations.
+
+    `faults` has for each judged fault whether it occurs under each of E errors, shape (E, N); `succeeds` has the
+    success without one size of the stated errors each, and last with a needle that stands as planned, shape (C, N).
+    """
+
+    faults: dict[str, Flags]
+    succeeds: Flags
 
 
-def _hand_off(scene: PlannedPass, approach_m: ArrayLike | None) -> HandOff | None:
+def _judged(
+    scene: PlannedPass,
+    drawn: Drawn,
+    approach_m: ArrayLike | None,
+    under: Sequence[ArmErrors],
+    spared: Sequence[ArmErrors],
+    varied: DoubtSettings,
+    limits: Limits,
+) -> _Judged:
+    """Judge a pass under some errors, and whether it succeeds under the `spared` ones."""
+    displaced = [drawn.under(one, scene.stamps_s) for one in [*under, *spared]]
+    arms = _handing_over(scene, approach_m, varied.unknown_depth_mm)
+    missed: dict[str, Flags] = {}
+    upright = np.zeros(len(drawn.shift_mm), dtype=bool)  # the stated errors, with a needle that stands as planned
+    if arms is not None:
+        caught = [_caught(arms, drawn.shift_mm, one, drawn.turned, varied) for one in displaced]
+        missed = {name: ~np.array(one) for name, one in zip(AT_THE_END, zip(*caught, strict=True), strict=True)}
+        unturned = np.broadcast_to(np.eye(3), drawn.turned.shape)
+        upright = ~np.logical_and(*_caught(arms, drawn.shift_mm, displaced[0], unturned, varied))
+    lost = np.logical_or.reduce([np.zeros((len(displaced), len(upright)), dtype=bool), *missed.values()])
+    wanted = ~lost
+    wanted[: len(under)] = True  # of these every fault is counted; of the others success alone
+    found = spoiled(scene, drawn.shift_mm, displaced, limits, wanted)
+    spoilt = np.logical_or.reduce(list(found.values()))
+    good = ~(lost | spoilt)[len(under) :]
+    faults = {name: one[: len(under)] for name, one in (found | missed).items()}
+    return _Judged(faults, np.concatenate([good, ~(upright | spoilt[0])[None]]))
+
+
+def _handing_over(scene: PlannedPass, approach_m: ArrayLike | None, depth_mm: float) -> tuple[Planned, Planned] | None:
     """Return both arms at the end of A2, PSM_M in its actual or else its desired pose; None if neither is known."""
     if scene.phase[-1] != A2:
         return None
-    tip, jaw = scene.arms[0].tip_mm[-1], scene.arms[0].rotation[-1]
+    last = np.array([len(scene.phase) - 1])
+    arm = scene.arms[0].at(last)
     if len(scene.arms) == 2:
-        other = scene.arms[1]
-        return HandOff(tip, jaw, other.base @ other.tip_mm[-1] + other.base_mm, other.base @ other.rotation[-1])
+        return arm, scene.arms[1].at(last)
     if scene.taking is not None:
-        return HandOff(tip, jaw, scene.taking.tip_mm, scene.taking.rotation)
-    if approach_m is None:
+        tip, jaw = scene.taking.tip_mm, scene.taking.rotation
+    elif approach_m is not None:
+        (tip,), (jaw,) = hand_off(arm.tip_mm, arm.rotation, approach_m)
+    else:
         return None
-    (tip_m,), (jaw_m,) = hand_off(tip[None], jaw[None], approach_m)
-    return HandOff(tip, jaw, tip_m, jaw_m)
+    # An arm of which the base is not known: straight, and as deep as arms usually are.
+    joints = np.zeros((1, 6))
+    joints[:, INSERTION] = depth_mm + instrument_of(DEFAULT_INSTRUMENT).wrist_offset_mm - WRIST_MM
+    (own_tip,), (own_jaw,) = forward(joints)
+    base = jaw @ own_jaw.T
+    mine = (own_tip[None], own_jaw[None], joints, DEFAULT_INSTRUMENT, base, tip - base @ own_tip)
+    return arm, Planned(*mine, opening_rad=np.zeros(1))
 
 
-# ---- counting --------------------------------------------------------------------------------------------------
+def _caught(
+    arms: tuple[Planned, Planned], shift_mm: Floats, errors: Displaced, turned: Floats, varied: DoubtSettings
+) -> tuple[Flags, Flags]:
+    """Return whether the needle is between PSM_M's fingers, and at a right angle, each of shape (N,).
 
-
-def _under(found: list[dict[str, Flags]], tip_error_mm: float) -> TipDoubt:
-    """Count the variations of each pass; variation k of a plan succeeds if variation k of all its passes does."""
-    wrong = np.any([np.any(list(one.values()), axis=0) for one in found], axis=0)
-    return TipDoubt(tip_error_mm, _share(wrong), tuple(_pass(one) for one in found))
-
-
-def _pass(found: dict[str, Flags]) -> PassDoubt:
-    on_the_way, at_the_end = ([found[name] for name in names if name in found] for names in (ON_THE_WAY, AT_THE_END))
-    return PassDoubt(
-        succeeds=_share(np.any(on_the_way + at_the_end, axis=0)),
-        clear=_share(np.any(on_the_way, axis=0)),
-        caught=_share(np.any(at_the_end, axis=0)) if at_the_end else None,
-        faults=Faults(**{name: int(np.count_nonzero(wrong)) for name, wrong in found.items()}),
-    )
-
-
-def _share(wrong: Flags) -> Probability:
-    """Count the variations without a fault."""
-    count, of = int(np.count_nonzero(~wrong)), len(wrong)
-    lower, upper = wilson(count, of)
-    return Probability(count, of, count / of, lower, upper)
+    `catch` has PSM_M's jaws as planned, so PSM_A is taken to where it is relative to them.
+    """
+    (tip_a, jaw_a), (tip_m, jaw_m) = (arm.poses(arm.joints) for arm in arms)
+    planned = HandOff(tip_a[0], jaw_a[0], tip_m[0], jaw_m[0])
+    (tip_a, jaw_a), (tip_m, jaw_m) = (arm.poses(arm.shifted(shift_mm)) for arm in arms)
+    jaw_a, jaw_m, centre = errors.jaw_turn[0] @ jaw_a, errors.jaw_turn[1] @ jaw_m, arms[1].base_mm
+    tip_m = np.einsum("nij,nj->ni", errors.base_turn, tip_m - centre) + centre + errors.base_mm
+    back = planned.jaw_m @ np.swapaxes(errors.base_turn @ jaw_m, 1, 2)  # from PSM_M's jaws as they are to the planned
+    askew = jaw_a @ planned.jaw_a.T
+    grip = tip_a + errors.tip_mm[0, :, -1] + HELD_MM * jaw_a[:, :, 2] - tip_m - errors.tip_mm[1, :, -1]
+    apart = np.einsum("nij,nj->ni", back, grip) - (planned.tip_a + HELD_MM * planned.jaw_a[:, 2] - planned.tip_m)
+    place, angle = catch(planned, back @ askew @ turned, apart, varied.opening_rad)
+    return place, angle <= varied.stated_rad

@@ -1,11 +1,15 @@
 """Plans, their motion, and the simulator's verdict."""
 
+import json
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from skills.verification.errors import UNCALIBRATED
 from tests.api.service import GOAL_MM, KESTREL, Service, assert_problem, copy_of_trained, serving
+from tests.arms import ARMS
 from tests.db.test_packed import forged
 
 POINTS = [[5.0, 55.0, -125.0], [11.0, 55.0, -125.0], [17.0, 55.0, -125.0]]
@@ -102,25 +106,26 @@ def test_a_plan_that_hands_nothing_over_is_made_on_request_alone(still: Service)
 
 def test_a_headline_is_good_only_if_the_stated_arm_error_allows_it(tmp_path: Path):
     levels = {}
-    for tip_error_mm in (0.65, 3.0):
-        folder = tmp_path / f"{tip_error_mm}"
+    for errors in (ARMS, UNCALIBRATED):
+        folder = tmp_path / errors.name
         folder.mkdir()
-        with serving(copy_of_trained(folder), replay_tip_error_mm=tip_error_mm) as service:
+        with serving(copy_of_trained(folder), arm_errors=json.dumps(asdict(errors))) as service:
             made = plan(service, GOAL_MM, psm_m={"approach": APPROACH, "base": BASE})
             service.client.play(made["id"])
             playback = service.client.playback(service.work()[-1]["result"]["playback"])
             headline = playback["headline"]
             assert playback["feasible"]
             [whole] = [
-                under["plan"] for under in playback["report"]["doubt"]["under"] if under["tip_error_mm"] == tip_error_mm
+                under["plan"] for under in playback["report"]["doubt"]["under"] if under["errors"] == asdict(errors)
             ]
-            assert (headline["probability"], headline["tip_error_mm"]) == (whole, tip_error_mm)
+            assert (headline["probability"], headline["errors"]) == (whole, errors.name)
+            assert headline["costs_most"] in headline["text"]
             assert f"succeeds in {whole['count']} of {whole['of']} worlds" in headline["text"]
-            levels[tip_error_mm] = headline["level"], headline["word"]
+            levels[errors.name] = headline["level"], headline["word"]
             page = service.http.get(f"/pages/plans/{made['id']}", headers={"Accept": "text/html"}).text
             assert f'class="verdict {headline["level"]}"' in page
             assert f"{headline['word']}: feasible in an exact simulation" in page
-    assert levels == {0.65: ("good", "Likely to succeed"), 3.0: ("bad", "Likely to fail")}
+    assert levels == {"bench": ("good", "Likely to succeed"), "uncalibrated": ("bad", "Likely to fail")}
 
 
 # ---- PSM_M, starts and time -------------------------------------------------------------------------------------

@@ -7,7 +7,8 @@ from skills.kinematics import POINTING_DOWN, inverse, matrix_of
 from skills.planning.handoff import PsmM, realign
 from skills.planning.trajectory import PassPath, Trajectory, time_parametrise
 from skills.verification.clearance import clearance_between, clearance_to_pad, links_of
-from skills.verification.monte_carlo import DoubtSettings, doubt
+from skills.verification.monte_carlo import doubt
+from skills.verification.probabilities import DoubtSettings
 from tests.bench.timing import best_s, in_turn
 
 ROUNDS = 3
@@ -34,7 +35,11 @@ def doubting(table: Table) -> None:
             rounds=ROUNDS,
         )
         table.add_row(f"doubt, {settings.variations} variations of a pass {name}", f"{took:.2f} s", f"{poses} poses")
-        table.add_row("  a pose, two tip errors", f"{took / poses * 1e6:.1f} us", f"{took / solving:.1f} x one inverse")
+        table.add_row(
+            "  a pose, two sizes of errors and six costs",
+            f"{took / poses * 1e6:.1f} us",
+            f"{took / solving:.1f} x one inverse",
+        )
         table.add_row("  of what it may take", "", f"{took / ALLOWED_S:.1%}")
     _clearances(table)
 

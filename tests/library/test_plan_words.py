@@ -1,11 +1,13 @@
 """Headlines of plans: they name omissions, and are green only if the hand-over is probable enough."""
 
+from dataclasses import asdict
 from typing import Any
 
 import pytest
 
 from skills.library.plans import hands_over, plan_in_words
 from skills.library.playbacks import headline
+from skills.verification.errors import CALIBRATED, UNCALIBRATED
 
 NAN = float("nan")
 PSM_M = {"approach": [-1.0, 0.0, 0.0]}
@@ -21,9 +23,11 @@ FULL = about(psm_m=PSM_M, moves=True)
 def told(of: dict[str, Any], lower: float | None, count: int = 990, feasible: object = True) -> dict[str, Any]:
     upper = None if lower is None else min(1.0, count / 1000 + 0.03)
     whole = {"count": count, "of": 1000, "probability": count / 1000, "lower": lower, "upper": upper}
-    report = {"feasible": feasible, "failure_in_words": "Pass 0, A1, sample 3: no.", "doubt": {"under": []}}
-    report["doubt"]["under"].append({"tip_error_mm": 0.65, "plan": whole})
-    return headline(of, report, tip_error_mm=0.65, lower_bound=0.95)
+    under = [{"errors": asdict(CALIBRATED), "plan": whole}]
+    cost = {"error": "registration_deg", "without": {"count": count + 4, "probability": count / 1000 + 0.004}}
+    judged = {"version": 2, "under": under, "costs": [cost]}
+    report = {"feasible": feasible, "failure_in_words": "Pass 0, A1, sample 3: no.", "doubt": judged}
+    return headline(of, report, errors=CALIBRATED, lower_bound=0.95)
 
 
 @pytest.mark.parametrize(
@@ -62,7 +66,11 @@ def test_a_plan_that_hands_over_and_succeeds_surely_is_good():
     line = told(FULL, 0.98)
     assert (line["level"], line["word"]) == ("good", "Likely to succeed")
     assert "in 990 of 1000 worlds: 99.0 % (98.0 % to 100.0 %, 95 %)" in line["text"]
-    assert "tip error of 0.65 mm" in line["text"]
+    assert "with the errors of a calibrated arm the complete plan" in line["text"]
+    assert line["costs_most"] in line["text"]
+    assert (
+        line["costs_most"] == "Most is lost by the rotation of PSM_M's base: without it 99.4 % of the worlds succeed."
+    )
 
 
 @pytest.mark.parametrize(
@@ -87,7 +95,18 @@ def test_nothing_else_is_good(of, lower, count, feasible, level, word):
 
 
 def test_an_error_that_was_not_judged_is_said_and_not_good():
-    report = {"feasible": True, "doubt": None}
-    line = headline(FULL, report, tip_error_mm=1.0, lower_bound=0.95)
-    assert (line["level"], line["probability"]) == ("caution", None)
-    assert "was not judged" in line["text"]
+    whole = {"count": 999, "of": 1000, "probability": 0.999, "lower": 0.99, "upper": 1.0}
+    first_judge = {"under": [{"tip_error_mm": 0.65, "plan": whole}]}
+    other = {"version": 2, "under": [{"errors": asdict(CALIBRATED), "plan": whole}], "costs": []}
+    for doubted, words in (
+        (None, "older version"),
+        (first_judge, "judged by an older version, without errors of registration and wrist; play it again."),
+        (other, "with the errors of a calibrated arm, which the installation stated then; now it states the errors"),
+    ):
+        line = headline(FULL, {"feasible": True, "doubt": doubted}, errors=UNCALIBRATED, lower_bound=0.95)
+        assert (line["level"], line["probability"], line["costs_most"]) == ("caution", None, None)
+        assert words in line["text"]
+    line = headline(
+        FULL, {"feasible": True, "doubt": other, "stated_by": "request"}, errors=UNCALIBRATED, lower_bound=0.95
+    )
+    assert (line["level"], line["errors"]) == ("good", "calibrated")

@@ -4,6 +4,7 @@ import io
 import json
 import math
 import zipfile
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -26,12 +27,13 @@ from skills.library.replay import check_doubt, cleared, replay_bag
 from skills.packing import canonical, sha256
 from skills.schemas.requests import PlanIn
 from skills.transparency import PublicKey, read_notes
+from skills.verification.errors import CALIBRATED, UNCALIBRATED, ArmErrors
 from skills.verification.playback import Playback, link_pairs
 from tests.independent_history import check_envelope
 from tests.library import cases
 from tests.library.attacks import tampering
 
-ASKED: dict[str, Any] = {"tip_error_mm": 0.65, "lower_bound": 0.9}
+ASKED: dict[str, Any] = {"errors": UNCALIBRATED, "lower_bound": 0.9}
 OF_A1_ALONE: dict[str, Any] = ASKED | {"handoff": "none"}
 
 
@@ -72,9 +74,19 @@ def judged(database: Database, plan: Plan, *, feasible: bool = True, digest: str
     return identity
 
 
-def doubt(*lower: float | None, tip_error_mm: float = 0.65) -> dict[str, Any]:
+def doubt(*lower: float | None, errors: ArmErrors = UNCALIBRATED, stated_by: str = "installation") -> dict[str, Any]:
     passes = [{"succeeds": {"count": 990, "of": 1000, "lower": bound}} for bound in lower]
-    return {"doubt": {"under": [{"tip_error_mm": tip_error_mm, "passes": passes}]}}
+    under = [{"errors": asdict(errors), "passes": passes, "plan": {"count": 700}}]
+    without = {"count": 880, "probability": 0.88}
+    costs = [{"error": "registration_mm", "without": without}]
+    return {"doubt": {"version": 2, "under": under, "costs": costs}, "stated_by": stated_by}
+
+
+def of_the_first_judge(lower: float) -> dict[str, Any]:
+    """Return a stored verdict as the judge wrote it that knew tip errors alone."""
+    succeeds = {"count": 990, "of": 1000, "probability": 0.99, "lower": lower, "upper": 1.0}
+    under = [{"tip_error_mm": mm, "plan": succeeds, "passes": [{"succeeds": succeeds}]} for mm in (0.65, 3.0)]
+    return {"doubt": {"seed": 0, "under": under, "settings": {"tip_errors_mm": [0.65, 3.0]}}}
 
 
 def gate(database: Database, plan: Plan, **asked: Any) -> str:
@@ -236,11 +248,15 @@ def test_consent_that_is_withdrawn_while_a_bag_is_composed_is_seen(
         (doubt(0.95, None), {}, "only nan"),
         (doubt(math.nan), {}, "only nan"),
         (doubt(0.95), {"lower_bound": math.nan}, "nan is required"),
-        (doubt(0.95), {"tip_error_mm": 3.0}, "This plan was not judged with a tip error of 3 mm"),
-        (doubt(0.95), {"tip_error_mm": math.nan}, "was not judged"),
-        (doubt(), {}, "was not judged"),
-        ({"doubt": None}, {}, "was not judged"),
-        ({}, {}, "was not judged"),
+        (doubt(0.85), {}, "the errors of an uncalibrated arm a pass .* Most is lost by the offset of PSM_M's base: wi"),
+        (doubt(0.95), {"errors": CALIBRATED}, "of an uncalibrated arm, which .* states the errors of a calibrated arm"),
+        (doubt(0.95, stated_by="request"), {"errors": CALIBRATED}, None),
+        (doubt(0.85, stated_by="request", errors=CALIBRATED), {}, "With the errors of a calibrated arm a pass"),
+        (doubt(), {}, "only nan"),
+        (of_the_first_judge(0.99), {}, "judged by an older version, without errors of registration and wrist; play"),
+        (of_the_first_judge(0.99), {"errors": CALIBRATED}, "older version"),
+        ({"doubt": None}, {}, "older version"),
+        ({}, {}, "older version"),
     ],
 )
 def test_the_least_certain_pass_has_to_reach_the_lower_bound(report, asked, words):

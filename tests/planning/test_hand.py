@@ -26,7 +26,8 @@ from skills.planning.path_fit import TREMOR_S, fit_to_demo, trace
 from skills.planning.plan import SuturePoint, departure_of, driven_pass, stack
 from skills.planning.trajectory import A1, A2, Trajectory, time_parametrise
 from skills.verification.clearance import openings
-from skills.verification.monte_carlo import DoubtSettings, doubt
+from skills.verification.monte_carlo import doubt
+from skills.verification.probabilities import DoubtSettings
 from tests.planning.test_path_fit import shipped
 
 TURN_RAD = np.radians(60)

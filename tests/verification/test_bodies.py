@@ -23,8 +23,11 @@ from skills.verification.bodies import (
     too_near,
 )
 from skills.verification.clearance import links_of
-from skills.verification.monte_carlo import DoubtSettings, doubt, draw, scene_of
+from skills.verification.errors import CALIBRATED, UNCALIBRATED, draw
+from skills.verification.monte_carlo import doubt, scene_of
+from skills.verification.probabilities import DoubtSettings
 from skills.verification.verdict import Limits, judge
+from tests.arms import EXACT
 from tests.planning.motions import PSM_M, hand_off, ideal_playback
 from tests.planning.test_transfers import BESIDE
 
@@ -211,11 +214,12 @@ def test_the_bodies_of_both_generations_have_names_of_their_own():
 
 
 def test_a_plan_whose_bodies_meet_never_succeeds_though_every_needle_is_caught():
-    few = DoubtSettings(variations=40, tip_errors_mm=(0.0,), suture_point_mm=0.0, needle_rad=0.0)
-    (only,) = doubt(JAMMED, approach_m=PSM_M, pad_top_mm=-170.0, settings=few).under
+    few = DoubtSettings(variations=40, suture_point_mm=0.0, needle_rad=0.0)
+    asked = {"approach_m": PSM_M, "pad_top_mm": -170.0, "settings": few, "errors": EXACT}
+    only = doubt(JAMMED, **asked).under[0]
     assert only.plan.count == 0
     assert (only.passes[0].faults.bodies, only.passes[0].faults.arms, only.passes[0].caught.count) == (40, 0, 40)
-    (only,) = doubt(FREE, approach_m=PSM_M, pad_top_mm=-170.0, settings=few).under
+    only = doubt(FREE, **asked).under[0]
     assert (only.passes[0].faults.bodies, only.plan.count) == (0, 40)
 
 
@@ -224,18 +228,27 @@ def test_a_variation_is_too_near_where_its_own_distances_say_so(limit_mm):
     """Against the distances of every variation and sample; at these limits some are too near and some are not."""
     scene = scene_of(FREE, 0, -170.0, 0.5)
     scene = replace(scene, arms=tuple(arm.at(np.arange(0, len(scene.phase), 25)) for arm in scene.arms))
-    drawn, errors = draw(1, 0, 40, 5.0, 0.0), np.array([0.65, 3.0])
+    stamps_s = np.arange(len(scene.arms[0].joints)) / 4
+    drawn = draw(1, 0, 40, len(stamps_s), suture_point_mm=5.0, needle_rad=0.0)
+    displaced = [drawn.under(errors, stamps_s) for errors in (EXACT, CALIBRATED, UNCALIBRATED)]
     joints = [arm.shifted(drawn.shift_mm) for arm in scene.arms]
-    offset = drawn.offset_a - drawn.offset_m
     expected = []
-    for error in errors:
+    for errors in displaced:
         a, m = (
             parts_of(q, arm.instrument).seen_from(arm.base, arm.base_mm)
             for q, arm in zip(joints, scene.arms, strict=True)
         )
-        by = np.repeat(error * offset, len(scene.arms[0].joints), axis=0)[:, None]
-        moved = replace(a, begin_mm=a.begin_mm + by, end_mm=a.end_mm + by)
-        least = between(moved, radii_of("400006"), m, radii_of("400006")).reshape(40, -1).min(axis=1)
+        by_a, by_m = (one.reshape(-1, 1, 3) for one in errors.tip_mm)
+        turn = np.repeat(errors.base_turn, len(stamps_s), axis=0)
+        by_m = by_m + np.repeat(errors.base_mm, len(stamps_s), axis=0)[:, None]
+        centre = scene.arms[1].base_mm
+        a = replace(a, begin_mm=a.begin_mm + by_a, end_mm=a.end_mm + by_a)
+        begin, end = (np.einsum("tij,tkj->tki", turn, one - centre) + centre + by_m for one in (m.begin_mm, m.end_mm))
+        moved = replace(m, begin_mm=begin, end_mm=end)
+        least = between(a, radii_of("400006"), moved, radii_of("400006")).reshape(40, -1).min(axis=1)
         expected.append(least < limit_mm)
-    found = too_near(scene.arms, joints, offset, errors, limit_mm)
+    every = np.ones((3, 40), dtype=bool)
+    found = too_near(scene.arms, joints, displaced, limit_mm, every)
     np.testing.assert_array_equal(found, expected)
+    some = np.random.default_rng(0).random((3, 40)) < 0.5
+    np.testing.assert_array_equal(too_near(scene.arms, joints, displaced, limit_mm, some), found & some)

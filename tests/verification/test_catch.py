@@ -16,10 +16,16 @@ from skills.verification.clearance import (
     HandOff,
     catch,
 )
-from skills.verification.monte_carlo import draw
+from skills.verification.errors import MEAN_LENGTH, Drawn, draw
 
 APPROACH = (-0.94, 0.10, -0.33)
 OPENING_RAD = radians(30)
+
+
+def drawn_errors(seed: int, count: int, needle_rad: float) -> tuple[Drawn, np.ndarray]:
+    """Return draws, and offsets between the arms of the mean length of one arm's at a tip error of 1 mm."""
+    drawn = draw(seed, 0, count, 1, suture_point_mm=5.0, needle_rad=needle_rad)
+    return drawn, drawn.tip_bias[0] / MEAN_LENGTH
 
 
 def planned_hand_off() -> HandOff:
@@ -40,11 +46,9 @@ def test_as_planned_the_needle_lies_along_the_hinge_between_the_fingers():
 
 
 def test_jaws_that_are_turned_over_catch_the_same():
-    drawn = draw(0, 0, 300, 5.0, radians(10))
+    drawn, offset = drawn_errors(0, 300, radians(10))
     over = replace(PLANNED, jaw_m=PLANNED.jaw_m @ np.diag([-1.0, -1.0, 1.0]))
-    for one, other in zip(
-        *(catch(at, drawn.turned, drawn.offset_a, OPENING_RAD) for at in (PLANNED, over)), strict=True
-    ):
+    for one, other in zip(*(catch(at, drawn.turned, offset, OPENING_RAD) for at in (PLANNED, over)), strict=True):
         np.testing.assert_allclose(one, other, atol=1e-9)
 
 
@@ -84,8 +88,8 @@ def test_along_the_hinge_the_needle_slides_through_until_it_ends():
 
 
 def test_a_sampled_arc_crosses_the_jaws_at_the_same_place_and_angle():
-    drawn = draw(3, 0, 400, 5.0, radians(25))
-    apart = 2.0 * drawn.offset_a
+    drawn, offset = drawn_errors(3, 400, radians(25))
+    apart = 2.0 * offset
     between, askew = catch(PLANNED, drawn.turned, apart, OPENING_RAD)
     n, a, a_m = PLANNED.jaw_a[:, 0], PLANNED.jaw_a[:, 2], PLANNED.jaw_m[:, 2]
     free = -n * np.sign(n @ a_m)
@@ -113,10 +117,10 @@ def test_a_sampled_arc_crosses_the_jaws_at_the_same_place_and_angle():
 
 def test_the_angle_alone_fails_as_often_as_the_error_function_says():
     # Without any turn, the tangent is off by asin(d / r) for an offset d along the hinge, a normal number.
-    drawn = draw(1, 0, 200_000, 0.0, 0.0)
-    apart = 3.0 * (drawn.offset_a - drawn.offset_m)
+    drawn, offset = drawn_errors(1, 200_000, 0.0)
+    apart = 3.0 * (drawn.tip_bias[0] - drawn.tip_bias[1]) / MEAN_LENGTH
     _, askew = catch(PLANNED, drawn.turned, apart, OPENING_RAD)
     sigma = 3.0 / sqrt(8 / np.pi) * sqrt(2)  # the mean length of an offset is 3 mm, and there are two
     share = np.count_nonzero(askew <= radians(15)) / 200_000
     assert share == pytest.approx(erf(NEEDLE_RADIUS_MM * np.sin(radians(15)) / sigma / sqrt(2)), abs=0.004)
-    assert np.linalg.norm(3.0 * drawn.offset_a, axis=1).mean() == pytest.approx(3.0, abs=0.01)
+    assert np.linalg.norm(3.0 * offset, axis=1).mean() == pytest.approx(3.0, abs=0.01)

@@ -24,8 +24,11 @@ from skills.verification.clearance import (
     clearance_to_pad,
     links_of,
 )
-from skills.verification.monte_carlo import Doubt, DoubtSettings, TipDoubt, doubt, draw, looked_at, scene_of
+from skills.verification.errors import CALIBRATED, MEAN_LENGTH, SIZES, UNCALIBRATED, ArmErrors, Displaced, draw
+from skills.verification.monte_carlo import doubt, looked_at, scene_of
+from skills.verification.probabilities import Doubt, DoubtSettings, DoubtUnder
 from skills.verification.verdict import Limits
+from tests.arms import EXACT
 from tests.verification.test_catch import APPROACH, OPENING_RAD, PLANNED
 
 PAD_TOP_MM = -150.0  # 5 mm under the lowest finger tips
@@ -33,7 +36,7 @@ BASE_MM = (160.0, 20.0, 20.0)
 BASE_XYZW = (0.0, 0.0, float(np.sin(np.radians(22.5))), float(np.cos(np.radians(22.5))))
 PSM_M = PsmM(APPROACH, BASE_MM, BASE_XYZW)
 PATH_MM = np.array([[-10, 55, -135], [-20, 60, -130], [-10, 55, -120], [5, 55, -125]], dtype=float)
-NO_DOUBT = DoubtSettings(variations=40, tip_errors_mm=(0.0,), suture_point_mm=0.0, needle_rad=0.0)
+NO_DOUBT = DoubtSettings(variations=40, suture_point_mm=0.0, needle_rad=0.0)
 FEW = DoubtSettings(variations=200)
 
 
@@ -52,18 +55,29 @@ ALONE = motion(2)
 BESIDE = motion(2, PSM_M)
 
 
+def only(**sizes: float) -> ArmErrors:
+    """Return the errors of an arm with these sizes and no others."""
+    return replace(EXACT, **sizes)
+
+
+def of_tips(mean_mm: float) -> ArmErrors:
+    """Return constant errors of the tips of this mean length, and no others."""
+    return only(tip_bias_mm=mean_mm / MEAN_LENGTH)
+
+
 def judged(trajectory: Trajectory = ALONE, approach=APPROACH, pad_top_mm: float = PAD_TOP_MM, **given) -> Doubt:
-    return doubt(trajectory, approach_m=approach, pad_top_mm=pad_top_mm, **{"settings": FEW, **given})
+    given = {"settings": FEW, "errors": of_tips(0.65), **given}
+    return doubt(trajectory, approach_m=approach, pad_top_mm=pad_top_mm, **given)
 
 
-def under(found: Doubt, k: int = 0) -> TipDoubt:
-    return found.under[k]
+def under(found: Doubt) -> DoubtUnder:
+    return found.under[0]
 
 
-@pytest.mark.parametrize("tip_error_mm", [0.65, 3.0])
-def test_catching_is_as_likely_as_the_integral_over_all_offsets(tip_error_mm):
+@pytest.mark.parametrize("errors", [of_tips(0.65), of_tips(3.0), only(registration_mm=1.5), only(tip_noise_mm=0.5)])
+def test_catching_is_as_likely_as_the_integral_over_all_offsets(errors):
     # Without any turn the place is y = e_y and z = 7 + e_z + r (1 - sin phi), where r cos phi = -e_x.
-    sigma = tip_error_mm / sqrt(8 / np.pi) * sqrt(2)
+    sigma = sqrt(errors.registration_mm**2 + 2 * errors.tip_bias_mm**2 + 2 * errors.tip_noise_mm**2)
     e = np.linspace(-5, 5, 161)
     weight = np.exp(-(e**2) / 2)
     weight /= weight.sum()
@@ -77,8 +91,8 @@ def test_catching_is_as_likely_as_the_integral_over_all_offsets(tip_error_mm):
     good &= np.abs(y) * np.cos(OPENING_RAD) + half <= depth * np.sin(OPENING_RAD)
     good &= np.abs(x) <= NEEDLE_RADIUS_MM * np.sin(radians(15))
     expected = np.einsum("ijk,i,j,k", good.astype(float), weight, weight, weight)
-    settings = DoubtSettings(variations=4000, tip_errors_mm=(tip_error_mm,), needle_rad=0.0)
-    caught = under(judged(motion(1), settings=settings)).passes[0].caught
+    settings = DoubtSettings(variations=4000, needle_rad=0.0)
+    caught = under(judged(motion(1), settings=settings, errors=errors)).passes[0].caught
     assert caught.lower - 0.01 <= expected <= caught.upper + 0.01  # the grid's own error is a few thousandths
 
 
@@ -87,33 +101,41 @@ def test_catching_is_as_likely_as_the_integral_over_all_offsets(tip_error_mm):
 
 @pytest.mark.parametrize("trajectory", [ALONE, BESIDE], ids=["alone", "beside PSM_M"])
 def test_without_any_doubt_a_clear_plan_succeeds_for_certain(trajectory):
-    found = judged(trajectory, settings=NO_DOUBT)
-    (only,) = found.under
-    assert (only.plan.count, only.plan.of, only.plan.probability) == (40, 40, 1.0)
-    assert only.plan.lower == pytest.approx(1 / (1 + 1.959964**2 / 40))  # Wilson's bound of all of n, by hand
-    assert all(one.caught.probability == 1.0 for one in only.passes)
-    assert (found.with_psm_m, found.hand_offs) == (trajectory is BESIDE, 2)
-    assert only.passes[0].faults.arms == (0 if trajectory is BESIDE else None)
+    found = judged(trajectory, settings=NO_DOUBT, errors=EXACT)
+    assert [one.errors for one in found.under] == [EXACT, CALIBRATED, UNCALIBRATED]
+    exact = under(found)
+    assert (exact.plan.count, exact.plan.of, exact.plan.probability) == (40, 40, 1.0)
+    assert exact.plan.lower == pytest.approx(1 / (1 + 1.959964**2 / 40))  # Wilson's bound of all of n, by hand
+    assert all(one.caught.probability == 1.0 for one in exact.passes)
+    assert (found.with_psm_m, found.hand_offs, found.version) == (trajectory is BESIDE, 2, 2)
+    assert exact.passes[0].faults.arms == (0 if trajectory is BESIDE else None)
 
 
 def test_a_plan_into_the_pad_never_succeeds_though_every_needle_is_caught():
-    (only,) = judged(pad_top_mm=-140.0, settings=NO_DOUBT).under
-    assert (only.plan.count, only.passes[0].clear.count, only.passes[0].caught.count) == (0, 0, 40)
-    assert (only.passes[0].faults.pad, only.passes[0].faults.reach) == (40, 0)
+    found = under(judged(pad_top_mm=-140.0, settings=NO_DOUBT, errors=EXACT))
+    assert (found.plan.count, found.passes[0].clear.count, found.passes[0].caught.count) == (0, 0, 40)
+    assert (found.passes[0].faults.pad, found.passes[0].faults.reach) == (40, 0)
 
 
 def test_psm_m_in_the_way_is_found_in_every_variation():
     # It stands in PSM_A's place, 3 mm to its side, and moves as it does.
     same = OtherArm(np.array([3.0, 0.0, 0.0]), np.array([0.0, 0, 0, 1]), "400006", ALONE.joints)
-    (only,) = judged(replace(ALONE, psm_m=same), settings=NO_DOUBT).under
-    assert (only.passes[0].faults.arms, only.passes[0].faults.pad, only.plan.count) == (40, 0, 0)
+    found = under(judged(replace(ALONE, psm_m=same), settings=NO_DOUBT, errors=EXACT))
+    assert (found.passes[0].faults.arms, found.passes[0].faults.pad, found.plan.count) == (40, 0, 0)
 
 
-def wrong(scene, **given) -> dict[str, list[bool]]:
-    """Return the failures in four variations, in which all but the given numbers are zero, at a tip error of 1 mm."""
-    nothing = replace(draw(0, 0, 4, 0.0, 0.0), offset_a=np.zeros((4, 3)), offset_m=np.zeros((4, 3)))
-    drawn = replace(nothing, **{name: np.array(rows, dtype=float) for name, rows in given.items()})
-    found = monte_carlo.spoiled(scene, drawn, np.array([1.0]), Limits())
+def off(scene, a=(0, 0, 0), m=(0, 0, 0), base=(0, 0, 0)) -> Displaced:
+    """Return the displacement of PSM_A, PSM_M and PSM_M's base by rows of offsets, or by one in each variation."""
+    count, (a, m, base) = 4, (np.broadcast_to(np.array(one, float), (4, 3)) for one in (a, m, base))
+    exact = draw(0, 0, count, len(scene.phase), suture_point_mm=0.0, needle_rad=0.0).under(EXACT, scene.stamps_s)
+    tips = np.repeat(np.stack([a, m])[:, :, None], len(scene.phase), axis=2)
+    return replace(exact, tip_mm=tips, base_mm=base)
+
+
+def wrong(scene, shift_mm=(0, 0, 0), **given) -> dict[str, list[bool]]:
+    """Return the failures in four variations, in which all but the given numbers are zero."""
+    shift_mm = np.broadcast_to(np.array(shift_mm, float), (4, 3))
+    found = monte_carlo.spoiled(scene, shift_mm, [off(scene, **given)], Limits())
     return {name: one[0].tolist() for name, one in found.items()}
 
 
@@ -121,11 +143,11 @@ def test_an_arm_offset_down_nears_the_pad_and_a_pass_shifted_down_does_not():
     scene = looked_at(scene_of(BESIDE, 0, PAD_TOP_MM, OPENING_RAD), 20)
     spare = float(clearance_to_pad(scene.arms[0].links(scene.arms[0].joints), PAD_TOP_MM).min()) - 1.0
     down = [[0, 0, -spare + 0.01], [0, 0, -spare - 0.01], [9, 9, 0], [0, 0, spare]]
-    assert wrong(scene, offset_a=down)["pad"] == [False, True, False, False]
+    assert wrong(scene, a=down)["pad"] == [False, True, False, False]
     assert wrong(scene, shift_mm=down)["pad"] == [False] * 4
     other = float(clearance_to_pad(scene.arms[1].links(scene.arms[1].joints), PAD_TOP_MM).min()) - 1.0
     down = [[0, 0, -other + 0.01], [0, 0, -other - 0.01], [0, 0, 0], [0, 0, 9]]
-    assert wrong(scene, offset_m=down)["pad"] == [False, True, False, False]
+    assert wrong(scene, m=down)["pad"] == [False, True, False, False]
 
 
 def test_each_arm_comes_nearer_to_the_other_by_its_own_offset():
@@ -133,9 +155,9 @@ def test_each_arm_comes_nearer_to_the_other_by_its_own_offset():
     beside = OtherArm(np.array([20.0, 0.0, 0.0]), np.array([0.0, 0, 0, 1]), "400006", ALONE.joints)
     scene = looked_at(scene_of(replace(ALONE, psm_m=beside), 0, PAD_TOP_MM, 0.06), 20)
     along = [[0, 0, 0], [13, 0, 0], [-13, 0, 0], [0, 13, 0]]
-    assert wrong(scene, offset_a=along)["arms"] == [False, True, False, False]
-    assert wrong(scene, offset_m=along)["arms"] == [False, False, True, False]
-    assert wrong(scene, offset_a=along, offset_m=along)["arms"] == [False] * 4
+    assert wrong(scene, a=along)["arms"] == [False, True, False, False]
+    assert wrong(scene, m=along)["arms"] == wrong(scene, base=along)["arms"] == [False, False, True, False]
+    assert wrong(scene, a=along, m=along)["arms"] == [False] * 4
     assert wrong(scene, shift_mm=along)["arms"] == [False] * 4
 
 
@@ -150,8 +172,9 @@ def test_the_pad_is_cleared_as_often_as_the_error_function_says():
     settings = DoubtSettings(variations=4000, suture_point_mm=0.0)
     whole = scene_of(ALONE, 0, -148.0, 0.06).arms[0]
     spare = float(clearance_to_pad(whole.links(whole.joints), -148.0).min()) - 1.0
-    for one in judged(pad_top_mm=-148.0, settings=settings).under:
-        clear, sigma = one.passes[0].clear, one.tip_error_mm / sqrt(8 / np.pi)
+    for mean_mm in (0.65, 3.0):
+        found = judged(pad_top_mm=-148.0, settings=settings, errors=of_tips(mean_mm))
+        clear, sigma = under(found).passes[0].clear, mean_mm / MEAN_LENGTH
         expected = (1 + erf(spare / sigma / sqrt(2))) / 2
         assert clear.lower - 0.005 <= expected <= clear.upper + 0.005
 
@@ -193,27 +216,48 @@ def test_a_jaw_that_was_not_realigned_hands_nothing_on():
     other = OtherArm(
         np.array(BASE_MM), np.array(BASE_XYZW), "400006", np.repeat(beside.psm_m.joints[-1:], len(turned), 0)
     )
-    assert under(judged(replace(turned, psm_m=other), settings=NO_DOUBT)).passes[0].caught.count == 0
+    found = judged(replace(turned, psm_m=other), settings=NO_DOUBT, errors=EXACT)
+    assert under(found).passes[0].caught.count == 0
 
 
-def test_it_counts_which_arm_is_off_which_way(monkeypatch):
+def caught(scene, displaced: Displaced) -> bool:
+    arms = monte_carlo._handing_over(scene, APPROACH, 200.0)
+    turned = np.broadcast_to(np.eye(3), (4, 3, 3))
+    place, angle = monte_carlo._caught(arms, np.zeros((4, 3)), displaced, turned, NO_DOUBT)
+    assert (place & angle).all() == (place & angle).any()
+    return bool((place & angle)[0])
+
+
+@pytest.mark.parametrize("trajectory", [ALONE, BESIDE], ids=["alone", "beside PSM_M"])
+def test_it_counts_which_arm_is_off_which_way(trajectory):
+    scene = scene_of(trajectory, 0, PAD_TOP_MM, OPENING_RAD)
     out = 3.0 * PLANNED.jaw_m[:, 2]  # there are 2.87 mm to the tips of PSM_M's fingers, and 3.07 to its wrist
-    nothing = replace(draw(0, 0, 40, 0.0, 0.0), offset_a=np.zeros((40, 3)), offset_m=np.zeros((40, 3)))
-    settings = replace(NO_DOUBT, tip_errors_mm=(1.0,))
-    for given, caught in (
-        ({"offset_a": out}, 0),
-        ({"offset_a": -out}, 40),
-        ({"offset_m": out}, 40),
-        ({"offset_m": -out}, 0),
-        ({"offset_a": out, "offset_m": out}, 40),
-    ):
-        drawn = replace(nothing, **{name: np.tile(value, (40, 1)) for name, value in given.items()})
-        monkeypatch.setattr("skills.verification.monte_carlo.draw", lambda *_, drawn=drawn: drawn)
-        assert under(judged(settings=settings)).passes[0].caught.count == caught
+    given = ({"a": out}, {"a": -out}, {"m": out}, {"m": -out}, {"base": -out}, {"a": out, "m": out})
+    assert [caught(scene, off(scene, **one)) for one in given] == [False, True, True, False, False, True]
+
+
+def test_jaws_that_are_turned_together_catch_as_planned():
+    # All is turned by 20 degrees about the place where the needle is held, and PSM_M's hinge with it.
+    scene = scene_of(BESIDE, 0, PAD_TOP_MM, OPENING_RAD)
+    about = np.array([0.2, -0.5, 0.8]) / np.linalg.norm([0.2, -0.5, 0.8])
+    turn = np.tile(rodrigues(radians(20) * about), (2, 4, 1, 1))
+    grip = PLANNED.tip_a + 9.0 * PLANNED.jaw_a[:, 2]
+    moved = [grip + turn[0, 0] @ (tip - grip) - tip for tip in (PLANNED.tip_a, PLANNED.tip_m)]
+    together = replace(off(scene, *moved), jaw_turn=turn)
+    assert caught(scene, together)
+    assert not caught(scene, replace(off(scene), jaw_turn=turn))  # each about its own hinge
+
+
+def rodrigues(vector) -> np.ndarray:
+    """Rodrigues' formula, written anew."""
+    angle = float(np.linalg.norm(vector))
+    x, y, z = vector / angle
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
 
 
 def test_a_needle_that_is_nowhere_near_is_at_no_angle():
-    faults = under(judged(settings=replace(FEW, tip_errors_mm=(1e6,)))).passes[0].faults
+    faults = under(judged(errors=of_tips(1500.0))).passes[0].faults
     assert (faults.place, faults.angle) == (200, 200)
 
 
@@ -225,17 +269,18 @@ def test_without_an_approach_success_means_only_being_clear():
 
 
 def test_psm_m_beside_catches_what_its_wanted_pose_alone_catches():
-    beside, alone = judged(BESIDE, approach=None), judged(ALONE)
-    for k in range(2):
-        assert [one.caught for one in under(beside, k).passes] == [one.caught for one in under(alone, k).passes]
+    for errors in (only(registration_mm=1.0, wrist_deg=3.0, tip_bias_mm=0.5), of_tips(3.0)):
+        beside, alone = (judged(one, errors=errors) for one in (BESIDE, ALONE))
+        assert [one.caught for one in under(beside).passes] == [one.caught for one in under(alone).passes]
 
 
-def test_more_error_never_helps_where_nothing_else_is_in_doubt():
-    errors = (0.0, 0.3, 0.65, 1.0, 2.0, 3.0, 5.0)
-    settings = DoubtSettings(variations=500, tip_errors_mm=errors, suture_point_mm=0.0, needle_rad=0.0)
-    counts = [one.plan.count for one in judged(BESIDE, settings=settings).under]
+@pytest.mark.parametrize("size", ["registration_mm", "registration_deg", "wrist_deg", "tip_bias_mm", "tip_noise_mm"])
+def test_more_error_never_helps_where_nothing_else_is_in_doubt(size):
+    settings = DoubtSettings(variations=300, suture_point_mm=0.0, needle_rad=0.0)
+    asked = {"settings": settings, "trajectory": motion(1, PSM_M)}
+    counts = [under(judged(errors=only(**{size: value}), **asked)).plan.count for value in (0.0, 0.5, 2.0, 12.0)]
     assert counts == sorted(counts, reverse=True)
-    assert counts[0] == 500 and counts[-1] < 100
+    assert counts[0] == 300 and counts[-1] < 100
 
 
 def test_a_plan_of_two_passes_succeeds_about_as_often_as_both_of_them():
@@ -246,11 +291,11 @@ def test_a_plan_of_two_passes_succeeds_about_as_often_as_both_of_them():
 
 
 def test_a_fault_is_counted_in_every_variation_that_has_it():
-    for one in judged(BESIDE, settings=DoubtSettings(variations=400)).under[1].passes:
+    for one in under(judged(BESIDE, errors=of_tips(3.0), settings=DoubtSettings(variations=400))).passes:
         faults = asdict(one.faults)
         missed, on_the_way = one.caught.of - one.caught.count, one.clear.of - one.clear.count
         assert max(faults["place"], faults["angle"]) <= missed <= faults["place"] + faults["angle"]
-        way = [faults[name] for name in ("limits", "pad", "arms")]
+        way = [faults[name] for name in ("limits", "pad", "arms", "bodies")]
         assert max(way) <= on_the_way <= sum(way)
 
 
@@ -262,7 +307,7 @@ def test_between_the_poses_looked_at_nothing_comes_much_nearer(enters):
     whole = scene_of(motion(1, replace(PSM_M, enters=enters)), 0, PAD_TOP_MM, OPENING_RAD)
     thin = looked_at(whole, DoubtSettings().stretches)
     assert len(thin.phase) < 70 < len(whole.phase) / 5
-    drawn = draw(5, 0, 20, 5.0, 0.0)
+    drawn = draw(5, 0, 20, 1, suture_point_mm=5.0, needle_rad=0.0)
     every, some = (nearest_mm(scene, drawn) for scene in (whole, thin))
     assert (some[:2] - every[:2]).max() < 0.01  # to the pad, of either arm
     assert (some[2] - every[2]).max() < 0.25  # between the arms, each up to 3 mm off
@@ -279,7 +324,7 @@ def test_the_lowest_pose_is_looked_at_wherever_on_the_way_it_is():
 def nearest_mm(scene, drawn) -> np.ndarray:
     count, links = len(drawn.shift_mm), [arm.links(arm.shifted(drawn.shift_mm)) for arm in scene.arms]
     top = PAD_TOP_MM + np.repeat(drawn.shift_mm[:, 2], len(scene.phase))
-    apart = np.repeat(3.0 * (drawn.offset_a - drawn.offset_m), len(scene.phase), axis=0)
+    apart = np.repeat(3.0 / MEAN_LENGTH * (drawn.tip_bias[0] - drawn.tip_bias[1]), len(scene.phase), axis=0)
     meets = np.tile(scene.handing_over, count)
     found = [*(clearance_to_pad(one, top) for one in links), monte_carlo._apart(links[0].moved(apart), links[1], meets)]
     return np.array([one.reshape(count, -1).min(axis=1) for one in found])
@@ -312,15 +357,61 @@ def test_a_pass_draws_what_it_draws_whatever_passes_there_are_beside_it():
 
 
 def test_what_is_drawn_is_even_about_nothing_and_within_its_bounds():
-    drawn = draw(0, 0, 50_000, 5.0, radians(10))
+    drawn = draw(0, 0, 50_000, 1, suture_point_mm=5.0, needle_rad=radians(10))
     assert np.abs(drawn.shift_mm).max() <= 5.0
     assert drawn.shift_mm.std(axis=0) == pytest.approx(5.0 / sqrt(3), abs=0.02)
     angle = np.arccos(np.clip((np.einsum("nii", drawn.turned) - 1) / 2, -1, 1))
     assert angle.max() <= radians(10) + 1e-9 and angle.mean() == pytest.approx(radians(5), abs=1e-3)
     axes = np.stack([drawn.turned[:, i, j] - drawn.turned[:, j, i] for i, j in ((2, 1), (0, 2), (1, 0))])
     assert np.abs(axes.mean(axis=1)).max() < 0.003
-    both = np.concatenate([drawn.offset_a, drawn.offset_m], axis=1)
-    np.testing.assert_allclose(np.corrcoef(both.T), np.eye(6), atol=0.02)
+    every = [drawn.registration, drawn.registration_turn, *drawn.wrist, *drawn.tip_bias, *drawn.tip_noise[:, :, 0]]
+    all_of_them = np.concatenate([*every, drawn.shift_mm / (5 / sqrt(3))], axis=1)
+    np.testing.assert_allclose(np.cov(all_of_them.T), np.eye(27), atol=0.03)
+
+
+def test_a_base_stays_where_it_is_from_pass_to_pass_and_all_else_is_drawn_anew():
+    one, other, third = (
+        draw(seed, k, 5, 3, suture_point_mm=5.0, needle_rad=0.1) for seed, k in ((0, 0), (0, 1), (1, 0))
+    )
+    for name, same in (
+        ("registration", True),
+        ("registration_turn", True),
+        ("wrist", False),
+        ("tip_bias", False),
+        ("tip_noise", False),
+        ("shift_mm", False),
+        ("turned", False),
+    ):
+        assert np.array_equal(getattr(one, name), getattr(other, name)) == same, name
+        assert not np.array_equal(getattr(one, name), getattr(third, name)), name
+
+
+def test_noise_correlates_in_time_as_it_is_stated():
+    stamps_s = np.array([0.0, 0.1, 0.4, 0.4, 2.4])
+    drawn = draw(0, 0, 40_000, len(stamps_s), suture_point_mm=0.0, needle_rad=0.0)
+    noise = drawn.under(only(tip_noise_mm=2.0, tip_correlation_s=0.5), stamps_s).tip_mm[1, :, :, 2]
+    expected = 4.0 * np.exp(-np.abs(stamps_s[:, None] - stamps_s) / 0.5)
+    np.testing.assert_allclose(np.cov(noise.T), expected, atol=0.1)
+    still = drawn.under(only(tip_noise_mm=2.0), stamps_s).tip_mm[1, :, :, 2]
+    np.testing.assert_allclose(np.cov(still.T), 4.0 * np.eye(5), atol=0.1)
+
+
+# ---- which error costs the most ------------------------------------------------------------------------------------
+
+
+def test_the_cost_of_an_error_is_the_plan_without_it_in_the_same_worlds():
+    asked = {"settings": DoubtSettings(variations=200), "trajectory": motion(1, PSM_M)}
+    found = judged(errors=CALIBRATED, **asked)
+    counts = [one.without.count for one in found.costs]
+    assert counts == sorted(counts, reverse=True) and counts[0] > under(found).plan.count
+    for one in found.costs:
+        if one.error == "needle":
+            alone = judged(errors=CALIBRATED, **asked | {"settings": replace(asked["settings"], needle_rad=0.0)})
+        else:
+            alone = judged(errors=CALIBRATED.without(one.error), **asked)
+        assert one.without == under(alone).plan, one.error
+    assert {one.error for one in found.costs} == {*SIZES, "needle"} - {"tip_correlation_s"}
+    assert {one.error for one in judged(errors=of_tips(0.65)).costs} == {"tip_bias_mm", "needle"}
 
 
 # ---- invalid numbers -----------------------------------------------------------------------------------------------
@@ -330,23 +421,24 @@ def test_what_is_drawn_is_even_about_nothing_and_within_its_bounds():
     "name", ["joint_margin", "insertion_mm", "clearance_pad_mm", "clearance_psm_m_mm", "clearance_bodies_mm"]
 )
 def test_a_limit_that_is_not_a_number_is_kept_by_no_variation(name):
-    found = judged(BESIDE, settings=NO_DOUBT, limits=Limits(**{name: nan}))
+    found = judged(BESIDE, settings=NO_DOUBT, errors=EXACT, limits=Limits(**{name: nan}))
     assert (under(found).plan.count, under(found).passes[0].clear.count) == (0, 0)
 
 
 def test_joints_that_are_not_numbers_go_wrong_everywhere():
     whole = scene_of(BESIDE, 0, PAD_TOP_MM, OPENING_RAD)
-    drawn = replace(draw(0, 0, 3, 5.0, 0.0), shift_mm=np.array([[0.0, 0, 0], [nan, 0, 0], [0, 0, 0]]))
-    wrong = monte_carlo.spoiled(looked_at(whole, 5), drawn, np.array([0.0]), Limits())
-    assert list(wrong) == ["reach", "limits", "pad", "arms", "bodies"]
-    assert [one[0].tolist() for one in wrong.values()] == [[False, True, False]] * 5
+    found = wrong(looked_at(whole, 5), shift_mm=np.array([[0.0, 0, 0], [nan, 0, 0], [0, 0, 0], [0, 0, 0]]))
+    assert list(found) == ["reach", "limits", "pad", "arms", "bodies"]
+    assert list(found.values()) == [[False, True, False, False]] * 5
+    found = wrong(looked_at(whole, 5), a=[[nan, nan, nan], [0, 0, 0], [0, 0, 0], [0, 0, 0]])
+    assert list(found.values()) == [[False] * 4] * 2 + [[True, False, False, False]] * 3
 
 
 def test_doubts_that_cannot_be_meant_are_refused():
-    for wrong in ({"variations": 0}, {"stretches": 0}, {"tip_errors_mm": ()}):
-        with pytest.raises(BadSettings, match="at least one"):
+    for wrong in ({"variations": 0}, {"stretches": 0}):
+        with pytest.raises(BadSettings, match="1 to 1000 stretches"):
             DoubtSettings(**wrong)
-    for wrong in ({"tip_errors_mm": (0.65, nan)}, {"needle_rad": -0.1}, {"stated_rad": nan}):
+    for wrong in ({"suture_point_mm": nan}, {"needle_rad": -0.1}, {"stated_rad": nan}):
         with pytest.raises(BadSettings, match="finite"):
             DoubtSettings(**wrong)
     with pytest.raises(BadInput, match="height"):

@@ -27,6 +27,7 @@ from skills.api.authorisation import Caller, Role
 from skills.errors import UnknownFormat
 from skills.formats import READABLE
 from skills.library.overview import Style
+from skills.library.playbacks import error_called
 
 HTML = "text/html"
 JSON = "application/json"
@@ -209,6 +210,7 @@ FILTERS = {
     "degrees": degrees,
     "outline": outline,
     "state_mark": STATE_MARKS.__getitem__,
+    "error_called": error_called,
     "state_words": STATE_WORDS.__getitem__,
     "job_mark": JOB_MARKS.__getitem__,
 }

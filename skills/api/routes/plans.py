@@ -35,6 +35,7 @@ from skills.schemas.given import Comparison, Plan, Playback, SuturePoints
 from skills.schemas.given import Trajectory as GivenTrajectory
 from skills.schemas.requests import DIGEST, FRAME, Name, PlanIn, PlaybackIn, Schema
 from skills.settings import MEBIBYTE, Settings
+from skills.verification.errors import stated_errors
 from skills.verification.playback import Pictures
 
 router = router_of(route_class=Strict, tags=["plans"], max_body_size=MEBIBYTE)
@@ -61,7 +62,7 @@ def play(body: PlaybackIn, db: Db, jobs: Jobs, actor: Actor, settings: Configure
     with db.reading() as session:
         surgeon = plans.find_plan(session, body.plan).policy.surgeon.slug
     with db.writing([locks.surgeon(surgeon)]) as session:
-        job, new = playbacks.request_playback(session, body.plan, actor, settings)
+        job, new = playbacks.request_playback(session, body.plan, actor, settings, body.arm_errors)
         answer = accepted(session, job, QUEUED if new else did_nothing(job))
     # after the commit; if the engine cannot be notified now, a worker finds the job's row later
     if new:
@@ -179,8 +180,8 @@ def _contents(
     settings: Settings,
 ) -> bytes:
     if media_type == BAG:
-        asked = {
-            "tip_error_mm": settings.replay_tip_error_mm,
+        asked: dict[str, Any] = {
+            "errors": stated_errors(settings.arm_errors),
             "lower_bound": settings.replay_lower_bound,
             "constant_turn_deg": settings.constant_turn_deg,
         }

@@ -63,7 +63,10 @@ function wrong(problem) {
 button.addEventListener("click", async () => {
   button.disabled = true;
   try {
-    const job = await call("POST", "/playbacks", { plan: place.dataset.plan.split("/").pop() });
+    const job = await call("POST", "/playbacks", {
+      plan: place.dataset.plan.split("/").pop(),
+      errors: document.getElementById("errors").value || null,
+    });
     if (job.state === "succeeded") location.reload();
     else await follow(job.id);
   } catch (problem) {

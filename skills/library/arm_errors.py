@@ -1,0 +1,112 @@
+"""A laboratory's own errors from a file: setpoints and measured poses of a recording, or of a table of joints.
+
+    recording or table --read_measured--> Measured --calibrate_arm--> ArmCalibration
+
+A *recording* needs `measured_cp` and `setpoint_cp` of the arm in one frame. Each measured pose is compared with the
+setpoint before or after it that is nearest in time.
+
+A *table* needs the columns `measured_q1` to `measured_q6` and `setpoint_q1` to `setpoint_q6`, in rad and m as the
+dVRK's `measured_js` has them. With a tracker it also has `marker_x`, `marker_y` and `marker_z`, in m; with times `t_s`.
+"""
+
+import csv
+from pathlib import Path
+
+import numpy as np
+
+from skills.arrays import Floats
+from skills.errors import BadInput, BadRecording
+from skills.formats import read_recording
+from skills.kinematics import DEFAULT_INSTRUMENT, INSERTION, forward, matrix_of
+from skills.verification.measured_errors import Measured
+
+MOST_ROWS = 1_000_000
+_JOINTS = tuple(f"q{number}" for number in range(1, 7))
+_NEEDED = tuple(f"{kind}_{joint}" for kind in ("measured", "setpoint") for joint in _JOINTS)
+_MARKER = ("marker_x", "marker_y", "marker_z")
+_M_TO_MM = 1000.0
+
+
+def read_measured(
+    file: Path, *, arm: str | None = None, instrument: str = DEFAULT_INSTRUMENT, rate_hz: float | None = None
+) -> Measured:
+    """Read setpoints and measured poses of an arm.
+
+    Args:
+        file: A recording, or a table whose header has the columns of joints.
+        arm: The arm of a recording with several.
+        instrument: Number of the instrument, for a table.
+        rate_hz: Samples per second of a table without times; None: its times stay unknown.
+
+    Raises:
+        BadInput: The table lacks a column, has a cell that is no number, or too many rows.
+        BadRecording: The recording cannot be used, or has no setpoints of the arm.
+        OSError: The file cannot be read.
+    """
+    with file.open("rb") as opened:
+        header = opened.readline(4096).decode("utf-8", "replace").strip().lower().split(",")
+        if set(_NEEDED) & set(header):
+            return _of_table(file, instrument, rate_hz)
+        opened.seek(0)
+        recording = read_recording(opened)
+    motion = recording.motion_of(arm=arm)
+    setpoints = recording.setpoint_of(motion)
+    if setpoints is None:
+        raise BadRecording(
+            f"The recording has no setpoints of {motion.arm} in the frame {motion.frame}; record its setpoint_cp "
+            "beside its measured_cp."
+        )
+    if motion.rotation_xyzw is None or setpoints.rotation_xyzw is None:
+        raise BadRecording(f"The poses of {motion.arm} have no rotations; record its setpoint_cp and measured_cp.")
+    after = np.minimum(np.searchsorted(setpoints.stamps_ns, motion.stamps_ns), len(setpoints.stamps_ns) - 1)
+    before = np.maximum(after - 1, 0)
+    sooner = motion.stamps_ns - setpoints.stamps_ns[before] < setpoints.stamps_ns[after] - motion.stamps_ns
+    nearest = np.where(sooner, before, after)
+    period_ns = np.median(np.diff(setpoints.stamps_ns)) if len(setpoints.stamps_ns) > 1 else 0
+    beside = np.abs(setpoints.stamps_ns[nearest] - motion.stamps_ns) <= period_ns
+    if not beside.any():
+        raise BadRecording("No setpoint was recorded within one period of a measured pose; record both at once.")
+    return Measured(
+        setpoint_mm=setpoints.tip_mm[nearest][beside],
+        setpoint=matrix_of(setpoints.rotation_xyzw[nearest][beside]),
+        measured_mm=motion.tip_mm[beside],
+        measured=matrix_of(motion.rotation_xyzw[beside]),
+        stamps_s=recording.seconds(motion.stamps_ns[beside]),
+    )
+
+
+def _of_table(file: Path, instrument: str, rate_hz: float | None) -> Measured:
+    with file.open(newline="", encoding="utf-8") as opened:
+        rows = csv.reader(opened)
+        names = [name.strip().lower() for name in next(rows)]
+        if missing := [name for name in _NEEDED if name not in names]:
+            raise BadInput(f"The table has no column {missing[0]}; give {', '.join(_NEEDED)} in rad and m.")
+        wanted = [name for name in (*_NEEDED, *_MARKER, "t_s") if name in names]
+        at = [names.index(name) for name in wanted]
+        cells: list[list[float]] = []
+        for number, row in enumerate(rows, start=2):
+            if len(cells) >= MOST_ROWS:
+                raise BadInput(f"The table has more than {MOST_ROWS} rows; give a part of it.")
+            try:
+                cells.append([float(row[column]) for column in at])
+            except (ValueError, IndexError):
+                raise BadInput(f"Row {number} of the table has a cell that is no number.", row=number) from None
+    columns = dict(zip(wanted, np.array(cells, np.float64).reshape(-1, len(wanted)).T, strict=True))
+    marked = set(_MARKER) <= set(columns)
+    if rate_hz is not None and not 0 < rate_hz <= 10_000:
+        raise BadInput("The rate must be a number of samples per second above 0, at most 10000.", rate_hz=rate_hz)
+    stamps_s = columns.get("t_s")
+    if stamps_s is None and rate_hz is not None:
+        stamps_s = np.arange(len(cells)) / rate_hz
+    (setpoint_mm, setpoint), (measured_mm, measured) = (
+        forward(_joints(columns, kind), instrument) for kind in ("setpoint", "measured")
+    )
+    marker_mm = np.stack([columns[name] for name in _MARKER], axis=1) * _M_TO_MM if marked else None
+    return Measured(setpoint_mm, setpoint, measured_mm, measured, stamps_s, marker_mm)
+
+
+def _joints(columns: dict[str, Floats], kind: str) -> Floats:
+    """Return the joints of a table in rad and mm, shape (N, 6)."""
+    joints = np.stack([columns[f"{kind}_{joint}"] for joint in _JOINTS], axis=1)
+    joints[:, INSERTION] *= _M_TO_MM
+    return joints

@@ -1,0 +1,89 @@
+"""A laboratory's own errors: the effective number of samples, bands, their coverage, and the tracker's fit."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from skills.errors import BadInput
+from skills.kinematics import forward
+from skills.verification.errors import SIZES, UNCALIBRATED, rotation_of
+from skills.verification.measured_errors import (
+    LEAST_EFFECTIVE,
+    Measured,
+    calibrate_arm,
+    effective_number,
+)
+
+
+def lasting(rng, count: int, keeps: float, axes: int = 3) -> np.ndarray:
+    """Return errors of size 1 of which each keeps a part of the one before, shape (count, axes)."""
+    made = rng.standard_normal((count, axes))
+    for k in range(1, count):
+        made[k] = keeps * made[k - 1] + np.sqrt(1 - keeps**2) * made[k]
+    return made
+
+
+def recorded(count: int = 3000, keeps: float = 0.9, seed: int = 0) -> Measured:
+    """Return an arm that moves about, with errors of 0.2 mm and 0.5 degrees that last 10 samples or so."""
+    rng = np.random.default_rng(seed)
+    phase = np.linspace(0, 40, count)[:, None] * [1.0, 0.7, 0.9, 0.5, 1.3, 1.1] + [0, 1, 2, 3, 4, 5]
+    joints = [0.0, 0.0, 150.0, 0.0, 0.0, 0.0] + np.sin(phase) * [0.4, 0.3, 30.0, 1.0, 0.6, 0.6]
+    tip, jaw = forward(joints)
+    turned = jaw @ rotation_of(np.radians(0.5) * lasting(rng, count, keeps))
+    return Measured(tip, jaw, tip + 0.2 * lasting(rng, count, keeps), turned, np.arange(count) * 0.01)
+
+
+def test_the_effective_number_is_that_of_a_noise_whose_autocorrelation_is_known():
+    rng = np.random.default_rng(1)
+    for keeps in (0.0, 0.5, 0.9):
+        values = lasting(rng, 20_000, keeps, axes=1)[:, 0]
+        assert effective_number(values) / len(values) == pytest.approx((1 - keeps) / (1 + keeps), rel=0.2)
+    assert effective_number(np.zeros(100)) == 100
+
+
+def test_the_stated_errors_are_those_that_were_put_in():
+    found = calibrate_arm(recorded(8000), name="bench 3")
+    assert found.errors.tip_noise_mm == pytest.approx(0.2, rel=0.07)
+    assert found.errors.tip_correlation_s == pytest.approx(-0.01 / np.log(0.9), rel=0.2)
+    assert [one.deviation for one in found.wrist] == pytest.approx([0.5] * 3, rel=0.08)
+    left = set(SIZES) - {"tip_noise_mm", "tip_correlation_s"}
+    assert all(getattr(found.errors, size) == getattr(UNCALIBRATED, size) for size in left)
+    assert all(found.errors.sources[size].startswith("Not measured by this recording") for size in left)
+    assert "of the encoders and not of the tip" in found.in_words
+
+
+def test_bands_hold_as_many_of_the_samples_left_out_as_they_say():
+    found = [calibrate_arm(recorded(1000, seed=seed), name="ours") for seed in range(8)]
+    assert np.mean([one.coverage for one in found]) == pytest.approx(0.9, abs=0.03)
+    # Few independent samples make wide bands: the deviation is 0.2 mm, so a certain band is 0.66 mm wide.
+    few, many = (calibrate_arm(recorded(count), name="ours").tip[0].width for count in (800, 5000))
+    assert 0.6 < many < few
+
+
+def test_too_few_independent_samples_are_refused():
+    with pytest.raises(BadInput, match=rf"at least {LEAST_EFFECTIVE:.0f} and 4 are needed. Record more"):
+        calibrate_arm(recorded(100, keeps=0.98), name="ours")
+    with pytest.raises(BadInput, match="10 samples hold 0"):
+        calibrate_arm(recorded(10), name="ours")
+
+
+def test_a_tracker_shows_the_errors_that_encoders_do_not():
+    still = recorded(2000)
+    rng = np.random.default_rng(5)
+    off = 1.2 * lasting(rng, 2000, 0.9)  # cables
+    turn = rotation_of(np.array([[0.3, -1.0, 2.0]]))[0]
+    marker = still.setpoint_mm + off + still.setpoint @ [3.0, -20.0, 12.0]
+    tracked = replace(still, marker_mm=marker @ turn.T + [100.0, -300.0, 1300.0])
+    found = calibrate_arm(tracked, name="ours")
+    assert [one.deviation for one in found.tracked] == pytest.approx([1.2] * 3, rel=0.1)
+    assert found.errors.tip_bias_mm == pytest.approx(1.2, rel=0.1)
+    assert found.errors.sources["tip_bias_mm"].startswith("Tracker")
+    exact = calibrate_arm(replace(tracked, marker_mm=(marker - off) @ turn.T), name="ours")
+    assert max(abs(value) for one in exact.tracked for value in (one.mean, one.deviation)) < 1e-5
+    assert found.tip == exact.tip
+
+
+def test_times_that_do_not_increase_are_refused():
+    with pytest.raises(BadInput, match="increase"):
+        replace(recorded(100), stamps_s=np.zeros(100))

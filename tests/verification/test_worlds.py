@@ -1,0 +1,87 @@
+"""The probability in closed form beside an independent Monte Carlo of the same event (`tests.verification.worlds`)."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from skills.kinematics import POINTING_DOWN
+from skills.learning.slip import wilson
+from skills.planning.handoff import realign
+from skills.planning.trajectory import PassPath, Trajectory, time_parametrise
+from skills.verification.errors import MEAN_LENGTH, SIZES, ArmErrors
+from skills.verification.monte_carlo import doubt
+from skills.verification.probabilities import DoubtSettings
+from skills.verification.verdict import Limits
+from tests.verification import worlds
+from tests.verification.test_monte_carlo import PAD_TOP_MM, PATH_MM, PSM_M, motion
+
+TIPS = ArmErrors("tips alone", 0, 0, 0, 0.65 / MEAN_LENGTH, 0, 0, dict.fromkeys(SIZES, "a test"))
+# An independent Monte Carlo of the first judge's plan, with these errors added to a tip error of 0.65 mm on average.
+FOUND_BEFORE = {
+    "registration off by 1 mm": (replace(TIPS, registration_mm=1.0), 0.90),
+    "registration off by 2 mm": (replace(TIPS, registration_mm=2.0), 0.48),
+    "registration off by 1 degree": (replace(TIPS, registration_deg=1.0), 0.28),
+    "wrists off by 3 degrees": (replace(TIPS, wrist_deg=3.0), 0.91),
+    "wrists off by 5 degrees": (replace(TIPS, wrist_deg=5.0), 0.66),
+}
+
+
+def probability(
+    trajectory: Trajectory, errors: ArmErrors, pad_top_mm: float = PAD_TOP_MM, variations: int = 2000
+) -> float:
+    settings = DoubtSettings(variations=variations)
+    tools = Limits(clearance_bodies_mm=-1e6)  # the other worlds have no outer bodies
+    found = doubt(trajectory, approach_m=None, pad_top_mm=pad_top_mm, errors=errors, settings=settings, limits=tools)
+    return found.under[0].plan.probability
+
+
+@pytest.mark.parametrize(("errors", "found"), FOUND_BEFORE.values(), ids=FOUND_BEFORE)
+def test_errors_that_the_first_judge_left_out_cost_as_much_as_was_found(errors, found):
+    assert probability(motion(1, PSM_M), errors) == pytest.approx(found, abs=0.04)
+
+
+def some_plan(seed: int) -> tuple[Trajectory, ArmErrors, float]:
+    """Return a plan of one pass with an approach, a height of the pad and errors of its own."""
+    rng = np.random.default_rng(seed)
+    approach = np.array(PSM_M.approach) + rng.uniform(-0.15, 0.15, 3)
+    path = PATH_MM + rng.uniform(-4, 4, 3) + np.append(np.zeros((1, 3)), rng.uniform(-2, 2, (3, 3)), axis=0)
+    psm_m = replace(PSM_M, approach=tuple(approach.tolist()))
+    one = PassPath(path, POINTING_DOWN, realign(POINTING_DOWN, approach).rotation)
+    pad_top_mm = float(path[:, 2].min()) - 10.2 - rng.uniform(2.0, 6.0)
+    errors = replace(
+        TIPS,
+        registration_mm=rng.uniform(0, 1.6),
+        registration_deg=rng.uniform(0, 0.6),
+        wrist_deg=rng.uniform(0, 3),
+        tip_bias_mm=rng.uniform(0, 0.8),
+        tip_noise_mm=rng.uniform(0, 0.5),
+        tip_correlation_s=rng.choice([0.0, 0.3, 2.0]),
+    )
+    return time_parametrise([one], rate_hz=100.0, psm_m=psm_m), errors, pad_top_mm
+
+
+def compared(plans: int, variations: int, tried: int) -> tuple[list[float], int]:
+    """Return the probabilities of plans from 0.2 to 0.99, and how many are within the other one's Wilson interval."""
+    found, agree, seed = [], 0, 0
+    while len(found) < plans:
+        trajectory, errors, pad_top_mm = some_plan(seed)
+        closed = probability(trajectory, errors, pad_top_mm, variations)
+        if 0.2 <= closed <= 0.99:
+            lower, upper = wilson(worlds.successes(trajectory, errors, pad_top_mm, tried, 2000 + seed), tried)
+            found.append(closed)
+            agree += lower <= closed <= upper
+        seed += 1
+    return found, agree
+
+
+def test_a_few_plans_succeed_as_often_as_in_independent_worlds():
+    found, agree = compared(plans=3, variations=1000, tried=150)
+    assert agree == 3, found
+
+
+@pytest.mark.nightly
+def test_50_plans_succeed_as_often_as_in_independent_worlds():
+    found, agree = compared(plans=50, variations=4000, tried=300)
+    assert agree >= 45, found
+    assert min(found) < 0.3 and max(found) > 0.95
