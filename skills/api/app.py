@@ -22,12 +22,12 @@ from skills.api.routes import catalogue, datasets, demos, operating, pages, plan
 from skills.api.sessions import Sessions
 from skills.db.session import Database
 from skills.jobs import Engine
+from skills.library.arm_errors import stated_errors
 from skills.library.catalogue import seed_catalogue
 from skills.library.history import keep_signed
 from skills.library.recordings import confined_reader
 from skills.logs import request_id
 from skills.settings import Settings
-from skills.verification.errors import stated_errors
 
 DESCRIPTION = (
     "Suture styles as a service: a recorded needle hand-off of a surgeon is discretised, learnt, certified, "

@@ -1,5 +1,6 @@
-"""A laboratory's own errors from a file: setpoints and measured poses of a recording, or of a table of joints.
+"""A laboratory's own errors: as it states them, and from setpoints and measured poses of a recording or a table.
 
+    name or JSON --stated_errors--> ArmErrors
     recording or table --read_measured--> Measured --calibrate_arm--> ArmCalibration
 
 A *recording* needs `measured_cp` and `setpoint_cp` of the arm in one frame. Each measured pose is compared with the
@@ -10,14 +11,16 @@ dVRK's `measured_js` has them. With a tracker it also has `marker_x`, `marker_y`
 """
 
 import csv
+import json
 from pathlib import Path
 
 import numpy as np
 
 from skills.arrays import Floats
-from skills.errors import BadInput, BadRecording
+from skills.errors import BadInput, BadRecording, BadSettings
 from skills.formats import read_recording
 from skills.kinematics import DEFAULT_INSTRUMENT, INSERTION, forward, matrix_of
+from skills.verification.errors import NAMED, SIZES, ArmErrors, checked_own
 from skills.verification.measured_errors import Measured
 
 MOST_ROWS = 1_000_000
@@ -25,6 +28,25 @@ _JOINTS = tuple(f"q{number}" for number in range(1, 7))
 _NEEDED = tuple(f"{kind}_{joint}" for kind in ("measured", "setpoint") for joint in _JOINTS)
 _MARKER = ("marker_x", "marker_y", "marker_z")
 _M_TO_MM = 1000.0
+
+
+def stated_errors(stated: str) -> ArmErrors:
+    """Return the errors that a laboratory states: "calibrated", "uncalibrated", or its own as JSON.
+
+    Raises:
+        BadSettings: The text is neither of them, a size is missing or impossible, or has no source; or its own errors
+            have the name of a default.
+    """
+    if stated in NAMED:
+        return NAMED[stated]
+    try:
+        read = json.loads(stated)
+        own = ArmErrors(**read)
+    except (ValueError, TypeError, AttributeError):
+        raise BadSettings(
+            f"The errors of an arm are {' or '.join(NAMED)}, or JSON with name, {', '.join(SIZES)} and sources."
+        ) from None
+    return checked_own(own)
 
 
 def read_measured(

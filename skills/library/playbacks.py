@@ -28,6 +28,7 @@ from skills.db.service_tables import Job, record_event
 from skills.db.session import Database
 from skills.errors import BadPlan, Conflict, NotDrawnYet
 from skills.library import jobs, releases
+from skills.library.arm_errors import stated_errors
 from skills.library.integrity import find_by_digest, learnt, planned
 from skills.library.jobs import PICTURES, PicturesRequest, PlaybackRequest
 from skills.library.plans import find_plan, hand_of, hands_over, plan_in_words, psm_m_moves, trajectory_of
@@ -36,7 +37,7 @@ from skills.planning.trajectory import Trajectory
 from skills.remedies import Action, Remedy
 from skills.settings import Settings
 from skills.verification.asked import asked_of
-from skills.verification.errors import CALLED, NAMED, ArmErrors, stated_errors
+from skills.verification.errors import CALLED, NAMED, ArmErrors
 from skills.verification.intent import compare
 from skills.verification.monte_carlo import doubt
 from skills.verification.playback import Pictures

@@ -1,6 +1,6 @@
 """Errors of real arms: their sizes, each with its source, and seeded draws of them.
 
-    name or JSON --stated_errors--> ArmErrors: of a calibrated arm, of an uncalibrated one, or a laboratory's own
+    ArmErrors: CALIBRATED, UNCALIBRATED, or a laboratory's own
     seed --draw--> Drawn: random numbers of size 1 --Drawn.under(ArmErrors)--> Displaced: in mm and rad
 
 Five errors place the arms elsewhere than a plan says. All are normally distributed about zero, and their sizes are
@@ -21,7 +21,6 @@ Each error has its own stream of random numbers, decided by the seed, the error 
 zero, all others are drawn as before, and the difference is the effect of that error.
 """
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from math import isfinite, pi, radians, sqrt
@@ -156,26 +155,6 @@ UNCALIBRATED = ArmErrors(
     },
 )
 NAMED = MappingProxyType({one.name: one for one in (CALIBRATED, UNCALIBRATED)})
-
-
-def stated_errors(stated: str) -> ArmErrors:
-    """Return the errors that a laboratory states: "calibrated", "uncalibrated", or its own as JSON.
-
-    Raises:
-        BadSettings: The text is neither of them, a size is missing or impossible, or has no source; or its own errors
-            have the name of a default.
-    """
-    if stated in NAMED:
-        return NAMED[stated]
-    try:
-        read = json.loads(stated)
-        own = ArmErrors(**read)
-    except (ValueError, TypeError, AttributeError):
-        raise BadSettings(
-            f"The errors of an arm are {' or '.join(NAMED)}, or JSON with name, {', '.join(SIZES)} and sources; "
-            "`skills calibrate-arm` writes it.",
-        ) from None
-    return checked_own(own)
 
 
 def checked_own(own: ArmErrors) -> ArmErrors:

@@ -22,7 +22,6 @@ that the error can be.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import exp, inf, log, sqrt
-from statistics import NormalDist
 from typing import Any
 
 import numpy as np
@@ -33,7 +32,7 @@ from skills.fields import Count, Fraction, schema
 from skills.kinematics import check_rotation, quaternion_of
 from skills.verification.errors import CALIBRATED, MEAN_LENGTH, UNCALIBRATED, ArmErrors
 
-BAND = 0.9
+BAND, _HALF_BAND = 0.9, 1.6449  # of a normal error, in deviations
 BLOCKS = 6  # ours: with fewer the others are too few, with more a block is no longer than the errors last
 LEAST_EFFECTIVE, LEAST_ALONG_AN_AXIS = 20.0, 4.0  # ours: with fewer a band's width is uncertain by more than a third
 _STILL_MM = 1e-6  # round-off of kinematics
@@ -232,7 +231,7 @@ def _check_number(errors: Floats, blocks: int) -> None:
 
 def _axes(errors: Floats, unit: str, blocks: int, assumed: float) -> tuple[AxisErrors, ...]:
     """Return the figures of errors along three axes, shape (N, 3), beside a normal error of the assumed deviation."""
-    half = NormalDist(0, assumed).inv_cdf((1 + BAND) / 2)
+    half = _HALF_BAND * assumed
     found = []
     for axis, values in zip("xyz", errors.T, strict=True):
         within, widths = _cross_validated(values, blocks)

@@ -7,9 +7,10 @@ import pytest
 from pydantic import ValidationError
 
 from skills.errors import BadSettings
+from skills.library.arm_errors import stated_errors
 from skills.schemas.requests import PlaybackIn
 from skills.settings import Settings
-from skills.verification.errors import CALIBRATED, CALLED, NAMED, SIZES, UNCALIBRATED, ArmErrors, stated_errors
+from skills.verification.errors import CALIBRATED, CALLED, NAMED, SIZES, UNCALIBRATED, ArmErrors
 from tests.arms import ARMS
 
 PLAN = "0" * 64

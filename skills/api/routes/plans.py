@@ -25,6 +25,7 @@ from skills.errors import UnknownFormat
 from skills.formats import BYTES
 from skills.formats.replay_bag import rows_of_pass
 from skills.library import locks, plans, playbacks
+from skills.library.arm_errors import stated_errors
 from skills.library.jobs import QUEUED, did_nothing
 from skills.library.plans import find_suture_points, motion_of, plan_json, trajectory_of
 from skills.library.playbacks import find_playback, playback_json
@@ -35,7 +36,6 @@ from skills.schemas.given import Comparison, Plan, Playback, SuturePoints
 from skills.schemas.given import Trajectory as GivenTrajectory
 from skills.schemas.requests import DIGEST, FRAME, Name, PlanIn, PlaybackIn, Schema
 from skills.settings import MEBIBYTE, Settings
-from skills.verification.errors import stated_errors
 from skills.verification.playback import Pictures
 
 router = router_of(route_class=Strict, tags=["plans"], max_body_size=MEBIBYTE)
