@@ -165,7 +165,7 @@ def replay_bag(
         {"use": USE, "plan": row.sha256, "before_each_pass": BY_HAND, "passes": timetable(trajectory, arms)}
     )
     head = signatures.head_over(database, rows)
-    members[README] = _readme(papers[PLAN], arms, head).encode()
+    members[README] = _readme(papers[PLAN], papers[VERDICT]["report"], arms, head).encode()
     for arm in arms:
         members |= folder_of(arm, row.sha256)
     members[SIGNATURE] = signatures.sign_files(
@@ -351,12 +351,17 @@ def _written(paper: dict[str, Any]) -> bytes:
     return json.dumps(paper, indent=2, sort_keys=True, allow_nan=False).encode() + b"\n"
 
 
-def _readme(plan: dict[str, Any], arms: tuple[ArmMotion, ...], head: Note) -> str:
+def _readme(plan: dict[str, Any], report: dict[str, Any], arms: tuple[ArmMotion, ...], head: Note) -> str:
     """Return the text of the bag's README: its contents, and the figures of each arm to check before it moves."""
+    errors, stated_by = ArmErrors(**report["doubt"]["under"][0]["errors"]), report["stated_by"]
     about = [
         f"A needle hand-off for replay: plan {plan['sha256']},",
         f"surgeon {plan['surgeon']}, {plan['suture']}, policy version {plan['policy']['version']}.",
         plan["in_words"],
+        "",
+        f"Every pass is likely enough to succeed with {errors_in_words(errors.name)}, as the {stated_by} stated them:",
+        f"{errors.in_words}.",
+        "With greater errors it was not judged: compare these with your arms.",
         "",
         USE,
         "",

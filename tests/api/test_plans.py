@@ -128,6 +128,18 @@ def test_a_headline_is_good_only_if_the_stated_arm_error_allows_it(tmp_path: Pat
     assert levels == {"bench": ("good", "Likely to succeed"), "uncalibrated": ("bad", "Likely to fail")}
 
 
+def test_a_playback_states_errors_of_its_own_or_takes_those_of_the_installation(still: Service):
+    asked = {"plan": plan(still, [5.0, 56.0, -125.0])["id"]}
+    own, calibrated, installed = asked | {"errors": asdict(ARMS)}, asked | {"errors": "calibrated"}, asked
+    jobs = [still.http.post("/playbacks", json=body).json()["id"] for body in (own, calibrated, installed, own)]
+    assert len(set(jobs)) == 3 and jobs[0] == jobs[3]
+    for wrong in ("exact", asdict(ARMS) | {"tip_bias_mm": -1}, asdict(ARMS) | {"sources": {}}):
+        assert_problem(still.http.post("/playbacks", json=asked | {"errors": wrong}), 422)
+    renamed = asdict(ARMS) | {"name": "calibrated"}
+    problem = assert_problem(still.http.post("/playbacks", json=asked | {"errors": renamed}), range(400, 423))
+    assert "give your own another name" in problem["detail"]
+
+
 # ---- PSM_M, starts and time -------------------------------------------------------------------------------------
 
 APPROACH = [-0.94, 0.10, -0.33]

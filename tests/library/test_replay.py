@@ -332,6 +332,8 @@ def papers_say_whose_it_is_and_how_far_it_goes(data: bytes, plan: Plan) -> None:
     assert "actions" not in papers["policy.json"]
     for words in (
         "skills verify",
+        "with the errors of an uncalibrated arm, as the installation stated them:",
+        "registration 14.4 mm and 3 degrees, wrist 3 degrees",
         "ASSUMED to point straight down",
         "calls its arm 'PSM'",
         "-a PSM1 -b PSM1 -m servo_jp",
