@@ -80,21 +80,32 @@ def _tables(found: "Atlas") -> None:
 
 
 def _recognition(found: "Atlas") -> None:
-    seen = found.recognition
-    if seen is None:
-        out.print(f"recognition: none. {found.no_recognition_because}", soft_wrap=True)
-        return
-    low, high = seen.interval
-    out.print(
-        f"recognition: {seen.right} of {seen.tested} with their session left out, {seen.accuracy:.0%} "
-        f"({low:.0%} to {high:.0%}), by chance {seen.chance:.0%}; log loss {seen.log_loss:.2f} nat, guessing "
-        f"{seen.log_loss_of_guessing:.2f}",
-        soft_wrap=True,
-    )
+    for seen in found.recognition:
+        low, high = seen.interval
+        out.print(
+            f"recognition on {seen.arm}: {seen.right} of {seen.tested} with their session left out, "
+            f"{seen.accuracy:.0%} ({low:.0%} to {high:.0%}), by chance {seen.chance:.0%}; log loss "
+            f"{seen.log_loss:.2f} nat, guessing {seen.log_loss_of_guessing:.2f}; by {', '.join(seen.compared)}",
+            soft_wrap=True,
+        )
+    if found.no_recognition_because is not None:
+        out.print(f"no recognition: {found.no_recognition_because}", soft_wrap=True)
+    if found.votes is not None:
+        out.print(
+            f"votes of recordings: {found.votes.right} of {found.votes.recordings}, {found.votes.accuracy:.0%}",
+            soft_wrap=True,
+        )
     if found.whose is not None:
-        likely = ", ".join(f"{one.surgeon} {one.probability:.0%}" for one in found.whose.likely[:3])
-        out.print(f"{found.whose.demo[:SHORT]} of {found.whose.surgeon}: {likely}", soft_wrap=True)
-    out.print("Set-up and day are confounded with the surgeon: see docs/atlas.md.")
+        whose = found.whose
+        likely = ", ".join(f"{one.surgeon} {one.probability:.0%}" for one in whose.likely[:3])
+        voted = f"; its recording votes for {whose.voted} ({whose.voters})" if whose.voted else ""
+        out.print(
+            f"{whose.demo[:SHORT]} of {whose.surgeon}, {whose.arm}: {likely}; none of these "
+            f"{whose.none_of_these:.0%}{voted}",
+            soft_wrap=True,
+        )
+    if found.recognition:
+        out.print("Set-up and day are confounded with the surgeon: see docs/atlas.md.")
 
 
 def _rounded(distance: float | None) -> str | None:

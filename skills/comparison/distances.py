@@ -47,7 +47,7 @@ STEEPEST = 0.99  # cosine between x and the base's z axis; beyond it, the base's
 
 THREADS = 2  # the loops release the GIL; the service, which calls this too, needs its other cores
 WORTH_A_THREAD = 200  # pairs; with 100 states they take 6 ms
-VERSION = 1  # of shapes and distances: raise it when their numbers change, so that stored ones are measured again
+VERSION = 2  # of shapes, signatures and distances: raise it when their numbers change, so that all are measured again
 AXES = ("along the way", "sideways", "upwards")  # x, y and z of a shape's own frame
 FURTHER = (("less far along", "further along"), ("further right", "further left"), ("lower", "higher"))  # by sign
 PARTS = ("first third", "middle third", "last third")
@@ -188,12 +188,14 @@ class Measured:
         others: Numbers that identify the others, shape (K,).
         apart_mm: Distance from each, with the size taken into account, shape (K,).
         apart_scaled: The same for scaled shapes, in units of the distance from start to goal, shape (K,).
+        signature: The result of `skills.comparison.signature.signature_of`, with its NaN; None: of an older version.
     """
 
     shape_mm: Floats | None
     others: Ints
     apart_mm: Floats
     apart_scaled: Floats
+    signature: Floats | None = None
 
     def __post_init__(self) -> None:
         count = len(self.others)

@@ -2,7 +2,8 @@
 
     Database --atlas_of--> Atlas
 
-An atlas compares all active demonstrations of the suture type whose surgeon's consent covers it.
+An atlas compares all active demonstrations of the suture type whose surgeon's consent covers it; of more than `MOST`, a
+sample. Of overlapping cuts of one motion the newest counts.
 
 A pair is measured at the first request that contains both demonstrations, so a new demonstration costs one row of
 distances. The results are stored in one row for each demonstration (`MeasuredShape`), in short transactions during the
@@ -15,7 +16,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import combinations
-from math import log
 from threading import Lock
 
 import numpy as np
@@ -43,30 +43,29 @@ from skills.comparison.distances import (
     silhouette,
     spread,
 )
-from skills.comparison.recognition import Validated, recognise, validate
+from skills.comparison.signature import NUMBERS, signature_of
 from skills.db import in_parts
-from skills.db.models import Demonstration, MeasuredShape, Surgeon, SutureType
+from skills.db.models import Demonstration, MeasuredShape, SutureType
 from skills.db.packed import pack
 from skills.db.row_visibility import EVERYBODYS
 from skills.db.session import Database
 from skills.demonstration.demonstration import Demo
-from skills.errors import BadInput, BadPath, Busy, Conflict, NotFound
+from skills.errors import BadPath, Busy, Conflict, NotFound
 from skills.library import locks
 from skills.library.catalogue import find_suture_type
-from skills.library.consent import may, require
+from skills.library.consent import require
 from skills.library.demos import find_demo
+from skills.library.members import Member, members_of, sessions_of, without_overlaps
+from skills.library.whose import recognise_arms, recognitions, votes, whose
 from skills.schemas.comparison import (
     Apartness,
     Atlas,
     Cluster,
     Consistency,
     LeftOutOfAtlas,
-    Likely,
     Merge,
     OfSurgeon,
     Place,
-    Recognition,
-    Whose,
 )
 
 DEMOS_AT_ONCE = 100  # recorded motions in memory; each has some thousand samples
@@ -76,7 +75,7 @@ PATIENCE_S = 30.0  # timeout of the wait for another thread's measuring; 1000 de
 _measuring = Lock()  # two requests at once would measure the same pairs twice
 
 Kept = dict[int, Measured]  # by the demonstration's row
-MOST = 2000  # demonstrations: a minute of measuring on two cores, once, and a response of 16 MB
+MOST = 2000  # demonstrations shown: a minute of measuring on two cores, once, and a response of 16 MB
 MOST_COMPARED = 40  # surgeons; all pairs of them are compared, in half a second
 DIGITS = 4  # of the rounded results: a tenth of a micrometre, far below the resolution of a recorder
 UNITS = {False: "mm", True: "lengths of start to goal"}
@@ -84,6 +83,9 @@ UNITS = {False: "mm", True: "lengths of start to goal"}
 AS_ASKED = "as asked"
 BY_SILHOUETTE = f"that with the best mean silhouette, and one where even that is below {WORTH:g}"
 
+OVERLAPPED = (
+    "A newer cut of the same motion counts: it shares at least half of the shorter one's time, in the same recording."
+)
 NO_DIRECTION = f"It ends within {LEAST_MM:g} mm of where it began, so it has no direction and cannot be compared."
 DISTANCE = (
     f"A distance is the total of dynamic time warping (Manhattan) of two shapes of {STATES} states, divided by "
@@ -111,12 +113,14 @@ class Apart:
         shapes_mm: Shape (N, STATES, 3).
         apart_mm: DTW totals in mm, shape (N, N); NaN for pairs that were not measured yet.
         apart_scaled: The same for scaled shapes, in lengths of start to goal.
+        signatures: Shape (N, NUMBERS).
     """
 
     rows: Ints
     shapes_mm: Floats
     apart_mm: Floats
     apart_scaled: Floats
+    signatures: Floats
 
 
 def far_apart(database: Database, rows: Sequence[int]) -> Apart:
@@ -128,18 +132,18 @@ def far_apart(database: Database, rows: Sequence[int]) -> Apart:
         Busy: Another thread has been measuring for more than `PATIENCE_S`.
     """
     wanted = sorted({*rows})
-    kept = _kept(database, wanted)
+    kept = kept_shapes(database, wanted)
     apart = _laid_out(kept)
     if len(kept) == len(wanted) and not np.isnan(apart.apart_mm).any():
         return apart
     with _one_at_a_time():
         known = apart.rows[~np.isnan(apart.apart_mm).any(axis=1)]
-        kept |= _kept(database, sorted({*wanted} - {*known.tolist()}))  # measured by another thread
-        new = _shapes(database, [row for row in wanted if row not in kept])
-        _keep(database, new)
+        kept |= kept_shapes(database, sorted({*wanted} - {*known.tolist()}))  # measured by another thread
+        new = shapes_of(database, [row for row in wanted if row not in kept])
+        keep_shapes(database, new)
         kept |= new
         for measured in _measure(kept):
-            _keep(database, measured)
+            keep_shapes(database, measured)
             kept |= measured
     return _laid_out(kept)
 
@@ -157,14 +161,14 @@ def _one_at_a_time() -> Iterator[None]:
 # ---- measuring ---------------------------------------------------------------------------------------------------
 
 
-def _shapes(database: Database, rows: Sequence[int]) -> Kept:
+def shapes_of(database: Database, rows: Sequence[int]) -> Kept:
     """Compute the shapes of recorded demonstrations, `DEMOS_AT_ONCE` at a time."""
     made: Kept = {}
     for at in range(0, len(rows), DEMOS_AT_ONCE):
         some = Demonstration.row.in_(rows[at : at + DEMOS_AT_ONCE])
         with database.reading() as session:
             recorded = session.execute(select(Demonstration.row, Demonstration.demo).where(some)).all()
-        made |= {row: Measured(_shape(demo), *_NOTHING) for row, demo in recorded}
+        made |= {row: Measured(_shape(demo), *_NOTHING, signature_of(demo)) for row, demo in recorded}
     return made
 
 
@@ -195,6 +199,7 @@ def _measure(kept: Mapping[int, Measured]) -> Iterator[Kept]:
                 np.append(known.others, apart.rows[others]),
                 np.append(known.apart_mm, mm),
                 np.append(known.apart_scaled, lengths),
+                known.signature,
             )
         yield grown
 
@@ -237,20 +242,22 @@ def _laid_out(kept: Mapping[int, Measured]) -> Apart:
             matrix[at, at] = 0.0
             matrix[at, places[there]] = matrix[places[there], at] = totals[there]
     whole = np.array([shape for shape in shapes.values() if shape is not None])
-    return Apart(rows, whole, apart_mm, apart_scaled)
+    signatures = np.array([kept[row].signature for row in rows.tolist()]).reshape(-1, NUMBERS)
+    return Apart(rows, whole, apart_mm, apart_scaled, signatures)
 
 
 # ---- storage -----------------------------------------------------------------------------------------------------
 
 
-def _kept(database: Database, rows: Sequence[int]) -> Kept:
+def kept_shapes(database: Database, rows: Sequence[int]) -> Kept:
+    """Return the stored measurements of demonstrations, given by their rows, of those that have any."""
     query = select(MeasuredShape.demonstration_row, MeasuredShape.measured)
     mine = MeasuredShape.version == VERSION, MeasuredShape.demonstration_row.in_(rows)
     with database.reading() as session:
         return {row: measured for row, measured in session.execute(query.where(*mine)).all()}  # noqa: C416 - mypy
 
 
-def _keep(database: Database, measured: Mapping[int, Measured]) -> None:
+def keep_shapes(database: Database, measured: Mapping[int, Measured]) -> None:
     """Replace the stored rows of some demonstrations by new measurements.
 
     Nothing is stored if a demonstration in a row, on either side of a distance, was erased since: its distance would
@@ -274,15 +281,6 @@ def _keep(database: Database, measured: Mapping[int, Measured]) -> None:
 # ---- the atlas -----------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class _Member:
-    row: int
-    sha256: str
-    surgeon: str
-    session: str | None
-    recording_row: int
-
-
 def atlas_of(
     database: Database, suture: str, *, scaled: bool = False, clusters: int | None = None, demo: str | None = None
 ) -> Atlas:
@@ -297,49 +295,60 @@ def atlas_of(
 
     Raises:
         NotFound: There is no such suture type, or nothing to compare, or no such demonstration in the atlas.
-        Conflict: There are more than `MOST`; or the demonstration was withdrawn, or consent does not cover it.
+        Conflict: The demonstration was withdrawn, consent does not cover it, or a newer cut overlaps it.
         BadInput: More clusters are requested than there are demonstrations.
         BadPath: The demonstration `demo` has no direction.
     """
-    found, without_consent, asked = _found(database, suture, demo)
+    found = _found(database, suture, demo)
+    chosen = found.members
     # Measuring may take a minute, outside any transaction; repeat until no member was withdrawn during it.
     while True:
-        apart = far_apart(database, [one.row for one in found])
-        still, without_consent, asked = _found(database, suture, demo)
-        if {*found} <= {*still}:  # demonstrations added since are left to the next atlas
+        apart = far_apart(database, [one.row for one in chosen])
+        found = _found(database, suture, demo)
+        if {*chosen} <= {*found.members}:  # demonstrations added since are left to the next atlas
             break
-        found = [one for one in found if one in still]  # consent or a demonstration was withdrawn during the measuring
+        chosen = [one for one in chosen if one in found.members]
     there = {*apart.rows.tolist()}
-    members = [one for one in found if one.row in there]
-    without_direction = [one.sha256 for one in found if one.row not in there]
-    if asked in without_direction:
+    members = [one for one in chosen if one.row in there]
+    without_direction = [one.sha256 for one in chosen if one.row not in there]
+    if found.asked in without_direction:
         raise BadPath(f"{NO_DIRECTION} Cut the hand-off from its start to the point where the needle is taken.")
-    left_out = LeftOutOfAtlas(
-        without_consent=without_consent,
-        without_direction=without_direction,
-        because=_because(without_consent, len(without_direction)),
-    )
+    left_out = _left_out(found, without_direction)
     if not members:
         raise NotFound(" ".join([f"There is no demonstration of '{suture}' to compare.", *left_out.because]))
     if scaled:
         shapes, far = np.array([in_lengths(shape) for shape in apart.shapes_mm]), apart.apart_scaled
     else:
         shapes, far = apart.shapes_mm, apart.apart_mm
-    return _told(suture, _compare(members, shapes, far / STATES, scaled), left_out, clusters, asked)
+    compared = _compare(members, shapes, far / STATES, scaled, apart.signatures)
+    return _told(suture, compared, left_out, clusters, found.asked)
 
 
-def _found(database: Database, suture: str, demo: str | None) -> tuple[list[_Member], int, str | None]:
-    """List the members of an atlas, count those left out for want of consent, and check the requested demonstration."""
+@dataclass(frozen=True)
+class _Found:
+    """The members of an atlas, what is left out of it, and the digest of the demonstration to be recognised."""
+
+    members: list[Member]
+    without_consent: int
+    overlapped: list[Member]
+    not_sampled: int
+    asked: str | None
+
+
+def _found(database: Database, suture: str, demo: str | None) -> _Found:
+    """List the members of an atlas and what is left out, and check the requested demonstration.
+
+    Of more than `MOST`, those with the smallest digests are a random sample that hardly changes as others are added.
+    """
     with database.reading() as session:
-        found, without_consent = _members(session, find_suture_type(session, suture).slug)
+        agreed, without_consent = members_of(session, find_suture_type(session, suture).slug)
         asked = None if demo is None else _asked(session, demo, suture)
-    if len(found) > MOST:
-        raise Conflict(
-            f"There are {len(found)} demonstrations of '{suture}', and an atlas has at most {MOST}; withdraw "
-            "those that are not used for learning.",
-            demos=len(found),
-        )
-    return found, without_consent, asked
+    members, overlapped = without_overlaps(agreed)
+    if asked in {one.sha256 for one in overlapped}:
+        raise Conflict(f"{OVERLAPPED} Request a newer cut of the recording, or withdraw that one.")
+    sample = {one.row for one in sorted(members, key=lambda one: (one.sha256 != asked, one.sha256))[:MOST]}
+    sampled = [one for one in members if one.row in sample]
+    return _Found(sampled, without_consent, overlapped, len(members) - len(sampled), asked)
 
 
 def atlases(session: Session) -> list[tuple[SutureType, int, int]]:
@@ -348,22 +357,6 @@ def atlases(session: Session) -> list[tuple[SutureType, int, int]]:
     counted = select(of.suture, func.count(), func.count(of.surgeon_row.distinct())).where(of.withdrawn_at.is_(None))
     found = session.execute(counted.group_by(of.suture).order_by(of.suture)).all()
     return [(find_suture_type(session, suture), demos, surgeons) for suture, demos, surgeons in found]
-
-
-def _members(session: Session, suture: str) -> tuple[list[_Member], int]:
-    """List the active demonstrations that may be compared, the oldest first, and count those that may not."""
-    of = Demonstration
-    query = select(of.row, of.sha256, Surgeon, of.session, of.recording_row).join(
-        Surgeon, of.surgeon_row == Surgeon.row
-    )
-    rows = session.execute(query.where(of.suture == suture, of.withdrawn_at.is_(None)).order_by(of.row)).all()
-    covered = {surgeon.slug: may(surgeon, "atlas") for _, _, surgeon, _, _ in rows}
-    members = [
-        _Member(row, sha256, surgeon.slug, recorded, recording)
-        for row, sha256, surgeon, recorded, recording in rows
-        if covered[surgeon.slug]
-    ]
-    return members, len(rows) - len(members)
 
 
 def _asked(session: Session, demo: str, suture: str) -> str:
@@ -377,13 +370,28 @@ def _asked(session: Session, demo: str, suture: str) -> str:
     return found.sha256
 
 
-def _because(without_consent: int, without_direction: int) -> list[str]:
+def _left_out(found: _Found, without_direction: list[str]) -> LeftOutOfAtlas:
     said = []
-    if without_consent:
-        said.append(f"Left out: {_count(without_consent)}, because the surgeon's consent does not cover an atlas.")
+    if found.without_consent:
+        said.append(
+            f"Left out: {_count(found.without_consent)}, because the surgeon's consent does not cover an atlas."
+        )
     if without_direction:
-        said.append(f"Left out: {_count(without_direction)}. {NO_DIRECTION}")
-    return said
+        said.append(f"Left out: {_count(len(without_direction))}. {NO_DIRECTION}")
+    if found.overlapped:
+        said.append(f"Left out: {_count(len(found.overlapped))}. {OVERLAPPED}")
+    if found.not_sampled:
+        said.append(
+            f"Left out: {_count(found.not_sampled)}. An atlas shows {MOST} at the most, drawn at random by their "
+            "digests; the nearest neighbours of a demonstration are searched among all."
+        )
+    return LeftOutOfAtlas(
+        without_consent=found.without_consent,
+        without_direction=without_direction,
+        overlapped=[one.sha256 for one in found.overlapped],
+        not_sampled=found.not_sampled,
+        because=said,
+    )
 
 
 def _count(demos: int) -> str:
@@ -397,13 +405,14 @@ def _count(demos: int) -> str:
 class _Compared:
     """Members with the distances between all of them, and the surgeon and session of each as numbers."""
 
-    members: Sequence[_Member]
+    members: Sequence[Member]
     shapes: Floats
     far: Floats
     scaled: bool
     surgeons: list[str]
     whose: Ints
     sessions: Ints
+    signatures: Floats
 
     def of(self, surgeon: int) -> Ints:
         """Return the indices of a surgeon's demonstrations."""
@@ -414,25 +423,9 @@ class _Compared:
         return self.members[one].sha256
 
 
-def _compare(members: Sequence[_Member], shapes: Floats, far: Floats, scaled: bool) -> _Compared:
-    slugs, whose = np.unique([one.surgeon for one in members], return_inverse=True)
-    return _Compared(members, shapes, far, scaled, slugs.tolist(), whose, _sessions(members))
-
-
-def _sessions(members: Sequence[_Member]) -> Ints:
-    """Number the sessions: demonstrations of one session name, or of one recording, were recorded together.
-
-    Cuts of one recording belong to one session even if their session names differ, or only some have one.
-    """
-    together: dict[object, set[int]] = {}
-    session = np.arange(len(members))
-    for number, one in enumerate(members):
-        for key in {one.recording_row, one.session or one.recording_row}:
-            together.setdefault(key, set()).add(number)
-    for numbers in together.values():
-        joined = np.unique(session[sorted(numbers)])
-        session[np.isin(session, joined)] = joined[0]
-    return np.unique(session, return_inverse=True)[1]
+def _compare(members: Sequence[Member], shapes: Floats, far: Floats, scaled: bool, signatures: Floats) -> _Compared:
+    slugs, surgeons = np.unique([one.surgeon for one in members], return_inverse=True)
+    return _Compared(members, shapes, far, scaled, slugs.tolist(), surgeons, sessions_of(members), signatures)
 
 
 def _told(suture: str, compared: _Compared, left_out: LeftOutOfAtlas, clusters: int | None, asked: str | None) -> Atlas:
@@ -441,7 +434,8 @@ def _told(suture: str, compared: _Compared, left_out: LeftOutOfAtlas, clusters: 
     number = clusters or how_many(far, tree)
     in_cluster = tree.cut(number)
     places, shows = chart(far)
-    validated, why_not = _validated(compared)
+    recognised = recognise_arms(members, compared.signatures)
+    of_asked = next((one for one in members if one.sha256 == asked), None)
     return Atlas(
         suture=suture,
         scaled=compared.scaled,
@@ -461,9 +455,10 @@ def _told(suture: str, compared: _Compared, left_out: LeftOutOfAtlas, clusters: 
         chart_shows=round(shows, DIGITS),
         surgeons=[_consistency(compared, one) for one in range(len(compared.surgeons))],
         differences=_differences(compared),
-        recognition=None if validated is None else _recognition(validated),
-        no_recognition_because=why_not,
-        whose=None if asked is None or validated is None else _whose(compared, validated, asked),
+        recognition=recognitions(recognised),
+        no_recognition_because=" ".join(recognised.because) or None,
+        votes=votes(recognised),
+        whose=None if of_asked is None else whose(recognised, of_asked),
         notes=[DISTANCE, CONFOUNDED, SESSIONS, *left_out.because],
     )
 
@@ -549,37 +544,3 @@ def _said(found: Difference, names: tuple[str, str], scaled: bool) -> str:
 
 def _length(length: float, scaled: bool) -> str:
     return f"{100 * length:.1f} % of the length" if scaled else f"{length:.1f} mm"
-
-
-def _validated(compared: _Compared) -> tuple[Validated | None, str | None]:
-    """Validate recognition, or return the reason why that is not possible."""
-    try:
-        return validate(compared.far, compared.whose, compared.sessions), None
-    # Too few surgeons or sessions is no error of the request: the atlas is returned without recognition.
-    except BadInput as error:
-        return None, error.words()
-
-
-def _recognition(validated: Validated) -> Recognition:
-    return Recognition(
-        surgeons=len(validated.surgeons),
-        tested=len(validated.tested),
-        right=validated.right,
-        accuracy=validated.accuracy,
-        interval=validated.interval,
-        chance=validated.chance,
-        log_loss=validated.log_loss,
-        log_loss_of_guessing=log(len(validated.surgeons)),
-        sureness=validated.sureness,
-    )
-
-
-def _whose(compared: _Compared, validated: Validated, asked: str) -> Whose:
-    one = [member.sha256 for member in compared.members].index(asked)
-    probability = recognise(compared.far, compared.whose, compared.sessions, one, validated)
-    likely = sorted(zip(probability.tolist(), compared.surgeons, strict=True), reverse=True)
-    return Whose(
-        demo=asked,
-        surgeon=compared.members[one].surgeon,
-        likely=[Likely(surgeon=surgeon, probability=p) for p, surgeon in likely],
-    )

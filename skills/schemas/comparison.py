@@ -28,7 +28,13 @@ EXAMPLE: dict[str, Any] = {
         {"id": IDS[3], "surgeon": "kestrel", "session": "friday", "cluster": 2, "at": [3.0, -0.5]},
     ],
     "recordings": 4,
-    "left_out": {"without_consent": 1, "without_direction": [], "because": ["Left out: 1 demonstration, ..."]},
+    "left_out": {
+        "without_consent": 1,
+        "without_direction": [],
+        "overlapped": [],
+        "not_sampled": 0,
+        "because": ["Left out: 1 demonstration, ..."],
+    },
     "distances": [[], [0.9], [6.0, 5.6], [6.2, 5.7, 1.0]],
     "merges": [
         {"one": 0, "other": 1, "distance": 0.9, "demos": 2},
@@ -62,22 +68,34 @@ EXAMPLE: dict[str, Any] = {
             "offsets": [[0.1, 0.1, -1.6], [0.2, 0.3, -8.9], [0.1, 0.1, -1.7]],
         }
     ],
-    "recognition": {
-        "surgeons": 2,
-        "tested": 4,
-        "right": 4,
-        "accuracy": 1.0,
-        "interval": [0.51, 1.0],
-        "chance": 0.5,
-        "log_loss": 0.02,
-        "log_loss_of_guessing": 0.693,
-        "sureness": 0.98,
-    },
+    "recognition": [
+        {
+            "arm": "PSM2",
+            "compared": ["shape", "tempo"],
+            "surgeons": 2,
+            "tested": 4,
+            "right": 4,
+            "accuracy": 1.0,
+            "interval": [0.51, 1.0],
+            "chance": 0.5,
+            "log_loss": 0.02,
+            "log_loss_of_guessing": 0.693,
+            "sureness": 0.98,
+            "curve": [{"demos": 2, "said": 0.97, "right": 1.0}, {"demos": 2, "said": 0.99, "right": 1.0}],
+            "stranger_if_known": 0.3,
+            "stranger_if_left_out": 0.4,
+        }
+    ],
     "no_recognition_because": None,
+    "votes": {"recordings": 4, "right": 4, "accuracy": 1.0, "interval": [0.51, 1.0], "chance": 0.5},
     "whose": {
         "demo": IDS[3],
+        "arm": "PSM2",
         "surgeon": "kestrel",
         "likely": [{"surgeon": "kestrel", "probability": 0.98}, {"surgeon": "heron", "probability": 0.02}],
+        "none_of_these": 0.2,
+        "voted": "kestrel",
+        "voters": 1,
     },
     "notes": ["A distance is ...", "Set-up and day are confounded with the surgeon: ..."],
 }
@@ -100,6 +118,10 @@ class LeftOutOfAtlas(Given):
 
     without_consent: Count = Field(description="Number of those whose surgeon's consent does not cover an atlas.")
     without_direction: list[Sha256] = Field(description="Those that end where they began.")
+    overlapped: list[Sha256] = Field(
+        description="Cuts that share at least half of the shorter one's time with a newer cut of the recording."
+    )
+    not_sampled: Count = Field(description="Of more demonstrations than an atlas shows, those not drawn.")
     because: list[str]
 
 
@@ -158,9 +180,22 @@ class Apartness(Given):
     offsets: Thirds
 
 
-class Recognition(Given):
-    """The accuracy of recognising the surgeon of a demonstration, measured on sessions that were left out."""
+class Calibrated(Given):
+    """One group of a calibration curve: tested demonstrations with similar probability of the guessed surgeon."""
 
+    demos: Count
+    said: Fraction = Field(description="Mean probability of the guess.")
+    right: Fraction = Field(description="Share of right guesses: equal to `said` if the probabilities hold.")
+
+
+class Recognition(Given):
+    """The accuracy of recognising the surgeon of one arm's demonstrations, measured on sessions that were left out."""
+
+    arm: str = Field(description="Demonstrations are only compared with those of the same arm.")
+    compared: list[str] = Field(
+        description="Families of numbers that sessions left out of the fit chose: shape, tempo, jaw, turning, "
+        "orientation. The place of the hand-off is not compared."
+    )
     surgeons: Count
     tested: Count = Field(description="Number of demonstrations whose surgeon has another session.")
     right: Count
@@ -174,6 +209,19 @@ class Recognition(Given):
     sureness: Fraction = Field(
         description="Mean probability of the guesses: equal to the accuracy if the probabilities are right."
     )
+    curve: list[Calibrated] = Field(description="In increasing order of `said`.")
+    stranger_if_known: Fraction = Field(description="Mean probability of `none_of_these` where the surgeon is known.")
+    stranger_if_left_out: Fraction = Field(description="The same with the surgeon's demonstrations left out.")
+
+
+class Votes(Given):
+    """The accuracy of the votes of recordings: all tested demonstrations of one recording, of all arms, together."""
+
+    recordings: Count
+    right: Count
+    accuracy: Fraction
+    interval: tuple[float, float] = Field(description="Of the accuracy at 95 % (Wilson).")
+    chance: Fraction
 
 
 class Likely(Given):
@@ -187,8 +235,18 @@ class Whose(Given):
     """The recognised surgeons of one demonstration."""
 
     demo: Sha256
+    arm: str
     surgeon: Slug = Field(description="The surgeon that it was stored under.")
-    likely: list[Likely] = Field(description="In decreasing order of probability.")
+    likely: list[Likely] = Field(
+        description="In decreasing order of probability; they sum to 1 and hold if it is one of these surgeons."
+    )
+    none_of_these: Fraction = Field(
+        description="Probability that the recording is of another surgeon, if that is as likely as any one of these."
+    )
+    voted: Slug | None = Field(
+        description="The surgeon for whom the recording's demonstrations of all arms vote; null if none was tested."
+    )
+    voters: Count = Field(description="Their number.")
 
 
 class Atlas(Given):
@@ -217,12 +275,35 @@ class Atlas(Given):
     )
     surgeons: list[Consistency]
     differences: list[Apartness] = Field(description="Of all pairs of the 40 surgeons with the most demonstrations.")
-    recognition: Recognition | None
-    no_recognition_because: str | None = None
+    recognition: list[Recognition] = Field(description="By arm; an arm without recognition is not listed.")
+    no_recognition_because: str | None = Field(description="For the arms without; null if all have recognition.")
+    votes: Votes | None = Field(description="null without recognition.")
     whose: Whose | None = Field(
         description="Of the demonstration `demo` of the request; null without one, or without recognition."
     )
     notes: list[str] = Field(description="How to read the numbers, and what they do not show.")
+
+
+class Neighbour(Given):
+    """A demonstration, and its distance from another."""
+
+    demo: Sha256
+    surgeon: Slug
+    session: str | None
+    arm: str
+    distance: float = Field(description="In `unit`, about the mean difference per state.")
+
+
+class Nearest(Given):
+    """The demonstrations of the same suture type that are nearest to one, among all of them and exactly."""
+
+    demo: Sha256
+    suture: Slug
+    scaled: bool
+    unit: str = Field(description="mm, or lengths of start to goal where size does not count.")
+    searched: Count = Field(description="Number of demonstrations that it was compared with.")
+    nearest: list[Neighbour] = Field(description="In increasing order of distance.")
+    notes: list[str]
 
 
 class ScoredStyle(Given):

@@ -9,7 +9,9 @@ import pytest
 
 from skills.api.pages import drawings
 from skills.comparison.distances import STATES
-from skills.library.atlas import _compare, _Member, _told
+from skills.comparison.signature import NUMBERS
+from skills.library.atlas import _compare, _told
+from skills.library.members import Member
 from skills.schemas.comparison import Atlas, LeftOutOfAtlas
 from tests import backends
 from tests.api.keyed import As, key
@@ -44,7 +46,7 @@ def test_the_client_reads_it_and_asks_whose_style_one_is(compared: Service):
     assert [one["demos"] for one in found["clusters"]] == [3, 3]
     assert found["whose"]["demo"] == demo
     assert found["whose"]["likely"][0]["surgeon"] == found["whose"]["surgeon"] == cohorts.name(1)
-    assert found["recognition"]["right"] == 6
+    assert [(one["arm"], one["right"]) for one in found["recognition"]] == [("PSM", 6)]
     assert sum(len(row) for row in found["distances"]) == 15
 
 
@@ -118,7 +120,9 @@ def test_more_than_can_be_seen_is_drawn_in_groups_that_hold_all_of_it():
 
 def drawn_from(far: np.ndarray) -> Atlas:
     """Return an atlas in which demonstrations have nothing but distances."""
-    members = [_Member(at, f"{at:064x}", f"surgeon-{at % 3}", None, at) for at in range(len(far))]
-    shapes = np.zeros((len(far), STATES, 3))
-    left_out = LeftOutOfAtlas(without_consent=0, without_direction=[], because=[])
-    return _told(cases.SUTURE, _compare(members, shapes, far, False), left_out, 4, None)
+    members = [
+        Member(at, f"{at:064x}", f"surgeon-{at % 3}", None, at, "PSM2", "PSM2_base", 0.0, 1.0) for at in range(len(far))
+    ]
+    shapes, signatures = np.zeros((len(far), STATES, 3)), np.random.default_rng(4).normal(size=(len(far), NUMBERS))
+    left_out = LeftOutOfAtlas(without_consent=0, without_direction=[], overlapped=[], not_sampled=0, because=[])
+    return _told(cases.SUTURE, _compare(members, shapes, far, False, signatures), left_out, 4, None)

@@ -21,6 +21,7 @@ from tests.bench.million import million
 from tests.bench.playing import playing
 from tests.bench.pose_styles import pose_styles
 from tests.bench.reading import reading
+from tests.bench.recognition import recognition
 from tests.bench.scaling import scaling
 from tests.bench.serving import serving
 from tests.bench.session import session
@@ -44,6 +45,7 @@ PARTS = {
     "history": history,
     "serving": serving,
     "atlas": atlas,
+    "recognition": recognition,
     "combining": combining,
     "geometry": geometry,
     "joining": joining,

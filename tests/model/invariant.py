@@ -170,11 +170,12 @@ class Model:
         return [one for one in self.demos.values() if one.style == style and not one.withdrawn]
 
     def in_atlas(self, suture: str) -> set[str]:
-        return {
-            one.sha256
+        newest = {  # of each recording, which the steps cut alike
+            one.recording: one.sha256
             for one in self.demos.values()
             if one.style[1] == suture and not one.withdrawn and self.may(one.style[0], "atlas")
         }
+        return {*newest.values()}
 
     def may_learn(self, demos: Set[str], of_any: bool = False) -> bool:
         """Return whether learning from these demonstrations, and storing the result, is allowed now."""
