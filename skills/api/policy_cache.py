@@ -22,7 +22,7 @@ from skills.api.responses import KEPT_BYTES, Body, Encoded, answer, negotiate
 from skills.db.changes import Kept, Unasked, changes_of
 from skills.db.session import Database
 from skills.errors import Busy, SkillsError, UnknownFormat
-from skills.library import consent, integrity, policies
+from skills.library import consent, integrity, neighbours, policies
 from skills.library.history import sign_history
 from skills.library.releases import STANDS
 from skills.library.signatures import first_head
@@ -150,6 +150,7 @@ class PolicyCache:
             await asyncio.sleep(SWEEP_S)
             with suppress(SkillsError, SQLAlchemyError):  # the database may be readable again at the next sweep
                 await asyncio.to_thread(self.forget_erased)
+                await asyncio.to_thread(neighbours.forget_gone, self._database)
 
     def forget_erased(self) -> None:
         """Remove from memory every policy that is no longer in the database."""

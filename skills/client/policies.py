@@ -30,6 +30,7 @@ from skills.errors import BadInput, Corrupt
 from skills.schemas.given import (
     Atlas,
     Job,
+    Nearest,
     NextPose,
     NextStep,
     Policy,
@@ -241,6 +242,17 @@ class Atlases(Connection):
             demo: Digest of a demonstration in the atlas; the atlas then says whose style it resembles.
         """
         return await self._get(Atlas, at("styles", suture, "atlas"), scaled=scaled, clusters=clusters, demo=demo)
+
+    @call
+    async def nearest(self, demo: str, *, count: int = 10, scaled: bool = False) -> Nearest:
+        """Return the demonstrations of the same suture type that are nearest to one, among all of them and exactly.
+
+        Args:
+            demo: Digest of the demonstration.
+            count: Number of neighbours, at most 100.
+            scaled: Normalise size too; distances are then in units of the distance from start to goal.
+        """
+        return await self._get(Nearest, at("demos", demo, "nearest"), count=count, scaled=scaled)
 
 
 class Scores(Connection):

@@ -276,7 +276,9 @@ class Atlas(Given):
     surgeons: list[Consistency]
     differences: list[Apartness] = Field(description="Of all pairs of the 40 surgeons with the most demonstrations.")
     recognition: list[Recognition] = Field(description="By arm; an arm without recognition is not listed.")
-    no_recognition_because: str | None = Field(description="For the arms without; null if all have recognition.")
+    no_recognition_because: str | None = Field(
+        default=None, description="For the arms without; null if all have recognition."
+    )
     votes: Votes | None = Field(description="null without recognition.")
     whose: Whose | None = Field(
         description="Of the demonstration `demo` of the request; null without one, or without recognition."

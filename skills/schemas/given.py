@@ -19,7 +19,7 @@ from skills.gridworld.scene import Scene
 from skills.planning.plan import Departure
 from skills.planning.trajectory import Seam, Transfer
 from skills.schemas import Given, Handedness, Page, PolicyName, SkillLevel
-from skills.schemas.comparison import Atlas, Score
+from skills.schemas.comparison import Atlas, Nearest, Score
 from skills.schemas.policies import (
     Job,
     NextPose,
@@ -60,6 +60,7 @@ __all__ = [
     "Job",
     "Key",
     "LeafProof",
+    "Nearest",
     "NewKey",
     "NextPose",
     "NextStep",

@@ -50,9 +50,25 @@ def test_the_client_reads_it_and_asks_whose_style_one_is(compared: Service):
     assert sum(len(row) for row in found["distances"]) == 15
 
 
+def test_the_nearest_are_those_of_the_atlas(compared: Service):
+    found = compared.client.atlas(cases.SUTURE)
+    demo, rows = found["demos"][0]["id"], found["distances"]
+    answer = compared.client.nearest(demo, count=2)
+    order = sorted(range(1, 6), key=lambda one: rows[one][0])[:2]
+    assert [one["demo"] for one in answer["nearest"]] == [found["demos"][one]["id"] for one in order]
+    assert [one["distance"] for one in answer["nearest"]] == [rows[one][0] for one in order]
+    assert answer["searched"] == 5 and compared.client.nearest(demo, scaled=True)["unit"] == "lengths of start to goal"
+    first = compared.http.get(f"/demos/{demo}/nearest")
+    again = compared.http.get(f"/demos/{demo}/nearest", headers={"If-None-Match": first.headers["etag"]})
+    assert (first.status_code, again.status_code) == (200, 304)
+
+
 @pytest.mark.parametrize(
     ("path", "status"),
     [
+        (f"/demos/{'0' * 64}/nearest", 404),
+        (f"/demos/{'0' * 64}/nearest?count=101", 422),
+        (f"/demos/{'0' * 64}/nearest?count=0", 422),
         ("/styles/nothing/atlas", 404),
         ("/styles/simple-interrupted/atlas", 404),
         (f"{ATLAS}?demo={'0' * 64}", 404),

@@ -18,6 +18,7 @@ from tests.bench.joining import joining
 from tests.bench.kinematics import kinematics
 from tests.bench.learning import learning
 from tests.bench.million import million
+from tests.bench.neighbours import neighbours
 from tests.bench.playing import playing
 from tests.bench.pose_styles import pose_styles
 from tests.bench.reading import reading
@@ -45,6 +46,7 @@ PARTS = {
     "history": history,
     "serving": serving,
     "atlas": atlas,
+    "neighbours": neighbours,
     "recognition": recognition,
     "combining": combining,
     "geometry": geometry,

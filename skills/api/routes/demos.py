@@ -36,6 +36,7 @@ from skills.library import demos, erasure, locks, overview, recordings, scores
 from skills.library.atlas import CONFOUNDED, DISTANCE, MOST, SESSIONS, atlas_of, atlases
 from skills.library.catalogue import find_suture_type
 from skills.library.demos import demo_json, path_json, reward_map_json
+from skills.library.neighbours import nearest_to
 from skills.library.recordings import recording_json
 from skills.library.sweep import drop_contents, sweep_erased
 from skills.schemas import OutcomeAsked
@@ -43,6 +44,7 @@ from skills.schemas.given import (
     Atlas,
     Demonstration,
     DemoPath,
+    Nearest,
     Page,
     Recording,
     RecordingPreview,
@@ -291,6 +293,24 @@ def get_atlas(
     the distances of new demonstrations.
     """
     return give(atlas_of(db, suture, scaled=scaled, clusters=clusters, demo=demo))
+
+
+MOST_NEAREST = 100  # neighbours of a demonstration
+
+
+@atlas_router.get("/demos/{demo}/nearest", dependencies=[needs("reader")], **gives(Nearest, 404, 409))
+def get_nearest(
+    demo: Digest,
+    db: Db,
+    give: Giving,
+    count: Annotated[int, Query(ge=1, le=MOST_NEAREST, description="Number of neighbours.")] = 10,
+    scaled: Annotated[bool, Query(description="Scale all demonstrations to the same size.")] = False,
+) -> Response:
+    """Return the demonstrations of the same suture type that are nearest to one, among all of them and exactly.
+
+    The first request after a start reads all shapes into memory, seconds for tens of thousands of demonstrations.
+    """
+    return give(nearest_to(db, demo, count, scaled=scaled))
 
 
 MOST_PAIRS = 60  # of surgeons, shown on a page
