@@ -58,7 +58,7 @@ TOKENS = (
     '{"a": 1}', '[["b"]]', f'"{CANARY}"', '"' + "x" * 5000 + '"', "1.5e308", '"; DROP TABLE jobs; --"',
 )  # fmt: skip
 # A request for an atlas fills this cache, which the history notes, and changes nothing else.
-CACHED = {"measured_shapes": 0, "history": 0, "history_checkpoints": 0}
+CACHED = {"measured_shapes": 0, "history": 0, "history_checkpoints": 0, "history_tiles": 0}
 FREE_TEXT = {
     "owner",
     "reason",
@@ -239,7 +239,7 @@ def lists() -> list[str]:
 
 
 def test_no_limit_and_no_cursor_is_ours_to_blame(still: Service, untouched: None):
-    assert len(lists()) == 8
+    assert len(lists()) == 9
     for path in lists():
         for name, values in (("limit", LIMITS), ("cursor", CURSORS)):
             for value in values:

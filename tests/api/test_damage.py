@@ -147,6 +147,7 @@ def test_an_erased_surgeon_is_nowhere_in_the_files(service: Service):
     assert rows.pop("suture_types") == 11
     assert rows.pop("history") > 0
     assert rows.pop("history_checkpoints") > 0
+    rows.pop("history_tiles", None)  # there is one for every 256 leaves
     # heron uploaded the same bytes
     shared = dict.fromkeys(["recordings", "recording_chunks", "recording_uploads", "parsed_recordings"], 1)
     shared["parsed_chunks"] = 1
