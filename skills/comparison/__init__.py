@@ -4,7 +4,7 @@ distances     shapes in a common frame, and dynamic time warping between all of 
 differences   the axis and the part of the path in which two differ
 clusters      average linkage, and positions in a plane
 nearest       the nearest shapes among many, exactly, without measuring all
-signature     a motion as numbers: shape, tempo, jaw, turning, orientation, place
+traits        a motion as numbers: shape, tempo, jaw, turning, orientation, place
 recognition   the surgeon of a demonstration, with a probability calibrated on sessions left out, or none of these
 combining     several demonstrations as one, and a demonstration at another place
 """

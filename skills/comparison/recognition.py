@@ -3,7 +3,7 @@
     signatures --fit--> Metric --away--> squared distance from each surgeon
     p(surgeon) ~ exp(-distance / temperature)
 
-A signature (`skills.comparison.signature`) is compared in a metric that is learnt from the surgeons' own repetitions: a
+A signature (`skills.comparison.traits`) is compared in a metric that is learnt from the surgeons' own repetitions: a
 number in which they repeat themselves counts much, one in which they vary counts little, and what varies together
 counts once (Fisher's discriminant; the covariance within surgeons is shrunk towards a multiple of the identity, as by
 Friedman, "Regularized Discriminant Analysis", JASA 1989). The distance is that from the surgeon's mean, less the more
@@ -32,7 +32,7 @@ from math import exp, log, sqrt
 import numpy as np
 
 from skills.arrays import Flags, Floats, Ints, frozen
-from skills.comparison.signature import FAMILIES, FRAMED
+from skills.comparison.traits import FAMILIES, FRAMED
 from skills.errors import BadInput
 from skills.learning.slip import wilson
 

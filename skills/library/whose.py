@@ -14,7 +14,7 @@ import numpy as np
 
 from skills.arrays import Floats, Ints
 from skills.comparison.recognition import Validated, recognise, usable, validate, vote
-from skills.comparison.signature import NUMBERS
+from skills.comparison.traits import NUMBERS
 from skills.errors import BadInput
 from skills.learning.slip import wilson
 from skills.library.members import Member, numbered, sessions_of

@@ -19,7 +19,7 @@ from rich.table import Table
 
 from skills.comparison.distances import STATES, distances, resampled, shape_of
 from skills.comparison.recognition import Validated, usable, validate, vote
-from skills.comparison.signature import FAMILIES, NUMBERS, signature_of
+from skills.comparison.traits import FAMILIES, NUMBERS, signature_of
 from skills.demonstration.demonstration import Demo, cut_demo
 from skills.demonstration.recording import Recording
 from skills.demonstration.segments import propose_by_arm

@@ -16,7 +16,7 @@ from skills.comparison.recognition import (
     validate,
     vote,
 )
-from skills.comparison.signature import FAMILIES, NUMBERS, signature_of
+from skills.comparison.traits import FAMILIES, NUMBERS, signature_of
 from skills.errors import BadInput
 from tests.comparison.cohort import Cohort, cohort
 
