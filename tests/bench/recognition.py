@@ -82,10 +82,11 @@ Method = Callable[[Sequence[HandOff], "Labels"], tuple[np.ndarray, np.ndarray]]
 
 @dataclass(frozen=True, eq=False)
 class Labels:
-    """The surgeon and the trial of each hand-off, as numbers."""
+    """The surgeon and the trial of each hand-off of one arm, as numbers, and the number of the task's surgeons."""
 
     truth: np.ndarray
     trials: np.ndarray
+    users: int
 
 
 def learnt(numbers: Callable[[HandOff], np.ndarray], *, place: bool = False, framed: bool = True) -> Method:
@@ -95,7 +96,9 @@ def learnt(numbers: Callable[[HandOff], np.ndarray], *, place: bool = False, fra
         given = np.array([numbers(one) for one in some])
         sets = usable(given, place=place, one_frame=framed)
         found = validate(given, labels.truth, labels.trials, labels.trials, sets)
-        return found.tested, found.probability
+        every = np.zeros((len(found.tested), labels.users))
+        every[:, found.surgeons] = found.probability
+        return found.tested, every
 
     return recognise
 
@@ -107,7 +110,7 @@ def nearest(path: Callable[[HandOff], np.ndarray]) -> Method:
         paths = np.array([path(one) for one in some])
         far = distances(paths, paths)
         far[labels.trials[:, None] == labels.trials] = MAKES_NO_SENSE
-        return np.arange(len(some)), np.eye(labels.truth.max() + 1)[labels.truth[far.argmin(axis=1)]]
+        return np.arange(len(some)), np.eye(labels.users)[labels.truth[far.argmin(axis=1)]]
 
     return recognise
 
@@ -184,7 +187,7 @@ def judged(some: Sequence[HandOff], method: Method) -> Figures:
         mine = [one for one in some if one.arm == arm]
         trial = np.unique([one.trial for one in mine], return_inverse=True)[1]
         truth = np.array([users.index(one.user) for one in mine])
-        tested, probability = method(mine, Labels(truth, trial))
+        tested, probability = method(mine, Labels(truth, trial, len(users)))
         several = np.array([len(np.unique(trial[truth == truth[one]])) > 1 for one in tested])
         for one, found in zip(tested[several].tolist(), probability[several], strict=True):
             ballots.setdefault(mine[one].trial, []).append(found)
