@@ -94,7 +94,6 @@ def test_the_table_of_rooms_names_each_after_those_that_it_imports():
         ("movement_primitives", "report/rivals.py"),
         ("safetensors", "learning/networks.py"),
         ("torch", "deep/"),
-        ("sklearn", "scoring/calibration.py"),
         ("gymnasium", "deep/"),
         ("stable_baselines3", "deep/"),
         ("sb3_contrib", "deep/"),
@@ -133,7 +132,6 @@ DOMAIN = [file for file in FILES if named(file).split("/")[0].removesuffix(".py"
 MAY_IMPORT = {
     *("bisect", "collections", "dataclasses", "functools", "itertools", "math", "types", "typing"),
     *("numpy", "safetensors", "skills", "scipy"),
-    *("sklearn", "threadpoolctl"),  # regression, and the number of threads for its sums
     "concurrent",  # threads that compute concurrently, each writing only its own part of an array
 }
 

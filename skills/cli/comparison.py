@@ -3,7 +3,7 @@
 import re
 from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -134,20 +134,23 @@ def score(
     start_s: Annotated[float | None, typer.Option(help="The start of the hand-off in a file.")] = None,
     end_s: Annotated[float | None, typer.Option(help="The end of the hand-off in a file.")] = None,
     reference: Annotated[str | None, typer.Option(help="The demonstration of the style to compare with.")] = None,
+    task: Annotated[
+        str | None, typer.Option(help="The task of the whole recording, for its rating; needed if there are several.")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Score a motion against a style: its distance, where it deviates, and its percentiles. Not a credential."""
     with service() as client:
         if Path(what).exists():
             part = _part(client, Path(what), proposal, arm, start_s, end_s)
-            scored = client.score(surgeon, suture, reference=reference, **part)
+            scored = client.score(surgeon, suture, reference=reference, task=task, **part)
         elif DIGEST.fullmatch(what) is None or any(one is not None for one in (proposal, arm, start_s, end_s)):
             raise BadInput(
                 f"There is no file {what}. Name a recording's file, or a demonstration by its digest and without "
                 "--proposal, --arm, --start-s and --end-s."
             )
         else:
-            scored = client.score(surgeon, suture, demo=what, reference=reference)
+            scored = client.score(surgeon, suture, demo=what, reference=reference, task=task)
     if as_json:
         print_json(scored)
     else:
@@ -207,12 +210,10 @@ def calibrate(
             help="A folder with TASK/kinematics/AllGestures/*.txt and TASK/meta_file_TASK.txt.", file_okay=False
         ),
     ],
-    task: Annotated[str | None, typer.Option(help="The task, such as Suturing; needed if there are several.")] = None,
-    arm: Annotated[Literal["PSM_left", "PSM_right"] | None, typer.Option(help="Only this arm.")] = None,
-    of: Annotated[
-        Literal["hand-off", "trial"],
-        typer.Option(help="The motion that is measured: each proposed hand-off, or the complete trial."),
-    ] = "hand-off",
+    task: Annotated[
+        list[str] | None,
+        typer.Option(help="A task, such as Suturing; again for another. By default all of the folder."),
+    ] = None,
     seed: Annotated[int, typer.Option(help="Seed of the bootstrap and the permutations.", min=0)] = 0,
     permutations: Annotated[
         int,
@@ -220,17 +221,21 @@ def calibrate(
     ] = 200,
     as_json: AsJson = False,
 ) -> None:
-    """Fit a model of skill ratings to a folder of rated trials, and store it: every score uses the newest model."""
+    """Fit a model of skill ratings to a folder of rated trials, and store it: every score uses the newest model.
+
+    All tasks are fitted together and judged one by one, on surgeons left out. A task is rated only if the model is
+    better than chance and than the duration alone.
+    """
     from skills.db.session import Database
     from skills.library.calibrations import calibrate_on, keep, read_cohort
-    from skills.scoring.calibration import check_permutations, level_refusals
+    from skills.scoring.validation import check_permutations
     from skills.serving import prepare
     from skills.settings import settings
 
     check_permutations(permutations)
     prepare(settings())
     with err.status("reading") as status:
-        rated = read_cohort(folder, task=task, arm=arm, of=of, told=lambda share: status.update(f"reading {share:.0%}"))
+        rated = read_cohort(folder, tasks=task or (), told=lambda share: status.update(f"reading {share:.0%}"))
         _tell_left_out(rated.left_out)
         about = calibrate_on(
             rated,
@@ -245,7 +250,7 @@ def calibrate(
     if as_json:
         print_json({"sha256": stored.sha256, **about})
     else:
-        _tell_model(about["model"], level_refusals(about["validated"]))
+        _tell_model(about)
         out.print(f"Stored, and used by every score from now on: {stored.sha256}", soft_wrap=True)
 
 
@@ -256,48 +261,78 @@ def _tell_left_out(left_out: dict[str, list[str]]) -> None:
 
 
 def _tell_judged(about: dict[str, Any]) -> None:
+    """Print the quality of the model and of its rivals, for each task."""
+    tasks, validated = about["data"]["tasks"], about["validated"]
+    for name, judged in validated["tasks"].items():
+        levels = ", ".join(f"{count} {level}" for level, count in tasks[name]["levels"].items())
+        out.print(f"{name}: {judged['trials']} trials ({levels}) of {judged['surgeons']} surgeons", soft_wrap=True)
+        _tell_task(judged)
+    if len(tasks) > 1:
+        out.print("The mean of the tasks")
+        _tell_task(validated["mean"])
+    chosen = "; ".join(f"{design} ({count} times)" for design, count in validated["chosen"].items())
+    out.print(f"Chosen with a surgeon left out: {chosen}", markup=False, soft_wrap=True)
+
+
+def _tell_task(judged: dict[str, Any]) -> None:
     from rich.table import Table
 
-    from skills.scoring.calibration import RIVALS
+    from skills.scoring.validation import RIVALS, SEEN
 
-    data, judged = about["data"], about["validated"]
-    levels = ", ".join(f"{count} {level}" for level, count in data["levels"].items())
-    arm = f" of {data['arm']}" if data["arm"] else ""
-    out.print(f"{data['task']}, each {data['of']}{arm}: {data['trials']} trials ({levels}) of {data['surgeons']} "
-              f"surgeons, {data['motions']} motions", soft_wrap=True)  # fmt: skip
     table = Table(box=None, pad_edge=False)
     for name in ("a surgeon left out", "rho", "95 %", "level right", "95 %"):
         table.add_column(name, no_wrap=True)
-    rivals = {label: judged["rivals"][name] for name, label in RIVALS.items()}
-    for name, row in {"the model": judged["all_figures"], **rivals}.items():
-        right = (f"{100 * row['accuracy']:.0f} %", _span(row["accuracy_interval"]))
-        # An order has no levels of its own.
-        table.add_row(name, f"{row['rho']:.2f}", _span(row["rho_interval"]),
-                      *(("", "") if name == RIVALS["shorter_first"] else right))  # fmt: skip
-    chance = judged["chance"]
-    table.add_row("chance", f"{chance['rho']:.2f}", f"p = {chance['rho_p']:.3f}", f"{100 * chance['accuracy']:.0f} %",
-                  f"p = {chance['accuracy_p']:.3f}")  # fmt: skip
+
+    def tell(label: str, row: dict[str, Any]) -> None:
+        right = ("", "")
+        if row["accuracy"] is not None:
+            right = (f"{100 * row['accuracy']:.0f} %", _span(row["accuracy_interval"]))
+        table.add_row(label, f"{row['rho']:.2f}", _span(row["rho_interval"]), *right)
+
+    tell("the model", judged["model"])
+    for name, label in RIVALS.items():
+        if name not in SEEN:
+            tell(label, judged["rivals"][name])
+    chance, accuracy = judged["chance"], ("", "")
+    if chance["accuracy"] is not None:
+        accuracy = (f"{100 * chance['accuracy']:.0f} %", f"p = {chance['accuracy_p']:.3f}")
+    table.add_row("chance", f"{chance['rho']:.2f}", f"p = {chance['rho_p']:.3f}", *accuracy)
+    table.add_row("a repetition left out", *[""] * 4)
+    tell("the model", judged["repetition_out"])
+    for name in SEEN:
+        tell(RIVALS[name], judged["rivals"][name])
     out.print(table)
-    out.print(f"The model's rho minus the best of the durations': {_span(judged['over_duration'])} (95 %)")
+    out.print(f"The model's rho minus the better of the durations': {_span(judged['over_duration'])} (95 %)")
+    parts = ", ".join(f"{name} {part['rho']:.2f}" for name, part in judged["parts"].items())
+    out.print(f"Its rho with the parts of the rating: {parts}", soft_wrap=True)
 
 
-def _tell_model(model: dict[str, Any], levels_refused: list[str]) -> None:
+def _tell_model(about: dict[str, Any]) -> None:
+    """Print the weights of each task, and which tasks are rated."""
     from rich.table import Table
 
-    from skills.scoring.features import KIND_OF
+    from skills.library.calibrations import accepted
+    from skills.scoring.calibration import from_numbers
+    from skills.scoring.trials import KIND_OF
+    from skills.scoring.validation import level_refusals, refusals
 
-    weights = Table(box=None, pad_edge=False)
-    for name in ("figure", "mean", "deviation", "unit", "points per deviation"):
-        weights.add_column(name)
-    for name, centre, scale, weight in zip(
-        model["figures"], model["centre"], model["scale"], model["rating_weights"], strict=True
-    ):
-        kind = KIND_OF[name]
-        weights.add_row(kind.label, f"{centre:.2f}", f"{scale:.2f}", cell(kind.unit), f"{weight:+.2f}")
-    out.print(weights)
-    for sentence in levels_refused:
-        out.print(f"No skill level is given: {sentence}", soft_wrap=True)
-    out.print(f"Rating at the means {model['rating']:.1f}; 90 % of unseen ones within {model['rating_margin']:.1f}.")
+    model, used = from_numbers(about["model"]), accepted(about)
+    for task, name in enumerate(model.tasks):
+        judged = about["validated"]["tasks"][name]
+        if name not in used:
+            out.print(f"{name} is not rated: {' '.join(refusals(judged))}", markup=False, soft_wrap=True)
+            continue
+        weights = Table(box=None, pad_edge=False)
+        for column in ("figure", "typical", "unit", "points per deviation"):
+            weights.add_column(column)
+        for figure, centre, weight in zip(model.figures, model.centre[task], model.weights[task, 0], strict=True):
+            kind = KIND_OF[figure]
+            weights.add_row(kind.label, f"{kind.readable(float(centre)):.3g}", cell(kind.unit), f"{weight:+.2f}")
+        out.print(f"{name} is rated by")
+        out.print(weights)
+        for sentence in level_refusals(judged):
+            out.print(f"No skill level is given: {sentence}", soft_wrap=True)
+        out.print(f"Typical rating {model.means[task, 0]:.1f}; 90 % of unseen ones within {model.margins[task]:.1f}.")
 
 
 def _span(interval: list[float] | tuple[float, float]) -> str:

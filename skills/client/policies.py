@@ -271,6 +271,7 @@ class Scores(Connection):
         start_s: float | None = None,
         end_s: float | None = None,
         reference: str | None = None,
+        task: str | None = None,
     ) -> Score:
         """Score a demonstration, or a part of a recording, against a style; nothing is stored. Not a credential.
 
@@ -285,10 +286,11 @@ class Scores(Connection):
             end_s: End of the part.
             reference: The demonstration of the style to compare with; default: that of its released policy, else its
                 newest.
+            task: The task of the whole recording, for its rating; default: the only one of the calibration.
         """
         body = {
             **{"surgeon": surgeon, "suture": suture, "demo": demo, "recording": recording, "reference": reference},
-            **{"arm": arm, "topic": topic, "start_s": start_s, "end_s": end_s},
+            **{"arm": arm, "topic": topic, "start_s": start_s, "end_s": end_s, "task": task},
         }
         return await self._ask(Score, "POST", at("scores"), given(body))
 

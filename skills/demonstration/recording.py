@@ -254,7 +254,7 @@ class Recording:
         arms = sorted({m.arm for m in fitting})
         if len(arms) > 1:
             raise NoUsableTopic(f"The recording has several arms: {', '.join(arms)}. Name one.", arms=arms)
-        return min(fitting, key=_preference)
+        return min(fitting, key=preference)
 
     def seconds(self, stamps_ns: Ints) -> Floats:
         """Convert stamps to seconds since `origin_ns`; integers are subtracted first, so that no nanosecond is lost."""
@@ -269,7 +269,7 @@ def base_frames(recording: Recording) -> tuple[BaseFrame, ...]:
     return recording.bases
 
 
-def _preference(motion: Motion) -> tuple[int, str]:
+def preference(motion: Motion) -> tuple[int, str]:
     """Prefer the pose relative to the arm's own remote centre: camera and set-up joints do not move it."""
     known = [f"/{motion.arm}/local/measured_cp", f"/{motion.arm}/measured_cp"]
     return (known.index(motion.topic) if motion.topic in known else len(known), motion.topic)

@@ -26,6 +26,7 @@ from skills.arrays import Floats, Ints
 from skills.demonstration.recording import Label, Motion, Recording, Signal, Topic, recorded_motion
 from skills.errors import NotAQuaternion, NotFinite, UnreadableRecording
 from skills.formats.cells import is_number
+from skills.scoring.calibration import PARTS
 
 COLUMNS = 76
 RATE_HZ = 30.0
@@ -35,14 +36,6 @@ GESTURES = 10_000  # of a trial; the longest has 60
 ORTHONORMAL = 5e-3  # ours: we measured deviations of 1e-3 in the masters' matrices of the data set
 Skill = Literal["novice", "intermediate", "expert"]
 SKILLS: dict[str, Skill] = {"N": "novice", "I": "intermediate", "E": "expert"}
-SCORES = (
-    "respect for tissue",
-    "suture and needle handling",
-    "time and motion",
-    "flow of operation",
-    "overall performance",
-    "quality of final product",
-)
 
 _ARMS = {"MTML": 0, "MTMR": 19, "PSM_left": 38, "PSM_right": 57}  # index of the first of the arm's 19 columns
 _GESTURE = re.compile(r"\s*(\d{1,7})\s+(\d{1,7})\s+(G\d{1,2})\s*")
@@ -57,7 +50,7 @@ class RatedTrial:
         trial: Its name, such as "Suturing_B001".
         skill: "novice", "intermediate" or "expert", as reported by the surgeon.
         score: The global rating score, 6 to 30: the sum of the parts.
-        parts: One to five for each of `SCORES`.
+        parts: One to five for each of `PARTS`.
     """
 
     trial: str
@@ -74,6 +67,7 @@ class Trial:
         name: Such as "Suturing_B001".
         task: Such as "Suturing".
         user: The letter of the surgeon.
+        number: The number of the repetition.
         kinematics: The file with its motion.
         transcription: The file with its gestures, None where there is none.
         rated: Its ratings in the task's meta file, None where there are none.
@@ -82,6 +76,7 @@ class Trial:
     name: str
     task: str
     user: str
+    number: int
     kinematics: Path
     transcription: Path | None
     rated: RatedTrial | None
@@ -131,7 +126,7 @@ def read_meta(text: str) -> dict[str, RatedTrial]:
     rated = {}
     for line in text.splitlines():
         cells = line.split()
-        if len(cells) == 3 + len(SCORES) and cells[1] in SKILLS and all(cell.isdecimal() for cell in cells[2:]):
+        if len(cells) == 3 + len(PARTS) and cells[1] in SKILLS and all(cell.isdecimal() for cell in cells[2:]):
             score, *parts = (int(cell[:4]) for cell in cells[2:])
             rated[cells[0]] = RatedTrial(cells[0], SKILLS[cells[1]], score, tuple(parts))
     return rated
@@ -160,6 +155,7 @@ def trials(folder: Path) -> Iterator[Trial]:
             name=kinematics.stem,
             task=task,
             user=named["user"],
+            number=int(named["number"]),
             kinematics=kinematics,
             transcription=transcription if transcription.is_file() else None,
             rated=_meta_of(home, task).get(kinematics.stem),
@@ -287,7 +283,7 @@ def _gestures(transcription: str, stamps_ns: Ints) -> tuple[Label, ...]:
 
 
 def _notes(rated: RatedTrial) -> tuple[tuple[str, str], ...]:
-    parts = zip(SCORES, rated.parts, strict=True)
+    parts = zip(PARTS, rated.parts, strict=True)
     about = [("trial", rated.trial), ("skill", rated.skill), ("global rating score", str(rated.score))]
     return (*about, *((name, str(value)) for name, value in parts))
 

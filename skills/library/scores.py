@@ -4,7 +4,8 @@
 
 Percentiles are taken among the stored demonstrations of the suture type, measured against the same reference, by the
 skill level that surgeons state; a surgeon's own demonstrations form a progress curve over time. Demonstrations of
-surgeons who did not agree to be compared are left out.
+surgeons who did not agree to be compared are left out. The rating is that of the whole recording of the motion, as a
+trial of a task of the calibration.
 
 A score is computed from stored values at every request and is not stored, so it follows every addition, withdrawal and
 erasure. It is meant for self-directed learning; it is not an examination.
@@ -20,7 +21,7 @@ from sqlalchemy.orm import Session
 
 from skills.arrays import Floats
 from skills.comparison.distances import VERSION, distances, shape_of
-from skills.db.models import Demonstration, MeasuredShape, StoredCalibration, StoredRecording, Surgeon
+from skills.db.models import Demonstration, MeasuredShape, StoredRecording, Surgeon
 from skills.db.row_visibility import EVERYBODYS
 from skills.db.session import Database
 from skills.demonstration.demonstration import Demo, cut_demo
@@ -33,9 +34,12 @@ from skills.library.demos import find_demo, newest_demo
 from skills.library.recordings import Teller, find_recording, stored_recording
 from skills.schemas.comparison import CurvePoint, Percentiles, Reference, Score, ScoredStyle
 from skills.schemas.requests import ScoreIn
-from skills.scoring.calibration import LEVELS, Level, Skill, level_refusals, rate, refusals, unrated
+from skills.scoring.calibration import LEVELS, Level
 from skills.scoring.deviation import as_recorded, laid, laid_on
 from skills.scoring.features import KINDS, Numbers, compare, measure
+from skills.scoring.rating import Skill, rate, unrated
+from skills.scoring.trials import measure_trial
+from skills.scoring.validation import refusals
 
 LEAST_DEMOS, LEAST_SURGEONS = 5, 2  # of a level: with fewer, a percentile is meaningless, or describes one person
 MOST_OTHERS = 1000  # the newest of a suture type; more would not change a percentile visibly
@@ -202,10 +206,12 @@ def score(database: Database, asked: ScoreIn, tell: Teller) -> Score:
     # No transaction is open during the computation.
     numbers, beside = measure(scored.demo), measure(taught)
     deviation = laid_on(scored.demo, taught)
+    skill = _skill(database, scored.recording, asked.task, tell)
     with database.reading() as session:  # again: consent may have ended while the two were compared
         _agreed_still(session, [reference, scored.row], scored.recording)
         others = list(others_of(session, asked.suture, np.array(deviation.reference_mm)))
-        calibration = calibrations.newest(session)
+        if skill.calibrated and not _all_agree(session, scored.recording):
+            skill = unrated(NOT_AGREED)
     mine = {**numbers, "distance_mm": deviation.distance_mm}
     row = scored.row
     return Score(
@@ -223,7 +229,7 @@ def score(database: Database, asked: ScoreIn, tell: Teller) -> Score:
         tie_break=TIE_BREAK,
         percentiles=percentiles(others, mine, row, reference),
         curve=course(others, row),
-        skill=_skill(calibration, numbers),
+        skill=skill,
         use=CREDENTIAL,
     )
 
@@ -233,6 +239,13 @@ def references(session: Session, suture: str) -> list[Surgeon]:
     having = select(Demonstration.surgeon_row).where(Demonstration.suture == suture, Demonstration.learnable)
     found = session.scalars(select(Surgeon).where(Surgeon.row.in_(having)).order_by(Surgeon.slug))
     return sorted((one for one in found if may(one, "atlas")), key=lambda one: one.skill_level != "expert")
+
+
+def rated_tasks(session: Session) -> list[str]:
+    """List the tasks of the current calibration; none of one that is not used."""
+    stored = calibrations.newest(session)
+    model = None if stored is None else calibrations.read_calibration(stored)
+    return [] if model is None else list(model.tasks)
 
 
 # ---- the two motions ----------------------------------------------------------------------------------------------
@@ -290,10 +303,14 @@ def _agreed_by_all(session: Session, recording: StoredRecording) -> None:
     Raises:
         Conflict: The consent of a surgeon with a demonstration in this recording does not cover a comparison.
     """
+    if not _all_agree(session, recording):
+        raise Conflict("The consent of a surgeon in this recording does not cover comparisons.")
+
+
+def _all_agree(session: Session, recording: StoredRecording) -> bool:
     also = select(Demonstration.surgeon_row).where(Demonstration.recording_row == recording.row)
     surgeons = session.scalars(select(Surgeon).where(Surgeon.row.in_(also)), execution_options=EVERYBODYS)
-    if not all(may(surgeon, "atlas") for surgeon in surgeons):
-        raise Conflict("The consent of a surgeon in this recording does not cover comparisons.")
+    return all(may(surgeon, "atlas") for surgeon in surgeons)
 
 
 def _agreed_still(session: Session, compared: Sequence[Demonstration | None], recording: StoredRecording) -> None:
@@ -310,15 +327,36 @@ def _agreed_still(session: Session, compared: Sequence[Demonstration | None], re
         _agreed_by_all(session, recording)
 
 
-def _skill(calibration: StoredCalibration | None, numbers: Numbers) -> Skill:
-    """Return the calibrated model's rating of the figures, or the reason why there is none."""
-    if calibration is None:
+NOT_AGREED = "Not rated: the consent of a surgeon in this recording does not cover comparisons."
+
+
+def _skill(database: Database, recording: StoredRecording, task: str | None, tell: Teller) -> Skill:
+    """Return the calibrated model's rating of a whole recording, or the reason why there is none."""
+    with database.reading() as session:
+        stored = calibrations.newest(session)
+        agreed = _all_agree(session, recording)
+    if stored is None:
         return unrated("Not calibrated: the operator of this installation can calibrate it on rated trials.")
-    model = calibrations.read_calibration(calibration)
-    refused = refusals(calibration.about["validated"])
-    if refused:
-        why = "Not rated: the stored model belongs to an older version, is not accepted by this one and was not used."
-        again = "The operator of this installation can calibrate it again, on more rated trials."
-        return unrated(" ".join([why, *refused, again]))
-    levels_refused = level_refusals(calibration.about["validated"])
-    return rate(model, numbers, calibration.sha256, calibration.about, levels_refused)
+    model = calibrations.read_calibration(stored)
+    if model is None:
+        return unrated(
+            "Not rated: the stored calibration belongs to an older version, which rated single hand-offs or arms, and "
+            "it is not used any more. The operator of this installation can calibrate it again, on rated trials."
+        )
+    named = task or (model.tasks[0] if len(model.tasks) == 1 else None)
+    if named not in model.tasks:
+        why = "the calibration has several tasks" if named is None else f"the calibration has no task {named}"
+        return unrated(f"Not rated: {why}. Name the recording's task; it has {', '.join(model.tasks)}.")
+    judged = stored.about["validated"]["tasks"][named]
+    if refused := refusals(judged):
+        return unrated(
+            f"Not rated: the calibration is not accepted for {named}. {' '.join(refused)} The operator of this "
+            "installation can calibrate it again, on rated trials of more surgeons."
+        )
+    if not agreed:
+        return unrated(NOT_AGREED)
+    try:
+        trial = measure_trial(stored_recording(database, recording.sha256, tell).recording)
+        return rate(model, named, trial, stored.sha256, judged)
+    except BadInput as error:
+        return unrated(f"Not rated: {error.message}")

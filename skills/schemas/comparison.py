@@ -11,9 +11,10 @@ from pydantic import ConfigDict, Field
 
 from skills.fields import Count, Fraction, Sha256, Slug
 from skills.schemas import Given
-from skills.scoring.calibration import Level, Skill
+from skills.scoring.calibration import Level
 from skills.scoring.deviation import Deviation
 from skills.scoring.features import ScoreFigure
+from skills.scoring.rating import Skill
 
 # The example of the OpenAPI document.
 IDS = ["1a" * 32, "2b" * 32, "3c" * 32, "4d" * 32]
@@ -367,5 +368,5 @@ class Score(Given):
     tie_break: str
     percentiles: list[Percentiles]
     curve: list[CurvePoint] = Field(description="The surgeon's demonstrations up to this one, in order of recording.")
-    skill: Skill
+    skill: Skill = Field(description="The rating of the whole recording, not of the motion alone.")
     use: str

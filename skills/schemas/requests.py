@@ -413,6 +413,11 @@ class ScoreIn(Schema):
         description="The demonstration of the style to compare with. Left out, the one that its released policy was "
         "learnt from, else its newest.",
     )
+    task: Name | None = Field(
+        default=None,
+        description="The task of the whole recording, as the calibration names it, for the rating. Left out, the only "
+        "one of the calibration.",
+    )
 
     @model_validator(mode="after")
     def _one_of_two(self) -> Self:

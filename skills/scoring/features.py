@@ -2,8 +2,8 @@
 
     Demo --measure--> Numbers;   Numbers, Numbers --compare--> ScoreFigures
 
-All come from `skills.demonstration.quality`, except the size. A model of skill is a sum of those in `MODELLED`
-(`skills.scoring.calibration`): every laboratory records them, unlike the clutch.
+All come from `skills.demonstration.quality`, except the size. They describe one hand-off of one arm; the figures of a
+model of skill are those of a whole trial (`skills.scoring.trials`).
 """
 
 from collections.abc import Mapping
@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from skills.arrays import Floats
 from skills.demonstration.demonstration import Demo
 from skills.demonstration.quality import describe
 from skills.fields import Figure, schema
@@ -41,15 +40,6 @@ KINDS = (
     FigureKind("idle_share", "", "Idle", "share of the driven time slower than 1 mm/s and without a turn"),
     FigureKind("orientation_change_rad", "rad", "Orientation drift", "largest angle from the first orientation"),
 )
-MODELLED = (
-    "duration_s",
-    "path_length_mm",
-    "spectral_arc_length",
-    "log_dimensionless_jerk",
-    "idle_share",
-    "orientation_change_rad",
-)
-KIND_OF = {kind.name: kind for kind in KINDS}
 
 
 @schema
@@ -91,14 +81,3 @@ def compare(measured: Numbers, reference: Numbers) -> tuple[ScoreFigure, ...]:
 def _compare(kind: FigureKind, value: float | None, reference: float | None) -> ScoreFigure:
     ratio = value / reference if value is not None and reference else None
     return ScoreFigure(**vars(kind), value=value, reference=reference, ratio=ratio)
-
-
-def modelled(measured: Numbers, names: tuple[str, ...] = MODELLED) -> Floats | None:
-    """Return the figures that a model uses, shape (F,); None if one of them was not recorded.
-
-    Args:
-        measured: The motion's figures, as `measure` returns them.
-        names: The figures of the model.
-    """
-    values = [measured[name] for name in names]
-    return None if None in values else np.array(values, dtype=np.float64)

@@ -1,10 +1,9 @@
 """A cohort of rated trials in the layout of JIGSAWS, entirely synthetic, of known truth.
 
-Every surgeon has a skill from 0 to 1. The lower it is, the more a hand-off hesitates, swerves and turns, and the more
-time it takes; the ratings follow the skill within a point or two. Nothing is taken from the data set.
+Every surgeon has a skill from 0 to 1. The lower it is, the more both instruments stop, sway, turn and grip, and the
+more time they take; the ratings follow the skill within a point or two. Nothing is taken from the data set.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -55,32 +54,39 @@ def rated(name: str, surgeon: Surgeon, rng: np.random.Generator) -> RatedTrial:
 
 
 def trial(skill: float, rng: np.random.Generator) -> tuple[np.ndarray, str]:
-    """Return one trial: its 76 columns, and the gestures of its one hand-off, by the right instrument."""
+    """Return one trial: its 76 columns, and the gestures of a hand-off by the right instrument.
+
+    Both instruments move from place to place and close their jaws; the masters make the same motions twice as large.
+    """
     clumsy = float(np.clip(1.0 - skill, 0.0, 1.0))
-    strokes = 1 + round(4 * clumsy + rng.normal(0.0, 0.4))
-    seconds = float(np.clip(4.0 + 3.0 * clumsy + rng.normal(0.0, 1.2), 2.5, None))
-    way = np.concatenate(list(strokes_of(max(1, strokes), seconds)))
+    moving = round(max(4.0, 6.0 + 1.5 * clumsy + rng.normal(0.0, 1.0)) * RATE_HZ)
     rest = round(REST_S * RATE_HZ)
-    way = np.concatenate([np.zeros(rest), way, np.ones(rest)])
-    swerve_m = 0.002 + 0.010 * clumsy
-    tip = np.stack(
-        [0.04 * way, swerve_m * np.sin(np.pi * way), 0.3 * swerve_m * np.sin(3 * np.pi * way)], axis=1
-    ) + np.array([0.0, 0.05, -0.10])
-    turns = turning(0.2 + (0.2 + 0.8 * clumsy) * way)
-    first, last = rest + 1, rest + round(0.8 * (len(way) - 2 * rest))
-    gestures = f"1 {first - 1} G1 \n{first} {last} G6 \n{last + 1} {len(way) - rest} G4 \n"
-    still = np.hstack([np.tile([0.0, 0.05, -0.1], (len(way), 1)), np.tile(np.eye(3).ravel(), (len(way), 1))])
-    return np.hstack([*(arm(still[:, :3], still[:, 3:]) for _ in range(3)), arm(tip, turns.reshape(-1, 9))]), gestures
+    arms = [instrument(side, clumsy, moving, rest, rng) for side in range(2)]
+    gestures = f"1 {rest} G1 \n{rest + 1} {rest + moving // 2} G6 \n{rest + moving // 2 + 1} {rest + moving} G4 \n"
+    masters = [np.hstack([2.0 * one[:, :3], one[:, 3:]]) for one in arms]
+    return np.hstack([*masters, *arms]), gestures
 
 
-def strokes_of(count: int, seconds: float) -> Iterator[np.ndarray]:
-    """Divide the path from 0 to 1 into minimum-jerk strokes, each from rest to rest."""
-    samples = round(seconds * RATE_HZ / count)
+def instrument(side: int, clumsy: float, moving: int, rest: int, rng: np.random.Generator) -> np.ndarray:
+    """Return the 19 columns of one instrument: strokes between places, with a sway, a turn and grips."""
+    strokes = max(2, round(4.0 * np.exp(0.8 * clumsy) + rng.normal(0.0, 0.4)))
+    places = rng.normal(0.0, 0.015, (strokes + 1, 3))
+    lengths = np.full(strokes, moving // strokes)
+    lengths[-1] += moving - lengths.sum()
+    way = np.concatenate(
+        [a + (b - a) * stroke(n)[:, None] for a, b, n in zip(places[:-1], places[1:], lengths, strict=True)]
+    )
+    tip = np.concatenate([np.tile(places[0], (rest, 1)), way, np.tile(places[-1], (rest, 1))])
+    seconds = np.arange(len(tip)) / RATE_HZ
+    sway_m = 0.001 * np.exp(clumsy + rng.normal(0.0, 0.1))
+    tip = tip + sway_m * np.sin(2 * np.pi * (1.2 + 0.3 * side) * seconds)[:, None] + np.array([0.04 * side, 0.05, -0.1])
+    turns = turning(0.3 * side + 0.25 * np.exp(clumsy) * np.sin(2 * np.pi * seconds / 3.0))
+    grips = max(1, round(2.0 * np.exp(0.9 * clumsy) + rng.normal(0.0, 0.3)))
+    jaw = np.where(np.sin(2 * np.pi * grips * seconds / seconds[-1]) > 0, 0.6, -0.3)
+    return np.hstack([tip, turns.reshape(-1, 9), np.zeros((len(tip), 6)), jaw[:, None]])
+
+
+def stroke(samples: int) -> np.ndarray:
+    """Return the way from 0 to 1 in a minimum-jerk stroke, from rest to rest."""
     u = np.arange(1, samples + 1) / samples
-    for number in range(count):
-        yield (number + 10 * u**3 - 15 * u**4 + 6 * u**5) / count
-
-
-def arm(tip_m: np.ndarray, turns: np.ndarray) -> np.ndarray:
-    """Write an arm's 19 columns; velocities are not used, and the gripper stays closed."""
-    return np.hstack([tip_m, turns, np.zeros((len(tip_m), 6)), np.full((len(tip_m), 1), -0.5)])
+    return np.asarray(10 * u**3 - 15 * u**4 + 6 * u**5)

@@ -1,5 +1,7 @@
 """Scores on a real database: the reference, the percentiles, the history, and only surgeons with consent."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -10,13 +12,15 @@ from skills.formats.reader_process import read_told
 from skills.library.calibrations import keep
 from skills.library.catalogue import put_surgeon
 from skills.library.demos import upload_demo, withdraw_demo
+from skills.library.recordings import store_recording
 from skills.library.scores import LEAST_DEMOS, score
 from skills.packing import canonical, sha256
 from skills.schemas.comparison import Score
 from skills.schemas.requests import DemoIn, ScoreIn
-from skills.scoring.calibration import as_numbers
-from tests.library import cases
-from tests.scoring.test_model import model
+from skills.scoring.calibration import SkillModel, as_numbers
+from tests.library import cases, rated
+from tests.library.test_calibrations import OLD
+from tests.scoring.test_rating import JUDGED, model
 
 NO_ATLAS = {"uses": ["training", "export"]}
 READ = read_told
@@ -167,28 +171,86 @@ def test_what_cannot_be_scored_is_refused(database: Database) -> None:
         scored(database, reference, reference=bent(2.0, "kestrel", database).sha256)
 
 
-def test_a_calibrated_model_rates_and_says_on_what(database: Database) -> None:
-    judged = {"rho": 0.9, "rho_interval": [0.8, 0.95], "accuracy": 0.75}
-    chance = {"rho": -0.2, "rho_p": 0.01, "accuracy": 0.2, "accuracy_p": 0.01, "commonest": 0.4}
-    duration = {"rho": 0.5, "accuracy": 0.5}
-    about = {
-        "model": as_numbers(model(rating_weights=[-0.3, -0.1])),
-        "data": {"task": "Suturing", "of": "hand-off", "trials": 40, "surgeons": 8},
-        "validated": {"all_figures": judged, "duration_only": duration, "chance": chance, "over_duration": [0.1, 0.6]},
+def calibration(*tasks: str, **judged: Any) -> dict[str, Any]:
+    """Return a stored calibration of tasks, each with the same figures and the same model."""
+    one = model(highest=[[1e9] * 17], lowest=[[-1e9] * 17])
+    arrays = {
+        name: np.repeat(value, len(tasks), axis=0) for name, value in vars(one).items() if isinstance(value, np.ndarray)
     }
-    demo = bent(0.0, "kestrel", database)
-    older = about | {"validated": {"all_figures": judged | {"rho": -0.84}, "duration_only": duration, "chance": chance}}
+    return {
+        "version": 2,
+        "model": as_numbers(SkillModel(**vars(one) | arrays | {"tasks": tasks})),
+        "validated": {"tasks": dict.fromkeys(tasks, JUDGED | judged), "mean": JUDGED},
+    }
+
+
+@pytest.fixture
+def trial(database: Database) -> dict[str, Any]:
+    """Store a trial of two instruments and a reference to compare with; return the part of it to score."""
+    bent(0.0, "kestrel", database)
+    data = rated.text(rated.trial(0.5, np.random.default_rng(0))[0])
+    sha256 = store_recording(database, cases.upload(data, "text/plain"), "test")[0].sha256
+    return {"recording": sha256, "arm": "PSM_right", "start_s": 1.0, "end_s": 4.0}
+
+
+def stored(database: Database, about: dict[str, Any]) -> str:
     with database.writing() as session:
-        session.add(StoredCalibration(sha256=sha256(canonical(older)), about=older))
-    skill = scored(database, demo).skill
-    assert (skill.calibrated, skill.rating, skill.levels) == (False, None, None)
-    assert "older version" in skill.words[0] and "no better than the duration alone" in skill.words[0]
+        return keep(session, about, "test")[0].sha256
+
+
+def test_the_whole_recording_is_rated_and_not_the_motion(database: Database, trial: dict[str, Any]) -> None:
+    digest = stored(database, calibration("Knot_Tying"))
+    skill = scored(database, **trial).skill
+    assert skill.calibrated and (skill.calibration, skill.task) == (digest, "Knot_Tying")
+    assert skill.rating == pytest.approx(18.0 + sum(term.points for term in skill.terms))
+    assert scored(database, **trial | {"end_s": 3.0}).skill == skill
+    assert "rate the whole recording" in skill.words[1] and len(skill.terms) == 17
+
+
+def test_of_several_tasks_one_is_named(database: Database, trial: dict[str, Any]) -> None:
+    stored(database, calibration("Knot_Tying", "Needle_Passing"))
+    said = "Not rated: {}. Name the recording's task; it has Knot_Tying, Needle_Passing."
+    assert scored(database, **trial).skill.words == (said.format("the calibration has several tasks"),)
+    assert scored(database, **trial, task="Sewing").skill.words == (said.format("the calibration has no task Sewing"),)
+    assert scored(database, **trial, task="Needle_Passing").skill.task == "Needle_Passing"
+
+
+def test_a_task_without_evidence_is_not_rated(database: Database, trial: dict[str, Any]) -> None:
+    about = calibration("Knot_Tying", "Needle_Passing")
+    about["validated"]["tasks"]["Needle_Passing"] = JUDGED | {"over_duration": [-0.1, 0.4]}
+    stored(database, about)
+    skill = scored(database, **trial, task="Needle_Passing").skill
+    assert (skill.calibrated, skill.rating, skill.levels, skill.terms) == (False, None, None, ())
+    assert "not accepted for Needle_Passing" in skill.words[0] and "no better than the duration alone" in skill.words[0]
+    assert scored(database, **trial, task="Knot_Tying").skill.calibrated
+
+
+def test_a_recording_of_one_arm_is_not_rated_in_words(database: Database) -> None:
+    stored(database, calibration("Knot_Tying"))
+    skill = scored(database, bent(0.0, "kestrel", database)).skill
+    assert skill.words[0].startswith("Not rated: A trial has two instruments")
+
+
+def test_a_calibration_of_an_older_version_is_not_used(database: Database, trial: dict[str, Any]) -> None:
     with database.writing() as session:
-        stored, _ = keep(session, about, "test")
-    skill = scored(database, demo).skill
-    assert skill.calibrated and skill.calibration == stored.sha256
-    assert skill.rating == pytest.approx(18.0 + sum(skill.terms.values()))
-    said = " ".join(skill.words)
-    assert "40 rated trials (Suturing, each hand-off) of 8 surgeons" in said
-    assert "rank correlation of 0.90 (0.80 to 0.95; the duration alone: 0.50, chance: -0.20)" in said
-    assert skill.outside and "do not rely on this rating" in said  # one second, while the calibration has 4 to 20
+        session.add(StoredCalibration(sha256=sha256(canonical(OLD)), about=OLD))
+    (said,) = scored(database, **trial).skill.words
+    assert "older version" in said and "calibrate it again" in said
+
+
+def test_without_the_consent_of_all_in_a_recording_it_is_not_rated(database: Database) -> None:
+    """A demonstration whose surgeon agreed, in a recording with one of a surgeon who did not."""
+    bent(0.0, "kestrel", database)
+    data = rated.text(rated.trial(0.5, np.random.default_rng(0))[0])
+    put(database, "plover")
+    put(database, "wren")
+    cut = {"surgeon": "plover", "suture": cases.SUTURE, "arm": "PSM_right"}
+    agreed = upload_demo(database, cases.upload(data, "text/plain"), DemoIn(**cut, start_s=1.0, end_s=4.0), "test").row
+    other = cut | {"surgeon": "wren", "start_s": 4.0, "end_s": 6.0}
+    upload_demo(database, cases.upload(data, "text/plain"), DemoIn(**other), "test")
+    stored(database, calibration("Knot_Tying"))
+    assert scored(database, agreed).skill.calibrated
+    put(database, "wren", consent=NO_ATLAS)
+    found = scored(database, agreed)
+    assert found.deviation.total_mm > 0
+    assert found.skill.words == ("Not rated: the consent of a surgeon in this recording does not cover comparisons.",)

@@ -1,6 +1,7 @@
-"""Calibration on a cohort of known truth: skill is found, not invented, and reported correctly."""
+"""The fit of a model of skill: against scikit-learn, without the surgeon that is left out, and its numbers."""
 
-from dataclasses import asdict
+import json
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -8,292 +9,139 @@ import pytest
 
 from skills.errors import BadInput
 from skills.scoring.calibration import (
-    ACCEPTED_P,
-    LEAST_PERMUTATIONS,
-    LOGISTIC,
-    RIDGE,
-    RIVALS,
+    LEVELS,
     Cohort,
+    Design,
+    SkillModel,
+    as_numbers,
     calibrate,
+    designs_of,
+    from_numbers,
     held_out,
-    level_refusals,
-    refusals,
-    rival_predictions,
-    shuffled,
-    spearman,
-    validate,
+    left_out_scores,
+    rank_correlations,
 )
-from skills.scoring.features import MODELLED
-
-SURGEONS, TRIALS = 8, 5
+from tests.scoring.cohorts import cohort
 
 
-def cohort(seed: int = 0, surgeons: int = SURGEONS, motions: int = 1, told: float = 1.0) -> Cohort:
-    """Return a cohort whose figures depend on skill, with noise, the duration least; with `told` 0 they do not."""
-    rng = np.random.default_rng(seed)
-    skill = np.linspace(-1.0, 1.0, surgeons)
-    whose = np.repeat(np.arange(surgeons), TRIALS)
-    trials = np.repeat(np.arange(surgeons * TRIALS), motions)
-    weights = told * np.array([-0.4, -1.0, 1.0, 1.0, -1.0, -1.0])
-    values = np.array([10.0, 80.0, -2.0, -8.0, 0.1, 0.6]) + np.array([2.0, 15.0, 0.5, 2.0, 0.05, 0.2]) * (
-        skill[whose][trials][:, None] * weights + rng.normal(0.0, 0.6, (len(trials), len(MODELLED)))
-    )
-    ratings = np.rint(np.clip(18.0 + 8.0 * skill[whose] + rng.normal(0.0, 1.0, len(whose)), 6, 30))
-    return Cohort(values, trials, whose, ratings, np.searchsorted([-0.35, 0.35], skill)[whose])
+def fitted_by_sklearn(drawn: Cohort, inside: np.ndarray, design: Design) -> np.ndarray:
+    """Return the scores of all trials by scikit-learn, as one would write it: shape (N,)."""
+    from sklearn.linear_model import Ridge  # here, because the import takes a second
+
+    figures = drawn.values.mean(axis=1) if design.masters else drawn.values[:, 0]
+    standard, aims, shares = np.empty_like(figures), np.empty(len(figures)), np.empty(len(figures))
+    for task in range(len(drawn.names)):
+        here, seen = drawn.tasks == task, inside & (drawn.tasks == task)
+        standard[here] = (figures[here] - figures[seen].mean(axis=0)) / figures[seen].std(axis=0)
+        aims[here] = (drawn.ratings[here, 0] - drawn.ratings[seen, 0].mean()) / drawn.ratings[seen, 0].std()
+        shares[here] = 1.0 / seen.sum()
+    scores = np.empty(len(figures))
+    for task in range(len(drawn.names)):
+        seen = inside if design.together else inside & (drawn.tasks == task)
+        ridge = Ridge(alpha=design.strength, fit_intercept=False)
+        ridge.fit(standard[seen], aims[seen], sample_weight=shares[seen])
+        size = np.sqrt(np.average(ridge.predict(standard[seen]) ** 2, weights=shares[seen]))
+        here = drawn.tasks == task
+        scores[here] = ridge.predict(standard[here]) / size
+    return scores
 
 
-def test_skill_that_shows_is_found_at_surgeons_left_out() -> None:
-    found = validate(cohort(), permutations=20)
-    best, chance = found.all_figures, found.chance
-    print(best, found.duration_only, chance)
-    assert best.rho > 0.8
-    assert best.rho_interval[0] > 0.4
-    assert best.rho > found.duration_only.rho + 0.1
-    assert best.accuracy_interval[0] > chance.commonest
-    assert chance.rho < 0.3 and chance.rho_p < 0.1 and chance.accuracy_p < 0.2  # of 20; one in 21 is the least
+@pytest.mark.parametrize(("tasks", "sides"), [(1, 1), (2, 2)])
+def test_scores_of_surgeons_left_out_are_those_of_scikit_learn(tasks: int, sides: int) -> None:
+    drawn = cohort(tasks=tasks, sides=sides, surgeons=5, trials=3)
+    found = left_out_scores(drawn, drawn.surgeons, drawn.ratings[:, :1, None])
+    designs = designs_of(drawn)
+    assert len(designs) == 3 * tasks * sides
+    for surgeon, (best,) in enumerate(found.chosen):
+        out = drawn.surgeons == surgeon
+        expected = fitted_by_sklearn(drawn, ~out, designs[best])
+        np.testing.assert_allclose(found.scores[out, 0, 0], expected[out], atol=1e-9)
 
 
-def fallen_to_chance(seeds: range) -> None:
-    """Shuffle labels among surgeons, and assert that neither figure is above chance on average."""
-    rhos, rights, claims = [], [], 0
-    for seed in seeds:
-        drawn = cohort(seed)
-        dealt = shuffled(drawn, np.random.default_rng([seed, 1]))
-        found = held_out(dealt)
-        rhos.append(spearman(found.ratings, dealt.ratings))
-        rights.append(float((found.levels == dealt.levels).mean()))
-        claims += rhos[-1] > 0.8
-    print(f"{len(seeds)} shuffles: rho {np.mean(rhos):.2f}, right {np.mean(rights):.2f}")
-    assert np.mean(rhos) < 0.1
-    assert np.mean(rights) < 0.4
-    assert claims <= 0.1 * len(seeds)
-
-
-def test_with_labels_shuffled_rho_and_accuracy_fall_to_chance() -> None:
-    fallen_to_chance(range(10))
-
-
-@pytest.mark.nightly
-def test_with_labels_shuffled_many_times() -> None:
-    fallen_to_chance(range(300))
-
-
-def test_chance_is_told_where_nothing_shows() -> None:
-    found = validate(cohort(3, told=0.0), permutations=20)
-    print(found)
-    assert found.chance.rho_p > 0.05
-    assert found.all_figures.rho < found.chance.rho_95
-
-
-@pytest.mark.nightly
-def test_the_chance_of_a_small_p_is_small_where_nothing_shows() -> None:
-    """Of 40 cohorts without any effect, at most a fifth may claim p < 0.1."""
-    small = sum(validate(cohort(seed, told=0.0), permutations=40).chance.rho_p < 0.1 for seed in range(40))
-    assert small <= 8
-
-
-# ---- acceptance, where the truth is known --------------------------------------------------------------------------
-
-
-def drawn_cohort(kind: str, seed: int) -> Cohort:
-    """Draw figures with an effect of the surgeon and one of the trial, and ratings by a known rule, with noise.
-
-    Args:
-        kind: The rule. "nothing", "surgeon" (an effect of the surgeon that no figure shows), "duration", "shared" (the
-            duration, which every figure shows with noise) or "smoothness".
-        seed: Seed of the draw.
-    """
-    rng = np.random.default_rng([seed, len(kind)])
-    whose = np.repeat(np.arange(SURGEONS), TRIALS)
-
-    def effects(size: float) -> np.ndarray:
-        return size * (rng.normal(size=SURGEONS)[whose] + rng.normal(size=len(whose)))
-
-    values = np.stack([effects(0.7) for _ in MODELLED], axis=1)
-    if kind == "shared":
-        values[:, 1:] = values[:, :1] + 0.5 * values[:, 1:]
-    told = {
-        "nothing": rng.normal(size=len(whose)),
-        "surgeon": effects(1.0),
-        "duration": effects(0.3) - values[:, 0],
-        "shared": effects(0.3) - values[:, 0],
-        "smoothness": effects(0.15) + values[:, 3],
-    }[kind]
-    ratings = np.rint(np.clip(18.0 + 5.0 * told / told.std(), 6, 30))
-    means = np.array([ratings[whose == surgeon].mean() for surgeon in range(SURGEONS)])
-    levels = means.argsort().argsort() * 3 // SURGEONS
-    return Cohort(values, np.arange(len(whose)), whose, ratings, levels[whose])
-
-
-def accepted(kind: str, draws: int) -> int:
-    """Return the number of draws whose model is accepted."""
-    judged = (validate(drawn_cohort(kind, seed), permutations=20) for seed in range(draws))
-    count = sum(not refusals(asdict(one)) for one in judged)
-    print(f"{kind}: {count} of {draws} accepted")
-    return count
-
-
-HOPELESS = ("nothing", "surgeon", "duration", "shared")
-
-
-def test_models_of_nothing_and_of_the_duration_alone_are_refused() -> None:
-    assert sum(accepted(kind, 1) for kind in ("surgeon", "shared")) == 0  # the most deceptive; all of them at night
-
-
-def test_a_model_that_truly_predicts_is_accepted() -> None:
-    assert accepted("smoothness", 1) == 1
-
-
-@pytest.mark.nightly
-@pytest.mark.parametrize("kind", HOPELESS)
-def test_of_many_hopeless_models_at_most_a_twentieth_is_accepted(kind: str) -> None:
-    assert accepted(kind, 100) <= 5
-
-
-@pytest.mark.nightly
-def test_of_many_predictive_models_most_are_accepted() -> None:
-    assert accepted("smoothness", 100) >= 95
-
-
-def test_the_duration_of_the_trial_competes_with_a_model_of_hand_offs() -> None:
-    """Hand-offs whose own durations say nothing, in trials whose duration says everything."""
-    drawn = drawn_cohort("smoothness", 0)
-    whole = np.stack([30.0 - drawn.ratings, np.ones(40), np.ones(40)], axis=1)
-    told = Cohort(drawn.values, drawn.trials, drawn.surgeons, drawn.ratings, drawn.levels, whole)
-    found = validate(told, permutations=20)
-    assert found.rivals["motion_duration"].rho < 0.5
-    assert found.duration_only.rho == found.rivals["shorter_first"].rho == pytest.approx(1.0)
-    assert found.over_duration[1] <= 0.0
-    assert any("no better than the duration alone (1.00" in why for why in refusals(asdict(found)))
-
-
-# ---- few permutations ------------------------------------------------------------------------------------------------
-
-
-def judged_by(as_good: int, permutations: int) -> dict[str, Any]:
-    """Return the figures of an excellent model, with p from the permutations that do as well."""
-    p = (1 + as_good) / (1 + permutations)
-    return {
-        "all_figures": {"rho": 0.9, "rho_interval": (0.8, 0.95), "accuracy": 0.9},
-        "duration_only": {"rho": 0.1, "accuracy": 0.3},
-        "chance": {"permutations": permutations, "rho_p": p, "accuracy_p": p, "commonest": 0.4},
-        "over_duration": (0.5, 0.8),
-    }
-
-
-@pytest.mark.parametrize(
-    ("as_good", "permutations", "said"),
-    [
-        (1, 20, "p = 0.095; at most 0.05 is accepted; it may be 0.009 to 0.236, because 20 permutations are few"),
-        (10, 200, "p = 0.055; at most 0.05 is accepted; it may be 0.027 to 0.090, because 200 permutations are few"),
-    ],
-)
-def test_a_refusal_that_few_permutations_may_have_made_says_so(as_good: int, permutations: int, said: str) -> None:
-    judged = judged_by(as_good, permutations)
-    (order,), (levels,) = refusals(judged), level_refusals(judged)
-    assert order == f"A random order does as well ({said}: calibrate again with more)."
-    assert levels == f"Random levels are right as often ({said}: calibrate again with more)."
-
-
-def test_a_refusal_that_more_permutations_would_confirm_asks_for_none() -> None:
-    for as_good, permutations in ((10, 20), (20, 200), (600, 10_000)):
-        judged = judged_by(as_good, permutations)
-        (one,), (other,) = refusals(judged), level_refusals(judged)
-        assert "with more" not in one + other
-    older = judged_by(1, 20)
-    del older["chance"]["permutations"]
-    assert ["with more" in why for why in (*refusals(older), *level_refusals(older))] == [False, False]
-    assert refusals(judged_by(0, 20)) == level_refusals(judged_by(0, 20)) == []
-
-
-@pytest.mark.parametrize("permutations", [0, 1, 18])
-def test_permutations_that_could_accept_no_model_are_refused(permutations: int) -> None:
-    with pytest.raises(BadInput, match=rf"{permutations} permutations .* at least 19"):
-        validate(cohort(), permutations=permutations)
-    assert 1 / (1 + LEAST_PERMUTATIONS) <= ACCEPTED_P < 1 / LEAST_PERMUTATIONS
-
-
-def test_rivals_are_the_trivial_predictions_and_have_not_seen_the_surgeon() -> None:
-    from sklearn.linear_model import Ridge  # here and below, because the import takes a second
-    from sklearn.preprocessing import StandardScaler
-
-    drawn = cohort(motions=2)
-    found = rival_predictions(drawn)
-    assert list(found) == list(RIVALS)
-    means = [drawn.ratings[drawn.surgeons != surgeon].mean() for surgeon in drawn.surgeons]
-    np.testing.assert_allclose(found["mean"].ratings, means)
-    duration_s = drawn.values[:, 0].reshape(-1, 2).sum(axis=1)  # of both motions, by default
-    np.testing.assert_allclose(drawn.whole[:, 0], duration_s)
-    np.testing.assert_allclose(found["shorter_first"].ratings, -duration_s)
-    np.testing.assert_allclose(found["gestures"].ratings, means)  # two in every trial
-    mine = drawn.surgeons == 3
-    theirs, trial = ~mine, np.flatnonzero(mine)[0]
-    standard = StandardScaler().fit(duration_s[theirs, None])
-    ridge = Ridge(alpha=RIDGE).fit(standard.transform(duration_s[theirs, None]), drawn.ratings[theirs])
-    expected = ridge.predict(standard.transform(duration_s[[trial], None]))
-    np.testing.assert_allclose(found["trial_duration"].ratings[trial], expected[0])
-
-
-def test_the_model_is_that_of_scikit_learn_as_one_would_write_it() -> None:
-    from sklearn.linear_model import LogisticRegression, Ridge
-    from sklearn.preprocessing import StandardScaler
-
-    drawn = cohort()
-    model = calibrate(drawn)
-    standard = StandardScaler().fit_transform(drawn.values)
-    ridge = Ridge(alpha=RIDGE).fit(standard, drawn.ratings)
-    logistic = LogisticRegression(C=LOGISTIC, max_iter=1000).fit(standard, drawn.levels)
-    np.testing.assert_allclose(model.ratings(drawn.values), ridge.predict(standard).clip(6, 30))
-    np.testing.assert_allclose(model.probabilities(drawn.values), logistic.predict_proba(standard), atol=1e-6)
-    assert model.levels == ("novice", "intermediate", "expert")
-
-
-def test_of_two_levels_the_probability_is_that_of_scikit_learn_too() -> None:
-    from sklearn.linear_model import LogisticRegression
-    from sklearn.preprocessing import StandardScaler
-
-    drawn = cohort()
-    two = Cohort(drawn.values, drawn.trials, drawn.surgeons, drawn.ratings, np.where(drawn.levels == 0, 0, 2))
-    model = calibrate(two)
-    standard = StandardScaler().fit_transform(two.values)
-    logistic = LogisticRegression(C=LOGISTIC, max_iter=1000).fit(standard, two.levels)
-    assert model.levels == ("novice", "expert")
-    np.testing.assert_allclose(model.probabilities(two.values), logistic.predict_proba(standard), atol=1e-6)
-
-
-def test_the_margin_holds_nine_tenths_of_what_was_left_out() -> None:
-    drawn = cohort(motions=3)
-    held = (np.abs(held_out(drawn).off) <= calibrate(drawn).rating_margin).mean()
-    assert 0.9 <= held <= 0.95
+def test_the_chosen_design_is_the_best_on_the_other_surgeons() -> None:
+    drawn = cohort(seed=2, tasks=2, surgeons=4, trials=3)
+    designs = designs_of(drawn)
+    found = left_out_scores(drawn, drawn.surgeons, drawn.ratings[:, :1, None])
+    for out, (best,) in enumerate(found.chosen[:2]):
+        rhos = []
+        for number, design in enumerate(designs):
+            scores = np.zeros(len(drawn.tasks))
+            for other in set(range(4)) - {out}:
+                mine = drawn.surgeons == other
+                scores[mine] = fitted_by_sklearn(drawn, ~mine & (drawn.surgeons != out), design)[mine]
+            if number == best:
+                np.testing.assert_allclose(found.inner[out, :, 0], scores, atol=1e-9)
+            rows = [of_task[drawn.surgeons[of_task] != out] for of_task in drawn.by_task]
+            rhos.append(np.mean([rank_correlations(scores[None, one], drawn.ratings[one, 0])[0] for one in rows]))
+        assert rhos[best] == pytest.approx(max(rhos))
 
 
 def test_a_surgeon_left_out_is_not_seen() -> None:
-    """A surgeon's own ratings do not change the prediction for that surgeon."""
-    drawn = cohort()
-    ratings = np.where(drawn.surgeons == 3, 6.0, drawn.ratings)
-    lied = Cohort(drawn.values, drawn.trials, drawn.surgeons, ratings, drawn.levels)
+    """A surgeon's own ratings, parts and levels change nothing for that surgeon, and something for all others."""
+    drawn = cohort(tasks=2)
     mine = drawn.surgeons == 3
-    np.testing.assert_array_equal(held_out(lied).ratings[mine], held_out(drawn).ratings[mine])
-    assert (held_out(lied).ratings[~mine] != held_out(drawn).ratings[~mine]).all()
+    ratings = np.where(mine[:, None], [6.0, *[1.0] * 6], drawn.ratings)
+    lied = replace(drawn, ratings=ratings, levels=np.where(mine, 0, drawn.levels))
+    one, other = held_out(drawn), held_out(lied)
+    for of_one, of_other in ((one.scores, other.scores), (one.ratings, other.ratings), (one.levels, other.levels)):
+        np.testing.assert_array_equal(of_one[mine], of_other[mine])
+    assert (one.scores[~mine, 0] != other.scores[~mine, 0]).all()
 
 
-def test_a_trial_of_many_motions_weighs_as_much_as_any_other() -> None:
-    once = cohort()
-    twice = Cohort(
-        np.concatenate([once.values, once.values[:5]]), np.append(once.trials, np.arange(5)),
-        once.surgeons, once.ratings, once.levels,
-    )  # fmt: skip
-    values = once.values
-    np.testing.assert_allclose(calibrate(twice).ratings(values), calibrate(once).ratings(values), atol=1e-9)
-    np.testing.assert_allclose(held_out(twice).ratings, held_out(once).ratings, atol=1e-9)
+def test_variants_are_predicted_as_each_alone() -> None:
+    drawn = cohort(surgeons=5)
+    rng = np.random.default_rng(1)
+    several = np.stack([drawn.ratings[rng.permutation(25), :1] for _ in range(3)], axis=2)
+    levels = np.stack([drawn.levels, drawn.levels[::-1], drawn.levels], axis=1)
+    together = held_out(drawn, several, levels)
+    for variant in range(3):
+        alone = held_out(drawn, several[:, :, variant : variant + 1], levels[:, variant : variant + 1])
+        np.testing.assert_allclose(together.scores[:, :, variant], alone.scores[:, :, 0], atol=1e-12)
+        np.testing.assert_array_equal(together.levels[:, variant], alone.levels[:, 0])
+
+
+def test_a_task_without_a_trial_in_the_fit_is_scored_as_average() -> None:
+    """With one repetition in a task, none is left when it is left out."""
+    drawn = cohort(tasks=2, surgeons=5, trials=3)
+    once = replace(drawn, repetitions=np.where(drawn.tasks == 1, 0, drawn.repetitions))
+    scores = left_out_scores(once, once.repetitions, once.ratings[:, :1, None]).scores
+    np.testing.assert_array_equal(scores[once.tasks == 1], 0.0)
+    assert (scores[once.tasks == 0] != 0.0).all()
+
+
+def test_the_model_rates_in_points_and_the_levels_are_the_nearest() -> None:
+    drawn = cohort(surgeons=10)
+    found = held_out(drawn)
+    model = calibrate(drawn, found)
+    predicted = model.ratings(0, drawn.figures(model.masters))
+    assert np.abs(predicted[:, 0] - drawn.ratings[:, 0]).mean() < 0.5 * drawn.ratings[:, 0].std()
+    assert rank_correlations(predicted[:, 0][None], drawn.ratings[:, 0])[0] > 0.9
+    np.testing.assert_allclose(model.ratings(0, model.centre)[0, 0], drawn.ratings[:, 0].mean())
+    mean = [drawn.ratings[drawn.levels == level, 0].mean() for level in range(len(LEVELS))]
+    np.testing.assert_allclose(model.level_ratings[0], mean)
+    np.testing.assert_allclose(model.level_shares[0].sum(axis=1), 1.0)
+    right = (found.levels[:, 0] == drawn.levels).mean()
+    assert right > 0.5
+    held = (np.abs(found.ratings[:, 0] - drawn.ratings[:, 0]) <= model.margins[0]).mean()
+    assert 0.9 <= held <= 0.95
+
+
+def test_ratings_stay_in_their_range() -> None:
+    drawn = cohort()
+    model = calibrate(drawn, held_out(drawn))
+    far = model.centre[0] + 100.0 * np.sign(model.weights[0, 0]) * model.scale[0]
+    best, worst = model.ratings(0, far), model.ratings(0, 2 * model.centre[0] - far)
+    assert best[0] == 30.0 and worst[0] == 6.0
+    assert (best[1:] <= 5.0).all() and (worst[1:] >= 1.0).all()
 
 
 def test_a_figure_that_never_varies_weighs_nothing() -> None:
     drawn = cohort()
     values = drawn.values.copy()
-    values[:, 4] = 0.1
-    model = calibrate(Cohort(values, drawn.trials, drawn.surgeons, drawn.ratings, drawn.levels))
-    assert model.rating_weights[4] == pytest.approx(0.0, abs=1e-9)
+    values[:, :, 4] = 0.1
+    still = replace(drawn, values=values)
+    model = calibrate(still, held_out(still))
+    np.testing.assert_allclose(model.weights[0, :, 4], 0.0, atol=1e-12)
 
 
 def test_rank_correlation_is_that_of_scipy_ties_included() -> None:
@@ -302,31 +150,35 @@ def test_rank_correlation_is_that_of_scipy_ties_included() -> None:
     rng = np.random.default_rng(2)
     for _ in range(20):
         one, other = rng.integers(0, 6, 15).astype(float), rng.integers(0, 6, 15).astype(float)
-        assert spearman(one, other) == pytest.approx(spearmanr(one, other).statistic)
-    assert spearman(np.ones(4), np.arange(4.0)) == 0.0
+        assert rank_correlations(one[None], other)[0] == pytest.approx(spearmanr(one, other).statistic)
+    assert rank_correlations(np.ones((1, 4)), np.arange(4.0))[0] == 0.0
 
 
-def test_shuffling_deals_whole_surgeons_out() -> None:
+def test_every_bit_of_a_model_survives_as_numbers() -> None:
+    drawn = cohort(tasks=2)
+    model = calibrate(drawn, held_out(drawn))
+    again = from_numbers(json.loads(json.dumps(as_numbers(model))))
+    assert as_numbers(again) == as_numbers(model)
+
+
+@pytest.mark.parametrize("wrong", [{"centre": [[1.0]]}, {"margins": [np.nan]}, {"means": [[1.0] * 6]}])
+def test_numbers_that_are_no_model_are_refused(wrong: dict[str, Any]) -> None:
     drawn = cohort()
-    dealt = shuffled(drawn, np.random.default_rng(5))
-    blocks = {tuple(drawn.ratings[drawn.surgeons == s]) for s in range(SURGEONS)}
-    assert {tuple(dealt.ratings[dealt.surgeons == s]) for s in range(SURGEONS)} == blocks
-    assert (dealt.ratings != drawn.ratings).any()
+    with pytest.raises(BadInput):
+        SkillModel(**vars(calibrate(drawn, held_out(drawn))) | wrong)
 
 
 @pytest.mark.parametrize(
     ("changed", "said"),
     [
-        ({"surgeons": np.zeros(40, int)}, "There is 1 surgeon"),
-        ({"surgeons": np.arange(40) % 2}, "There are 2 surgeons"),
-        ({"levels": np.zeros(40, int)}, "one skill level"),
-        ({"ratings": np.full(40, 18.0)}, "the same rating"),
-        ({"ratings": np.full(40, np.nan)}, "NaN"),
-        ({"values": np.full((40, 6), np.inf)}, "NaN or infinity"),
+        ({"surgeons": np.zeros(40, int)}, "Task_A has rated trials of 1 surgeon; at least 4"),
+        ({"surgeons": np.arange(40) % 3}, "of 3 surgeons; at least 4"),
+        ({"ratings": np.full((40, 7), 4.0)}, "Task_A have the same rating"),
+        ({"ratings": np.full((40, 7), np.nan)}, "NaN"),
+        ({"values": np.full((40, 1, 17), np.inf)}, "NaN or infinity"),
+        ({"thirds": np.zeros((40, 1, 2, 17))}, "thirds has shape"),
     ],
 )
 def test_what_nothing_can_be_learnt_from_is_refused(changed: dict[str, np.ndarray], said: str) -> None:
-    drawn = cohort()
-    whole = {name: getattr(drawn, name) for name in ("values", "trials", "surgeons", "ratings", "levels")}
     with pytest.raises(BadInput, match=said):
-        Cohort(**(whole | changed))
+        replace(cohort(), **changed)

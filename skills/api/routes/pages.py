@@ -145,21 +145,24 @@ def show_score(
     db: Db,
     tell: Tell,
     surgeon: Annotated[str, Query(max_length=64)] = "",
+    task: Annotated[str, Query(max_length=64, pattern="^[A-Za-z_]*$")] = "",
 ) -> Response:
     """Show the score of a demonstration against a surgeon's style; by default that of an expert, if there is one."""
     with db.reading() as session:
         found = find_demo(session, demo)
         surgeons = scores.references(session, found.suture)
+        tasks = scores.rated_tasks(session)
     others = [one.slug for one in surgeons if one.row != found.surgeon_row]
     against = surgeon or next(iter(others), found.surgeon.slug)
-    score = scores.score(db, ScoreIn(surgeon=against, suture=found.suture, demo=found.sha256), tell)
+    score = scores.score(db, ScoreIn(surgeon=against, suture=found.suture, demo=found.sha256, task=task or None), tell)
     drawn: dict[str, Any] = {
         "views": drawings.deviation_views(score.deviation),
         "along": drawings.deviation_along(score.deviation),
         "curve": drawings.score_curve(score.curve, found.sha256) if len(score.curve) > 1 else None,
         "key": drawings.score_key(),
     }
-    return render(request, "score.html", caller, demo=found, score=score, surgeons=surgeons, **drawn)
+    drawn |= {"surgeons": surgeons, "tasks": tasks, "asked_task": task}
+    return render(request, "score.html", caller, demo=found, score=score, **drawn)
 
 
 @router.get("/pages/recordings", dependencies=[needs("reader")])
