@@ -62,7 +62,7 @@ def test_what_is_not_there_is_said(skills: Run, what: str) -> None:
 
 def test_a_folder_is_calibrated_on_and_used_by_the_next_score(skills: Run, tmp_path: Path) -> None:
     lab = rated.folder(tmp_path / "lab")
-    code, said = skills("calibrate", str(lab), "--permutations", "20", "--json")
+    code, said = skills("calibrate", str(lab), "--permutations", "39", "--json")
     assert code == 0, said
     about = json.loads(said)
     assert about["data"]["trials"] == 40 and about["validated"]["mean"]["model"]["rho"] > 0.8

@@ -262,6 +262,8 @@ def _tell_left_out(left_out: dict[str, list[str]]) -> None:
 
 def _tell_judged(about: dict[str, Any]) -> None:
     """Print the quality of the model and of its rivals, for each task."""
+    from skills.demonstration.quality import times_in_words
+
     tasks, validated = about["data"]["tasks"], about["validated"]
     for name, judged in validated["tasks"].items():
         levels = ", ".join(f"{count} {level}" for level, count in tasks[name]["levels"].items())
@@ -270,7 +272,7 @@ def _tell_judged(about: dict[str, Any]) -> None:
     if len(tasks) > 1:
         out.print("The mean of the tasks")
         _tell_task(validated["mean"])
-    chosen = "; ".join(f"{design} ({count} times)" for design, count in validated["chosen"].items())
+    chosen = "; ".join(f"{design} ({times_in_words(count)})" for design, count in validated["chosen"].items())
     out.print(f"Chosen with a surgeon left out: {chosen}", markup=False, soft_wrap=True)
 
 

@@ -38,6 +38,7 @@ from skills.scoring.calibration import (
     calibrate,
     from_numbers,
 )
+from skills.scoring.trials import NAMES as FIGURES
 from skills.scoring.trials import TrialFigures, measure_trial
 from skills.scoring.validation import BOOTSTRAPS, NOTHING, PERMUTATIONS, refusals, validate
 
@@ -172,7 +173,8 @@ def read_calibration(stored: StoredCalibration) -> SkillModel | None:
     if stored.about.get("version") != VERSION:
         return None
     try:
-        return from_numbers(stored.about["model"])
+        model = from_numbers(stored.about["model"])
+        return model if model.figures == FIGURES else None
     except (BadInput, KeyError, TypeError) as error:
         raise Corrupt("The numbers of the stored calibration are no model.", Remedy(Action.CALIBRATE)) from error
 

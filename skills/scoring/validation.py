@@ -37,8 +37,8 @@ BOOTSTRAPS = 2000
 DRAWN_AT_ONCE = 100_000  # trials, whose ranks take some 10 MB
 PERMUTATIONS = 200
 PERMUTED_AT_ONCE = 25
-ACCEPTED_P = 0.05  # ours: greatest p-value of an accepted model against chance
-LEAST_PERMUTATIONS = 19  # p is at least 1 / (permutations + 1): of fewer, it is above `ACCEPTED_P` for every model
+ACCEPTED_P = 0.025  # ours: greatest p-value of an accepted model against chance
+LEAST_PERMUTATIONS = 39  # p is at least 1 / (permutations + 1): of fewer, it is above `ACCEPTED_P` for every model
 ENOUGH = (30, 5)  # surgeons, and trials of each: of simulated cohorts with a plain signal, so many are accepted
 RIVALS = {
     "shorter_first": "shorter trials first, not fitted",
@@ -76,7 +76,8 @@ class Chance:
     Attributes:
         permutations: Number of permutations.
         rho: The mean rank correlation.
-        rho_p: Share of permutations at least as good as the model, with the model counted as one of them.
+        rho_p: Share of permutations at least as good as the model, with the model counted as one of them. A permutation
+            counts with its best task, so that several tasks give chance no more opportunities than one.
         accuracy: The mean share of correct levels; None for the mean over tasks, as the next two.
         accuracy_p: As `rho_p`, for the share of correct levels.
         commonest: The share of correct levels if the commonest level is always predicted.
@@ -171,9 +172,9 @@ def validate(
         chance = Chance(
             permutations,
             rho=float(permuted.rhos[task].mean()),
-            rho_p=_p(permuted.rhos[task], of_task["model"].rho),
+            rho_p=_p(permuted.rhos.max(axis=0), of_task["model"].rho),
             accuracy=float(rights.mean()),
-            accuracy_p=_p(rights, of_task["model"].accuracy or 0.0),
+            accuracy_p=_p(permuted.rights.max(axis=0), of_task["model"].accuracy or 0.0),
             commonest=float(np.bincount(cohort.levels[rows]).max() / len(rows)),
         )
         surgeons = len(np.unique(cohort.surgeons[rows]))
@@ -355,7 +356,7 @@ def refusals(judged: Mapping[str, Any]) -> list[str]:
     by_chance, rho_p = chance.get("rho", np.nan), chance.get("rho_p", np.nan)
     more_low, more_high = judged.get("over_duration", UNKNOWN)
     why = []
-    if not low > max(0.0, by_chance):
+    if not (low > 0 and low > by_chance):
         why.append(
             f"Its rank correlation may be no better than by chance ({rho:.2f}, 95 %: {low:.2f} to {high:.2f}; by "
             f"chance {by_chance:.2f})."
@@ -404,8 +405,8 @@ def level_refusals(judged: Mapping[str, Any]) -> list[str]:
 
 def known_parts(judged: Mapping[str, Any]) -> tuple[str, ...]:
     """Return the parts of a rated task's rating that are predicted better than by chance."""
-    by_chance = max(0.0, judged["chance"]["rho"])
-    return tuple(name for name, part in judged["parts"].items() if part["rho_interval"][0] > by_chance)
+    by_chance, lows = judged["chance"]["rho"], {name: part["rho_interval"][0] for name, part in judged["parts"].items()}
+    return tuple(name for name, low in lows.items() if low > 0 and low > by_chance)
 
 
 def _in_words(p: float, chance: Mapping[str, Any]) -> str:

@@ -38,7 +38,7 @@ def scoring(tmp_path_factory: pytest.TempPathFactory, stored: dict[str, str]) ->
         about = {"surgeon": "plover", "suture": cases.SUTURE, "arm": "PSM_right", "start_s": 1.0, "end_s": 4.0}
         stored["trial"] = service.client.add_demo(trial, media_type="text/plain", **about)["id"]
         with service.database.writing() as session:
-            keep(session, calibrate_on(read_cohort(rated.folder(folder / "lab")), permutations=20), "test")
+            keep(session, calibrate_on(read_cohort(rated.folder(folder / "lab")), permutations=39), "test")
         yield service
 
 

@@ -61,7 +61,7 @@ def test_a_user_is_refused_with_the_figures_and_nothing_is_stored(
     url = f"sqlite:///{tmp_path / 'skills.sqlite'}"
     monkeypatch.setenv("SKILLS_DATABASE_URL", url)
     settings.cache_clear()
-    result = CliRunner().invoke(app, ["calibrate", str(jigsaws), "--permutations", "20"], env={"COLUMNS": "120"})
+    result = CliRunner().invoke(app, ["calibrate", str(jigsaws), "--permutations", "39"], env={"COLUMNS": "120"})
     settings.cache_clear()
     said = result.stdout + result.stderr
     assert result.exit_code == 1, said
