@@ -42,8 +42,9 @@ def copy_of(name: str, fill: Callable[[str], None], backend: str, folder: Path) 
 
 
 def place(file: Path) -> str:
-    """Put an empty migrated SQLite database at a path, and return its URL."""
-    shutil.copy(migrated_file(), file)
+    """Put an empty migrated SQLite database at a path where there is none, and return its URL."""
+    if not file.exists():
+        shutil.copy(migrated_file(), file)
     return f"sqlite:///{file}"
 
 

@@ -11,6 +11,7 @@ from skills.verification.errors import CALIBRATED, UNCALIBRATED
 
 NAN = float("nan")
 PSM_M = {"approach": [-1.0, 0.0, 0.0]}
+TISSUE = {"scene": {"tissue": {"height_mm": -140.0}}}
 
 
 def about(passes: int = 5, psm_m: dict[str, Any] | None = None, moves: bool = False) -> dict[str, Any]:
@@ -47,11 +48,12 @@ def test_a_plan_says_what_it_does_and_leaves_out(of: dict[str, Any], words: str)
 @pytest.mark.parametrize(
     ("scene", "words"),
     [
-        (None, "nothing is checked against tissue; the simulator's pad lies below every motion."),
-        ({"learnt_sha256": None, "differs": []}, "the stated scene, of which its policy knows nothing."),
-        ({"learnt_sha256": "ab", "differs": []}, "the scene of its policy, whose odds hold at the demonstrated place"),
+        (None, "Tissue: not given, so nothing is checked against it, and this motion is not exported."),
+        ({"scene": {"tissue": None}}, "Tissue: not given. It is checked against the stated obstacles, and"),
+        (TISSUE | {"learnt_sha256": None, "differs": []}, "the stated scene, of which its policy knows nothing."),
+        (TISSUE | {"learnt_sha256": "ab", "differs": []}, "the scene of its policy, whose odds hold at the"),
         (
-            {"learnt_sha256": "ab", "differs": ["box 0 is new", "c"]},
+            TISSUE | {"learnt_sha256": "ab", "differs": ["box 0 is new", "c"]},
             "the one that its policy was learnt in: box 0 is new, c",
         ),
     ],
