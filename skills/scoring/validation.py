@@ -39,7 +39,7 @@ PERMUTATIONS = 200
 PERMUTED_AT_ONCE = 25
 ACCEPTED_P = 0.025  # ours: greatest p-value of an accepted model against chance
 LEAST_PERMUTATIONS = 39  # p is at least 1 / (permutations + 1): of fewer, it is above `ACCEPTED_P` for every model
-ENOUGH = (30, 5)  # surgeons, and trials of each: of simulated cohorts with a plain signal, so many are accepted
+ENOUGH = (40, 5)  # surgeons, and trials of each: of simulated cohorts with a plain signal, so many are accepted
 RIVALS = {
     "shorter_first": "shorter trials first, not fitted",
     "duration": "duration, fitted",

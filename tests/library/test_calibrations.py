@@ -231,7 +231,7 @@ def test_a_model_of_what_cannot_be_known_is_refused_and_nothing_is_stored(
     database: Database, unknowable: dict[str, Any]
 ) -> None:
     assert unknowable["validated"]["mean"]["model"]["rho"] < 0.5
-    said = r"not accepted, and nothing was stored\. Suturing: .*p = .*There are 8 surgeons.*about 30 with 5 trials"
+    said = r"not accepted, and nothing was stored\. Suturing: .*p = .*There are 8 surgeons.*about 40 with 5 trials"
     with pytest.raises(BadInput, match=said), database.writing() as session:
         keep(session, unknowable, "test")
     with database.reading() as session:

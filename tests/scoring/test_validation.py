@@ -191,7 +191,7 @@ def test_each_comparison_can_refuse_and_nan_does(
 
 def test_a_model_without_any_figure_is_refused_in_words() -> None:
     why = refusals({})
-    assert len(why) == 4 and "about 30 with 5 trials each are needed" in why[3]
+    assert len(why) == 4 and "about 40 with 5 trials each are needed" in why[3]
     assert len(level_refusals({})) == 2
 
 
@@ -199,7 +199,7 @@ def of_p(as_good: int, permutations: int) -> dict[str, Any]:
     """Return the figures of an excellent model, with p from the permutations that do as well."""
     p = (1 + as_good) / (1 + permutations)
     return {
-        "surgeons": 30,
+        "surgeons": 40,
         "model": {"rho": 0.9, "rho_interval": (0.8, 0.95), "accuracy": 0.9},
         "rivals": {"duration": {"rho": 0.1, "accuracy": 0.3}},
         "chance": {"permutations": permutations, "rho": 0.0, "rho_p": p, "accuracy_p": p, "commonest": 0.4},
