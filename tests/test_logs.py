@@ -184,8 +184,7 @@ class Overheard(Processes):
 
     def start(self) -> None:
         with self.database.with_name("log").open("ab") as log:
-            command = [sys.executable, "-m", "skills", "serve"]
-            self.process = subprocess.Popen(command, env=self.environment, stderr=log)
+            self.process = subprocess.Popen(self.command, env=self.environment, stderr=log)
         with Client(self.url) as client:
             wait_until_ready(client, self.process)
 

@@ -83,7 +83,7 @@ LIMITS: Mapping[str, tuple[str, float]] = MappingProxyType(
 
 @schema
 @dataclass(frozen=True)
-class Deviation:
+class Mismatch:
     """The greatest deviation of one kind: its first sample, its value and its limit."""
 
     kind: str
@@ -100,13 +100,13 @@ class Comparison:
     values: Mapping[str, Floats]
 
     @property
-    def deviations(self) -> tuple[Deviation, ...]:
+    def deviations(self) -> tuple[Mismatch, ...]:
         """The greatest deviation of each kind, NaN counting as the greatest."""
         found = []
         for kind, values in self.values.items():
             unit, limit = LIMITS[kind]
             sample = int(np.argmax(np.where(np.isnan(values), np.inf, values)))
-            found.append(Deviation(kind, sample, float(values[sample]), limit, unit))
+            found.append(Mismatch(kind, sample, float(values[sample]), limit, unit))
         return tuple(found)
 
 

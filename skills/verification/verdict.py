@@ -41,7 +41,7 @@ from skills.planning.motion_laws import A2, PHASES, TRANSFER
 from skills.planning.trajectory import Trajectory, joint_ratios
 from skills.verification.bodies import BodiesClearance, BodiesReport, bodies_clearance
 from skills.verification.clearance import FINGER_REACH_MM, Bounds, needle_to_pad_mm, openings, psm_m_poses
-from skills.verification.intent import LIMITS, Comparison, Deviation
+from skills.verification.intent import LIMITS, Comparison, Mismatch
 from skills.verification.playback import CLEARANCE_SEEN_MM, PAD, PSM_A, PSM_M, Playback
 from skills.verification.scene_clearance import SceneClearance
 
@@ -469,7 +469,7 @@ class PlaybackReport:
     files: Mapping[str, Sha256]
     settings: Limits
     bodies: BodiesReport | None = field(default=None, kw_only=True)
-    intent: tuple[Deviation, ...] | None = field(default=None, kw_only=True)
+    intent: tuple[Mismatch, ...] | None = field(default=None, kw_only=True)
 
 
 def judge(

@@ -44,12 +44,11 @@ class Service:
             "SKILLS_WORKERS": "1",
             **{f"SKILLS_{name.upper()}": str(value) for name, value in settings.items()},
         }
+        self.command = [sys.executable, "-m", "skills", "serve", "--port", str(self.port)]
         self.process: subprocess.Popen[bytes] | None = None
 
     def launch(self) -> None:
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "skills", "serve", "--port", str(self.port)], env=self.environment
-        )
+        self.process = subprocess.Popen(self.command, env=self.environment)
 
     def start(self) -> None:
         self.launch()

@@ -3,7 +3,6 @@
 import json
 import re
 import subprocess
-import sys
 from collections import Counter
 from pathlib import Path
 from threading import Event, Thread
@@ -38,8 +37,7 @@ class Installation(Service):
 
     def launch(self) -> None:
         with self.log.open("ab") as log:
-            command = [sys.executable, "-m", "skills", "serve"]
-            self.process = subprocess.Popen(command, env=self.environment, stderr=log)
+            self.process = subprocess.Popen(self.command, env=self.environment, stderr=log)
 
     def start(self) -> None:
         """Start it, wait until it is ready, and keep it running from then on."""
