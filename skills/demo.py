@@ -58,6 +58,11 @@ def main() -> int:
                 cancel_films(client)
         out.print("\nLearnt, certified, released; stacked at five suture points; played back in PyBullet:")
         out.print(report)
+        out.print(
+            "The worlds are those of an uncalibrated arm, because no errors of the arms were stated; nothing would be "
+            "exported. docs/errors.md says how to measure and state yours.",
+            soft_wrap=True,
+        )
         draw_samples(client, styles)
         real_recording(client)
         cancel_films(client)

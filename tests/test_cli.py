@@ -203,6 +203,9 @@ def test_a_plan_is_played_drawn_exported_and_its_bag_verified(
     code, said = skills("export", plan, str(tmp_path / "early.zip"))
     assert (code, "was not played" in said, (tmp_path / "early.zip").exists()) == (1, True, False), said
     own = tmp_path / "arms.json"
+    own.write_text('{"registration_mm": 0.3}')
+    code, said = skills("play", plan, "--errors", str(own))
+    assert (code, "JSON with name, registration_mm" in said, "calibrate-arm" in said) == (1, True, True), said
     own.write_text(json.dumps(asdict(ARMS)))
     code, said = skills("play", plan, "--errors", str(own), "--pictures", str(tmp_path / "pictures"))
     assert (code, "feasible" in said, "bench: registration 0.3 mm" in said) == (0, True, True), said

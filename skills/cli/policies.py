@@ -31,7 +31,7 @@ from skills.cli.shell import (
     show,
     triple,
 )
-from skills.errors import BadInput, BadSignature, Conflict
+from skills.errors import BadInput, BadSettings, BadSignature, Conflict
 
 if TYPE_CHECKING:
     from skills.client import Client
@@ -612,15 +612,20 @@ def _stated(errors: str | None) -> Any:
     """Return the errors of the arms as a request states them: a name, or the JSON of a file.
 
     Raises:
-        BadInput: The file cannot be read, or is not JSON.
+        BadInput: The file cannot be read, or does not have the errors of an arm.
     """
+    from skills.library.arm_errors import stated_errors
+
     if errors is None or errors in ("calibrated", "uncalibrated"):
         return errors
     try:
-        return json.loads(Path(errors).read_bytes())
-    except (OSError, ValueError) as error:
-        why = f"The errors {errors} cannot be read as JSON: {error}."
-        raise BadInput(why, "Write calibrated, uncalibrated, or a file of `skills calibrate-arm`.") from None
+        text = Path(errors).read_text()
+        stated_errors(text)
+        return json.loads(text)
+    except (OSError, ValueError, BadSettings) as error:
+        why = error.message if isinstance(error, BadSettings) else f"It cannot be read: {error}."
+        remedy = "Write calibrated, uncalibrated, or a file of `skills calibrate-arm` (docs/errors.md)."
+        raise BadInput(f"--errors {errors}: {why}", remedy) from None
 
 
 @plan_commands.command()

@@ -49,13 +49,14 @@ def some_plan(seed: int) -> tuple[Trajectory, ArmErrors, float]:
     psm_m = replace(PSM_M, approach=tuple(approach.tolist()))
     one = PassPath(path, POINTING_DOWN, realign(POINTING_DOWN, approach).rotation)
     pad_top_mm = float(path[:, 2].min()) - 10.2 - rng.uniform(2.0, 6.0)
+    most = rng.uniform(0.2, 1.0)  # so that some plans have small errors alone
     errors = replace(
         TIPS,
-        registration_mm=rng.uniform(0, 1.6),
-        registration_deg=rng.uniform(0, 0.6),
-        wrist_deg=rng.uniform(0, 3),
-        tip_bias_mm=rng.uniform(0, 0.8),
-        tip_noise_mm=rng.uniform(0, 0.5),
+        registration_mm=most * rng.uniform(0, 2.4),
+        registration_deg=most * rng.uniform(0, 0.9),
+        wrist_deg=most * rng.uniform(0, 3),
+        tip_bias_mm=most * rng.uniform(0, 0.8),
+        tip_noise_mm=most * rng.uniform(0, 0.5),
         tip_correlation_s=rng.choice([0.0, 0.3, 2.0]),
     )
     return time_parametrise([one], rate_hz=100.0, psm_m=psm_m), errors, pad_top_mm
@@ -76,12 +77,13 @@ def compared(plans: int, variations: int, tried: int) -> tuple[list[float], int]
 
 
 def test_a_few_plans_succeed_as_often_as_in_independent_worlds():
-    found, agree = compared(plans=3, variations=1000, tried=80)
-    assert agree == 3, found
+    found, agree = compared(plans=4, variations=1000, tried=80)
+    assert agree >= 3, found  # the intervals hold 95 %
 
 
 @pytest.mark.nightly
 def test_50_plans_succeed_as_often_as_in_independent_worlds():
     found, agree = compared(plans=50, variations=4000, tried=300)
+    print(f"{agree} of 50 agree, {min(found):.2f} to {max(found):.2f}")
     assert agree >= 45, found
     assert min(found) < 0.3 and max(found) > 0.95
