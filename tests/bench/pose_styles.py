@@ -11,8 +11,6 @@ proposed for the right instrument; five of other surgeons, drawn by a seed, are 
 """
 
 import os
-import tarfile
-import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -26,9 +24,9 @@ from scipy.spatial.transform import Rotation, Slerp
 from skills.arrays import Floats
 from skills.demonstration.demonstration import Demo, cut_demo
 from skills.demonstration.segments import propose_segments
-from skills.formats.jigsaws import read_jigsaws, trials
 from skills.learning.evaluation import dtw
 from skills.learning.pose_style import PHASES, PoseStyle, laid_rotations, laid_tip, learn_pose_style, mean_rotation
+from tests.bench.recognition import TASKS, recordings
 from tests.bench.timing import best_s
 
 if TYPE_CHECKING:
@@ -37,7 +35,6 @@ if TYPE_CHECKING:
 Poses = tuple[Floats, Floats]  # positions, (PHASES, 3), and unit quaternions, (PHASES, 4)
 Method = Callable[[list[Poses], Poses, Poses], Poses]  # demonstrations, their medoid, start and goal pose: a motion
 PHASE = np.linspace(0.0, 1.0, PHASES)
-TASKS = {"knot_tying": "Knot_Tying", "needle_passing": "Needle_Passing"}  # folders of the archive, and their names
 RIGHT, COMBINED = "PSM_right", 5
 
 
@@ -59,28 +56,14 @@ def motions() -> dict[str, list[Poses]]:
 
 def surgeons() -> dict[str, list[tuple[str, Poses]]]:
     """Return the hand-offs of each task of JIGSAWS with the letters of their surgeons, resampled in time, in mm."""
-    (archive,) = Path(os.environ["SKILLS_TEST_JIGSAWS"]).glob("*.tar.xz")
     found: dict[str, list[tuple[str, Poses]]] = {task: [] for task in TASKS.values()}
-    with tempfile.TemporaryDirectory() as name, tarfile.open(archive) as packed:
-        for member in packed:
-            task = TASKS.get(Path(member.name).parent.name)
-            content = packed.extractfile(member)
-            if task is None or content is None:
-                continue
-            to = Path(name, task, "kinematics", "AllGestures", Path(member.name).name)
-            to.parent.mkdir(parents=True, exist_ok=True)
-            to.write_bytes(content.read())
-        for trial in trials(Path(name)):
-            if trial.kinematics.stat().st_size == 0:
-                continue  # one trial has an empty file
-            with trial.kinematics.open("rb") as file:
-                recording = read_jigsaws(file)
-            longest = max(propose_segments(recording, RIGHT), key=lambda one: one.end_s - one.start_s, default=None)
-            if longest is None:
-                continue
-            demo = cut_demo(recording, arm=RIGHT, start_s=longest.start_s, end_s=longest.end_s)
-            assert demo.rotation_xyzw is not None, "every row has an orientation"
-            found[trial.task].append((trial.user, _resampled(demo.tip_mm, Rotation.from_quat(demo.rotation_xyzw))))
+    for task, surgeon, _, recording in recordings():
+        longest = max(propose_segments(recording, RIGHT), key=lambda one: one.end_s - one.start_s, default=None)
+        if longest is None:
+            continue
+        demo = cut_demo(recording, arm=RIGHT, start_s=longest.start_s, end_s=longest.end_s)
+        assert demo.rotation_xyzw is not None, "every row has an orientation"
+        found[task].append((surgeon, _resampled(demo.tip_mm, Rotation.from_quat(demo.rotation_xyzw))))
     return found
 
 
