@@ -46,6 +46,12 @@ _CODES |= {errno.EPERM: _CONTAINED, errno.EACCES: _CONTAINED}
 _NOTED_BYTES = 2000
 # numba needs its cache folder; without it every process would compile the loops again.
 _KEPT = ("PATH", "LD_LIBRARY_PATH", "NUMBA_CACHE_DIR", "XDG_CACHE_HOME", "HOME")
+# glibc's; larger blocks than the second threshold are still returned at once, and it allows no higher one.
+_MALLOC = {
+    "MALLOC_ARENA_MAX": "1",
+    "MALLOC_TRIM_THRESHOLD_": str(256 << 20),
+    "MALLOC_MMAP_THRESHOLD_": str(32 << 20),
+}
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 log = logging.getLogger(__name__)
@@ -89,15 +95,12 @@ def environment() -> dict[str, str]:
     """Return a minimal environment for a subprocess.
 
     It has the paths of modules, libraries and compiled loops, and one thread for each numerical library; no secrets.
-    One heap for all threads: glibc reserves 64 MiB for each further one, which a fork could use above its limit.
+    One heap for all threads: glibc reserves 64 MiB for each further one, which a fork could use above its limit. The
+    heap keeps freed memory: these processes end soon, and a page that is returned is mapped again by the next array.
     """
     kept = {name: os.environ[name] for name in _KEPT if name in os.environ}
     threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-    return (
-        kept
-        | threads
-        | {"MALLOC_ARENA_MAX": "1", "PYTHONPATH": os.pathsep.join(path or os.getcwd() for path in sys.path)}
-    )
+    return kept | threads | _MALLOC | {"PYTHONPATH": os.pathsep.join(path or os.getcwd() for path in sys.path)}
 
 
 # ---- outside the process ---------------------------------------------------------------------------------------

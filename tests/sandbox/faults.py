@@ -3,6 +3,7 @@
 import ctypes
 import json
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -36,6 +37,17 @@ def chatter(given: BinaryIO, answer: BinaryIO) -> None:
     print("of Python", flush=True)
     os.write(1, b"of a C library\n")
     answer.write(b"quiet")
+
+
+def freed_and_used_again(given: BinaryIO, answer: BinaryIO) -> None:
+    """Write how many pages were mapped for arrays of megabytes that others of their size have just left."""
+    pages = []
+    for _ in range(2):
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+        for _ in range(10):
+            _several = [np.ones(400_000) for _ in range(4)]
+        pages.append(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+    answer.write(json.dumps(pages[1]).encode())
 
 
 def surroundings(given: BinaryIO, answer: BinaryIO) -> None:

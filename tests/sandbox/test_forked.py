@@ -2,6 +2,7 @@
 
 import json
 import os
+import resource
 import selectors
 import signal
 import socket
@@ -79,6 +80,11 @@ def test_get_ready_runs_once_in_the_server_and_every_fork_inherits_it(given):
         assert [json.loads(run(server, "who_got_ready", given)) for _ in range(3)] == 3 * [[server.pid]]
     finally:
         server.close()
+
+
+def test_a_fork_uses_freed_memory_again(server, given):
+    asked_for_each = 10 * 4 * 400_000 * 8 // resource.getpagesize()
+    assert json.loads(run(server, "freed_and_used_again", given)) < asked_for_each / 10
 
 
 def test_a_fork_is_told_where_compiled_loops_are_kept(given, monkeypatch):
