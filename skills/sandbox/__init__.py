@@ -46,8 +46,10 @@ _CODES |= {errno.EPERM: _CONTAINED, errno.EACCES: _CONTAINED}
 _NOTED_BYTES = 2000
 # numba needs its cache folder; without it every process would compile the loops again.
 _KEPT = ("PATH", "LD_LIBRARY_PATH", "NUMBA_CACHE_DIR", "XDG_CACHE_HOME", "HOME")
-# glibc's; larger blocks than the second threshold are still returned at once, and it allows no higher one.
+# glibc's; larger blocks than the second threshold are still returned at once, and it allows no higher one. Arrow's own
+# allocator reserves 1 GiB of addresses at a time, which leaves others nothing below a limit.
 _MALLOC = {
+    "ARROW_DEFAULT_MEMORY_POOL": "system",
     "MALLOC_ARENA_MAX": "1",
     "MALLOC_TRIM_THRESHOLD_": str(256 << 20),
     "MALLOC_MMAP_THRESHOLD_": str(32 << 20),
