@@ -18,7 +18,7 @@ from typing import Any
 
 from sqlalchemy import create_engine, make_url, text
 
-from skills.db.session import Database
+from skills.db.session import Database, upgrade
 from tests.leftovers import shared
 from tests.needs import need
 from tests.waiting import until
@@ -93,6 +93,18 @@ def _template_on_server(name: str, fill: Callable[[str], None]) -> str:
 
     shared(f"postgresql-{name}", make)
     return name
+
+
+@cache
+def tables() -> list[str]:
+    """Return the statements that create all tables in an empty SQLite database, as the migrations do."""
+    with closing(sqlite3.connect(template("tables", _upgrade))) as made:
+        return [statement for statement in made.iterdump() if statement not in ("BEGIN TRANSACTION;", "COMMIT;")]
+
+
+def _upgrade(url: str) -> None:
+    with create_engine(url).begin() as connection:
+        upgrade(connection)
 
 
 def on_server(statement: str) -> None:

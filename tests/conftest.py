@@ -33,8 +33,8 @@ SMALL_BYTES = 100_000
 STATEMENTS = 2000  # more than all tests of a process have; SQLAlchemy's own limit is 500 for each database
 
 # No deadlines, because on a busy machine an example may take any time. By day every run has the same examples, so it is
-# red only for a change; `make nightly` searches at random, with 100 examples in the place of 30.
-hypothesis_settings.register_profile("tests", deadline=None, derandomize=True, max_examples=30)
+# red only for a change; `make nightly` searches at random, with 100 examples in the place of 20.
+hypothesis_settings.register_profile("tests", deadline=None, derandomize=True, max_examples=20)
 hypothesis_settings.register_profile("nightly", deadline=None)
 hypothesis_settings.load_profile("tests")
 
@@ -160,6 +160,30 @@ def shared_statements() -> Iterator[None]:
         for dialect in (PGDialect_psycopg, SQLiteDialect_pysqlite):
             patched.setattr(dialect, "__eq__", lambda one, other: type(one) is type(other))
             patched.setattr(dialect, "__hash__", lambda one: hash(type(one)))
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def shared_tables() -> Iterator[None]:
+    """Let restores into SQLite copy tables that were migrated once, instead of migrating from the first revision on.
+
+    That takes half of a restore; `tests/migrations` migrates.
+    """
+    from skills.db import archive
+    from skills.db.session import revision_of, revisions
+    from tests import backends
+
+    migrate = archive.upgrade
+
+    def upgrade(connection: Any, to: str = "head") -> None:
+        if connection.dialect.name == "sqlite" and to == revisions()[0] and revision_of(connection) is None:
+            for statement in backends.tables():
+                connection.exec_driver_sql(statement)
+        else:
+            migrate(connection, to)
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(archive, "upgrade", upgrade)
         yield
 
 

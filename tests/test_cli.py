@@ -98,6 +98,7 @@ def test_a_dataset_is_exported_verified_and_never_overwritten(skills, tmp_path: 
         assert (code, "exists already" in said) == (1, True), said
 
 
+@pytest.mark.nightly  # by day tests/formats
 def test_videos_of_the_users_own_dataset_are_exported_with_the_recordings(skills, tmp_path: Path) -> None:
     theirs = lerobots.write(videos.dataset("v2.1"), tmp_path / "theirs")
     assert skills("migrate")[0] == 0
@@ -267,6 +268,7 @@ def test_the_first_real_bag_of_a_new_user_is_learnt_and_released(skills) -> None
     assert (code, "ECM" in said, "local/measured_cp" in said) == (1, True, True), said  # the reason, and the remedy
 
 
+@pytest.mark.nightly  # by day tests/library
 def test_a_style_is_learnt_from_several_demonstrations(skills, tmp_path: Path) -> None:
     assert (skills("migrate")[0], skills("seed")[0]) == (0, 0)
     style = ("kestrel", "simple-interrupted")
@@ -337,6 +339,7 @@ def test_an_unreleased_version_gives_reason_remedy_and_exit_code(skills, tmp_pat
         assert "Traceback" not in said
 
 
+@pytest.mark.nightly  # by day tests/library
 def test_a_demo_with_hysteresis_reports_states_crossings_and_loss(skills, tmp_path: Path) -> None:
     bag = tmp_path / "plover.mcap"
     bag.write_bytes(next(s for s in sample_recordings() if s.surgeon == "plover").data)
@@ -656,6 +659,21 @@ def test_tab_in_a_shell_is_silent_whatever_is_wrong(wrong: dict[str, str], tmp_p
     given = {name: value.format(folder=tmp_path) for name, value in wrong.items()}
     (tmp_path / "no.sqlite").write_bytes(b"this is no database" * 100)
     assert completed("skills policy show k", **given) == ([], "")
+
+
+def test_tab_is_silent_if_a_library_is_still_at_work_when_time_is_up() -> None:
+    """The destructor of the thread's own data aborts, as a library in C++ does whose thread is made to exit."""
+    script = (
+        "import ctypes, time; from skills.cli import shell; shell.LIMIT_S = 0.1\n"
+        "def hangs():\n"
+        "    libc, key = ctypes.CDLL(None), ctypes.c_uint()\n"
+        "    libc.pthread_key_create(ctypes.byref(key), libc.abort)\n"
+        "    libc.pthread_setspecific(key, ctypes.c_void_p(1))\n"
+        "    while True: time.sleep(0.0001)\n"
+        "print(shell._in_time(hangs, ''))"
+    )
+    ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (0, "[]\n", "")
 
 
 def test_the_commands_know_every_learner_that_has_a_joining_rule() -> None:

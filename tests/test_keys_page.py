@@ -76,6 +76,7 @@ def test_what_cannot_be_done_says_so_and_exits_with_1(installation: Path):
     assert json.loads(skills("keys", "list", "--json")) == []
 
 
+@pytest.mark.nightly  # by day tests/api and tests/e2e show keys to a service
 def test_local_commands_need_no_key_and_send_theirs_to_a_server(installation: Path, monkeypatch: pytest.MonkeyPatch):
     made = json.loads(skills("keys", "create", "anna", "--role", "reader", "--json"))
     assert made["secret"].split("_")[1] == made["key"]

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.main import get_command
@@ -191,9 +192,14 @@ def test_every_link_of_a_page_leads_to_a_file_and_a_heading(page: Path) -> None:
         assert not anchor or anchor in anchors(to), f"{target}#{anchor}"
 
 
+@cache
+def commands() -> Any:
+    return get_command(app)
+
+
 def unknown_words(line: str) -> list[str]:
     """List the words of a command line that are no command or option, without those that are values."""
-    words, command = line.split(), get_command(app)
+    words, command = line.split(), commands()
     while hasattr(command, "commands"):
         if not words or words[0] not in command.commands:
             return words[:1] or [line]

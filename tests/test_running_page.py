@@ -101,7 +101,7 @@ def loaded(monkeypatch: pytest.MonkeyPatch) -> Callable[[Policy, str], Any]:
 
 @pytest.mark.parametrize(
     "rule",
-    [{}, {"phased": False}, {"join_share": 0.5}, {"join_share": 1.0}],
+    [{}, {"phased": False}, {"join_share": 0.5}, pytest.param({"join_share": 1.0}, marks=pytest.mark.nightly)],
     ids=["phase", "cell", "joining half", "joining the start"],
 )
 @pytest.mark.parametrize(("name", "form"), [*IN_JSON, *IN_OTHER_FORMS])
@@ -113,7 +113,7 @@ def test_the_runner_acts_as_the_service_in_every_state_and_phase(loaded, name, r
     assert runner.next(outside, 0) == (0, None, False)
 
 
-@pytest.mark.parametrize("form", ["live", "npz"])
+@pytest.mark.parametrize("form", [pytest.param("live", marks=pytest.mark.nightly), "npz"])
 @pytest.mark.parametrize("learner", LEARNERS, ids=["phase", "cell"])
 def test_the_runner_acts_as_the_service_on_a_recording(loaded, learner, form):
     policy = recorded(5.0, learner)

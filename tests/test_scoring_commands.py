@@ -60,6 +60,7 @@ def test_what_is_not_there_is_said(skills: Run, what: str) -> None:
     assert code == 1 and "There is no" in said, said
 
 
+@pytest.mark.nightly  # by day tests/library
 def test_a_folder_is_calibrated_on_and_used_by_the_next_score(skills: Run, tmp_path: Path) -> None:
     lab = rated.folder(tmp_path / "lab")
     code, said = skills("calibrate", str(lab), "--permutations", "39", "--json")

@@ -7,9 +7,11 @@ Completion proposes the existing surgeons and suture types. A shell waits for it
 short timeout and ignores all errors.
 """
 
+import atexit
 import errno
 import inspect
 import json
+import os
 import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -53,7 +55,15 @@ def _in_time(find: Callable[[], list[str]], incomplete: str) -> list[str]:
     thread = Thread(target=look, daemon=True)
     thread.start()
     thread.join(LIMIT_S)
+    atexit.register(_end_without, thread)
     return list(found)
+
+
+def _end_without(thread: Thread) -> None:
+    """End the process at once if a thread still runs: the interpreter's end kills it, within a library by abort()."""
+    if thread.is_alive():
+        sys.stdout.flush()
+        os._exit(0)
 
 
 def _surgeons() -> list[str]:

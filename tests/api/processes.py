@@ -1,4 +1,4 @@
-"""Several servers in separate processes on one database, without workers."""
+"""A server in a process of its own beside this one, on one database, without workers."""
 
 import socket
 import subprocess
@@ -19,23 +19,17 @@ PATIENCE_S = END_S
 
 
 @contextmanager
-def servers(url: str, number: int) -> Iterator[list[httpx.Client]]:
-    """Start servers as `skills serve` does, and yield a client of each once it responds."""
-    settings = [Settings(database_url=url, port=free_port(), workers=0) for _ in range(number)]
-    command = [sys.executable, "-m", "skills", "serve"]
-    started = [subprocess.Popen(command, env=environment(one)) for one in settings]
-    clients = [httpx.Client(base_url=f"http://127.0.0.1:{one.port}", timeout=PATIENCE_S) for one in settings]
+def server(url: str) -> Iterator[httpx.Client]:
+    """Start a server as `skills serve` does, and yield a client of it once it responds."""
+    settings = Settings(database_url=url, port=free_port(), workers=0)
+    process = subprocess.Popen([sys.executable, "-m", "skills", "serve"], env=environment(settings))
     try:
-        for one, process in zip(settings, started, strict=True):
-            wait_until_it_answers(one.port, process)
-        yield clients
+        wait_until_it_answers(settings.port, process)
+        with httpx.Client(base_url=f"http://127.0.0.1:{settings.port}", timeout=PATIENCE_S) as client:
+            yield client
     finally:
-        for client in clients:
-            client.close()
-        for process in started:
-            process.terminate()
-        for process in started:
-            process.wait(PATIENCE_S)
+        process.terminate()
+        process.wait(PATIENCE_S)
 
 
 def learn_two_versions(url: str) -> None:

@@ -121,6 +121,7 @@ def test_a_page_that_cannot_be_drawn_says_why(compared: Service, query: str, sai
     assert (answer.status_code, said in answer.text) == (404, True)
 
 
+@pytest.mark.nightly  # rarely breaks
 def test_more_than_can_be_seen_is_drawn_in_groups_that_hold_all_of_it():
     shapes = np.random.default_rng(3).normal(0, 1, (70, 2))
     far = np.abs(shapes[:, None] - shapes[None, :]).sum(axis=2)

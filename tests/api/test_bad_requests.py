@@ -95,8 +95,8 @@ SEGMENTS = (
 )
 
 
-# By day every fourth of the requests, which are other ones for each route or value.
-OF_ALL = pytest.mark.parametrize("of", [4, pytest.param(1, marks=pytest.mark.nightly)], ids=["a fourth", "all"])
+# By day every eighth of the requests, which are other ones for each route or value.
+OF_ALL = pytest.mark.parametrize("of", [8, pytest.param(1, marks=pytest.mark.nightly)], ids=["an eighth", "all"])
 
 
 def some(values: Iterable[Any], number: int, of: int) -> list[Any]:

@@ -76,16 +76,16 @@ def test_with_a_database_a_queue_and_a_worker_it_is_ready(house: House):
         refuse_left_over(house.settings)
 
 
-def test_a_signing_key_that_is_missing_or_unreadable_is_named(house: House, tmp_path: Path):
+def test_a_signing_key_that_is_missing_or_unreadable_is_named(installation: Settings, tmp_path: Path):
     key = tmp_path / "signing.key"
-    settings = house.settings.model_copy(update={"signing_key": key})
+    settings = installation.model_copy(update={"signing_key": key})
     for content, why in ((None, "is missing"), (b"PRIVATE", "not a signing key"), (b"\xff", "cannot be read")):
         if content is not None:
             key.write_bytes(content)
         with pytest.raises(NotReady, match=why):
             refuse_unready(settings)
-    key.write_text(house.settings.signing_key.read_text())
-    with serving(house.settings.database_url, signing_key=key) as service:
+    key.write_text(installation.signing_key.read_text())
+    with serving(installation.database_url, signing_key=key) as service:
         key.unlink()
         problem = assert_problem(service.http.get("/readyz"), 503, "not-ready")
     assert "signing.key is missing" in problem["detail"]

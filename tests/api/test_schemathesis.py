@@ -55,14 +55,20 @@ def service(request: pytest.FixtureRequest, label: str) -> Service:
     return found
 
 
-def known(service: Service) -> dict[str, Any]:
-    """Return one id of everything that exists without the simulator."""
-    demo = service.client.demos()[0]
-    plan = service.client.plan(**KESTREL, suture_points=[{"position_mm": GOAL_MM}], handoff="none")
-    job = service.http.get("/jobs?state=succeeded").json()["items"][0]  # the events of a waiting job never end
-    policy = service.client.policy(**KESTREL)
-    names = {"demo": demo["id"], "recording": demo["recording"], "plan": plan["id"], "job": job["id"]}
-    return {**KESTREL, **names, "policy": policy["sha256"], "version": 1}
+def known(service: Service, label: str) -> dict[str, Any]:
+    """Return the ids of existing objects that are in an operation's path, of those without the simulator."""
+    client, http = service.client, service.http
+    found = {
+        "surgeon": lambda: KESTREL["surgeon"],
+        "suture": lambda: KESTREL["suture"],
+        "demo": lambda: client.demos()[0]["id"],
+        "recording": lambda: client.demos()[0]["recording"],
+        "plan": lambda: client.plan(**KESTREL, suture_points=[{"position_mm": GOAL_MM}], handoff="none")["id"],
+        "job": lambda: http.get("/jobs?state=succeeded").json()["items"][0]["id"],  # a waiting job's events never end
+        "policy": lambda: client.policy(**KESTREL)["sha256"],
+        "version": lambda: 1,
+    }
+    return {name: find() for name, find in found.items() if f"{{{name}}}" in label}
 
 
 def sweep(service: Service, label: str, examples: int) -> int:
@@ -72,7 +78,7 @@ def sweep(service: Service, label: str, examples: int) -> int:
 
     operation, sent = operations()[label], 0
     judged_by = JUDGED_BY[1:] if label == "GET /readyz" else JUDGED_BY  # there is no worker, so 503 is correct
-    names = {name: value for name, value in known(service).items() if f"{{{name}}}" in label}
+    names = known(service, label)
     modes = (GenerationMode.POSITIVE, GenerationMode.NEGATIVE)
     parts = [{}, {"path_parameters": names}] if names else [{}]
     made_up = st.one_of(*(operation.as_strategy(generation_mode=mode, **part) for mode in modes for part in parts))

@@ -22,18 +22,18 @@ from skills.library import integrity
 from skills.library.catalogue import put_surgeon
 from skills.library.keys import create_key
 from tests import backends
-from tests.api.processes import learn_two_versions, servers
+from tests.api.processes import learn_two_versions, server
 from tests.api.service import CSV, KESTREL, POLICY, Service, assert_problem, serving
 from tests.library import cases
 from tests.waiting import until
 
 RELEASE = f"{POLICY}/release"
-BY_DAY_S, AT_NIGHT_S = 2.0, 10.0  # of changes and readers as fast as they can
+BY_DAY_S, AT_NIGHT_S = 1.0, 10.0  # of changes and readers as fast as they can
 
 
 @dataclass(frozen=True)
 class Pair:
-    """Two servers on one database, in which kestrel's style has two versions."""
+    """An application in this process and a server on one database, in which kestrel's style has two versions."""
 
     url: str
     one: httpx.Client
@@ -69,10 +69,10 @@ class Pair:
 
 @pytest.fixture(scope="module", params=backends.BACKENDS)
 def pair(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Pair]:
-    url = backends.fresh(request.param, tmp_path_factory.mktemp("pair"))
-    learn_two_versions(url)
-    with servers(url, 2) as (one, other):
-        yield Pair(url, one, other)
+    url = backends.copy_of("two_versions", learn_two_versions, request.param, tmp_path_factory.mktemp("pair"))
+    with serving(url) as service, server(url) as other:
+        seeing(service)
+        yield Pair(url, service.http, other)
     backends.drop(url)
 
 
@@ -201,8 +201,7 @@ def test_under_load_nothing_is_served_after_its_end_is_acknowledged(pair: Pair, 
 
 
 def test_a_service_serves_what_it_has_just_released_on_postgresql_too(tmp_path: Path):
-    url = backends.fresh("postgresql", tmp_path)
-    learn_two_versions(url)
+    url = backends.copy_of("two_versions", learn_two_versions, "postgresql", tmp_path)
     with serving(url) as service:
         seeing(service)
         for version in (2, 1) * 5:
@@ -215,8 +214,7 @@ def test_a_service_serves_what_it_has_just_released_on_postgresql_too(tmp_path: 
 
 @pytest.mark.parametrize("backend", backends.BACKENDS)
 def test_erased_policies_leave_all_processes_memory_without_a_request(backend: str, tmp_path: Path):
-    url = backends.fresh(backend, tmp_path)
-    learn_two_versions(url)
+    url = backends.copy_of("two_versions", learn_two_versions, backend, tmp_path)
     with serving(url) as service, serving(url) as other:
         seeing(service)
         sha256 = service.client.policy(**KESTREL)["sha256"]
@@ -406,8 +404,7 @@ def test_a_served_policy_is_counted_by_its_route_however_it_was_found(trained: S
 
 def test_whatever_changes_what_is_served_is_told_on_postgresql(tmp_path: Path):
     """Each change is made as another process would: this process sees its own commits without a notification."""
-    url = backends.fresh("postgresql", tmp_path)
-    learn_two_versions(url)
+    url = backends.copy_of("two_versions", learn_two_versions, "postgresql", tmp_path)
     with serving(url) as service, serving(url) as other:
         demo = other.client.demos()[0]["id"]
         seeing(service)

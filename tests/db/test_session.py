@@ -25,7 +25,7 @@ from skills.settings import Settings
 from tests import backends
 from tests.waiting import END_S, crowded
 
-THREADS, TIMES = 6, 50
+THREADS, TIMES = 6, 20
 
 
 def add_counter(database: Database) -> None:
@@ -38,7 +38,7 @@ def count(database: Database) -> int:
         return int(session.get_one(SutureType, "counter").name)
 
 
-def test_300_read_then_write_transactions_lose_nothing_and_never_fail(database: Database):
+def test_120_read_then_write_transactions_lose_nothing_and_never_fail(database: Database):
     add_counter(database)
 
     def work(_: int) -> None:

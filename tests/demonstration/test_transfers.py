@@ -190,6 +190,7 @@ def test_both_arms_of_a_session_are_givers():
 # ---- real trials ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.nightly  # by day synthetic sessions
 def test_a_real_trial_of_four_stitches_has_about_four_transfers_a_hand():
     """In Needle_Passing the needle goes through four rings: to the left hand in each, and back after each."""
     need("jigsaws")

@@ -1,63 +1,80 @@
-"""`make demo`: with one style, one suture point and no film by day, as a new user runs it at night."""
+"""`make demo`: one style in this process by day, as a new user runs it at night."""
 
 import os
 import re
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
 from skills import demo
+from skills.client import Client
+from skills.settings import Settings
+from skills.simulation import film
+from tests import backends
+from tests.api.service import serving
+from tests.library.cases import working
 
-AS_IT_IS = ["-m", "skills.demo"]
 SURGEONS = {"kestrel", "heron", "wren", "plover"}
 FEW = {"kestrel"}  # the shortest path
-SHORT = f"""
-from skills import demo
-every = demo.load_samples
-demo.load_samples = lambda client: [one for one in every(client) if one.surgeon in {FEW}][:1]
-demo.N_POINTS = 1
-demo.save_film = lambda *_: None
-raise SystemExit(demo.main())
-"""
 
 
 @pytest.mark.needs("simulator")
-@pytest.mark.parametrize(
-    ("how", "surgeons", "real"),
-    [
-        pytest.param(["-c", SHORT], FEW, False, id="short"),
-        pytest.param(AS_IT_IS, SURGEONS, False, marks=pytest.mark.nightly, id="as it is"),
-        pytest.param(
-            AS_IT_IS, SURGEONS, True, marks=[pytest.mark.nightly, pytest.mark.needs("recordings")], id="a recording"
-        ),
-    ],
-)
-def test_the_demo_does_the_main_job_and_exits_with_0(
-    tmp_path: Path, how: list[str], surgeons: set[str], real: bool
+def test_one_style_of_it_goes_all_the_way_in_this_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    every = demo.load_samples
+    monkeypatch.setattr(demo, "load_samples", lambda client: [one for one in every(client) if one.surgeon in FEW][:1])
+    monkeypatch.setattr(demo, "N_POINTS", 1)
+    monkeypatch.setattr(demo, "running_service", served_here)
+    monkeypatch.setattr(demo, "out", Console(highlight=False, width=160))
+    monkeypatch.setattr(film, "FRAMES", 4)
+    monkeypatch.setattr(film, "FRAMES_PER_PASS", 4)
+    monkeypatch.setenv("SKILLS_SAMPLE_RECORDINGS", "")
+    monkeypatch.chdir(tmp_path)
+    assert demo.main() == 0
+    agrees(capsys.readouterr().out, tmp_path / "build" / "demo", FEW, real=False)
+
+
+@contextmanager
+def served_here(folder: Path) -> Iterator[Client]:
+    """Serve in this process, and carry out the jobs in a thread."""
+    url = backends.place(folder / "skills.sqlite")
+    with serving(url) as service, working(Settings(database_url=url)):
+        yield Client(service.http)
+
+
+@pytest.mark.nightly
+@pytest.mark.needs("simulator")
+@pytest.mark.parametrize("real", [False, pytest.param(True, marks=pytest.mark.needs("recordings"))])
+def test_the_demo_does_the_main_job_and_exits_with_0(tmp_path: Path, real: bool) -> None:
     environment = (
         os.environ | {"COLUMNS": "160", "SKILLS_WORKERS": "1"} | ({} if real else {"SKILLS_SAMPLE_RECORDINGS": ""})
     )
-    ended = subprocess.run([sys.executable, *how], env=environment, cwd=tmp_path, capture_output=True)
+    ended = subprocess.run([sys.executable, "-m", "skills.demo"], env=environment, cwd=tmp_path, capture_output=True)
     printed = ended.stdout.decode()
     assert ended.returncode == 0, printed + ended.stderr.decode()
+    agrees(printed, tmp_path / "build" / "demo", SURGEONS, real)
+
+
+def agrees(printed: str, pictures: Path, surgeons: set[str], real: bool) -> None:
+    """Assert that the demo tells of every style, and that its pictures are there."""
     styles = re.findall(
         r"^ (\w+) [a-z-]+ +(\d+)/(\d+) +0 +[2-5]\d% +feasible, \d+ of 1000 worlds ", printed, re.MULTILINE
     )
     assert {surgeon for surgeon, _, _ in styles} == surgeons
     assert all(exact == states for _, exact, states in styles)
-    pictures = tmp_path / "build" / "demo"
     learnt = "333 of 333 states, DTW 0 mm, 57% of the demonstration from a start on average; released."
     assert (learnt if real else "No real recording:") in printed
     assert ("Played back at its own place: No hand-off: feasible in an exact simulation" in printed) == real
     assert len(list(pictures.glob("*-playback.png"))) >= len(styles)
     begins = {".png": b"\x89PNG", ".gif": b"GIF89a", ".mp4": b"\0\0\0"}
     assert all(picture.read_bytes().startswith(begins[picture.suffix]) for picture in pictures.iterdir())
-    if how is not AS_IT_IS:
-        return
     drawn = [
         f"kestrel-simple-running-{kind}" for kind in ("animation.mp4", "animation.gif", "joints.png", "clearance.png")
     ]

@@ -15,10 +15,12 @@ from skills.client import Client
 from skills.db.session import Database
 from skills.library.keys import create_key
 from skills.seeds.recordings import sample_recordings
+from skills.settings import Settings
 from tests.api.service import GOAL_MM
 from tests.e2e.browsers import Watched, browsing
 from tests.e2e.conftest import Service, running
 from tests.formats import written
+from tests.library.cases import working
 from tests.waiting import END_S
 
 SAMPLE = next(s for s in sample_recordings() if len(s.segments) > 1)
@@ -31,6 +33,14 @@ expect.set_options(timeout=1000 * END_S)
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
     with browsing() as started:
+        yield started
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
+    """Yield a service whose jobs a thread carries out."""
+    folder = tmp_path_factory.mktemp("service")
+    with running(folder, workers=0) as started, working(Settings(database_url=f"sqlite:///{started.database}")):
         yield started
 
 
@@ -237,6 +247,7 @@ def test_a_withdrawal_says_what_it_means_and_needs_a_yes(flat: Watched, client: 
     expect(page.locator(".lead").first).to_contain_text("version 1 is served to clients")
 
 
+@pytest.mark.nightly  # by day the calls behind the page are tested
 def test_an_outcome_is_marked_on_the_page_of_its_style(flat: Watched, client: Client) -> None:
     page, dialog = flat.page, flat.page.get_by_role("dialog")
     flat.open(f"/pages/styles/{STYLE}")
@@ -268,6 +279,7 @@ def test_an_erasure_waits_until_the_pseudonym_is_typed(tab: Watched, client: Cli
     expect(page.get_by_role("button", name=f"Erase {SAMPLE.surgeon}")).to_be_visible()
 
 
+@pytest.mark.nightly  # by day the calls behind the page are tested
 def test_a_batch_is_started_and_watched(tab: Watched) -> None:
     page = tab.page
     tab.open("/pages/jobs")
@@ -279,7 +291,7 @@ def test_a_batch_is_started_and_watched(tab: Watched) -> None:
     tab.shoot("batch")
 
 
-BY_DAY = "phone-dark"  # with one 3-D view
+BY_DAY = "phone-dark"  # without 3-D views, which take most of the time
 BY_NIGHT = [pytest.param(name, marks=pytest.mark.nightly) for name in ("desk-light", "desk-dark", "phone-light")]
 PAGES = {
     "style": f"/pages/styles/{STYLE}",
@@ -308,9 +320,8 @@ def test_every_page_fits_its_window_and_says_what_it_is_for(
     browser: Browser, url: str, pages: dict[str, str], name: str
 ) -> None:
     how = {"phone": "phone" in name, "dark": "dark" in name}
-    with visiting(browser, url, **how) as seen, visiting(browser, url, **how, view=name != BY_DAY) as flat:
+    with visiting(browser, url, **how, view=name != BY_DAY) as tab:
         for which, path in pages.items():
-            tab = seen if which in DRAWN else flat
             tab.open(path)
             if which in DRAWN:
                 expect(tab.page.locator(DRAWN[which])).to_have_attribute("data-drawn", "true")
@@ -319,6 +330,7 @@ def test_every_page_fits_its_window_and_says_what_it_is_for(
             tab.shoot(f"{name}-{which}")
 
 
+@pytest.mark.nightly  # by day each page is opened
 def test_light_or_dark_is_chosen_and_stays(tab: Watched) -> None:
     ground = "getComputedStyle(document.body).backgroundColor"
     tab.open("/pages/jobs")
@@ -345,7 +357,8 @@ def test_everything_is_reached_with_the_keyboard_and_the_focus_is_seen(tab: Watc
     assert any("released" in one for one in reached)
 
 
-@pytest.mark.parametrize("name", ["desk-light", pytest.param("phone-dark", marks=pytest.mark.nightly)])
+@pytest.mark.nightly  # by day tests/api reads the page
+@pytest.mark.parametrize("name", ["desk-light", "phone-dark"])
 def test_a_demonstration_is_scored_from_the_page_of_its_style(browser: Browser, url: str, name: str) -> None:
     with visiting(browser, url, phone="phone" in name, dark="dark" in name, view=False) as tab:
         tab.open(f"/pages/styles/{STYLE}")

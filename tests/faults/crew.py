@@ -7,7 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from threading import Event, Lock, Thread
@@ -15,8 +15,6 @@ from typing import Any
 
 import httpx2 as httpx
 
-from skills.db.session import Database
-from skills.library.backup import back_up
 from skills.packing import sha256
 from tests.faults.ledger import Ledger, Read
 from tests.library import cases
@@ -42,9 +40,7 @@ def large(number: int) -> bytes:
 class Crew:
     """All clients of a run; what they ask and are told is in `ledger`."""
 
-    def __init__(
-        self, urls: Sequence[str], backups: Path, environment: Mapping[str, str], seed: int, training: bool = True
-    ) -> None:
+    def __init__(self, urls: Sequence[str], backups: Path, environment: Mapping[str, str], seed: int) -> None:
         """Create the clients.
 
         Args:
@@ -52,21 +48,15 @@ class Crew:
             backups: The folder for backups.
             environment: The environment of `skills backup`.
             seed: Seed of the choices.
-            training: Whether there is a worker; otherwise one version of the first style, the only one, is released and
-                withdrawn in turn, and backups are taken in this process, which takes a tenth of the time.
         """
         self.ledger = Ledger()
         self.broken: list[Exception] = []
         self._urls, self._backups, self._environment = urls, backups, dict(environment)
         self._over, self._serial, self._lock, self._seed = Event(), 0, Lock(), seed
-        self._training = training
         doing: list[Callable[[httpx.Client], None]] = [self._upload, self._upload]
-        if training:
-            doing += [self._learner(style, random.Random(f"{seed} {style}")) for style in STYLES]
-            doing += [partial(self._look, style=style) for style in STYLES]
-            doing += [self._upload_large, self._back_up, self._ask_ready]
-        else:
-            doing += [self._release_again, partial(self._look, style=STYLES[0]), self._back_up]
+        doing += [self._learner(style, random.Random(f"{seed} {style}")) for style in STYLES]
+        doing += [partial(self._look, style=style) for style in STYLES]
+        doing += [self._upload_large, self._back_up, self._ask_ready]
         self._threads = [Thread(target=self._live, args=(do, place)) for place, do in enumerate(doing)]
 
     @contextmanager
@@ -236,16 +226,6 @@ class Crew:
         if answer is not None:
             self.ledger.acknowledge(asked, style)
 
-    def _release_again(self, http: httpx.Client) -> None:
-        """Release the version that is there already, and withdraw it."""
-        path = f"/policies/{STYLES[0]}/{cases.SUTURE}/versions"
-        answer = self._until_done(http, "GET", path, f"{POLICY}/versions")
-        if answer is not None:
-            (one,) = answer.json()["items"]
-            self._release(http, STYLES[0], one["version"], one["sha256"])
-            self._over.wait(0.1)
-            self._withdraw(http, STYLES[0])
-
     def _look(self, http: httpx.Client, style: str) -> None:
         """Read what a style serves."""
         began_s = time.monotonic()
@@ -276,14 +256,14 @@ class Crew:
         """Write a backup with the command, and keep the newest three."""
         file = self._backups / f"{self._new()}.zip"
         asked = self.ledger.ask("backup", file.name)
-        said = self._command(file) if self._training else self._call(file)
+        said = self._command(file)
         if said is None:
             self.ledger.acknowledge(asked, file.name)
             for old in sorted(self._backups.glob("*.zip"), key=lambda one: one.stat().st_mtime)[:-3]:
                 old.unlink()
         else:
             self.ledger.refuse(f"skills backup: {said}")
-        self._over.wait(2.5 if self._training else 0.5)
+        self._over.wait(2.5)
 
     def _command(self, file: Path) -> str | None:
         """Write a backup with the command; return the reason why not, None if it was written."""
@@ -291,9 +271,3 @@ class Crew:
         done = subprocess.run(command, env=self._environment | {"PYTHONPATH": os.getcwd()}, capture_output=True)
         words = " ".join(done.stderr.decode(errors="replace").split())
         return f"exit {done.returncode}, {words[-110:]}" if done.returncode else None
-
-    def _call(self, file: Path) -> str | None:
-        """Write a backup in this process, whose disk and clock are right."""
-        with closing(Database(self._environment["SKILLS_DATABASE_URL"])) as database:
-            back_up(database, file)
-        return None

@@ -28,7 +28,7 @@ from tests.library.styles import add_styles, ask_retraining, damage, look, parts
 from tests.waiting import until
 
 SLOW = CellQLearning(episodes=60_000)  # some 50 ms of learning, so that a test can act midway
-STYLES = 24
+STYLES = 16
 STOPPED_S = 2.0  # the other workers' transactions end within that time, or the stop is tried again
 
 

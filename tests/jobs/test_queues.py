@@ -31,6 +31,7 @@ def test_a_person_who_waits_comes_before_a_batch_that_was_there_first(house: Hou
     assert all(house.ended(row).state == "succeeded" for row in parts)
 
 
+@pytest.mark.nightly  # slow if it fails, not wrong
 def test_pictures_are_drawn_one_after_the_other_and_hold_up_nothing(house: House, held: Path):
     pictures = [house.ask("pictures", held_by=str(held)) for _ in range(3)]
     house.begun(pictures[0])

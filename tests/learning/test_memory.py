@@ -18,12 +18,13 @@ def cost(waypoints: int) -> Cost:
     return measured(SIDE, waypoints)
 
 
+@pytest.mark.nightly  # 2 s
 def test_400_waypoints_at_1_mm_are_learnt_and_certified_within_1_gib():
     assert cost(400).certified
     assert cost(400).certificate_mib < GIB
 
 
-@pytest.mark.nightly  # by day the larger one stays within 1 GiB
+@pytest.mark.nightly
 def test_300_more_waypoints_need_far_less_than_one_number_per_cell_each():
     more_mib = cost(400).certificate_mib - cost(100).certificate_mib
     assert more_mib < 300 * SIDE**3 * 8 / 2**20 / 4  # 8 bytes each would be 304 MiB

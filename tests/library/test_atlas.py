@@ -96,6 +96,7 @@ def test_eight_surgeons_in_five_sessions_are_recognised_and_told_apart(database:
     assert any("Set-up and day" in note for note in found.notes)
 
 
+@pytest.mark.nightly  # by day tests/comparison has it
 def test_with_labels_shuffled_recognition_falls_to_chance(database: Database):
     drawn = cohort(1)
     cohorts.add_cohort(database, drawn, whose=np.random.default_rng(5).permutation(drawn.surgeons))

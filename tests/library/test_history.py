@@ -197,7 +197,7 @@ def _edits_at_random(full: Database, seed: int, count: int) -> None:
 
 
 def test_random_edits_are_found_and_named(full: Database):
-    _edits_at_random(full, 7, 30 if full.engine.dialect.name == "sqlite" else 10)
+    _edits_at_random(full, 7, 12 if full.engine.dialect.name == "sqlite" else 4)
 
 
 @pytest.mark.nightly

@@ -66,6 +66,7 @@ def refusal(database: Database, playback: StoredPlayback) -> str:
     return str(caught.value)
 
 
+@pytest.mark.nightly  # by day tests/api draws them
 @pytest.mark.needs("simulator")
 def test_pictures_are_drawn_and_stored_once_however_often_that_is_tried(
     database: Database, playback: StoredPlayback, monkeypatch: pytest.MonkeyPatch

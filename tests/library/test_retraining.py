@@ -121,7 +121,9 @@ def test_only_stale_styles_are_trained_and_each_says_why(database: Database, mon
 # ---- cancelling and erasing
 
 
-@pytest.mark.parametrize(("together", "begun", "kept"), [(1, 3, 2), (2, 4, 2), (5, 4, 0)])
+@pytest.mark.parametrize(
+    ("together", "begun", "kept"), [pytest.param(1, 3, 2, marks=pytest.mark.nightly), (2, 4, 2), (5, 4, 0)]
+)
 def test_a_cancelled_batch_stops_at_its_next_commit_and_drops_late_results(
     database: Database, monkeypatch: pytest.MonkeyPatch, together: int, begun: int, kept: int
 ):

@@ -131,6 +131,7 @@ def test_the_first_sample_that_fails_is_marked_in_every_panel_and_said():
         assert "Feasible in an exact simulation." in draw(ALONE, measured(ALONE), FEASIBLE).get_suptitle()
 
 
+@pytest.mark.nightly  # rarely breaks
 def test_the_same_playback_gives_the_same_picture_and_nothing_is_cut_off():
     motion = both_arms()
     report = FEASIBLE | {"failure": {"sample": 500}, "failure_in_words": "Pass 1 ..."}

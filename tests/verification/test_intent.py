@@ -632,8 +632,8 @@ def near_a_limit(trajectory: Trajectory) -> bool:
 
 def test_no_sound_plan_is_refused():
     """A slice of the nightly test below."""
-    plans = [one for one in sound_plans(seed=3, count=8) if passes_all_else(one)]
-    assert len(plans) >= 5
+    plans = [one for one in sound_plans(seed=3, count=4) if passes_all_else(one)]
+    assert len(plans) >= 2
     assert [refused(one) for one in plans] == [None] * len(plans)
 
 

@@ -77,8 +77,8 @@ def compared(plans: int, variations: int, tried: int) -> tuple[list[float], int]
 
 
 def test_a_few_plans_succeed_as_often_as_in_independent_worlds():
-    found, agree = compared(plans=4, variations=1000, tried=80)
-    assert agree >= 3, found  # the intervals hold 95 %
+    found, agree = compared(plans=2, variations=500, tried=80)
+    assert agree == 2, found  # the intervals hold 95 %, and the seeds are always the same
 
 
 @pytest.mark.nightly
