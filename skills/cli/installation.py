@@ -201,6 +201,13 @@ def verify(
         str | None,
         typer.Option(help=KEY),
     ] = None,
+    relearn: Annotated[
+        bool,
+        typer.Option("--relearn", help="Cut and learn every policy again, from its recordings, settings and seed."),
+    ] = False,
+    limit: Annotated[
+        int | None, typer.Option(help="Of --relearn: at most this number of policies, drawn at random.", min=1)
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Check every digest, reference and leaf of the history of this installation, or one replay bag.
@@ -215,7 +222,7 @@ def verify(
         return
     from skills.db.session import Database
     from skills.library.history import keep_signed
-    from skills.library.inspection import Checked, inspect_installation
+    from skills.library.inspection import inspect_installation
     from skills.library.recordings import confined_reader
     from skills.settings import settings
     from skills.transparency import read_notes
@@ -231,20 +238,44 @@ def verify(
             head = head or (kept if kept is not None and kept.exists() else None)
             heads = [] if head is None else read_notes(head.read_text())
         keep_signed(database, settings().checkpoints)
-        for part in inspect_installation(database, reader.tell, decode_all=decode_all, heads=heads):
+        for part in inspect_installation(
+            database,
+            reader.tell,
+            decode_all=decode_all,
+            heads=heads,
+            relearn=settings() if relearn else None,
+            limit=limit,
+        ):
             found[part.what] = part
-            told(f"{part.what} {part.count or ''}")
+            told(f"{part.what} {part.count or ''}{'' if part.of is None else f' of {part.of}'}")
     wrong = [one for part in found.values() for one in part.wrong]
+    left_out = [one for part in found.values() for one in part.left_out]
     if as_json:
-        counts = {part.what: {"checked": part.count, "wrong": len(part.wrong)} for part in found.values()}
-        print_json({"checked": counts, "wrong": [{"what": what, "why": why} for what, why in wrong]})
+        counts = {
+            part.what: {"checked": part.count, "wrong": len(part.wrong), "left_out": len(part.left_out)}
+            for part in found.values()
+        }
+        lists = {"wrong": wrong, "left_out": left_out}
+        named = {name: [{"what": what, "why": why} for what, why in some] for name, some in lists.items()}
+        print_json({"checked": counts} | named)
     else:
         for part in found.values():
-            out.print(f"{part.what:20} {part.count:>10} {f'{len(part.wrong)} WRONG' if part.wrong else 'whole'}")
+            out.print(f"{part.what:23} {part.count:>10} {state_of(part)}")
+        for what, why in left_out:
+            out.print(f"{what}: {why}", markup=False, soft_wrap=True)
         for what, why in wrong:
             err.print(f"{what}: {why}", style="red", markup=False, soft_wrap=True)
     if wrong:
         raise typer.Exit(1)
+
+
+def state_of(part: "Checked") -> str:
+    """Return the result of a part in words; nothing is called whole that was left out."""
+    if part.wrong:
+        return f"{len(part.wrong)} WRONG"
+    if not part.left_out:
+        return "whole"
+    return f"{part.count - len(part.left_out)} whole, {len(part.left_out)} not compared"
 
 
 @commands.command("public-key")
@@ -312,6 +343,7 @@ def _telling(doing: str) -> Iterator[Callable[[str], None]]:
 
 if TYPE_CHECKING:
     from skills.db.session import Database
+    from skills.library.inspection import Checked
 
 key_commands = typer.Typer()
 keys = typer.Typer(no_args_is_help=True, help="Keys: callers and their roles.")

@@ -4,12 +4,13 @@
 
 Tables and their packed values are taken from the models, so a new table is checked without being named here. The input
 of a row's digest differs from table to table: `AGREES` has a check for each. Cached contents of recordings are compared
-with their bytes, decoded again. Rows are named by table and number, never by a pseudonym. Nothing is changed, and
-transactions are short, so that other users are not blocked.
+with their bytes, decoded again; policies with their certificates, computed again, and on request with themselves,
+learnt again (`skills.library.relearning`). Rows are named by table and number, never by a pseudonym. Nothing is
+changed, and transactions are short, so that other users are not blocked.
 """
 
 import hashlib
-import tempfile
+import secrets
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -39,7 +40,7 @@ from skills.db.models import (
 from skills.db.packed import Packed, digest
 from skills.db.service_tables import DatasetChunk, ErasedSurgeon, Job, StoredDataset
 from skills.db.session import Database, revision_of, revisions
-from skills.errors import Busy, Corrupt, SkillsError
+from skills.errors import Busy, Corrupt, NotFound, SkillsError
 from skills.formats.reader_process import READER_VERSION, read_told
 from skills.gridworld.reward import sparse_reward
 from skills.library.calibrations import read_calibration
@@ -49,7 +50,9 @@ from skills.library.jobs import identity_of
 from skills.library.policies import path_of
 from skills.library.pose_styles import poses_of_demonstrations
 from skills.library.recordings import Teller, alike, cached_content, read_entry, recording_bytes
+from skills.library.relearning import Again, Recordings, compute_again, decoded, learn_again
 from skills.packing import canonical, sha256
+from skills.settings import Settings
 from skills.transparency import Note
 
 ROWS_AT_ONCE = 100
@@ -67,10 +70,18 @@ class Checked:
     what: str
     count: int = 0
     wrong: list[tuple[str, str]] = field(default_factory=list)
+    left_out: list[tuple[str, str]] = field(default_factory=list)  # not, or not wholly, compared, each with the reason
+    of: int | None = None  # the number of items that will be checked, where it is known before
 
 
 def inspect_installation(
-    database: Database, tell: Teller = read_told, *, decode_all: bool = False, heads: Sequence[Note] = ()
+    database: Database,
+    tell: Teller = read_told,
+    *,
+    decode_all: bool = False,
+    heads: Sequence[Note] = (),
+    relearn: Settings | None = None,
+    limit: int | None = None,
 ) -> Iterator[Checked]:
     """Check everything that is stored, part by part.
 
@@ -79,6 +90,8 @@ def inspect_installation(
         tell: The reader of recordings, possibly in another process.
         decode_all: Decode every recording whose content is cached, and not only the newest.
         heads: Signed heads of the history that were kept elsewhere.
+        relearn: The limits of time and memory with which every policy is learnt again; None: none is.
+        limit: Learn at most this number of policies again, drawn at random each time; None: all.
 
     Yields:
         Each part at its start, during its progress, and at its end.
@@ -96,6 +109,7 @@ def inspect_installation(
         if mapper.class_ not in WITH_OTHERS:
             yield from _rows(database, mapper)
     yield from _decoded_again(database, tell, decode_all)
+    yield from inspect_policies(database, tell, relearn, limit)
 
 
 def _at_once(what: str, look: Callable[[Session, Checked], None], database: Database) -> Iterator[Checked]:
@@ -269,26 +283,76 @@ def _decoded_again(database: Database, tell: Teller, every: bool) -> Iterator[Ch
 
 def _decoded_otherwise(database: Database, row: int, tell: Teller) -> Why:
     """Yield the fault of a cached content: it differs from the recording's bytes. Damaged ones are found before."""
-    with tempfile.TemporaryFile() as file:
-        with database.reading() as session:
-            stored = session.get(StoredRecording, row)
-            kept = None if stored is None else cached_content(session, stored)
-            if stored is None or kept is None:  # erased or replaced since, or damaged
-                return
-            try:
-                file.writelines(recording_bytes(session, stored))
-            except Corrupt:  # reported with the recording
-                return
-        try:
-            again = tell(file, **stored.reading)
-        except Busy:
-            raise
-        except SkillsError as error:
-            yield f"its content is cached, but it cannot be decoded again: {error.words()}"
-            return
+    with database.reading() as session:
+        stored = session.get(StoredRecording, row)
+        kept = None if stored is None else cached_content(session, stored)
+    if kept is None:  # erased or replaced since, or damaged
+        return
+    try:
+        again = decoded(database, row, tell)
+    except Busy:
+        raise
+    except (Corrupt, NotFound):  # damaged bytes are reported with the recording; it was erased since
+        return
+    except SkillsError as error:
+        yield f"its content is cached, but it cannot be decoded again: {error.words()}"
+        return
     parts = ("recording", "proposed", "identifications", "bases")
     if not all(alike(getattr(kept, part), getattr(again, part)) for part in parts):
         yield "its cached content differs from its bytes; delete its row of parsed_recordings, which is written again"
+
+
+# ---- policies computed and learnt again ------------------------------------------------------------------------------
+
+
+def inspect_policies(
+    database: Database, tell: Teller, relearn: Settings | None, limit: int | None = None
+) -> Iterator[Checked]:
+    """Learn policies again if wanted, and compute the certificates of the others again; see `inspect_installation`."""
+    done: set[int] = set()
+    if relearn is not None:
+        learn = partial(learn_again, database, recordings=Recordings(database, tell), settings=relearn)
+        yield from _again(database, Checked("policies learnt again"), limit, learn, done)
+    yield from _again(database, Checked("certificates"), None, partial(compute_again, database), done)
+
+
+def _again(
+    database: Database, checked: Checked, limit: int | None, compare: Callable[[int], Again], done: set[int]
+) -> Iterator[Checked]:
+    """Compute policy versions again that are not done yet, and compare each with what is stored."""
+    yield checked
+    try:
+        with database.reading() as session:
+            every = session.scalars(select(PolicyVersion.row).order_by(PolicyVersion.row))
+            rows = [row for row in every if row not in done]
+        if limit is not None and limit < len(rows):
+            rows = sorted(secrets.SystemRandom().sample(rows, limit))
+        checked.of = len(rows)
+        for row in rows:
+            name = f"{PolicyVersion.__tablename__} {row}"
+            try:
+                found = compare(row)
+            except Busy:
+                raise
+            except (Corrupt, NotFound):  # reported with the row; erased since
+                pass
+            except Exception as error:
+                checked.wrong.append((name, _in_words(error)))
+            else:
+                if found.left_out is None:
+                    done.add(row)
+                else:
+                    checked.left_out.append((name, found.left_out))
+                if found.differing:
+                    differing = ", ".join(found.differing)
+                    checked.wrong.append((name, f"computed again, it has other results: {differing}"))
+            checked.count += 1
+            yield checked
+    except Busy:
+        raise
+    except Exception as error:  # such as a schema without policies
+        checked.wrong.append((checked.what, _in_words(error)))
+    yield checked
 
 
 # ---- the input of each digest, and values that must agree --------------------------------------------------------

@@ -1,0 +1,191 @@
+"""`skills verify --relearn`: certificates and policies computed again agree, and consistent changes are named."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from sqlalchemy import text, update
+
+from skills.cli.installation import state_of
+from skills.comparison.combining import Corridor
+from skills.db.models import Demonstration, PolicyVersion
+from skills.db.session import Database
+from skills.formats.reader_process import read_told
+from skills.learning.dynamic_programming import ValueIteration
+from skills.learning.policy import LEARNER_VERSION
+from skills.learning.q_learning import PhaseQLearning
+from skills.library.catalogue import put_surgeon
+from skills.library.demos import mark_demo
+from skills.library.inspection import Checked, inspect_policies
+from skills.library.integrity import demo_identity, policy_identity
+from skills.library.training import GATE_VERSION, certified, lessons
+from skills.settings import Settings
+from tests import backends
+from tests.library import cases
+from tests.library.attacks import tampering
+from tests.library.test_scenes import SCENE, SLIPPING
+
+CERTIFICATES, RELEARNT = "certificates", "policies learnt again"
+RELEARN = Settings(learning_timeout_s=60.0)
+
+
+@pytest.fixture(scope="module")
+def filled(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a database with a version of each way to learn, in which nothing is wrong."""
+    folder = tmp_path_factory.mktemp("filled")
+    database = Database(backends.fresh("sqlite", folder))
+    cases.add_surgeon(database)
+    bag = cases.upload(cases.bag("PSM1", "PSM2"), "application/vnd.mcap")
+    demos = [
+        cases.store(database, bag, arm="PSM2"),
+        *(cases.add_demo(database, cases.hand_off((shift, 0.0, 0.0)), hysteresis=0.1) for shift in (0.4, 0.9)),
+    ]
+    two = {"demos": [one.sha256 for one in demos[1:]]}
+    cases.train(database, demos=[demos[0].sha256], release=True)
+    cases.train(database, seed=2**40 + 1, learner=PhaseQLearning(join_share=0.5))
+    cases.train(database, learner=cases.PUBLISHED)
+    cases.train(database, scene=SCENE.as_json(), learner=SLIPPING)
+    cases.train(database, learner=ValueIteration(), combine=Corridor(), **two)
+    with database.writing() as session:
+        mark_demo(session, demos[1].sha256, "recovery", None, "test")
+    cases.train(database, outcomes="any", combine=Corridor(), **two)
+    with database.writing() as session:  # not as when it was learnt from
+        mark_demo(session, demos[2].sha256, "failure", None, "test")
+    database.close()
+    return Path(database.url.removeprefix("sqlite:///"))
+
+
+@pytest.fixture
+def database(filled: Path, tmp_path: Path) -> Iterator[Database]:
+    """Yield a copy of that database."""
+    copy = tmp_path / "copy.sqlite"
+    copy.write_bytes(filled.read_bytes())
+    database = Database(f"sqlite:///{copy}")
+    yield database
+    database.close()
+
+
+def parts(database: Database, **how: Any) -> dict[str, Checked]:
+    """Return the parts, as they are at the end."""
+    return {part.what: part for part in inspect_policies(database, read_told, **({"relearn": RELEARN} | how))}
+
+
+def test_versions_of_every_kind_are_learnt_again_as_they_are(database):
+    assert {name: vars(part) for name, part in parts(database).items()} == {
+        RELEARNT: vars(Checked(RELEARNT, count=6, of=6)),
+        CERTIFICATES: vars(Checked(CERTIFICATES, count=0, of=0)),  # of those that were not learnt again
+    }
+
+
+def test_without_being_asked_nothing_is_learnt_again(database):
+    assert {name: vars(part) for name, part in parts(database, relearn=None).items()} == {
+        CERTIFICATES: vars(Checked(CERTIFICATES, count=6, of=6)),
+    }
+
+
+def test_with_a_limit_some_are_learnt_again_and_the_others_certified(database):
+    found = parts(database, limit=2)
+    assert {name: (part.count, part.wrong) for name, part in found.items()} == {
+        RELEARNT: (2, []),
+        CERTIFICATES: (4, []),
+    }
+
+
+def rewritten(database: Database, row: int, policy: Any, manifest: dict[str, Any]) -> None:
+    """Write a policy and a manifest with the digest of both, past the triggers."""
+    value = {"learnt": policy, "manifest": manifest, "sha256": policy_identity(manifest, policy)}
+    with tampering(database) as connection:
+        connection.execute(update(PolicyVersion).where(PolicyVersion.row == row).values(**value))
+        connection.commit()
+
+
+def test_a_certificate_with_better_figures_and_its_digest_is_named(database):
+    with database.reading() as session:
+        version = session.get_one(PolicyVersion, 2)
+        policy, manifest = version.learnt, version.manifest
+    metrics = manifest["metrics"] | dict.fromkeys(manifest["metrics"], 0.0)
+    rewritten(database, 2, policy, manifest | {"metrics": metrics})
+    for how in (RELEARN, None):
+        ((name, why),) = [one for part in parts(database, relearn=how).values() for one in part.wrong]
+        assert name == "policy_versions 2"
+        assert "metrics." in why
+        assert "values" not in why
+
+
+def test_other_actions_with_certificate_and_digests_are_named(database):
+    """The forged policy is certified by the service's own code, so only learning again can find it."""
+    with database.reading() as session:
+        version = session.get_one(PolicyVersion, 1)
+        (lesson,) = lessons(session, [version.demonstration_row])
+        policy, manifest = version.learnt, version.manifest
+        demo = version.demonstrations[0].demo
+    q = policy.q.copy()
+    q[policy.domain.certified] *= 1.0 + 1e-12
+    forged = replace(policy, q=q)
+    made = certified(lesson, {**_request(manifest), "release": False}, demo, forged)
+    rewritten(database, 1, forged, made.manifest)
+    with tampering(database) as connection:
+        connection.execute(
+            text("UPDATE policy_versions SET covered = :covered WHERE row = 1"), {"covered": made.coverage}
+        )
+        connection.commit()
+    assert parts(database, relearn=None)[CERTIFICATES].wrong == []
+    ((name, why),) = parts(database)[RELEARNT].wrong
+    assert name == "policy_versions 1"
+    assert why.startswith("computed again, it has other results: its values")
+
+
+def _request(manifest: dict[str, Any]) -> dict[str, Any]:
+    names = ("surgeon", "suture", "demos", "seed", "learner_version")
+    return {name: manifest[name] for name in names} | {"gate": GATE_VERSION}
+
+
+def test_a_demonstration_other_than_its_recording_is_named(database):
+    """Moved by a micrometre, which changes no cell, with the digest of its stored form."""
+    with database.reading() as session:
+        row = session.get_one(Demonstration, 1)
+        demo = replace(row.demo, tip_mm=row.demo.tip_mm + 1e-3)
+        assert demo_identity(row.recording.sha256, row.surgeon.slug, row.suture, demo, row.path) == row.sha256
+    with tampering(database) as connection:
+        connection.execute(update(Demonstration).where(Demonstration.row == 1).values(demo=demo))
+        connection.commit()
+    assert f"its demonstration {row.sha256[:12]}, cut out of its recording again" in str(
+        parts(database)[RELEARNT].wrong
+    )
+
+
+def test_a_version_of_an_older_learner_is_never_called_whole(database):
+    with database.reading() as session:
+        version = session.get_one(PolicyVersion, 1)
+        policy, manifest = version.learnt, version.manifest | {"learner_version": LEARNER_VERSION - 1}
+    rewritten(database, 1, policy, manifest)
+    made = f"made by an older learner (version {LEARNER_VERSION - 1}, now {LEARNER_VERSION})"
+    found = parts(database)
+    assert found[CERTIFICATES].left_out == [("policy_versions 1", f"{made}, its certificate was not computed again")]
+    assert found[RELEARNT].left_out == [("policy_versions 1", f"{made}, not learnt again")]
+    assert state_of(found[RELEARNT]) == "5 whole, 1 not compared"
+
+
+def test_of_an_older_gate_only_the_values_are_compared(database):
+    with database.reading() as session:
+        version = session.get_one(PolicyVersion, 1)
+        policy, manifest = version.learnt, version.manifest
+    certificate = {name: value for name, value in manifest["grid_certificate"].items() if name not in ("gate", "near")}
+    rewritten(database, 1, policy, manifest | {"grid_certificate": certificate})
+    part = parts(database)[RELEARNT]
+    assert part.wrong == []
+    ((_, why),) = part.left_out
+    assert why.endswith("only its values were compared")
+    rewritten(database, 1, replace(policy, q=policy.q * 2.0), manifest | {"grid_certificate": certificate})
+    assert "its values" in str(parts(database)[RELEARNT].wrong)
+
+
+def test_without_consent_nothing_is_learnt_again(database):
+    with database.writing() as session:
+        put_surgeon(session, "kestrel", {"consent": {"uses": []}}, "test")
+    part = parts(database)[RELEARNT]
+    assert part.wrong == []
+    assert len(part.left_out) == 6
+    assert "does not cover training" in part.left_out[0][1]
