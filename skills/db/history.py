@@ -35,12 +35,10 @@ from sqlalchemy import (
     LargeBinary,
     String,
     Table,
-    bindparam,
     insert,
     inspect,
     select,
     text,
-    update,
 )
 from sqlalchemy.orm import Mapped, mapped_column
 
@@ -602,14 +600,24 @@ def new_leaf(
     }  # fmt: skip
 
 
+_BLANKING = {
+    "sqlite": "UPDATE history SET salt = NULL, digests = NULL, key = NULL WHERE table_name = ? "
+    "AND key IN (SELECT value FROM json_each(?))",
+    "postgresql": "UPDATE history SET salt = NULL, digests = NULL, key = NULL WHERE table_name = %s "
+    "AND key = ANY(%s::text[])",
+}
+
+
 def removals(
     connection: Connection, table: str, keys: Sequence[str], latest: Mapping[str, Latest], at: str | None
 ) -> Iterator[dict[str, Any]]:
     """Yield a leaf for each removed row, and remove what the row's earlier leaves reveal about it."""
     known = [key for key in keys if key in latest]
-    if known:
-        empty = {"salt": None, "digests": None, "key": None}
-        blank = update(LEAVES).where(LEAVES.c.table_name == table, LEAVES.c.key == bindparam("of_key")).values(**empty)
-        connection.execute(blank, [{"of_key": key} for key in known])
+    if not known:
+        return
+    if connection.dialect.name == "sqlite":
+        connection.exec_driver_sql(_BLANKING["sqlite"], (table, json.dumps(known)))
+    else:
+        connection.exec_driver_sql(_BLANKING["postgresql"], (table, known))
     for key in known:
         yield new_leaf(table, REMOVE, at, None, None, latest[key])

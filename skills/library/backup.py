@@ -15,8 +15,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from datetime import datetime
-from itertools import pairwise
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import IO, Any, TypeVar
 
@@ -52,12 +51,13 @@ ENDS = {
     ("withdraw", "policy-version"): "releases",
     ("revoke", "key"): "keys",
 }
+RELEASED = ("release", "policy-version")
 MARKED = {(action, "demonstration"): outcome for outcome, action in MARKS.items()}
 LISTED = (
     *ENDS,
     *MARKED,
     ("erase", "surgeon"),
-    ("release", "policy-version"),
+    RELEASED,
     ("add", "surgeon"),
     ("change", "surgeon"),
 )
@@ -292,46 +292,45 @@ def _written(ended: Mapping[str, datetime]) -> dict[str, str | None]:
 
 
 def _listed(session: Session) -> Erasures:
+    """Return the list of an installation, with moments in the order of its events (`_in_order`)."""
     surgeons = {(one.salt, one.digest, one.erased_at) for one in session.scalars(select(Erasure))}
     ended: dict[str, dict[str, datetime]] = {kind: {} for kind in ENDS.values()}
-    kind_of = tuple_(Event.action, Event.object_kind)
-    events = select(Event.action, Event.object_kind, Event.object_id, func.max(Event.at)).where(kind_of.in_(ENDS))
-    for action, kind, name, at in session.execute(events.group_by(Event.action, Event.object_kind, Event.object_id)):
-        ended[ENDS[action, kind]][name] = at
-    ended["releases"] = _latest(ended["releases"], _superseded(session))
-    return Erasures(frozenset(surgeons), ended, _consents(session), _outcomes(session))
+    outcomes: dict[str, tuple[datetime, DemoOutcome]] = {}
+    stated: dict[str | None, datetime] = {}
+    released: dict[tuple[int, str], str] = {}  # by style, the policy of the last release
+    query = select(PolicyVersion.sha256, PolicyVersion.surgeon_row, PolicyVersion.suture)
+    styles = {sha256: (surgeon_row, suture) for sha256, surgeon_row, suture in session.execute(query)}
+    for event, at in _in_order(session):
+        kind, name = (event.action, event.object_kind), event.object_id
+        if kind in ENDS:
+            ended[ENDS[kind]][name] = at
+        elif kind in MARKED:  # of an erased demonstration too: it may have been added anew since
+            outcomes[name] = at, MARKED[kind]
+        elif kind == RELEASED and name in styles:
+            before = released.get(styles[name], name)
+            released[styles[name]] = name
+            if before != name:
+                ended["releases"][before] = at
+        elif event.object_kind == "surgeon":
+            stated[event.subject] = at
+    described = session.execute(select(Surgeon.subject, Surgeon.created_at, Surgeon.consent))
+    consents = {subject: (stated.get(subject, created_at), consent) for subject, created_at, consent in described}
+    return Erasures(frozenset(surgeons), ended, consents, outcomes)
 
 
-def _superseded(session: Session) -> dict[str, datetime]:
-    """Return, for each policy whose release was followed by another policy's, the moment when that last happened."""
-    style = (Release.surgeon_row, Release.suture)
-    query = select(*style, PolicyVersion.sha256, Release.released_at).join(
-        PolicyVersion, PolicyVersion.row == Release.policy_row
-    )
-    found: dict[str, datetime] = {}
-    for (*of, policy, _), (*of_next, next_policy, at) in pairwise(session.execute(query.order_by(*style, Release.row))):
-        if of == of_next and policy != next_policy:
-            found[policy] = max(at, found.get(policy, at))
-    return found
+def _in_order(session: Session) -> Iterator[tuple[Any, datetime]]:
+    """Yield the listed events in their order, each with a moment that is never before that of an earlier one.
 
-
-def _consents(session: Session) -> dict[str, tuple[datetime, Consent]]:
-    """Return, by subject, each surgeon's last stated consent and its moment."""
-    said = select(Event.subject, func.max(Event.at)).where(Event.object_kind == "surgeon").group_by(Event.subject)
-    when: dict[str | None, datetime] = {subject: at for subject, at in session.execute(said)}  # noqa: C416 - mypy
-    surgeons = session.execute(select(Surgeon.subject, Surgeon.created_at, Surgeon.consent))
-    return {subject: (when.get(subject, created_at), consent) for subject, created_at, consent in surgeons}
-
-
-def _outcomes(session: Session) -> dict[str, tuple[datetime, DemoOutcome]]:
-    """Return, by demonstration, the outcome of the newest mark and its moment.
-
-    They are read from the events, which remain when a demonstration is erased: it may have been added anew since.
+    The order is that of their rows. A clock that was set back would make a later event look earlier, and what ended
+    twice look known to a backup that knows the first end; so such an event follows the one before by a microsecond.
+    Events are never deleted, so a backup and a later list give the same moments to those that both have.
     """
-    marks = tuple_(Event.action, Event.object_kind).in_(MARKED)
-    newest = select(func.max(Event.row)).where(marks).group_by(Event.object_id)
-    events = select(Event.action, Event.object_kind, Event.object_id, Event.at).where(Event.row.in_(newest))
-    return {demo: (at, MARKED[action, kind]) for action, kind, demo, at in session.execute(events)}
+    columns = (Event.action, Event.object_kind, Event.object_id, Event.subject, Event.at)
+    kinds = tuple_(Event.action, Event.object_kind).in_(LISTED)
+    last: datetime | None = None
+    for event in session.execute(select(*columns).where(kinds).order_by(Event.row)):
+        last = event.at if last is None or event.at >= last else last + timedelta(microseconds=1)
+        yield event, last
 
 
 # ---- applying the list -------------------------------------------------------------------------------------------

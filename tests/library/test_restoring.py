@@ -3,20 +3,22 @@
 import json
 import time
 from collections.abc import Callable, Iterator
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
+from functools import partialmethod
 from pathlib import Path
 from typing import Any
 
 import pytest
 from sqlalchemy import select
 
-from skills.db.models import Demonstration, PolicyVersion, StoredRecording
+from skills.db import now
+from skills.db.models import Demonstration, PolicyVersion, Release, StoredRecording
 from skills.db.service_tables import Key
 from skills.db.session import Database
 from skills.errors import BadSettings, NotFound
 from skills.library.backup import back_up, keep_erasures, read_erasures, restore
 from skills.library.catalogue import find_surgeon, put_surgeon
-from skills.library.demos import withdraw_demo
+from skills.library.demos import mark_demo, withdraw_demo
 from skills.library.erasure import delete_recording, erase_demo, erase_surgeon
 from skills.library.inspection import inspect_installation
 from skills.library.keys import create_key, revoke_key
@@ -242,3 +244,55 @@ def test_a_list_that_cannot_be_written_keeps_the_service_from_starting(database:
     settings = Settings(database_url=database.url, erasures_file=tmp_path / "taken" / "erasures.json")
     with pytest.raises(BadSettings, match="SKILLS_ERASURES_FILE"), keeping_erasures(settings):
         pass
+
+
+def test_what_ended_again_while_the_clock_was_wrong_ends_again(
+    database: Database, restored: Callable[[], Database], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """An hour ahead everything ended once, and all of it came back; after the correction it ended for good."""
+    first, second = two_releases(database)
+    surgeon = "kestrel"
+
+    def end() -> None:
+        with database.writing() as session:
+            put_surgeon(session, surgeon, {"consent": {"uses": ["training"], "until": None}}, "test")
+            erase_demo(session, second, "test")
+            mark_demo(session, first, "failure", None, "test")
+
+    with monkeypatch.context() as ahead:
+        ahead.setattr("skills.db.service_tables.now", lambda: now() + timedelta(hours=1))
+        end()
+        with database.writing() as session:
+            mark_demo(session, first, "success", None, "test")
+            put_surgeon(session, surgeon, {"consent": BOTH}, "test")
+    cases.add_demo(database, cases.hand_off((1.0, 0.0, 0.0)))
+    back_up(database, tmp_path / "b.zip")
+    end()
+    after = restored()
+    with after.reading() as session:
+        assert [(one.sha256, one.outcome) for one in session.scalars(select(Demonstration))] == [(first, "failure")]
+        assert find_surgeon(session, surgeon).consent["uses"] == ["training"]
+
+
+def test_a_release_superseded_while_the_clock_was_wrong_is_not_served_again(
+    database: Database, restored: Callable[[], Database], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    cases.add_surgeon(database)
+    cases.add_demo(database)
+    one, other = (cases.train(database, seed=seed) for seed in (1, 2))
+
+    def serve(version: PolicyVersion) -> None:
+        with database.writing() as session:
+            release(session, session.get_one(PolicyVersion, version.row), "test")
+
+    with monkeypatch.context() as ahead:
+        an_hour = timedelta(hours=1)
+        ahead.setattr("skills.db.service_tables.now", lambda: now() + an_hour)
+        ahead.setattr(Release, "__init__", partialmethod(Release.__init__, released_at=now() + an_hour))
+        serve(one)
+        serve(other)
+    serve(one)
+    back_up(database, tmp_path / "b.zip")
+    serve(other)
+    assert served(database) == other.sha256
+    assert served(restored()) is None
