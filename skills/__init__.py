@@ -53,6 +53,8 @@ _CONTENTS = {
     "play": "simulation.player",
     "PlaybackReport": "verification.verdict",
     "judge": "verification.verdict",
+    "Refereed": "simulation.referee",
+    "referee": "simulation.referee",
 }
 __all__ = [*_CONTENTS, "__version__"]
 

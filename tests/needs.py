@@ -73,6 +73,7 @@ NEEDS = {
         "PyBullet is", "it has a wheel for Python 3.11 on Linux, x86_64, only", lambda: find_spec("pybullet")
     ),
     "fcl": Need("python-fcl is", "`make` installs the locked packages", lambda: find_spec("fcl")),
+    "mujoco": Need("MuJoCo is", "`make` installs the locked packages", lambda: find_spec("mujoco")),
     "deep": Need("the extra `deep` is", "make deep", lambda: all(find_spec(name) for name in NEEDED)),
     "lerobot": Need(
         "LeRobot is",

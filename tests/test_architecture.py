@@ -90,6 +90,7 @@ def test_the_table_of_rooms_names_each_after_those_that_it_imports():
         ("pyarrow", ("formats/lerobot/", "formats/cells.py")),
         ("pybullet", "simulation/"),
         ("pybullet_data", "simulation/"),
+        ("mujoco", "simulation/referee.py"),
         ("numba", "compiled.py"),
         ("movement_primitives", "report/rivals.py"),
         ("safetensors", "learning/networks.py"),

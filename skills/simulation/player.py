@@ -145,21 +145,21 @@ def request(trajectory: Trajectory, pad_top_mm: float, every: int = CLEARANCE_EV
 def _playback(answer: dict[str, Any], trajectory: Trajectory, pad_top_mm: float) -> Playback:
     """Check every number in the answer, because none is trusted, and return them as a playback."""
     count, with_m = len(trajectory), trajectory.psm_m is not None
-    looked_at = _array(answer, "looked_at", np.int64, (None,))
+    looked_at = array_from(answer, "looked_at", np.int64, (None,))
     seen = len(looked_at)
     low, high = trajectory.tip_mm[:, :2].min(axis=0), trajectory.tip_mm[:, :2].max(axis=0)
     try:
         return Playback(
-            tip_mm=_array(answer, "tip_mm", np.float64, (count, 3)),
-            rotation_xyzw=_array(answer, "rotation_xyzw", np.float64, (count, 4)),
-            joints=_array(answer, "joints", np.float64, (count, 6)),
-            tracking_mm=_array(answer, "tracking_mm", np.float64, (count,)),
-            efforts=_array(answer, "efforts", np.float64, (count, 6)),
-            contact_n=_array(answer, "contact_n", np.float64, (count,)),
+            tip_mm=array_from(answer, "tip_mm", np.float64, (count, 3)),
+            rotation_xyzw=array_from(answer, "rotation_xyzw", np.float64, (count, 4)),
+            joints=array_from(answer, "joints", np.float64, (count, 6)),
+            tracking_mm=array_from(answer, "tracking_mm", np.float64, (count,)),
+            efforts=array_from(answer, "efforts", np.float64, (count, 6)),
+            contact_n=array_from(answer, "contact_n", np.float64, (count,)),
             looked_at=looked_at,
-            clearances_mm=_array(answer, "clearances_mm", np.float64, (seen, len(link_pairs(with_m)))),
-            shaft_off_mm=_array(answer, "shaft_off_mm", np.float64, (seen,)),
-            psm_m_tip_mm=_array(answer, "psm_m_tip_mm", np.float64, (seen, 3)) if with_m else None,
+            clearances_mm=array_from(answer, "clearances_mm", np.float64, (seen, len(link_pairs(with_m)))),
+            shaft_off_mm=array_from(answer, "shaft_off_mm", np.float64, (seen,)),
+            psm_m_tip_mm=array_from(answer, "psm_m_tip_mm", np.float64, (seen, 3)) if with_m else None,
             pad_mm=np.append((low + high) / 2, pad_top_mm),
             picture_png=_plain(answer, "picture_png", bytes, lambda picture: picture.startswith(_PNG)),
             engine=_plain(answer, "engine", str, lambda name: 0 < len(name) <= 100),
@@ -170,7 +170,18 @@ def _playback(answer: dict[str, Any], trajectory: Trajectory, pad_top_mm: float)
         raise _nonsense("looked_at") from None
 
 
-def _array(answer: dict[str, Any], name: str, dtype: Any, shape: tuple[int | None, ...]) -> NDArray[Any]:
+def array_from(answer: dict[str, Any], name: str, dtype: Any, shape: tuple[int | None, ...]) -> NDArray[Any]:
+    """Return an array of a simulator's answer.
+
+    Args:
+        answer: The answer, which is untrusted.
+        name: The array's name.
+        dtype: Its type.
+        shape: Its shape; None: any length.
+
+    Raises:
+        SimulationFailed: It is missing, has another type or shape, or a number that is not finite.
+    """
     array = answer.get(name)
     if not isinstance(array, np.ndarray) or array.dtype != dtype or array.ndim != len(shape):
         raise _nonsense(name)

@@ -445,14 +445,14 @@ def _judged(
 ) -> _Judged:
     """Judge a pass under some errors, and whether it succeeds under the `spared` ones."""
     displaced = [drawn.under(one, scene.stamps_s) for one in [*under, *spared]]
-    arms = _handing_over(scene, approach_m, varied.unknown_depth_mm)
+    arms = at_hand_off(scene, approach_m, varied.unknown_depth_mm)
     missed: dict[str, Flags] = {}
     upright = np.zeros(len(drawn.shift_mm), dtype=bool)  # the stated errors, with a needle that stands as planned
     if arms is not None:
-        caught = [_caught(arms, drawn.shift_mm, one, drawn.turned, varied) for one in displaced]
+        caught = [caught_by(arms, drawn.shift_mm, one, drawn.turned, varied) for one in displaced]
         missed = {name: ~np.array(one) for name, one in zip(AT_THE_END, zip(*caught, strict=True), strict=True)}
         unturned = np.broadcast_to(np.eye(3), drawn.turned.shape)
-        upright = ~np.logical_and(*_caught(arms, drawn.shift_mm, displaced[0], unturned, varied))
+        upright = ~np.logical_and(*caught_by(arms, drawn.shift_mm, displaced[0], unturned, varied))
     lost = np.logical_or.reduce([np.zeros((len(displaced), len(upright)), dtype=bool), *missed.values()])
     wanted = ~lost
     wanted[: len(under)] = True  # of these every fault is counted; of the others success alone
@@ -463,8 +463,14 @@ def _judged(
     return _Judged(faults, np.concatenate([good, ~(upright | spoilt[0])[None]]))
 
 
-def _handing_over(scene: PlannedPass, approach_m: ArrayLike | None, depth_mm: float) -> tuple[Planned, Planned] | None:
-    """Return both arms at the end of A2, PSM_M in its actual or else its desired pose; None if neither is known."""
+def at_hand_off(scene: PlannedPass, approach_m: ArrayLike | None, depth_mm: float) -> tuple[Planned, Planned] | None:
+    """Return both arms at the end of A2, PSM_M in its actual or else its desired pose; None if neither is known.
+
+    Args:
+        scene: The pass.
+        approach_m: PSM_M's approach, shape (3,), for a scene without PSM_M; None if it is not known.
+        depth_mm: Distance of PSM_M's hinge from its remote centre where its base is not known.
+    """
     if scene.phase[-1] != A2:
         return None
     last = np.array([len(scene.phase) - 1])
@@ -486,10 +492,17 @@ def _handing_over(scene: PlannedPass, approach_m: ArrayLike | None, depth_mm: fl
     return arm, Planned(*mine, opening_rad=np.zeros(1))
 
 
-def _caught(
+def caught_by(
     arms: tuple[Planned, Planned], shift_mm: Floats, errors: Displaced, turned: Floats, varied: DoubtSettings
 ) -> tuple[Flags, Flags]:
     """Return whether the needle is between PSM_M's fingers, and at a right angle, each of shape (N,).
+
+    Args:
+        arms: Both arms at the hand-off, as `at_hand_off` returns them.
+        shift_mm: Shift of the pass in each variation, shape (N, 3).
+        errors: The displacements; the last of their samples counts.
+        turned: Rotation of the needle about PSM_A's grip, shape (N, 3, 3).
+        varied: The conditions of a catch.
 
     `catch` has PSM_M's jaws as planned, so PSM_A is taken to where it is relative to them.
     """

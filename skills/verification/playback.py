@@ -28,6 +28,21 @@ FINGERS = ("finger_1", "finger_2")
 PAD_SIZE_MM = (120.0, 120.0, 12.0)  # of `urdf/suture_pad.urdf`, whose frame is the middle of its top
 PAD_AROUND_MM = 20.0  # ours: least reach of the pad beyond a path, because an arm next to the pad would touch nothing
 
+# The checks of a verdict, and by which means each is decided.
+MEANS = {
+    "joints, speeds, accelerations": "PSM_A's joints as the simulator was set to them and read back, PSM_M's as "
+    "commanded, against published limits",
+    "tip and rotation": "PyBullet's forward kinematics against the closed form",
+    "shaft, wrist, fingers and pad": "PyBullet's distances between capsules, which are exact to 0.0001 mm as no convex "
+    "hull is among them (hulls are up to 2 mm off); between two measurements a bound in closed form",
+    "servo, effort and force": "PyBullet's motors under gravity with the arm's greatest efforts, PSM_A alone",
+    "outer bodies": "closed form: capsules around published joint origins",
+    "scene, tissue and needle": "closed form: capsules and the needle's arc",
+    "what was asked": "closed form, computed anew from the request",
+    "probability and catch": "closed form in seeded worlds; friction plays no part in it, and the contact referee "
+    "(MuJoCo) in no verdict",
+}
+
 
 @dataclass(frozen=True)
 class LinkPair:

@@ -42,7 +42,7 @@ from skills.planning.trajectory import Trajectory, joint_ratios
 from skills.verification.bodies import BodiesClearance, BodiesReport, bodies_clearance
 from skills.verification.clearance import FINGER_REACH_MM, Bounds, needle_to_pad_mm, openings, psm_m_poses
 from skills.verification.intent import LIMITS, Comparison, Mismatch
-from skills.verification.playback import CLEARANCE_SEEN_MM, PAD, PSM_A, PSM_M, Playback
+from skills.verification.playback import CLEARANCE_SEEN_MM, MEANS, PAD, PSM_A, PSM_M, Playback
 from skills.verification.scene_clearance import SceneClearance
 
 SCENE = "clearance of the scene"  # the quantity of a failure beside tissue or an obstacle
@@ -428,7 +428,8 @@ class PlaybackReport:
     two measurements a pair of links can have come nearer by `moved_between_looks_mm`, which the gates take into
     account. `peak_effort_ratio` is over the complete servo pass, `peak_contact_effort_ratio` over the samples in which
     the arm touches the pad. `bodies` compares the arms' outer bodies; null: not judged, as in older verdicts. `intent`
-    has the greatest deviation of each kind from what was asked; null: not compared with it, as in those.
+    has the greatest deviation of each kind from what was asked; null: not compared with it, as in those. `means` has
+    for each check the means by which it is decided; null in older verdicts.
     """
 
     feasible: bool
@@ -470,6 +471,7 @@ class PlaybackReport:
     settings: Limits
     bodies: BodiesReport | None = field(default=None, kw_only=True)
     intent: tuple[Mismatch, ...] | None = field(default=None, kw_only=True)
+    means: Mapping[str, str] | None = field(default=None, kw_only=True)
 
 
 def judge(
@@ -553,6 +555,7 @@ def judge(
         settings=limits,
         bodies=outer.report,
         intent=None if intent is None else intent.deviations,
+        means=dict(MEANS),
     )
 
 

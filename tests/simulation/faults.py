@@ -70,3 +70,23 @@ def no_gif(given: BinaryIO, answer: BinaryIO) -> None:
 
 def film_in_words(given: BinaryIO, answer: BinaryIO) -> None:
     packing.write(answer, {"mp4": "\0\0\0\x20ftypisom", "gif": ["GIF89a"]}, {})
+
+
+# ---- of the contact referee --------------------------------------------------------------------------------------
+
+
+def _refereeing(**changed: Any) -> Callable[[BinaryIO, BinaryIO], None]:
+    """Return a referee that holds every needle, but for a change to its answer."""
+
+    def trials(given: BinaryIO, answer: BinaryIO) -> None:
+        total = int(packing.read(given, {})["trials"].sum())
+        sound = {"ended": np.zeros(total, np.int64), "motion": np.zeros((total, 3)), "engine": "none"}
+        packing.write(answer, sound | changed, {})
+
+    return trials
+
+
+unknown_end = _refereeing(ended=np.array([0, 4]))
+nan_motion = _refereeing(motion=np.full((2, 3), np.nan))
+too_few_ends = _refereeing(ended=np.zeros(1, np.int64))
+nameless = _refereeing(engine="")

@@ -221,9 +221,9 @@ def test_a_jaw_that_was_not_realigned_hands_nothing_on():
 
 
 def caught(scene, displaced: Displaced) -> bool:
-    arms = monte_carlo._handing_over(scene, APPROACH, 200.0)
+    arms = monte_carlo.at_hand_off(scene, APPROACH, 200.0)
     turned = np.broadcast_to(np.eye(3), (4, 3, 3))
-    place, angle = monte_carlo._caught(arms, np.zeros((4, 3)), displaced, turned, NO_DOUBT)
+    place, angle = monte_carlo.caught_by(arms, np.zeros((4, 3)), displaced, turned, NO_DOUBT)
     assert (place & angle).all() == (place & angle).any()
     return bool((place & angle)[0])
 
