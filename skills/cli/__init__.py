@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from skills.cli import arms, comparison, datasets, demos, installation, policies, recordings
+from skills.cli import arms, comparison, datasets, demos, installation, plans, policies, recordings
 from skills.cli.shell import err, out, tell
 from skills.remedies import did_you_mean
 
@@ -80,7 +80,7 @@ for commands in (  # the order of the commands in `skills --help`
     datasets.commands,
     policies.learning_commands,
     policies.commands,
-    policies.plan_commands,
+    plans.commands,
     arms.commands,
     comparison.commands,
     comparison.scoring_commands,

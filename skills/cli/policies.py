@@ -1,4 +1,4 @@
-"""Commands of training, jobs, policies and plans: from a demonstration to the bag that a robot replays."""
+"""Commands of training, jobs and policies."""
 
 import hashlib
 import json
@@ -16,12 +16,10 @@ from skills.cli.shell import (
     OfSuture,
     Surgeon,
     Suture,
-    bar,
     cell,
     err,
     files,
     finished,
-    numbers,
     out,
     print_json,
     read_key,
@@ -31,7 +29,7 @@ from skills.cli.shell import (
     show,
     triple,
 )
-from skills.errors import BadInput, BadSettings, BadSignature, Conflict
+from skills.errors import BadInput, BadSignature, Conflict
 
 if TYPE_CHECKING:
     from skills.client import Client
@@ -63,9 +61,6 @@ SceneFile = Annotated[
 JOINING = {"nearest": 0.0, "start": 1.0}
 DEFAULT_LEARNER = "phase-q-learning"
 PHASED = (DEFAULT_LEARNER, "value-iteration")  # the learners that have a joining rule; a test compares them with all
-plan_commands = typer.Typer()
-
-PlanId = Annotated[str, typer.Argument(help="The plan's digest.")]
 
 
 @learning_commands.command()
@@ -470,182 +465,3 @@ def rollout(
         return
     told = "reaches the goal" if followed.finished else "stops before the goal"
     out.print(f"It {told} after {len(followed.states)} states, DTW {followed.dtw_total_mm:g} mm to the demonstration.")
-
-
-# ---- plans ---------------------------------------------------------------------------------------------------------
-
-
-@plan_commands.command()
-@refusing
-def plan(
-    surgeon: Surgeon,
-    suture: Suture,
-    point: Annotated[
-        list[str] | None, typer.Option(help="A suture point, as x,y,z in mm; repeatable, one for each pass.")
-    ] = None,
-    scene: Annotated[
-        Path | None,
-        typer.Option(help="Take the suture points from a simulator's MCAP file: the exit points of the needle."),
-    ] = None,
-    speed_mm_s: Annotated[
-        float, typer.Option(help="Greatest speed of the tip; the surgeon's tempo is slowed to it.")
-    ] = 20.0,
-    orientation: Annotated[
-        Literal["recorded", "constant"] | None,
-        typer.Option(help="The jaw: recorded, as the surgeon turned it, or constant. Recorded where it was."),
-    ] = None,
-    a2: Annotated[
-        Literal["recorded", "paper"] | None,
-        typer.Option(help="The end of A2: recorded, the demonstrated hand-off, or paper. Recorded where it was."),
-    ] = None,
-    obstacles: Annotated[
-        Path | None,
-        typer.Option(help="JSON file of tissue and obstacles for the verdict, as --scene of train; else the policy's."),
-    ] = None,
-    tissue: Annotated[
-        float | None,
-        typer.Option(help="Height of level tissue in the arm's frame, mm; without tissue nothing is exported."),
-    ] = None,
-    rate_hz: Annotated[float, typer.Option(help="Samples per second, 100 to 200.")] = 200.0,
-    approach: Annotated[str | None, typer.Option(help="PSM_M's approach direction, as x,y,z.")] = None,
-    base: Annotated[
-        str | None, typer.Option(help="PSM_M's base in the arm's frame, as x,y,z in mm and qx,qy,qz,qw.")
-    ] = None,
-    no_handoff: Annotated[
-        bool, typer.Option("--no-handoff", help="Plan the tip's path alone, without a hand-off: no PSM_M, no A2.")
-    ] = False,
-    tip_offset_mm: Annotated[
-        float,
-        typer.Option(
-            help="Distance of the finger tips from the hinge; with 10.2 the points are those of the finger tips."
-        ),
-    ] = 0.0,
-    as_json: AsJson = False,
-) -> None:
-    """Stack the released policy at suture points."""
-    if point and scene is not None:
-        raise BadInput("Use --point or --scene, not both.", "A scene's file contains the suture points itself.")
-    if not point and scene is None:
-        raise BadInput(
-            "A plan needs suture points, from --point or from --scene.",
-            "For each pass: --point X,Y,Z in mm; or --scene with a simulator's file that contains them.",
-        )
-    psm_m: dict[str, Any] = {} if approach is None else {"approach": triple(approach)}
-    if base is not None:
-        x, y, z, *turned = numbers(base, 7)  # position, then quaternion
-        psm_m["base"] = {"position_mm": (x, y, z), "rotation_xyzw": turned}
-    if no_handoff and psm_m:
-        raise BadInput("--no-handoff plans without PSM_M.", "Leave it out, or --approach and --base.")
-    with service() as client:
-        points: list[dict[str, Any]] = [{"position_mm": triple(one)} for one in point or ()]
-        if scene is not None:
-            goals = [mark for mark in client.suture_points(scene).points if mark.is_goal]
-            points = [{"position_mm": goal.position_mm, "rotation_xyzw": goal.turn_xyzw} for goal in goals]
-        made = client.plan(
-            surgeon,
-            suture,
-            points,
-            speed_mm_s=speed_mm_s,
-            rate_hz=rate_hz,
-            tip_offset_mm=tip_offset_mm,
-            psm_m=psm_m or None,
-            handoff="none" if no_handoff else None,
-            orientation=orientation,
-            a2=a2,
-            scene=None if obstacles is None else read_scene(obstacles),
-            tissue_mm=tissue,
-        )
-    show(made, as_json, ("id", "arm", "frame", "orientation", "trajectory.duration_s"))
-    if not as_json:
-        out.print(made.in_words, markup=False, soft_wrap=True)
-
-
-@plan_commands.command()
-@refusing
-def play(
-    plan_id: PlanId,
-    errors: Annotated[
-        str | None,
-        typer.Option(
-            help="Errors of the arms: calibrated, uncalibrated, or a JSON file with your own (docs/errors.md)."
-        ),
-    ] = None,
-    picture: Annotated[Path | None, typer.Option(help="Write a picture here.")] = None,
-    pictures: Annotated[
-        Path | None, typer.Option(help="Write the picture, a film and two plots to this folder.")
-    ] = None,
-    as_json: AsJson = False,
-) -> None:
-    """Play a plan in the simulator, and print the verdict; exit code 1 if it is not feasible."""
-    with service(workers=1) as client:
-        playback = client.playback(result_of(finished(client, client.play(plan_id, _stated(errors))))["playback"])
-        if picture is not None:
-            picture.write_bytes(client.picture(playback.id))
-        if pictures is not None:
-            pictures.mkdir(parents=True, exist_ok=True)
-            finished(client, client.draw(playback.id))
-            (pictures / "playback.png").write_bytes(client.picture(playback.id))
-            (pictures / "playback.mp4").write_bytes(client.animation(playback.id))
-            (pictures / "playback.gif").write_bytes(client.animation(playback.id, "gif"))
-            (pictures / "joints.png").write_bytes(client.plot(playback.id, "joints"))
-            (pictures / "clearance.png").write_bytes(client.plot(playback.id, "clearance"))
-    if as_json:
-        print_json(playback)
-    else:
-        assert playback.headline is not None, playback
-        out.print(playback.headline.text, markup=False, soft_wrap=True)
-        for under in playback.report.doubt.under:
-            least = min(one.succeeds.lower for one in under.passes)
-            named = (
-                f"{under.errors.name}: {under.errors.in_words}" if under.errors else f"tips {under.tip_error_mm} mm off"
-            )
-            out.print(
-                f"{named}; every pass succeeds with a probability of at least {least:.3f} (95 %)",
-                markup=False,
-                soft_wrap=True,
-            )
-    if not playback.feasible:
-        raise typer.Exit(1)
-
-
-def _stated(errors: str | None) -> Any:
-    """Return the errors of the arms as a request states them: a name, or the JSON of a file.
-
-    Raises:
-        BadInput: The file cannot be read, or does not have the errors of an arm.
-    """
-    from skills.library.arm_errors import stated_errors
-
-    if errors is None or errors in ("calibrated", "uncalibrated"):
-        return errors
-    try:
-        text = Path(errors).read_text()
-        stated_errors(text)
-        return json.loads(text)
-    except (OSError, ValueError, BadSettings) as error:
-        why = error.message if isinstance(error, BadSettings) else f"It cannot be read: {error}."
-        remedy = "Write calibrated, uncalibrated, or a file of `skills calibrate-arm` (docs/errors.md)."
-        raise BadInput(f"--errors {errors}: {why}", remedy) from None
-
-
-@plan_commands.command()
-@refusing
-def export(
-    plan_id: PlanId,
-    to: Annotated[Path, typer.Argument(help="The zip to write.", dir_okay=False)],
-    pass_index: Annotated[int | None, typer.Option("--pass", help="A single pass, counted from 0.")] = None,
-    no_handoff: Annotated[
-        bool, typer.Option("--no-handoff", help="Needed for a plan without a hand-off: no PSM_M, no A2.")
-    ] = False,
-    as_json: AsJson = False,
-) -> None:
-    """Write the bag of a plan that a robot or a simulator replays; read docs/replay.md first."""
-    with service() as client, bar("fetching") as progress:
-        client.save_replay_bag(plan_id, to, pass_index, progress, handoff="none" if no_handoff else None)
-    size = to.stat().st_size
-    if as_json:
-        print_json({"file": to, "size_bytes": size})
-    else:
-        out.print(
-            f"{to}: {size / 1e6:.1f} MB. Check it with `skills verify {to}` before it is used. Research use only."
-        )

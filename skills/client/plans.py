@@ -9,7 +9,7 @@ from skills.client.policies import Position
 from skills.client.transport import Progress
 from skills.errors import BadInput
 from skills.remedies import did_you_mean
-from skills.schemas.given import Comparison, Job, Plan, Playback, SuturePoints, Trajectory
+from skills.schemas.given import Comparison, Job, Plan, Playback, Reach, SuturePoints, Trajectory
 
 BAG = "application/zip"
 
@@ -79,6 +79,53 @@ class Plans(Connection):
             **{"tissue_mm": tissue_mm},
         }
         return await self._ask(Plan, "POST", at("plans"), given(body))
+
+    @call
+    async def reach(
+        self,
+        surgeon: str,
+        suture: str,
+        *,
+        version: int | None = None,
+        centre_mm: Position | None = None,
+        size_mm: Position | None = None,
+        step_mm: float | None = None,
+        rotations_xyzw: Sequence[Sequence[float]] | None = None,
+        tip_offset_mm: float | None = None,
+        psm_m: Mapping[str, Any] | None = None,
+        handoff: Literal["none"] | None = None,
+        orientation: Literal["recorded", "constant"] | None = None,
+        a2: Literal["recorded", "paper"] | None = None,
+        scene: Mapping[str, Any] | None = None,
+        tissue_mm: float | None = None,
+    ) -> Reach:
+        """Map where a style can be planned: reach, joint margins and clearances at each place of a box.
+
+        Args:
+            surgeon: The surgeon's pseudonym.
+            suture: The suture type.
+            version: The policy version; default: the released one.
+            centre_mm: The middle of the box in the arm's frame; default: the demonstrated goal.
+            size_mm: Its edges; default: 80, 80 and 0.
+            step_mm: The distance of the places; default: 8.
+            rotations_xyzw: Rotations of the grid world about each place; default: none.
+            tip_offset_mm: As of `plan`, like all that follow.
+            psm_m: The arm that takes the needle.
+            handoff: "none" for A1 alone.
+            orientation: "recorded" or "constant".
+            a2: "recorded" or "paper".
+            scene: Tissue and obstacles.
+            tissue_mm: Height of level tissue.
+        """
+        body = {
+            **{"surgeon": surgeon, "suture": suture, "version": version, "step_mm": step_mm, "psm_m": psm_m},
+            **{"tip_offset_mm": tip_offset_mm, "handoff": handoff, "orientation": orientation, "a2": a2},
+            **{"scene": scene, "tissue_mm": tissue_mm},
+            **{"centre_mm": None if centre_mm is None else list(centre_mm)},
+            **{"size_mm": None if size_mm is None else list(size_mm)},
+            **{"rotations_xyzw": None if rotations_xyzw is None else [list(one) for one in rotations_xyzw]},
+        }
+        return await self._ask(Reach, "POST", at("reach"), given(body))
 
     @call
     async def suture_points(

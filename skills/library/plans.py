@@ -4,7 +4,7 @@ PlanIn --plan_sutures--> Plan, stored
 recording of a simulated scene --find_suture_points--> SuturePoints, not stored
 """
 
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -64,32 +64,8 @@ def plan_sutures(database: Database, request: PlanIn, actor: str) -> tuple[Plan,
         NoApproach: A hand-off is requested, and neither request nor demonstration has PSM_M's approach.
         NoHandOff: The plan would have no hand-off, and such a plan was not requested.
     """
-    with database.reading() as session:
-        policy = policies.choose(session, request.surgeon, request.suture, request.version)
-        demo, followed, sha = hand_of(policy), learnt(policy), policy.sha256
-    for name in ("arm", "frame", "instrument"):
-        # The policy is certified for the demonstrated arm, frame and instrument only.
-        asked, have = getattr(request, name), getattr(demo, name)
-        if asked is not None and asked != have:
-            raise BadPlan(
-                f"The policy was demonstrated with {name} '{have}'; a plan must have the same, so give that value "
-                "or omit it."
-            )
-    _refuse_metres(followed, request)
-    plan = stack(
-        followed,
-        [point.value for point in request.suture_points],
-        demo=demo,
-        starts_mm=request.starts_mm,
-        psm_m=_takes_the_needle(request, demo.partner),
-        speed_mm_s=request.speed_mm_s,
-        rate_hz=request.rate_hz,
-        tip_offset_mm=request.tip_offset_mm,
-        orientation=request.orientation,
-        a2=request.a2,
-    )
-    learnt_in = None if followed.surroundings is None else followed.surroundings.scene
-    plan = replace(plan, scene=_scene(request, plan.frame, learnt_in))
+    style = style_of(database, request.surgeon, request.suture, request.version)
+    plan, learnt_in, sha = stacked(request, style), style.learnt_in, style.sha256
     trajectory = trajectory_of(plan)
     identity = plan_identity(sha, plan)
     about = describe_plan(plan, trajectory, learnt_in)
@@ -105,6 +81,64 @@ def plan_sutures(database: Database, request: PlanIn, actor: str) -> tuple[Plan,
         record_event(session, actor, "plan", "plan", identity, policy.surgeon)
         session.flush()
         return stored, True
+
+
+@dataclass(frozen=True, eq=False)
+class Style:
+    """The policy version that a plan follows, and the demonstration whose hand it has."""
+
+    version: int
+    sha256: str
+    policy: Policy
+    demo: Demo
+
+    @property
+    def learnt_in(self) -> Scene | None:
+        """The scene in which the policy was learnt."""
+        return None if self.policy.surroundings is None else self.policy.surroundings.scene
+
+
+def style_of(database: Database, surgeon: str, suture: str, version: int | None) -> Style:
+    """Return the requested version of a style, or the served one.
+
+    Raises:
+        NotFound: There is no such version, or nothing is served.
+        Conflict: The surgeon's consent does not cover training.
+    """
+    with database.reading() as session:
+        policy = policies.choose(session, surgeon, suture, version)
+        return Style(policy.version, policy.sha256, learnt(policy), hand_of(policy))
+
+
+def stacked(request: PlanIn, style: Style) -> SuturePlan:
+    """Return the plan that a request asks for, with its scene; nothing is stored.
+
+    Raises:
+        BadPlan, NoApproach, NoHandOff: As of `plan_sutures`.
+    """
+    demo = style.demo
+    for name in ("arm", "frame", "instrument"):
+        # The policy is certified for the demonstrated arm, frame and instrument only.
+        asked, have = getattr(request, name), getattr(demo, name)
+        if asked is not None and asked != have:
+            raise BadPlan(
+                f"The policy was demonstrated with {name} '{have}'; a plan must have the same, so give that value "
+                "or omit it."
+            )
+    _refuse_metres(style.policy, request)
+    plan = stack(
+        style.policy,
+        [point.value for point in request.suture_points],
+        demo=demo,
+        starts_mm=request.starts_mm,
+        psm_m=_takes_the_needle(request, demo.partner),
+        speed_mm_s=request.speed_mm_s,
+        rate_hz=request.rate_hz,
+        tip_offset_mm=request.tip_offset_mm,
+        orientation=request.orientation,
+        a2=request.a2,
+    )
+    return replace(plan, scene=_scene(request, plan.frame, style.learnt_in))
 
 
 def _scene(request: PlanIn, frame: str, learnt_in: Scene | None) -> Scene | None:

@@ -312,6 +312,48 @@ def _sample(one: Way, paces: Paces) -> _Sampled:
     return _Sampled(poses, (before, len(along), turning), deviation_mm, jaw)
 
 
+@dataclass(frozen=True, eq=False)
+class PassPoses:
+    """One pass as poses of each arm in PSM_A's base, S of them, whatever joints they need.
+
+    Attributes:
+        arms: The poses of PSM_A, and of PSM_M if it is in the scene.
+        phase: `TRANSFER`, `A1` or `A2` of each pose, shape (S,).
+        jaw_rad: Angle of PSM_A's jaw, shape (S,); None if it was not recorded.
+    """
+
+    arms: tuple[Poses, ...]
+    phase: Bytes
+    jaw_rad: Floats | None
+
+
+def poses_along(one: PassPath, psm_m: PsmM | None, step_mm: float) -> PassPoses:
+    """Return the poses of one pass by itself, evenly along the ways of all tips; a turn of 2 degrees counts as 1 mm.
+
+    Args:
+        one: The pass.
+        psm_m: The other arm; None, or one without a base, leaves it out.
+        step_mm: The tips together move about so far from one pose to the next, or jaws turn instead.
+
+    Raises:
+        NoMotion: Nothing moves.
+        BadPlan: It has no A2, but PSM_M would take the needle there.
+    """
+    (way,) = ways([one], psm_m)
+    fine = _sample(way, (Pace(20.0, PEAK_TURN_RAD_S, RATE_HZ[1] / 10),) * 3)
+    phase = np.repeat(np.array([TRANSFER, A1, A2], np.int8), fine.counts)
+    gone = np.zeros(len(phase) - 1)
+    for poses in fine.poses:
+        gone += np.linalg.norm(np.diff(poses.tip_mm, axis=0), axis=1)
+        gone += np.degrees(angle_between(poses.rotation[:-1], poses.rotation[1:])) / 2
+    along = np.append(0.0, np.cumsum(gone))
+    wanted = np.linspace(0.0, along[-1], max(2, ceil(along[-1] / step_mm) + 1))
+    ends = np.append(np.flatnonzero(np.diff(phase)), len(phase) - 1)
+    at = np.union1d(np.searchsorted(along, wanted - 1e-9).clip(0, len(along) - 1), ends)
+    jaw = None if fine.jaw_rad is None else fine.jaw_rad[at]
+    return PassPoses(tuple(Poses(arm.tip_mm[at], arm.rotation[at]) for arm in fine.poses), phase[at], jaw)
+
+
 def _brought(one: Way, pace: Pace) -> tuple[Poses, float, Floats | None]:
     """Return the poses of A1, its greatest distance from its straight moves, and the recorded angles of the jaw."""
     first = one.transfer[-1][0].rotation

@@ -46,6 +46,7 @@ from skills.schemas.recordings import (
     SuturePoints,
 )
 from skills.verification.probabilities import Doubt, Probability
+from skills.verification.reach import Place
 from skills.verification.scene_clearance import SceneReport
 from skills.verification.verdict import PlaybackReport
 
@@ -72,6 +73,7 @@ __all__ = [
     "PolicySummary",
     "PoseStyle",
     "Problem",
+    "Reach",
     "Ready",
     "Recording",
     "RecordingPreview",
@@ -95,6 +97,24 @@ __all__ = [
 
 
 # ---- plans, their motion, and the verdict on it --------------------------------------------------------------------
+
+
+class Reach(Given):
+    """Where a style can be planned.
+
+    `places` has all positions of the first rotation, x slowest and z fastest, then those of the second, and so on.
+    """
+
+    surgeon: Slug
+    suture: Slug
+    policy: PolicyName
+    arm: str
+    frame: str
+    step_mm: float
+    counts: tuple[Count, Count, Count] = Field(description="Number of places along x, y and z.")
+    rotations: Count
+    places: list[Place]
+    in_words: str
 
 
 @stored_schema

@@ -327,7 +327,7 @@ def bodies_clearance(trajectory: Trajectory, limit_mm: float) -> BodiesClearance
         for q, tool in ((trajectory.joints, trajectory.instrument), (m.joints, m.instrument))
     ]
     looks = _looks(ways)
-    seen = _distances(trajectory, looks)
+    seen = distances_at(trajectory, looks)
     while True:
         bound = _until_next(seen, [way[looks] for way in ways])
         # Up to the first look that is too near, every gap in which the bound is broken is halved.
@@ -339,7 +339,7 @@ def bodies_clearance(trajectory: Trajectory, limit_mm: float) -> BodiesClearance
             break
         more = (looks[gaps] + looks[gaps + 1]) // 2
         at = np.searchsorted(looks, more)
-        looks, seen = np.insert(looks, at, more), np.insert(seen, at, _distances(trajectory, more), axis=0)
+        looks, seen = np.insert(looks, at, more), np.insert(seen, at, distances_at(trajectory, more), axis=0)
     at_least = np.full(count, np.inf)
     at_least[looks] = bound
     broken = ~(bound >= limit_mm)
@@ -366,8 +366,16 @@ def _looks(ways: list[Floats]) -> Ints:
     return np.unique(np.concatenate([[0], np.flatnonzero(np.diff(steps) > 0), [len(gone) - 1]]))
 
 
-def _distances(trajectory: Trajectory, at: Ints) -> Floats:
-    """Return the distances of all pairs of parts at some samples, (C, B, B')."""
+def distances_at(trajectory: Trajectory, at: Ints) -> Floats:
+    """Return the distances of all parts of one arm from all of the other at some samples.
+
+    Args:
+        trajectory: A motion of both arms.
+        at: The samples, shape (C,).
+
+    Returns:
+        Distances in mm, as of `between`, shape (C, B, B').
+    """
     m = trajectory.psm_m
     assert m is not None
     base, found = matrix_of(m.base_xyzw[None])[0], []

@@ -144,30 +144,27 @@ def clearance_of(trajectory: Trajectory, scene: Scene) -> SceneClearance:
         The distances.
     """
     at_least, looked = np.full(len(trajectory), np.inf), np.zeros(len(trajectory), bool)
-    limit_mm = max(LEAST_MM, scene.margin_mm)
+    limit_mm = limit_of(scene)
     nearest: list[tuple[float, NearestToScene]] = []
-    for body in (PSM_A, PSM_M) if trajectory.psm_m is not None else (PSM_A,):
-        for group in (_tool(trajectory, body), _bodies(trajectory, body)):
-            distances = partial(_from_parts, group, scene, body)
-            looks, of_parts = _looked_at(distances, group.way_mm, group.look_mm, limit_mm)
-            bounds = [_until_next(apart, group.way_mm[looks]) for apart in of_parts.values()]
-            at_least[looks] = np.min([at_least[looks], *bounds], axis=0)
-            looked[looks] = True
-            nearest += [
-                _nearest(trajectory, (body, group.names), part, looks, apart) for part, apart in of_parts.items()
-            ]
+    for body, group in groups_of(trajectory):
+        distances = partial(from_parts, group, scene, body)
+        looks, of_parts = _looked_at(distances, group.way_mm, group.look_mm, limit_mm)
+        bounds = [_until_next(apart, group.way_mm[looks]) for apart in of_parts.values()]
+        at_least[looks] = np.min([at_least[looks], *bounds], axis=0)
+        looked[looks] = True
+        nearest += [_nearest(trajectory, (body, group.names), part, looks, apart) for part, apart in of_parts.items()]
     needle = np.full(len(trajectory), np.inf)
     if scene.tissue is not None:
         way = _way(needle_travel_mm(trajectory)[:, None])
         begins = np.flatnonzero(np.diff(trajectory.phase) | np.diff(trajectory.pass_index)) + 1
         ends = np.concatenate([begins - 1, begins])
-        looks, seen = _looked_at(partial(_of_needle, trajectory, scene.tissue), way, LOOK_MM, 0.0, ends)
+        looks, seen = _looked_at(partial(needle_from_tissue, trajectory, scene.tissue), way, LOOK_MM, 0.0, ends)
         apart = seen[TISSUE]
         needle[looks] = _until_next(apart, way[looks])
         needle[_by_hand(trajectory, needle)] = np.inf
         nearest.append(_nearest(trajectory, (NEEDLE, (ARC,)), TISSUE, looks, apart))
     nearest.sort(key=lambda pair: float(np.nan_to_num(pair[0], nan=-np.inf)))
-    least, least_of_needle = float(at_least.min()), float(needle.min())
+    least, leastneedle_from_tissue = float(at_least.min()), float(needle.min())
     return SceneClearance(
         SceneReport(
             limit_mm=limit_mm,
@@ -176,15 +173,20 @@ def clearance_of(trajectory: Trajectory, scene: Scene) -> SceneClearance:
             looks=int(np.count_nonzero(looked)),
             nearest=tuple(one for apart, one in nearest if not apart >= CLEARANCE_SEEN_MM),
             bodies=True,
-            needle_at_least_mm=None if least_of_needle >= CLEARANCE_SEEN_MM else least_of_needle,
+            needle_at_least_mm=None if leastneedle_from_tissue >= CLEARANCE_SEEN_MM else leastneedle_from_tissue,
         ),
         at_least,
         needle,
     )
 
 
+def limit_of(scene: Scene) -> float:
+    """Return the distance, mm, that both arms must keep from a scene."""
+    return max(LEAST_MM, scene.margin_mm)
+
+
 @dataclass(frozen=True, eq=False)
-class _Group:
+class Group:
     """Capsules of an arm that are compared together: the tool, with each opening of its jaw, or the outer bodies.
 
     Attributes:
@@ -204,7 +206,13 @@ class _Group:
     above_tissue: Flags
 
 
-def _tool(trajectory: Trajectory, body: str) -> _Group:
+def groups_of(trajectory: Trajectory) -> list[tuple[str, Group]]:
+    """Return the name of each arm of a motion with its tool, and with its outer bodies."""
+    arms = (PSM_A, PSM_M) if trajectory.psm_m is not None else (PSM_A,)
+    return [(body, group(trajectory, body)) for body in arms for group in (_tool, _bodies)]
+
+
+def _tool(trajectory: Trajectory, body: str) -> Group:
     m = trajectory.psm_m
     if body == PSM_A or m is None:
         steps = travel_mm(trajectory.joints, trajectory.instrument)
@@ -212,10 +220,10 @@ def _tool(trajectory: Trajectory, body: str) -> _Group:
     else:
         steps = travel_mm(m.joints, m.instrument)
     every = np.ones(len(LINKS), bool)
-    return _Group(LINKS, RADII_MM, _way(steps), LOOK_MM, partial(_links, trajectory, body), every)
+    return Group(LINKS, RADII_MM, _way(steps), LOOK_MM, partial(links_at, trajectory, body), every)
 
 
-def _bodies(trajectory: Trajectory, body: str) -> _Group:
+def _bodies(trajectory: Trajectory, body: str) -> Group:
     m = trajectory.psm_m
     mine = body == PSM_A or m is None
     joints, tool = (trajectory.joints, trajectory.instrument) if mine or m is None else (m.joints, m.instrument)
@@ -228,10 +236,10 @@ def _bodies(trajectory: Trajectory, body: str) -> _Group:
         return (links if mine or m is None else links.seen_from(matrix_of(m.base_xyzw[None])[0], m.base_mm),)
 
     above = np.isin(names, ABOVE_TISSUE)
-    return _Group(names, radii_of(tool)[: len(names)], way, LOOK_BODIES_MM, axes, above)
+    return Group(names, radii_of(tool)[: len(names)], way, LOOK_BODIES_MM, axes, above)
 
 
-def _links(trajectory: Trajectory, body: str, at: Ints) -> tuple[Links, ...]:
+def links_at(trajectory: Trajectory, body: str, at: Ints) -> tuple[Links, ...]:
     """Return an arm's links at some samples, in the frame of PSM_A's base; PSM_M's with each opening of its jaw."""
     m = trajectory.psm_m
     if body == PSM_A or m is None:
@@ -309,8 +317,8 @@ def _until_next(seen_mm: Floats, way_mm: Floats) -> Floats:
     return np.asarray(np.minimum(seen_mm, (seen_mm + after - ahead) / 2).min(axis=1))
 
 
-def _from_parts(group: _Group, scene: Scene, body: str, at: Ints) -> dict[str, Floats]:
-    """Return the distances of an arm's capsules from each part of a scene at some samples, (C, L)."""
+def from_parts(group: Group, scene: Scene, body: str, at: Ints) -> dict[str, Floats]:
+    """Return the distances of an arm's capsules from each part of a scene, by its name, at C samples, (C, L)."""
     axes, found = group.axes(at), {}
     parts: list[tuple[str, Callable[[Floats, Floats], Floats]]] = []
     if scene.tissue is not None:
@@ -327,7 +335,7 @@ def _from_parts(group: _Group, scene: Scene, body: str, at: Ints) -> dict[str, F
     return found
 
 
-def _of_needle(trajectory: Trajectory, tissue: Tissue, at: Ints) -> dict[str, Floats]:
+def needle_from_tissue(trajectory: Trajectory, tissue: Tissue, at: Ints) -> dict[str, Floats]:
     """Return lower bounds on the distances of the needle in PSM_A's jaws from tissue, (C, 1)."""
     above = tissue.above_mm(needle_arc_mm(trajectory, at)).min(axis=1)[:, None]
     return {TISSUE: np.where(above > 0, above / tissue.steep, above) - NEEDLE_THICK_MM / 2}
@@ -354,7 +362,7 @@ def flat_tissue_mm(trajectory: Trajectory, report: SceneReport) -> float:
     lowest = min(
         float((np.minimum(one.begin_mm[..., 2], one.end_mm[..., 2]) - RADII_MM).min())
         for body in arms
-        for one in _links(trajectory, body, every)
+        for one in links_at(trajectory, body, every)
     )
     apart = [one.least_mm for one in report.nearest if one.part == TISSUE and one.link in LINKS]
     return lowest - min((nan if one is None else one for one in apart), default=CLEARANCE_SEEN_MM)

@@ -42,6 +42,7 @@ NEEDED = {
     "POST /retrainings": TRAINER,
     "DELETE /jobs/{job}": TRAINER,
     "POST /plans": TRAINER,
+    "POST /reach": TRAINER,
     "POST /playbacks": TRAINER,
     "POST /datasets": TRAINER,
     "DELETE /datasets/{dataset}": TRAINER,

@@ -160,6 +160,12 @@ def plan_and_play(tab: Watched) -> None:
     at = float(x.input_value())
     page.get_by_role("slider", name="Suture point 1").press("ArrowRight")
     assert float(x.input_value()) == pytest.approx(at + 1)
+    page.get_by_role("button", name="Where can I plan?").click()
+    expect(page.locator("#reach-said")).to_contain_text("places can be planned")
+    tab.shoot("reach")
+    page.locator(".above .reach .yes").first.dispatch_event("click")
+    expect(page.get_by_label("Pass 2, x in mm")).to_be_visible()
+    page.get_by_role("button", name="Remove pass 2").click()
     page.get_by_role("button", name="Make the plan").click()
 
     page.wait_for_url(re.compile("/pages/plans/[0-9a-f]{64}"))

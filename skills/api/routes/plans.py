@@ -1,6 +1,7 @@
 """Routes of plans: suture points, plans, trajectories, replay bags, playbacks and pictures.
 
-`POST /suture-points` reads the suture points for a plan from a simulator's recording. The motion of a plan is returned
+`POST /suture-points` reads the suture points for a plan from a simulator's recording, `POST /reach` maps where they can
+be. The motion of a plan is returned
 as JSON, as a table, or as the bag that a robot replays; a recording of the replay is compared with the plan. A still
 picture of a playback comes with its verdict; the film and the plots are drawn afterwards.
 """
@@ -29,11 +30,13 @@ from skills.library.arm_errors import stated_errors
 from skills.library.jobs import QUEUED, did_nothing
 from skills.library.plans import find_suture_points, motion_of, plan_json, trajectory_of
 from skills.library.playbacks import find_playback, playback_json
+from skills.library.reach import map_style
 from skills.library.replay import compare_with_plan, replay_bag
 from skills.planning.plan import MAX_PASSES
 from skills.planning.trajectory import Trajectory
-from skills.schemas.given import Comparison, Plan, Playback, SuturePoints
+from skills.schemas.given import Comparison, Plan, Playback, Reach, SuturePoints
 from skills.schemas.given import Trajectory as GivenTrajectory
+from skills.schemas.reach import ReachIn
 from skills.schemas.requests import DIGEST, FRAME, Name, PlanIn, PlaybackIn, Schema
 from skills.settings import MEBIBYTE, Settings
 from skills.verification.playback import Pictures
@@ -54,6 +57,17 @@ def get_plan(plan: Digest, db: Db, give: Giving) -> Response:
     """Return a plan."""
     with db.reading() as session:
         return give(plan_json(plans.find_plan(session, plan)))
+
+
+@router.post("/reach", dependencies=[needs("trainer")], **says(Reach, 404, 409, 410))
+def map_reach(body: ReachIn, db: Db) -> Response:
+    """Return where a style can be planned: reach, joint margins and clearances over positions and rotations.
+
+    A place is `yes` if a plan of that pass alone keeps all limits of the verdict's closed form, `no` if it does not,
+    and `in doubt` next to a limit. Several passes, and the arms' errors, are left to plan and playback. Nothing is
+    stored.
+    """
+    return say(map_style(db, body).model_dump(mode="json"))
 
 
 @router.post("/playbacks", dependencies=[needs("trainer"), room_for_a_job], **starts_job(404))

@@ -9,8 +9,11 @@ const before = JSON.parse(form.dataset.before);
 const above = get("above");
 const [MARGIN, STEP_MM, FAR_MM] = [14, 1, 5];
 const AXES = ["x", "y", "z"];
+const [MOST_PLACES, LEAST_STEP_MM] = [400, 2];
 let path = [];
 let points = [];
+let places = [];
+let step_mm = 0;
 
 const degrees = ([x, y, z, w]) => (x || y ? null : (2 * Math.atan2(z, w) * 180) / Math.PI);
 const turned = (angle) => [0, 0, Math.sin((angle * Math.PI) / 360), Math.cos((angle * Math.PI) / 360)];
@@ -105,11 +108,44 @@ function draw() {
   const focused = document.activeElement?.dataset?.index;
   above.replaceChildren(
     ...ticks(low, high, at, height),
+    reachOf(at),
     ...boxes.map((corners) => element("polygon", { class: "box", points: line(corners) })),
     ...points.map((point) => element("polyline", { class: "path", points: line(path.map((one) => placed(one, point))) })),
     ...points.flatMap((point, index) => dotOf(point, index, at(point.at))),
   );
   if (focused !== undefined) above.querySelector(`[data-index="${focused}"]`)?.focus();
+}
+
+// The map of reach: a cell for each place, with its margins as a tooltip; one that can be planned adds a pass there.
+function reachOf(at) {
+  const all = element("g", { class: "reach" });
+  const side = step_mm * scale;
+  for (const place of places) {
+    const [x, y] = at(place.position_mm);
+    const kind = place.reach === "in doubt" ? "doubt" : place.reach;
+    const cell = element("g", { class: kind });
+    cell.append(element("rect", { x: x - side / 2, y: y - side / 2, width: side - 1, height: side - 1 }));
+    const [l, r, t, b] = [x - side / 4, x + side / 4, y - side / 4, y + side / 4];
+    if (kind !== "yes") cell.append(element("path", { d: `M${l} ${b} ${r} ${t}${kind === "no" ? `M${l} ${t} ${r} ${b}` : ""}` }));
+    cell.append(element("title", {}, inWords(place)));
+    if (kind !== "no") {
+      for (const [name, value] of Object.entries({ tabindex: -1, role: "button", "aria-label": inWords(place) })) cell.setAttribute(name, value);
+      cell.addEventListener("click", () => {
+        points.push({ ...points.at(-1), at: [...place.position_mm] });
+        show();
+      });
+    }
+    all.append(cell);
+  }
+  return all;
+}
+
+function inWords(place) {
+  const [x, y, z] = place.position_mm.map((one) => one.toFixed(1));
+  const told = [["joints", place.turn_margin_deg, "°"], ["insertion", place.insertion_margin_mm, " mm"], ["arms", place.bodies_mm, " mm"], ["tools", place.tools_mm, " mm"], ["scene", place.scene_mm, " mm"], ["needle", place.needle_mm, " mm"]];
+  const margins = told.filter(([, value]) => value !== null).map(([name, value, unit]) => `${name} ${value.toFixed(1)}${unit}`);
+  const answer = { yes: "can be planned", no: "refused", "in doubt": "in doubt" }[place.reach];
+  return `${x}, ${y}, ${z} mm: ${answer}${place.limited_by ? `, ${place.limited_by}` : ""} (${margins.join(", ")})`;
 }
 
 function around(of) {
@@ -185,9 +221,42 @@ function psmM() {
   return { ...asked, enters: enters.value, ...(source.value && { source: source.value }) };
 }
 
+// The settings that a plan and a map of reach share.
+function asked() {
+  const { tip_offset_mm: offset, handoff, orientation, a2, tissue_mm: tissue } = form.elements;
+  return {
+    surgeon: form.dataset.surgeon, suture: form.dataset.suture, version: Number(form.dataset.version),
+    tip_offset_mm: Number(offset.value), orientation: orientation.value || null, a2: a2.value || null,
+    ...(tissue.value && { tissue_mm: Number(tissue.value) }), ...(handoff.value === "none" ? { handoff: "none" } : { psm_m: psmM() }),
+  };
+}
+
+get("reach").addEventListener("click", async ({ target }) => {
+  const { low, high } = window_mm;
+  const size = high.map((one, i) => Math.min(400, one - low[i]));
+  const step = Math.max(LEAST_STEP_MM, Math.sqrt((size[0] * size[1]) / MOST_PLACES));
+  const last = points.at(-1);
+  target.disabled = true;
+  try {
+    const found = await call("POST", "/reach", {
+      ...asked(), centre_mm: [(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, last.at[2]], size_mm: [...size, 0],
+      step_mm: Math.ceil(step * 10) / 10, rotations_xyzw: [rotation(last)],
+    });
+    [places, step_mm] = [found.places, found.step_mm];
+    get("reach-key").hidden = false;
+    get("reach-said").textContent = found.in_words;
+    get("reach-said").className = "small";
+    draw();
+  } catch (problem) {
+    get("reach-said").textContent = problem.message;
+    get("reach-said").className = "said wrong";
+  }
+  target.disabled = false;
+});
+
 form.addEventListener("submit", async (event) => {
   event.preventDefault();
-  const { arm, frame, instrument, speed_mm_s: speed, tip_offset_mm: offset, handoff, orientation, a2, tissue_mm: tissue } = form.elements;
+  const { arm, frame, instrument, speed_mm_s: speed } = form.elements;
   const button = form.querySelector("button:not([type])");
   const said = get("plan-said");
   said.className = "said";
@@ -195,11 +264,9 @@ form.addEventListener("submit", async (event) => {
   button.disabled = true;
   try {
     const plan = await call("POST", "/plans", {
-      surgeon: form.dataset.surgeon, suture: form.dataset.suture, version: Number(form.dataset.version),
-      suture_points: points.map((point) => ({ position_mm: point.at, rotation_xyzw: rotation(point) })),
+      ...asked(), suture_points: points.map((point) => ({ position_mm: point.at, rotation_xyzw: rotation(point) })),
       arm: arm.value || null, frame: frame.value || null, instrument: instrument.value || null,
-      speed_mm_s: Number(speed.value), tip_offset_mm: Number(offset.value), orientation: orientation.value || null, a2: a2.value || null,
-      ...(tissue.value && { tissue_mm: Number(tissue.value) }), ...(handoff.value === "none" ? { handoff: "none" } : { psm_m: psmM() }),
+      speed_mm_s: Number(speed.value),
     });
     location.assign(`${root}/pages/plans/${plan.id}`);
   } catch (problem) {
