@@ -22,7 +22,7 @@ OPERATIONS = {
     "get_reward_map", "get_surgeon", "get_suture_type", "get_trajectory", "get_version",
     "list_all_keys", "list_demos", "list_jobs", "list_policies", "list_recordings",
     "list_surgeons", "list_suture_types",
-    "list_versions", "make_key", "make_plan", "mark_demo", "metrics", "newest_head", "next_action", "play",
+    "list_versions", "make_key", "make_plan", "map_reach", "mark_demo", "metrics", "newest_head", "next_action", "play",
     "preview_recording",
     "put_surgeon", "put_suture_type",
     "read_suture_points", "ready", "release", "retrain", "roll_out", "score", "served_at", "train",
