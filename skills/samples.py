@@ -13,14 +13,15 @@ import re
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib import resources
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import IO
 
 from skills.client import Client, Problem
-from skills.demonstration.segments import Agreement, agreement
+from skills.demonstration.recording import Recording as Recorded
+from skills.demonstration.segments import Segment, propose_by_arm
 from skills.errors import BadInput, BadRecording, SkillsError
 from skills.formats.archive import pack
 from skills.formats.jigsaws import Skill, Trial, meta_line, read_jigsaws, trials
@@ -225,6 +226,51 @@ class Evaluated:
     def a_trial(self) -> float:
         """Proposals per trial."""
         return self.proposed / max(self.trials, 1)
+
+
+SHARED = 0.5  # of the shorter of a label and a proposal that are the same hand-off
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Proposals of a recording compared with its labels, which were not shown to the proposals.
+
+    Attributes:
+        proposed: Number of proposals, of all arms.
+        labelled: Number of labelled hand-offs.
+        matched: Number of pairs of one proposal and one label that share `SHARED` of the shorter, of one arm.
+        confident: Confidence of each proposal, and whether it was matched; without those that have none.
+    """
+
+    proposed: int
+    labelled: int
+    matched: int
+    confident: tuple[tuple[float, bool], ...]
+
+
+def agreement(recording: Recorded) -> Agreement:
+    """Compare the proposals that are made without labels with the labelled hand-offs.
+
+    Args:
+        recording: A recording; without labels, none of its proposals is matched.
+    """
+    labelled = [one for one in propose_by_arm(recording) if one.found_by in ("stage", "gesture")]
+    proposed = propose_by_arm(replace(recording, labels=()))
+    left, matched = list(labelled), []
+    for one in proposed:
+        same = next((label for label in left if label.arm == one.arm and _shared(label, one) >= SHARED), None)
+        matched.append(same is not None)
+        if same is not None:
+            left.remove(same)
+    pairs = zip(proposed, matched, strict=True)
+    confident = tuple((one.confidence, is_matched) for one, is_matched in pairs if one.confidence is not None)
+    return Agreement(len(proposed), len(labelled), sum(matched), confident)
+
+
+def _shared(one: Segment, other: Segment) -> float:
+    """Return the common time of two segments as a share of the shorter one."""
+    common_s = min(one.end_s, other.end_s) - max(one.start_s, other.start_s)
+    return common_s / max(min(one.end_s - one.start_s, other.end_s - other.start_s), 1e-9)
 
 
 def evaluate_hand_offs(found: Iterable[Trial]) -> list[Evaluated]:

@@ -133,7 +133,6 @@ A2_RAD = 0.35  # 20 degrees in place: far more than an unsteady wrist, less than
 A1_SHARE = 1 / 3  # of the turn in place: a hand that reaches for the needle also turns, but on the way
 PROPOSALS_LIMIT = 1000  # of one arm
 OVERLAP_LIMIT = 3
-SHARED = 0.5  # of the shorter of a label and a proposal that are the same hand-off
 RELEASE_S = 3.0  # longest time from the last movement to the release, and to the other arm's grip
 
 FoundBy = Literal["stage", "gesture", "transfer", "jaw", "motion"]
@@ -232,6 +231,22 @@ def propose_by_arm(recording: Recording) -> tuple[Segment, ...]:
     return tuple(segment for arm in recording.arms for segment in _proposed(heard, recording.motion_of(arm=arm)))
 
 
+def movements_by_arm(recording: Recording) -> tuple[Segment, ...]:
+    """Find the movements of every arm that resemble a hand-off, whatever they were for; labels are not regarded.
+
+    They are those made with a closed jaw, or, where no jaw tells, those between rests. If needles are transferred, only
+    the last ones before a transfer are proposals.
+
+    Args:
+        recording: The recording.
+
+    Returns:
+        The movements arm by arm, those of each in order of time.
+    """
+    heard = _heard(replace(recording, labels=()))
+    return tuple(one for arm in recording.arms for one in _moved(_look(heard, recording.motion_of(arm=arm))))
+
+
 def _proposed(heard: "_Heard", motion: Motion) -> tuple[Segment, ...]:
     seen = _look(heard, motion)
     named = _named_passes(seen, heard.named[motion.arm])
@@ -240,54 +255,16 @@ def _proposed(heard: "_Heard", motion: Motion) -> tuple[Segment, ...]:
     if heard.transfers and seen.holding is not None:
         given = {one.released_s: one for one in heard.transfers if one.giver == motion.arm}
         return tuple(_given(seen, span, one) for span, one in _last_held(seen, given)[:PROPOSALS_LIMIT])
+    return _moved(seen)
+
+
+def _moved(seen: "_Seen") -> tuple[Segment, ...]:
     if seen.holding is not None:
         held = _without_hand_work(seen, _held(seen, seen.holding))
         return tuple(_told(seen, span, "jaw") for span in held[:PROPOSALS_LIMIT])
     turned = [span for span in _strokes(seen) if _ends_with_a2(seen, span)]
     spans = turned or [span for span in _bridged(_listed(seen.moving), PAUSE_S, seen) if _is_a_pass(seen, span)]
     return tuple(_told(seen, span, "motion") for span in _without_hand_work(seen, spans)[:PROPOSALS_LIMIT])
-
-
-@dataclass(frozen=True)
-class Agreement:
-    """Proposals of a recording compared with its labels, which were not shown to the proposals.
-
-    Attributes:
-        proposed: Number of proposals, of all arms.
-        labelled: Number of labelled hand-offs.
-        matched: Number of pairs of one proposal and one label that share `SHARED` of the shorter, of one arm.
-        confident: Confidence of each proposal, and whether it was matched; without those that have none.
-    """
-
-    proposed: int
-    labelled: int
-    matched: int
-    confident: tuple[tuple[float, bool], ...]
-
-
-def agreement(recording: Recording) -> Agreement:
-    """Compare the proposals that are made without labels with the labelled hand-offs.
-
-    Args:
-        recording: A recording; without labels, none of its proposals is matched.
-    """
-    labelled = [one for one in propose_by_arm(recording) if one.found_by in ("stage", "gesture")]
-    proposed = propose_by_arm(replace(recording, labels=()))
-    left, matched = list(labelled), []
-    for one in proposed:
-        same = next((label for label in left if label.arm == one.arm and _shared(label, one) >= SHARED), None)
-        matched.append(same is not None)
-        if same is not None:
-            left.remove(same)
-    pairs = zip(proposed, matched, strict=True)
-    confident = tuple((one.confidence, is_matched) for one, is_matched in pairs if one.confidence is not None)
-    return Agreement(len(proposed), len(labelled), sum(matched), confident)
-
-
-def _shared(one: Segment, other: Segment) -> float:
-    """Return the common time of two segments as a share of the shorter one."""
-    common_s = min(one.end_s, other.end_s) - max(one.start_s, other.start_s)
-    return common_s / max(min(one.end_s - one.start_s, other.end_s - other.start_s), 1e-9)
 
 
 def arrival(movement: Movement, start_s: float, end_s: float) -> float:

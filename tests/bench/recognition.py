@@ -1,7 +1,8 @@
 """Whose hand-off it is, on real surgeons: two tasks of JIGSAWS, leaving the trial out.
 
 `SKILLS_TEST_JIGSAWS` names the folder of the archive. Every hand-off that is proposed for either instrument is
-recognised by those of the same instrument in other trials; the hand-offs of a trial vote. Settings and temperature are
+recognised by those of the same instrument in other trials. A trial is recognised by all its movements, of which the
+proposals are some: each is recognised by the movements of other trials, and they vote. Settings and temperature are
 chosen on the training trials alone. The rivals have the same metric with fewer numbers, or the nearest neighbour by
 DTW. The trials are what the library calls sessions: the data set does not say which were recorded on one day.
 """
@@ -22,7 +23,7 @@ from skills.comparison.recognition import Validated, usable, validate, vote
 from skills.comparison.traits import FAMILIES, NUMBERS, signature_of
 from skills.demonstration.demonstration import Demo, cut_demo
 from skills.demonstration.recording import Recording
-from skills.demonstration.segments import propose_by_arm
+from skills.demonstration.segments import Segment, movements_by_arm, propose_by_arm
 from skills.errors import BadPath
 from skills.formats.jigsaws import read_jigsaws, trials
 from skills.learning.slip import wilson
@@ -30,12 +31,13 @@ from skills.learning.slip import wilson
 TASKS = {"knot_tying": "Knot_Tying", "needle_passing": "Needle_Passing"}  # folders of the archive, and their names
 DRAWS = 2000  # of the bootstrap over trials
 BINS = 5
+Parts = Callable[[Recording], Sequence[Segment]]
 MAKES_NO_SENSE = 1e9  # a distance between motions of one trial, so that none is its own nearest neighbour
 
 
 @dataclass(frozen=True, eq=False)
 class HandOff:
-    """A proposed hand-off of a trial."""
+    """A proposed hand-off of a trial, or another movement of it."""
 
     user: str
     trial: str
@@ -62,10 +64,10 @@ def recordings() -> Iterator[tuple[str, str, str, Recording]]:
                 yield trial.task, trial.user, trial.name, read_jigsaws(file)
 
 
-def hand_offs(recording: Recording, user: str, trial: str) -> list[HandOff]:
-    """Return the proposed hand-offs of both instruments that have a direction."""
+def hand_offs(recording: Recording, user: str, trial: str, parts: Parts = propose_by_arm) -> list[HandOff]:
+    """Return the proposed hand-offs, or other parts, of both instruments that have a direction."""
     found = []
-    for part in propose_by_arm(recording):
+    for part in parts(recording):
         demo = cut_demo(recording, arm=part.arm, start_s=part.start_s, end_s=part.end_s)
         try:
             shape_of(demo)
@@ -201,11 +203,11 @@ def judged(some: Sequence[HandOff], method: Method) -> Figures:
     return Figures(right, np.array([len(ballots[one]) for one in names]), voted, float(np.mean(losses)), sure, was)
 
 
-def by_task() -> dict[str, list[HandOff]]:
-    """Return the hand-offs of each task."""
+def by_task(parts: Parts = propose_by_arm) -> dict[str, list[HandOff]]:
+    """Return the hand-offs, or other parts, of each task."""
     found: dict[str, list[HandOff]] = {}
     for task, user, name, recording in recordings():
-        found.setdefault(task, []).extend(hand_offs(recording, user, name))
+        found.setdefault(task, []).extend(hand_offs(recording, user, name, parts))
     return found
 
 
@@ -256,24 +258,27 @@ def recognition(table: Table) -> None:
         table.add_row("recognition", "not measured", "SKILLS_TEST_JIGSAWS names no folder")
         return
     raw = whole_trials()
-    for task, some in by_task().items():
-        for name, method in METHODS.items():
-            found = judged(some, method)
-            low, high = found.interval
-            votes = wilson(int(found.voted.sum()), len(found.voted))
-            loss = f"{found.log_loss:.2f}" if "nearest" not in name else "-"
-            table.add_row(
-                f"{task}: {name}",
-                f"{found.accuracy:.1%} ({low:.1%} to {high:.1%})",
-                f"log loss {loss}; votes {found.voted.sum()} of {len(found.voted)}: {found.votes:.2f} "
-                f"({votes[0]:.2f} to {votes[1]:.2f})",
-            )
-            if name == "ours":
-                table.add_row("", "said, was", ", ".join(f"{said:.2f} {was:.2f}" for said, was in found.curve()))
-        for arm, validated in strangers(some):
-            known, unknown = validated.stranger.mean(), validated.unknown.mean()
-            table.add_row(f"{task}: none of these, {arm}", f"{known:.2f}, {unknown:.2f}", "surgeon known, left out")
-        users = len({one.user for one in some})
-        table.add_row(f"{task}: guessing", f"{1 / users:.1%}", f"log loss {log(users):.2f}; {len(some)} hand-offs")
-        shares = ", ".join(f"{share:.2f} {how}" for (of, how), share in raw.items() if of == task)
-        table.add_row(f"{task}: nearest whole trial by DTW", "", f"{shares}: raw positions of both instruments")
+    for part, tasks in {"hand-offs": by_task(), "movements": by_task(movements_by_arm)}.items():
+        for task, some in tasks.items():
+            users = len({one.user for one in some})
+            table.add_row(f"{task}: guessing", f"{1 / users:.1%}", f"log loss {log(users):.2f}; {len(some)} {part}")
+            for name, method in METHODS.items():
+                _tell(table, f"{task}, {part}: {name}", judged(some, method), has_loss="nearest" not in name)
+            for arm, validated in strangers(some):
+                known, unknown = validated.stranger.mean(), validated.unknown.mean()
+                table.add_row(f"none of these, {arm}", f"{known:.2f}, {unknown:.2f}", "surgeon known, left out")
+    for (task, how), share in raw.items():
+        table.add_row(f"{task}: nearest whole trial by DTW", f"{share:.2f}", f"raw positions of both instruments {how}")
+
+
+def _tell(table: Table, label: str, found: Figures, *, has_loss: bool) -> None:
+    low, high = found.interval
+    votes = wilson(int(found.voted.sum()), len(found.voted))
+    table.add_row(
+        label,
+        f"{found.accuracy:.1%} ({low:.1%} to {high:.1%})",
+        f"log loss {found.log_loss if has_loss else float('nan'):.2f}; votes {found.voted.sum()} of "
+        f"{len(found.voted)}: {found.votes:.2f} ({votes[0]:.2f} to {votes[1]:.2f})",
+    )
+    if has_loss:
+        table.add_row("", "said, was", ", ".join(f"{said:.2f} {was:.2f}" for said, was in found.curve()))

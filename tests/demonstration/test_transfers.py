@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from skills.demonstration.recording import Label, Recording, Signal, base_frames
-from skills.demonstration.segments import agreement, propose_by_arm
+from skills.demonstration.segments import propose_by_arm
 from skills.demonstration.transfers import Transfer, closed_jaw, find_transfers
 from skills.formats.jigsaws import read_jigsaws
+from skills.samples import agreement
 from tests.demonstration.exchanges import Given, exchanges
 from tests.demonstration.sessions import A, Kind, M, session
 from tests.demonstration.strokes import RATE, along_x, line, motion
