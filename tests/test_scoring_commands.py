@@ -74,3 +74,12 @@ def test_a_folder_is_calibrated_on_and_used_by_the_next_score(skills: Run, tmp_p
     assert skill["calibrated"] and skill["calibration"] == about["sha256"]
     code, said = skills("calibrate", str(tmp_path / "lab" / "Suturing" / "transcriptions"))
     assert code == 1 and "has no trials of JIGSAWS" in said, said
+
+
+def test_the_figures_of_a_refused_model_are_printed_as_json_too(skills: Run, tmp_path: Path) -> None:
+    lab = rated.folder(tmp_path / "lab", count=4, trials=3)
+    code, said = skills("calibrate", str(lab), "--permutations", "39", "--json")
+    assert code == 1, said
+    about, _ = json.JSONDecoder().raw_decode(said[said.index("{") :])
+    assert about["sha256"] is None and about["data"]["trials"] == 12 and "Suturing" in about["validated"]["tasks"]
+    assert "The model is not accepted" in said

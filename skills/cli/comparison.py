@@ -245,13 +245,17 @@ def calibrate(
         )
     if not as_json:
         _tell_judged(about)
-    with closing(Database(settings().database_url)) as database, database.writing() as session:
-        stored, _ = keep(session, about, "local")
-    if as_json:
-        print_json({"sha256": stored.sha256, **about})
-    else:
+    sha256 = None
+    try:
+        with closing(Database(settings().database_url)) as database, database.writing() as session:
+            stored, _ = keep(session, about, "local")
+            sha256 = stored.sha256
+    finally:
+        if as_json:  # the figures of a refused model too, without a digest
+            print_json({"sha256": sha256, **about})
+    if not as_json:
         _tell_model(about)
-        out.print(f"Stored, and used by every score from now on: {stored.sha256}", soft_wrap=True)
+        out.print(f"Stored, and used by every score from now on: {sha256}", soft_wrap=True)
 
 
 def _tell_left_out(left_out: dict[str, list[str]]) -> None:
