@@ -7,8 +7,10 @@ A shape is measured only if lower bounds of its distance do not exclude it. Warp
 are of boxes around the parts of a path: each point is paired with some point of the other path, so it is at least as
 far as the nearest box; of one part, that is LB_Keogh's bound with an unlimited window. More exactly, a warping passes
 through the boxes in order (Sakurai, Yoshikawa and Faloutsos, "FTW: fast similarity search under the time warping
-distance", PODS 2005). The candidates are taken by increasing bound until it exceeds the distance of the last neighbour
-found; a warping is abandoned once it exceeds that too.
+distance", PODS 2005). The most promising candidates are measured first; then all whose bound does not exceed the
+distance of the last neighbour found. A warping visits only those pairs of points through which it may stay within that
+distance, by what is behind it and the boxes' bound of what is ahead (as by Herrmann and Webb, "Early abandoning and
+pruning for elastic distances including dynamic time warping", DMKD 2021, but with a bound ahead).
 
 Shapes and boxes are held in memory: 3.1 kB for each, at most `MOST`.
 """
@@ -24,13 +26,15 @@ from skills.comparison import _kernels
 from skills.comparison.distances import STATES, THREADS
 
 COARSE, FINE = 10, 20  # parts of a shape; the coarse boxes are compared with all shapes, the fine ones with some
+PROMISING = 512  # candidates that are measured first
+TOGETHER = 512  # shapes whose coarse bounds are computed together, in the fastest cache
 SLACK = 1.0 + 1e-9  # sums of a hundred numbers in another order differ by less
 MOST = 140_000  # shapes: 420 MiB
-FIRST_ROOM, LAST_GROWN = 1024, 16_384  # shapes; beyond, there is room for `MOST`, of which only the used part is memory
-GROWTH = 4
+FIRST_ROOM, GROWTH = 1024, 4  # shapes; only the used part of the room is memory
 WORTH_A_THREAD = 2000  # shapes
 
 Boxes = NDArray[np.float32]
+_HELD = {"_shapes": 0, "_coarse": 2, "_fine": 0, "_rows": 0}  # the arrays of an index, and the axis of their shapes
 
 
 class ShapeIndex:
@@ -38,8 +42,8 @@ class ShapeIndex:
 
     def __init__(self) -> None:
         self._shapes = np.empty((FIRST_ROOM, STATES, 3))
-        self._coarse = np.empty((FIRST_ROOM, COARSE, 6), np.float32)
-        self._fine = np.empty((FIRST_ROOM, FINE, 6), np.float32)
+        self._coarse = np.empty((COARSE, 6, FIRST_ROOM), np.float32)  # by shapes last, for vector instructions
+        self._fine = np.empty((FIRST_ROOM, 6, FINE), np.float32)
         self._rows = np.empty(FIRST_ROOM, np.int64)
         self._places: dict[int, int] = {}
 
@@ -63,18 +67,16 @@ class ShapeIndex:
         assert row not in self._places and len(self) < MOST
         place = len(self)
         if place == len(self._rows):
-            for name in (
-                "_shapes",
-                "_coarse",
-                "_fine",
-                "_rows",
-            ):  # one after the other, so that only one is there twice
+            room = min(GROWTH * place, MOST)
+            for name, axis in _HELD.items():  # one after the other, so that only one is there twice
                 held = getattr(self, name)
-                room = np.empty((int(GROWTH * place), *held.shape[1:]), held.dtype)
-                room[:place] = held
-                setattr(self, name, room)
+                shape = list(held.shape)
+                shape[axis] = room
+                grown = np.empty(shape, held.dtype)
+                np.moveaxis(grown, axis, 0)[:place] = np.moveaxis(held, axis, 0)
+                setattr(self, name, grown)
         self._shapes[place], self._rows[place] = shape_mm, row
-        self._coarse[place], self._fine[place] = boxes_of(shape_mm, COARSE), boxes_of(shape_mm, FINE)
+        self._coarse[:, :, place], self._fine[place] = boxes_of(shape_mm, COARSE).T, boxes_of(shape_mm, FINE)
         self._places[row] = place
 
     def remove(self, rows: Iterable[int]) -> None:
@@ -84,7 +86,8 @@ class ShapeIndex:
             if place is None:
                 continue
             last = len(self._places)
-            for held in (self._shapes, self._coarse, self._fine, self._rows):
+            for name, axis in _HELD.items():
+                held = np.moveaxis(getattr(self, name), axis, 0)
                 held[place] = held[last]
                 held[last] = 0
             if place != last:
@@ -105,34 +108,46 @@ class ShapeIndex:
         """
         size = len(self)
         path = np.array(shape, np.float64, order="C")
-        shapes, coarse, fine = self._shapes[:size], self._coarse[:size], self._fine[:size]
+        shapes, fine = self._shapes[:size], self._fine[:size]
         lengths = shapes[:, -1, 0].copy() if scaled else np.ones(size)
         bounds = np.empty(size)
-        mine = {parts: boxes_of(path, parts) for parts in (COARSE, FINE)}
+        coarse_boxes, fine_boxes = (boxes_of(path, parts).astype(np.float64) for parts in (COARSE, FINE))
         threads = min(THREADS, 1 + size // WORTH_A_THREAD)
 
-        def bound(part: slice) -> None:
-            room = np.empty((COARSE, 6)), np.empty(COARSE)
-            _kernels.bound_all_compiled(mine[COARSE], STATES / COARSE, coarse[part], lengths[part], *room, bounds[part])
+        def bound(start: int, end: int) -> None:
+            room = np.empty(TOGETHER), np.empty((COARSE, TOGETHER))
+            _kernels.bound_all_compiled(coarse_boxes, STATES / COARSE, self._coarse, lengths, start, end, *room, bounds)
 
         def search(order: Ints) -> tuple[Ints, Floats]:
-            room = np.empty((FINE, 6)), np.empty(STATES + 1), np.empty((STATES, 3))
-            found, totals = np.empty(count, np.int64), np.empty(count)
-            _kernels.search_compiled(
-                path, mine[FINE], STATES / FINE, shapes, fine, lengths, order, bounds, SLACK, *room, found, totals
-            )
+            found, totals = np.full(count, -1), np.full(count, np.inf)
+            found[: len(known[0])], totals[: len(known[0])] = known
+            room = np.empty((6, FINE)), np.empty((3, STATES + 1)), np.empty((2, FINE, STATES))
+            given = path, np.ascontiguousarray(path.T), fine_boxes, shapes, fine, lengths, order, bounds, SLACK
+            _kernels.search_compiled(*given, *room, found, totals)
             return found[found >= 0], totals[found >= 0]
+
+        def search_all(places: Ints) -> tuple[Ints, Floats]:
+            order = places[np.argsort(bounds[places], kind="stable")]
+            # Dealt out in turn, so that each thread finds near ones soon; each has those that were known before.
+            pairs = list(pool.map(search, (np.ascontiguousarray(order[at::threads]) for at in range(threads))))
+            found, totals = (np.concatenate(column) for column in zip(*pairs, strict=True))
+            found, first = np.unique(found, return_index=True)
+            best = np.lexsort((found, totals[first]))[:count]
+            return found[best], totals[first][best]
 
         with ThreadPoolExecutor(threads) as pool:
             ends = np.linspace(0, size, threads + 1).astype(int).tolist()
-            list(pool.map(bound, (slice(*ends[at : at + 2]) for at in range(threads))))
-            places = np.arange(size) if among is None else np.flatnonzero(among)
-            order = places[np.argsort(bounds[places], kind="stable")]
-            # Dealt out in turn, so that each thread finds near ones soon.
-            found = list(pool.map(search, (np.ascontiguousarray(order[at::threads]) for at in range(threads))))
-        nearest, totals = (np.concatenate(column) for column in zip(*found, strict=True))
-        first = np.lexsort((nearest, totals))[:count]
-        return self._rows[nearest[first]], totals[first]
+            list(pool.map(bound, ends[:-1], ends[1:]))
+            if among is not None:
+                bounds[~among] = np.inf
+            known = np.empty(0, np.int64), np.empty(0)
+            promising = np.argpartition(bounds, PROMISING)[:PROMISING] if size > PROMISING else np.arange(size)
+            known = search_all(promising[np.isfinite(bounds[promising])])
+            limit = known[1][-1] * SLACK if len(known[1]) == count else np.finfo(float).max
+            left = bounds <= limit
+            left[promising] = False
+            known = search_all(np.flatnonzero(left))
+        return self._rows[known[0]], known[1]
 
 
 def boxes_of(shape: Floats, parts: int) -> Boxes:
@@ -143,8 +158,8 @@ def boxes_of(shape: Floats, parts: int) -> Boxes:
         parts: Their number, a divisor of STATES.
 
     Returns:
-        Shape (parts, 6).
+        Shape (6, parts).
     """
     of = shape.reshape(parts, STATES // parts, 3)
     low, high = of.min(axis=1).astype(np.float32), of.max(axis=1).astype(np.float32)
-    return np.concatenate([np.nextafter(low, np.float32(-np.inf)), np.nextafter(high, np.float32(np.inf))], axis=1)
+    return np.concatenate([np.nextafter(low, np.float32(-np.inf)), np.nextafter(high, np.float32(np.inf))], axis=1).T

@@ -11,12 +11,14 @@ One process holds at most `skills.comparison.nearest.MOST` shapes; the suture ty
 room. What a key may not see stays in the index, and is not searched for it.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from threading import Lock
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from sqlalchemy import Engine, Text, cast, func, select
+from sqlalchemy import ColumnElement, Engine, Row, Text, cast, func, select
 from sqlalchemy.orm import Session
 
 from skills.arrays import Floats, Ints
@@ -37,6 +39,7 @@ from skills.schemas.comparison import Nearest, Neighbour
 ROWS_AT_ONCE = 500  # shapes read from the database
 PATIENCE_S = 30.0  # timeout of the wait for another thread that fills the index
 DIGITS = 4
+CALLERS = 8  # keys with different rows whose rows are remembered
 MORE = 8  # neighbours beyond the requested ones, for those that turn out to be cuts of one motion
 
 
@@ -46,7 +49,8 @@ class _Held:
 
     index: ShapeIndex = field(default_factory=ShapeIndex)
     without: set[int] = field(default_factory=set)
-    said: str | None = None  # the rows as the database last listed them
+    listed: "_Listed | None" = None  # the rows as the database last listed them
+    visible: dict["_Listed", Ints] = field(default_factory=dict)  # what callers may see; the index has all of it
 
     def known(self) -> Ints:
         return np.concatenate([self.index.rows, np.array(sorted(self.without), np.int64)])
@@ -78,12 +82,19 @@ def nearest_to(database: Database, demo: str, count: int, *, scaled: bool = Fals
     try:
         with database.reading() as session:
             asked = _asked(session, demo)
-            everybodys = _Listed(session, asked.suture, everybodys=True)
-            visible = _Listed(session, asked.suture) if ONLY in session.info else everybodys
-        held = _follow(database, asked.suture, everybodys, visible.rows())
+            everybodys = _listed(session, asked.suture, everybodys=True)
+            visible = _listed(session, asked.suture) if ONLY in session.info else everybodys
+            held = _last_to_be_dropped(database, asked.suture)
+            _remove(session, held, everybodys)
+            rows = held.visible[visible] if visible in held.visible else visible.rows(session)
+        if visible not in held.visible:
+            _add_missing(database, asked.suture, held, rows)
+            if len(held.visible) == CALLERS:
+                held.visible.clear()
+            held.visible[visible] = rows
         if asked.row not in held.index:
             raise BadPath(f"{NO_DIRECTION} Cut the hand-off from its start to the point where the needle is taken.")
-        among = np.isin(held.index.rows, visible.rows(), kind="table")
+        among = None if visible == everybodys else np.isin(held.index.rows, rows, kind="table")
         shape = held.index.shape_of(asked.row)
         wanted = count
         while True:
@@ -94,7 +105,7 @@ def nearest_to(database: Database, demo: str, count: int, *, scaled: bool = Fals
             if len(neighbours) >= count or len(found[0]) < wanted + MORE:
                 break
             wanted *= 2
-        searched = int(among.sum()) - 1
+        searched = (len(held.index) if among is None else int(among.sum())) - 1
     finally:
         _using.release()
     return Nearest(
@@ -115,7 +126,7 @@ def forget_gone(database: Database) -> None:
     try:
         for suture, held in _held.get(database.engine, {}).items():
             with database.reading() as session:
-                _remove(held, _Listed(session, suture, everybodys=True))
+                _remove(session, held, _listed(session, suture, everybodys=True))
     finally:
         _using.release()
 
@@ -128,40 +139,74 @@ def _asked(session: Session, demo: str) -> Demonstration:
     return found
 
 
+@dataclass(frozen=True)
 class _Listed:
-    """The rows of a suture type that may be compared, as one text: cheap to read, and to compare with the last one."""
+    """The rows of a suture type that may be compared, in short: cheap to read, and to compare with the last one.
 
-    def __init__(self, session: Session, suture: str, *, everybodys: bool = False) -> None:
-        options = EVERYBODYS if everybodys else {}
-        of = Demonstration
-        surgeons = [one.row for one in session.scalars(select(Surgeon), execution_options=options) if may(one, "atlas")]
-        # Both queries are answered by an index alone: a row has the whole motion in it.
-        listed = select(func.aggregate_strings(cast(of.row, Text), ",")).where(of.suture == suture)
-        withdrawn = select(of.row).where(of.withdrawn_at.is_not(None))
-        self._texts = [
-            session.scalar(listed.where(of.surgeon_row.in_(some)), execution_options=options) or ""
-            for some in in_parts(surgeons)
-        ]
-        self._withdrawn = sorted(session.scalars(withdrawn, execution_options=options))
+    Rows are never used twice and never change, so as long as these agree the rows are the same ones: of the same
+    surgeons, without the same withdrawn ones, as many with the same sum up to the same last one.
+    """
 
-    @property
-    def said(self) -> str:
-        return f"{';'.join(self._texts)} {self._withdrawn}"
+    suture: str
+    surgeons: tuple[int, ...]
+    withdrawn: tuple[int, ...]
+    count: int
+    total: int
+    last: int
 
-    def rows(self) -> Ints:
+    def rows(self, session: Session, *, everybodys: bool = False) -> Ints:
         """Return the rows, increasing, shape (N,)."""
-        numbers = [np.array(text.split(","), np.int64) for text in self._texts if text]
-        listed = np.concatenate(numbers) if numbers else np.empty(0, np.int64)
-        return np.setdiff1d(listed, np.array(self._withdrawn, np.int64))
+        rows = func.aggregate_strings(cast(Demonstration.row, Text), ",")  # one text: of many rows the fastest way
+        texts = _of_each(session, [rows], self.suture, self.surgeons, everybodys=everybodys)
+        numbers = [np.array(text.split(","), np.int64) for (text,) in texts if text]
+        return np.setdiff1d(np.concatenate(numbers) if numbers else np.empty(0, np.int64), np.array(self.withdrawn))
 
 
-def _follow(database: Database, suture: str, everybodys: "_Listed", visible: Ints) -> _Held:
-    """Bring the index of a suture type up to date, with what the caller may see, and make it the last to be dropped."""
+def _listed(session: Session, suture: str, *, everybodys: bool = False) -> _Listed:
+    options = EVERYBODYS if everybodys else {}
+    of = Demonstration.row
+    surgeons = [one.row for one in session.scalars(select(Surgeon), execution_options=options) if may(one, "atlas")]
+    figures = [func.count(), func.coalesce(func.sum(of), 0), func.coalesce(func.max(of), 0)]
+    found = _of_each(session, figures, suture, surgeons, everybodys=everybodys)
+    counts, totals, lasts = zip(*found, strict=True) if found else ((), (), ())
+    withdrawn = select(of).where(Demonstration.withdrawn_at.is_not(None))
+    gone = tuple(sorted(session.scalars(withdrawn, execution_options=options)))
+    return _Listed(suture, tuple(surgeons), gone, sum(counts), int(sum(totals)), max(lasts, default=0))
+
+
+def _of_each(
+    session: Session, columns: Sequence[ColumnElement[Any]], suture: str, surgeons: Sequence[int], *, everybodys: bool
+) -> list[Row[Any]]:
+    """Aggregate the rows of surgeons' demonstrations; an index alone has them, where a row has the whole motion."""
+    query = select(*columns).where(Demonstration.suture == suture)
+    options = EVERYBODYS if everybodys else {}
+    return [
+        session.execute(query.where(Demonstration.surgeon_row.in_(some)), execution_options=options).one()
+        for some in in_parts(surgeons)
+    ]
+
+
+def _last_to_be_dropped(database: Database, suture: str) -> _Held:
+    """Return the index of a suture type, now the last that makes room for others."""
     indices = _held.setdefault(database.engine, {})
-    held = indices.pop(suture, None) or _Held()
-    indices[suture] = held
-    _remove(held, everybodys)
-    missing = np.setdiff1d(visible, held.known()).tolist()
+    indices[suture] = indices.pop(suture) if suture in indices else _Held()
+    return indices[suture]
+
+
+def _remove(session: Session, held: _Held, everybodys: _Listed) -> None:
+    """Remove the rows that may not be compared any more."""
+    if everybodys == held.listed:
+        return
+    gone = np.setdiff1d(held.known(), everybodys.rows(session, everybodys=True)).tolist()
+    held.index.remove(gone)
+    held.without -= {*gone}
+    held.listed = everybodys
+    held.visible.clear()
+
+
+def _add_missing(database: Database, suture: str, held: _Held, visible: Ints) -> None:
+    """Add the rows that a caller may see and that the index does not have."""
+    indices, missing = _held[database.engine], np.setdiff1d(visible, held.known()).tolist()
     if len(held.index) + len(missing) > places.MOST:
         raise Conflict(
             f"There are {len(held.index) + len(missing)} demonstrations of '{suture}', and an index holds "
@@ -172,17 +217,6 @@ def _follow(database: Database, suture: str, everybodys: "_Listed", visible: Int
         del indices[next(one for one in indices if one != suture)]
     for at in range(0, len(missing), ROWS_AT_ONCE):
         _add(database, held, missing[at : at + ROWS_AT_ONCE])
-    return held
-
-
-def _remove(held: _Held, everybodys: "_Listed") -> None:
-    """Remove the rows that may not be compared any more."""
-    if everybodys.said == held.said:
-        return
-    held.said = everybodys.said
-    gone = np.setdiff1d(held.known(), everybodys.rows()).tolist()
-    held.index.remove(gone)
-    held.without -= {*gone}
 
 
 def _add(database: Database, held: _Held, rows: list[int]) -> None:

@@ -48,70 +48,71 @@ def test_they_are_those_of_all_pairs_to_the_last_bit(scaled: bool, monkeypatch: 
 def test_bounds_never_exceed_the_distance(seed: int, spread_mm: float):
     one, other = varied(2, seed, spread_mm)
     total = distances([one], [other])[0, 0]
-    row = np.empty(STATES + 1)
     for parts in (COARSE, FINE):
-        mine, theirs = boxes_of(one, parts), boxes_of(other, parts).astype(float)
-        assert STATES / parts * _kernels.boxes_apart(mine, theirs, row) <= total * nearest.SLACK
-        assert _kernels.boxed_within(one, theirs, row, np.inf) <= total * nearest.SLACK
+        mine, theirs = boxes_of(one, parts).astype(float), boxes_of(other, parts).astype(float)
+        bound = STATES / parts * _kernels.boxes_apart(mine, theirs, np.empty(parts), np.empty(parts))
+        assert bound <= total * nearest.SLACK
+        held, bounds = np.array([boxes_of(other, parts)], np.float32).transpose(2, 1, 0), np.empty(1)
+        room = np.empty(1), np.empty((parts, 1))
+        _kernels.bound_all(mine, STATES / parts, held, np.ones(1), 0, 1, *room, bounds)
+        assert bounds[0] == pytest.approx(bound, rel=1e-12)
+        apart, ahead, before = np.empty((parts, STATES)), np.empty((parts, STATES)), np.empty(STATES)
+        nearby = _kernels.points_apart(one.T, theirs, apart, before)
+        assert nearby <= nearest.SLACK * _kernels.ahead_within(apart, before, np.inf, ahead) <= total * nearest.SLACK
+        assert _kernels.ahead_within(apart, before, total * nearest.SLACK, ahead) == ahead[0, 0] < np.inf
 
 
-def test_an_abandoned_warping_is_infinite_and_a_finished_one_exact():
-    one, other = varied(2, 5)
-    total, row = distances([one], [other])[0, 0], np.empty(STATES + 1)
-    assert _kernels.warped_within(one, other, row, total) == total
-    assert _kernels.warped_within(one, other, row, total / 4) == np.inf
+@settings(deadline=None)
+@given(st.integers(0, 10_000), st.floats(0.1, 20.0), st.floats(0.5, 2.0))
+def test_a_warping_is_exact_within_its_limit_and_infinite_beyond(seed: int, spread_mm: float, share: float):
+    one, other = varied(2, seed, spread_mm)
+    total, rows = distances([one], [other])[0, 0], np.empty((2, STATES + 1))
+    apart, ahead, before = np.empty((FINE, STATES)), np.empty((FINE, STATES)), np.empty(STATES)
+    _kernels.points_apart(one.T, boxes_of(other, FINE).astype(float), apart, before)
+    limit = share * total
+    bound = _kernels.ahead_within(apart, before, limit * nearest.SLACK, ahead)
+    found = np.inf
+    if bound < np.inf:
+        found = _kernels.warped_within(one, other, 1.0, ahead, limit * nearest.SLACK, *rows)
+    if total <= limit:
+        assert found == total
+    assert found in (total, np.inf)
+    if total > limit * nearest.SLACK**2:
+        assert found == np.inf
+
+
+def searched(shapes: np.ndarray, count: int, kernels: tuple) -> tuple[list, list, list, int]:
+    """Return bounds, neighbours, totals and warpings of a search for the first shape."""
+    size, (bound, search) = len(shapes), kernels
+    fine = np.array([boxes_of(shape, FINE) for shape in shapes])
+    mine, lengths = fine[0].astype(float), np.ones(size)
+    bounds, rows, totals = np.empty(size), np.full(count, -1), np.full(count, np.inf)
+    held = np.ascontiguousarray(fine.transpose(2, 1, 0))
+    bound(mine, STATES / FINE, held, lengths, 0, size, np.empty(8), np.empty((FINE, 8)), bounds)
+    order = np.argsort(bounds, kind="stable")
+    room = np.empty((6, FINE)), np.empty((3, STATES + 1)), np.empty((2, FINE, STATES))
+    axes = np.ascontiguousarray(shapes[0].T)
+    warped = search(
+        shapes[0], axes, mine, shapes, fine, lengths, order, bounds, nearest.SLACK, *room, rows, totals
+    )  # fmt: skip
+    return bounds.tolist(), rows.tolist(), totals.tolist(), warped
+
+
+PLAIN = _kernels.bound_all, _kernels.search
+COMPILED = _kernels.bound_all_compiled, _kernels.search_compiled
 
 
 def test_compiled_and_plain_agree_to_the_last_bit():
     shapes = varied(12)
-    fine = np.array([boxes_of(shape, FINE) for shape in shapes])
-    found = []
-    for bound, search in (
-        (_kernels.bound_all, _kernels.search),
-        (_kernels.bound_all_compiled, _kernels.search_compiled),
-    ):
-        bounds, rows, totals = np.empty(12), np.empty(3, np.int64), np.empty(3)
-        corners, row, room = np.empty((FINE, 6)), np.empty(STATES + 1), np.empty((STATES, 3))
-        bound(fine[0], STATES / FINE, fine, np.ones(12), corners, row, bounds)
-        order = np.argsort(bounds, kind="stable")
-        warped = search(
-            shapes[0], fine[0], STATES / FINE, shapes, fine, np.ones(12), order, bounds, 1.0, corners, row, room, rows,
-            totals,
-        )  # fmt: skip
-        found.append((bounds.tolist(), rows.tolist(), totals.tolist(), warped))
-    assert found[0] == found[1]
+    assert searched(shapes, 3, PLAIN) == searched(shapes, 3, COMPILED)
 
 
 def test_most_are_excluded_without_warping():
-    shapes = varied(400)
-    fine = np.array([boxes_of(shape, FINE) for shape in shapes])
-    bounds, rows, totals = np.empty(400), np.empty(5, np.int64), np.empty(5)
-    corners, row, room = np.empty((FINE, 6)), np.empty(STATES + 1), np.empty((STATES, 3))
-    _kernels.bound_all_compiled(fine[0], STATES / FINE, fine, np.ones(400), corners, row, bounds)
-    order = np.argsort(bounds, kind="stable")
-    warped = _kernels.search_compiled(
-        shapes[0],
-        fine[0],
-        STATES / FINE,
-        shapes,
-        fine,
-        np.ones(400),
-        order,
-        bounds,
-        1.0,
-        corners,
-        row,
-        room,
-        rows,
-        totals,
-    )
-    print(warped)
-    assert 5 <= warped < 100
+    assert 5 <= searched(varied(400), 5, COMPILED)[3] < 60
 
 
 def test_shapes_come_and_go(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(nearest, "FIRST_ROOM", 4)
-    monkeypatch.setattr(nearest, "LAST_GROWN", 16)
     monkeypatch.setattr(nearest, "MOST", 64)
     shapes, rng = varied(60), np.random.default_rng(3)
     found, there = ShapeIndex(), dict[int, np.ndarray]()

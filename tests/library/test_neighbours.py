@@ -157,3 +157,24 @@ def test_more_than_an_index_holds_are_refused(database: Database, names: list[st
     monkeypatch.setattr(nearest, "MOST", 5)
     with pytest.raises(Conflict, match="an index holds 5"):
         nearest_to(database, names[0], 3)
+
+
+def test_the_rows_are_listed_again_only_after_a_change(
+    database: Database, names: list[str], monkeypatch: pytest.MonkeyPatch
+):
+    listed: list[bool] = []
+    real = neighbours._Listed.rows
+
+    def counted(self: neighbours._Listed, *given, **how) -> np.ndarray:
+        listed.append(True)
+        return real(self, *given, **how)
+
+    monkeypatch.setattr(neighbours._Listed, "rows", counted)
+    before = found(database, names[0])
+    assert listed
+    listed.clear()
+    assert found(database, names[0]) == before and not listed
+    with database.writing() as session:
+        withdraw_demo(session, before[0], "test")
+    cases.add_demo(database, cohorts.hand_off(cohort(2), 0), cohorts.name(0), grid="fit")  # as many as before
+    assert before[0] not in found(database, names[0]) and listed
