@@ -196,9 +196,42 @@ def _tell(scored: "Score") -> None:
         table.add_row(one.label, *numbers, one.unit, *shares)
     out.print(table)
     out.print(f"Beside {scored.reference.demo}: {scored.reference.because}.", soft_wrap=True)
-    for sentence in (*scored.deviation.words, *scored.skill.words):
+    named = scored.differences.words if scored.differences else ()
+    for sentence in (*named, *scored.deviation.words, *scored.skill.words):
         out.print(sentence, markup=False, soft_wrap=True)
     out.print(scored.use, markup=False, soft_wrap=True)
+
+
+@scoring_commands.command()
+@refusing
+def progress(
+    surgeon: Annotated[str, typer.Argument(help="The surgeon's pseudonym.", autocompletion=complete_surgeons)],
+    suture: Annotated[str, typer.Option(help="The suture type.", autocompletion=complete_sutures)],
+    against: Annotated[
+        str, typer.Option(help="The surgeon whose style is the reference.", autocompletion=complete_surgeons)
+    ],
+    as_json: AsJson = False,
+) -> None:
+    """Compare a surgeon's demonstrations with a style's reference, session by session. Not a credential."""
+    with service() as client:
+        found = client.progress(surgeon, suture, against=against)
+    if as_json:
+        print_json(found)
+        return
+    rows = [
+        {
+            "session": one.session or "",
+            "stored": f"{one.stored_at:%Y-%m-%d}",
+            "demos": one.demos,
+            "distance, mm": f"{one.distance_mm:.1f}",
+            "duration, s": "" if one.duration_s is None else f"{one.duration_s:.1f}",
+            "smoothness": "" if one.log_dimensionless_jerk is None else f"{one.log_dimensionless_jerk:.1f}",
+        }
+        for one in found.sessions
+    ]
+    show(rows, False, ("session", "stored", "demos", "distance, mm", "duration, s", "smoothness"))
+    out.print(f"Medians, beside {found.reference.demo}: {found.reference.because}.", soft_wrap=True)
+    out.print(found.use, markup=False, soft_wrap=True)
 
 
 @scoring_commands.command()

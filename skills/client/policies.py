@@ -37,6 +37,7 @@ from skills.schemas.given import (
     PolicyCard,
     PolicySummary,
     PoseStyle,
+    Progress,
     RetrainedStyle,
     Retraining,
     Rollout,
@@ -293,6 +294,17 @@ class Scores(Connection):
             **{"arm": arm, "topic": topic, "start_s": start_s, "end_s": end_s, "task": task},
         }
         return await self._ask(Score, "POST", at("scores"), given(body))
+
+    @call
+    async def progress(self, surgeon: str, suture: str, *, against: str) -> Progress:
+        """Compare a surgeon's demonstrations with a style's reference, session by session. Not a credential.
+
+        Args:
+            surgeon: The surgeon whose demonstrations are compared.
+            suture: The suture type.
+            against: The surgeon whose style is the reference.
+        """
+        return await self._get(Progress, at("surgeons", surgeon, "progress"), suture=suture, against=against)
 
 
 Position = Sequence[float]

@@ -100,6 +100,20 @@ def placed(tip_mm: Floats, *, scaled: bool = False) -> Floats:
     Raises:
         BadPath: It ends within `LEAST_MM` of its start.
     """
+    length_mm = float(np.linalg.norm(tip_mm[-1] - tip_mm[0]))
+    there = (tip_mm - tip_mm[0]) @ own_axes(tip_mm).T / (length_mm if scaled else 1.0)
+    return frozen(there, np.float64, (None, 3), "tip_mm")
+
+
+def own_axes(tip_mm: Floats) -> Floats:
+    """Return the axes of a path's own frame, as rows, shape (3, 3): x towards its goal, y to the left, z upwards.
+
+    Args:
+        tip_mm: The path in the arm's base frame, shape (T, 3).
+
+    Raises:
+        BadPath: It ends within `LEAST_MM` of its start.
+    """
     way_mm = tip_mm[-1] - tip_mm[0]
     length_mm = float(np.linalg.norm(way_mm))
     if not length_mm >= LEAST_MM:
@@ -112,8 +126,7 @@ def placed(tip_mm: Floats, *, scaled: bool = False) -> Floats:
     up = np.array([0.0, 0.0, 1.0] if abs(x[2]) < STEEPEST else [0.0, 1.0, 0.0])
     z = up - (up @ x) * x
     z /= np.linalg.norm(z)
-    axes = np.stack([x, np.cross(z, x), z])
-    return frozen((tip_mm - tip_mm[0]) @ axes.T / (length_mm if scaled else 1.0), np.float64, (None, 3), "tip_mm")
+    return np.stack([x, np.cross(z, x), z])
 
 
 def distances(shapes: ArrayLike, references: ArrayLike) -> Floats:

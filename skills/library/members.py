@@ -56,6 +56,12 @@ def members_among(session: Session, suture: str, rows: Sequence[int]) -> list[Me
     return _listed(session, and_(Demonstration.suture == suture, Demonstration.recording_row.in_(recordings)))[0]
 
 
+def member_of(row: Demonstration) -> Member:
+    """Return a stored demonstration as a member."""
+    of = row.row, row.sha256, row.surgeon.slug, row.session, row.recording_row, row.arm, row.frame
+    return Member(*of, row.start_s, row.end_s)
+
+
 def _listed(session: Session, which: ColumnElement[bool]) -> tuple[list[Member], int]:
     of = Demonstration
     surgeons = {row.row: (row.slug, may(row, "atlas")) for row in session.scalars(select(Surgeon))}

@@ -31,11 +31,21 @@ from skills.library import calibrations, releases
 from skills.library.catalogue import find_surgeon, find_suture_type
 from skills.library.consent import may, require
 from skills.library.demos import find_demo, newest_demo
+from skills.library.members import member_of, sessions_of, without_overlaps
 from skills.library.recordings import Teller, find_recording, stored_recording
-from skills.schemas.comparison import CurvePoint, Percentiles, Reference, Score, ScoredStyle
+from skills.schemas.comparison import (
+    CurvePoint,
+    Percentiles,
+    Progress,
+    Reference,
+    Score,
+    ScoredStyle,
+    SessionFigures,
+)
 from skills.schemas.requests import ScoreIn
 from skills.scoring.calibration import LEVELS, Level
 from skills.scoring.deviation import as_recorded, laid, laid_on
+from skills.scoring.differences import differences
 from skills.scoring.features import KINDS, Numbers, compare, measure
 from skills.scoring.rating import Skill, rate, unrated
 from skills.scoring.trials import measure_trial
@@ -43,6 +53,7 @@ from skills.scoring.validation import refusals
 
 LEAST_DEMOS, LEAST_SURGEONS = 5, 2  # of a level: with fewer, a percentile is meaningless, or describes one person
 MOST_OTHERS = 1000  # the newest of a suture type; more would not change a percentile visibly
+MOST_OF_EXPERT = 20  # the newest of the reference's surgeon, for the expert's own spread
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,13 +74,23 @@ class _Level:
     surgeons: set[int] = field(default_factory=set)
 
 
-def others_of(session: Session, suture: str, onto_mm: Floats) -> Iterator[Other]:
+def others_of(
+    session: Session,
+    suture: str,
+    onto_mm: Floats,
+    compared: Sequence[Demonstration] = (),
+    surgeon: Surgeon | None = None,
+) -> Iterator[Other]:
     """Measure the newest demonstrations of a suture type against a reference's shape, where consent covers it.
+
+    Of overlapping cuts of one motion one counts: the compared demonstration, or else the newest.
 
     Args:
         session: The caller's transaction.
         suture: The suture type.
         onto_mm: The reference's shape, shape (STATES, 3).
+        compared: The demonstrations that are compared with each other.
+        surgeon: The only surgeon whose demonstrations are measured; None: all.
     """
     query = (
         select(Demonstration)
@@ -77,7 +98,13 @@ def others_of(session: Session, suture: str, onto_mm: Floats) -> Iterator[Other]
         .order_by(Demonstration.row.desc())
         .limit(MOST_OTHERS)
     )
-    agreed = {row.row: row for row in session.scalars(query) if may(row.surgeon, "atlas")}
+    if surgeon is not None:
+        query = query.where(Demonstration.surgeon_row == surgeon.row)
+    first = {one.row for one in compared}
+    found = sorted(session.scalars(query), key=lambda one: (one.row in first, one.row))
+    members, _ = without_overlaps([member_of(row) for row in found if may(row.surgeon, "atlas")])
+    counted = {one.row for one in members}
+    agreed = {row.row: row for row in found if row.row in counted}
     shapes = _shapes(session, list(agreed))
     if not shapes:
         return
@@ -148,13 +175,17 @@ def _share_below(value: float | None, among: Sequence[float | None]) -> float | 
 
 def course(others: Sequence[Other], scored: Demonstration | None) -> list[CurvePoint]:
     """List the scored surgeon's demonstrations of the suture type up to the scored one, in the order of recording."""
+    return _in_order(_up_to(others, scored))
+
+
+def _up_to(others: Sequence[Other], scored: Demonstration | None) -> list[Other]:
+    """Return the demonstrations of the scored one's surgeon up to it; none without it."""
     if scored is None:
         return []
+    return [one for one in others if one.row.surgeon_row == scored.surgeon_row and _when(one.row) <= _when(scored)]
 
-    def when(row: Demonstration) -> tuple[int, float]:
-        return row.recording_row, row.start_s
 
-    mine = [one for one in others if one.row.surgeon_row == scored.surgeon_row and when(one.row) <= when(scored)]
+def _in_order(mine: Sequence[Other]) -> list[CurvePoint]:
     return [
         CurvePoint(
             demo=one.row.sha256,
@@ -164,8 +195,70 @@ def course(others: Sequence[Other], scored: Demonstration | None) -> list[CurveP
             duration_s=one.numbers["duration_s"],
             log_dimensionless_jerk=one.numbers["log_dimensionless_jerk"],
         )
-        for one in sorted(mine, key=lambda one: when(one.row))
+        for one in sorted(mine, key=lambda one: _when(one.row))
     ]
+
+
+def _when(row: Demonstration) -> tuple[int, float]:
+    return row.recording_row, row.start_s
+
+
+def by_session(others: Sequence[Other]) -> list[SessionFigures]:
+    """Return the medians of one surgeon's demonstrations by sessions, in the order of recording.
+
+    As in an atlas, cuts of one recording are of one session, and a recording without a session name is one.
+    """
+    mine = sorted(others, key=lambda one: _when(one.row))
+    of = sessions_of([member_of(one.row) for one in mine])
+    firsts = np.unique(of, return_index=True)[1].tolist()
+    sessions = [[one for one, number in zip(mine, of, strict=True) if number == of[first]] for first in sorted(firsts)]
+    return [
+        SessionFigures(
+            session=some[0].row.session,
+            stored_at=some[0].row.recording.created_at,
+            demos=len(some),
+            distance_mm=float(np.median([one.distance_mm for one in some])),
+            duration_s=_median(some, "duration_s"),
+            log_dimensionless_jerk=_median(some, "log_dimensionless_jerk"),
+        )
+        for some in sessions
+    ]
+
+
+def _median(some: Sequence[Other], name: str) -> float | None:
+    known = [number for one in some if (number := one.numbers[name]) is not None]
+    return float(np.median(known)) if known else None
+
+
+def progress(database: Database, surgeon: str, suture: str, against: str) -> Progress:
+    """Return how a surgeon's demonstrations compare with another's reference, session by session.
+
+    Args:
+        database: The database, restricted to the rows that the caller may see.
+        surgeon: The surgeon whose demonstrations are compared.
+        suture: The suture type.
+        against: The surgeon of the reference.
+
+    Raises:
+        NotFound: There is no such surgeon or suture type, or nothing of the style to compare with.
+        Conflict: A consent does not cover a comparison.
+        BadPath: The reference ends where it began.
+    """
+    with database.reading() as session:
+        mine = find_surgeon(session, surgeon)
+        require(mine, "atlas")
+        find_suture_type(session, suture)
+        reference, because = _reference(session, against, suture)
+        require(reference.surgeon, "atlas")
+        others = list(others_of(session, suture, shape_of(reference.demo), [reference], mine))
+        return Progress(
+            surgeon=mine.slug,
+            style=ScoredStyle(surgeon=against, suture=suture),
+            reference=Reference(demo=reference.sha256, because=because, is_itself=mine.row == reference.surgeon_row),
+            sessions=by_session(others),
+            demos=_in_order(others),
+            use=CREDENTIAL,
+        )
 
 
 CREDENTIAL = "Research use only. It compares motions, does not judge the outcome, and is not a credential."
@@ -197,19 +290,22 @@ def score(database: Database, asked: ScoreIn, tell: Teller) -> Score:
     """
     with database.reading() as session:
         find_suture_type(session, asked.suture)
-        reference, because = _reference(session, asked)
+        reference, because = _reference(session, asked.surgeon, asked.suture, asked.reference)
         require(reference.surgeon, "atlas")
         scored = _stored(session, asked)
-        taught = reference.demo
+        taught, expert = reference.demo, _of_expert(session, reference, scored.row if scored else None)
     if scored is None:
         scored = _of_recording(database, asked, tell)
     # No transaction is open during the computation.
     numbers, beside = measure(scored.demo), measure(taught)
     deviation = laid_on(scored.demo, taught)
+    expert = [one for one in expert if _has_direction(one)]
+    named = differences(scored.demo, expert, taught) if expert else None
     skill = _skill(database, scored.recording, asked.task, tell)
     with database.reading() as session:  # again: consent may have ended while the two were compared
         _agreed_still(session, [reference, scored.row], scored.recording)
-        others = list(others_of(session, asked.suture, np.array(deviation.reference_mm)))
+        compared = [reference, *([scored.row] if scored.row else [])]
+        others = list(others_of(session, asked.suture, np.array(deviation.reference_mm), compared))
         if skill.calibrated and not _all_agree(session, scored.recording):
             skill = unrated(NOT_AGREED)
     mine = {**numbers, "distance_mm": deviation.distance_mm}
@@ -225,10 +321,12 @@ def score(database: Database, asked: ScoreIn, tell: Teller) -> Score:
         reference=Reference(demo=reference.sha256, because=because, is_itself=bool(row and row.row == reference.row)),
         figures=compare(numbers, beside),
         deviation=deviation,
+        differences=named,
         as_recorded=as_recorded(scored.demo, taught),
         tie_break=TIE_BREAK,
         percentiles=percentiles(others, mine, row, reference),
         curve=course(others, row),
+        sessions=by_session(_up_to(others, row)),
         skill=skill,
         use=CREDENTIAL,
     )
@@ -251,26 +349,45 @@ def rated_tasks(session: Session) -> list[str]:
 # ---- the two motions ----------------------------------------------------------------------------------------------
 
 
-def _reference(session: Session, asked: ScoreIn) -> tuple[Demonstration, str]:
+def _reference(session: Session, slug: str, suture: str, digest: str | None = None) -> tuple[Demonstration, str]:
     """Return the demonstration that represents a style, and the reason for this choice."""
-    surgeon = find_surgeon(session, asked.surgeon)
-    if asked.reference is not None:
-        named = find_demo(session, asked.reference)
-        if (named.surgeon_row, named.suture) != (surgeon.row, asked.suture):
+    surgeon = find_surgeon(session, slug)
+    if digest is not None:
+        named = find_demo(session, digest)
+        if (named.surgeon_row, named.suture) != (surgeon.row, suture):
             raise BadInput("The reference is a demonstration of another style; name one of this surgeon and suture.")
         if named.withdrawn_at is not None:
             raise Conflict("The reference was withdrawn; name another, or none.")
         return named, f"it was requested{f', and is marked {named.outcome}' if named.failed else ''}"
-    served = releases.served(session, surgeon, asked.suture)
+    served = releases.served(session, surgeon, suture)
     if served is not None:
         policy = served.policy
         more = len(policy.manifest["demos"]) - 1
         rest = f" and {more} more" if more else ""
         return policy.demonstration, f"the released policy, version {policy.version}, was learnt from it{rest}"
-    newest = newest_demo(session, surgeon.row, asked.suture)
+    newest = newest_demo(session, surgeon.row, suture)
     if newest is None:
-        raise NotFound(f"There is no demonstration of '{asked.surgeon}' and '{asked.suture}' to compare with.")
+        raise NotFound(f"There is no demonstration of '{slug}' and '{suture}' to compare with.")
     return newest, "no policy is released, and it is the newest demonstration"
+
+
+def _of_expert(session: Session, reference: Demonstration, scored: Demonstration | None) -> list[Demo]:
+    """Return the motions of the reference's surgeon, the reference first, without the scored motion and its cuts."""
+    of = Demonstration
+    same = of.surgeon_row == reference.surgeon_row, of.suture == reference.suture, of.arm == reference.arm
+    query = select(of).where(*same, of.learnable)
+    newest = [one for one in session.scalars(query.order_by(of.row.desc()).limit(MOST_OF_EXPERT)) if one != reference]
+    members = [member_of(one) for one in (*newest[::-1], reference, *([scored] if scored else []))]
+    counted = {one.row for one in without_overlaps(members)[0]} - {scored.row if scored else None}
+    return [one.demo for one in (reference, *newest) if one.row in counted]
+
+
+def _has_direction(demo: Demo) -> bool:
+    try:
+        shape_of(demo)
+    except BadPath:
+        return False
+    return True
 
 
 def _stored(session: Session, asked: ScoreIn) -> _Scored | None:

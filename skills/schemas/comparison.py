@@ -13,6 +13,7 @@ from skills.fields import Count, Fraction, Sha256, Slug
 from skills.schemas import Given
 from skills.scoring.calibration import Level
 from skills.scoring.deviation import Deviation
+from skills.scoring.differences import Differences
 from skills.scoring.features import ScoreFigure
 from skills.scoring.rating import Skill
 
@@ -347,6 +348,28 @@ class CurvePoint(Given):
     log_dimensionless_jerk: float | None
 
 
+class SessionFigures(Given):
+    """The demonstrations of one session, compared with the same reference: their medians."""
+
+    session: Slug | None = Field(description="null if the recording has no session name; it is then one of its own.")
+    stored_at: datetime = Field(description="When its first recording was stored.")
+    demos: Count
+    distance_mm: float
+    duration_s: float | None
+    log_dimensionless_jerk: float | None
+
+
+class Progress(Given):
+    """A surgeon's demonstrations of a suture type, session by session, compared with a style's reference."""
+
+    surgeon: Slug
+    style: ScoredStyle
+    reference: Reference
+    sessions: list[SessionFigures] = Field(description="In order of recording.")
+    demos: list[CurvePoint] = Field(description="The same demonstrations one by one.")
+    use: str
+
+
 class Score(Given):
     """A motion compared with a style's reference. Nothing of it is stored."""
 
@@ -365,8 +388,12 @@ class Score(Given):
     as_recorded: Deviation | None = Field(
         description="Where both were recorded, in the arm's frame; null if arm or frame differ."
     )
+    differences: Differences | None = Field(
+        description="From all motions of the reference's surgeon with its arm; null if there is no other than this one."
+    )
     tie_break: str
     percentiles: list[Percentiles]
     curve: list[CurvePoint] = Field(description="The surgeon's demonstrations up to this one, in order of recording.")
+    sessions: list[SessionFigures] = Field(description="The same by sessions.")
     skill: Skill = Field(description="The rating of the whole recording, not of the motion alone.")
     use: str

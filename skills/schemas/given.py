@@ -19,7 +19,7 @@ from skills.gridworld.scene import Scene
 from skills.planning.plan import Departure
 from skills.planning.trajectory import Seam, Transfer
 from skills.schemas import Given, Handedness, Page, PolicyName, SkillLevel
-from skills.schemas.comparison import Atlas, Nearest, Score
+from skills.schemas.comparison import Atlas, Nearest, Progress, Score
 from skills.schemas.policies import (
     Job,
     NextPose,
@@ -73,6 +73,7 @@ __all__ = [
     "PolicySummary",
     "PoseStyle",
     "Problem",
+    "Progress",
     "Reach",
     "Ready",
     "Recording",

@@ -153,6 +153,19 @@ def test_the_page_draws_the_way_in_steps_and_says_where(scoring: Service, stored
     assert "nan" not in text.lower().replace("nanometre", "")
 
 
+def test_differences_and_progress_are_given_and_shown(scoring: Service, stored: dict[str, str]) -> None:
+    scored = scoring.client.score("kestrel", cases.SUTURE, demo=stored["plover"])
+    assert [one["kind"] for one in scored["differences"]["named"]][0] == "time in motion"
+    shown = page(scoring, f"/pages/demos/{stored['plover']}/score?surgeon=kestrel")
+    assert "What kestrel does differently" in shown
+    assert all(words.split(";")[-1][:30] in shown for words in scored["differences"]["words"])
+    path = f"/surgeons/plover/progress?suture={cases.SUTURE}&against=kestrel"
+    found = scoring.http.get(path).json()
+    assert sum(one["demos"] for one in found["sessions"]) == len(found["demos"]) == 2
+    assert found["demos"][0]["distance_mm"] == pytest.approx(scored["deviation"]["distance_mm"])
+    assert_problem(scoring.http.get(path.replace("plover", "nobody")), 404, "not-found")
+
+
 def test_left_out_the_style_is_an_experts_and_another_ones(scoring: Service, stored: dict[str, str]) -> None:
     assert "plover beside heron" in page(scoring, f"/pages/demos/{stored['plover']}/score")
     assert "heron beside kestrel" in page(scoring, f"/pages/demos/{stored['heron']}/score")

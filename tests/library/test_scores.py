@@ -13,7 +13,7 @@ from skills.library.calibrations import keep
 from skills.library.catalogue import put_surgeon
 from skills.library.demos import upload_demo, withdraw_demo
 from skills.library.recordings import store_recording
-from skills.library.scores import LEAST_DEMOS, score
+from skills.library.scores import LEAST_DEMOS, progress, score
 from skills.packing import canonical, sha256
 from skills.schemas.comparison import Score
 from skills.schemas.requests import DemoIn, ScoreIn
@@ -126,6 +126,60 @@ def test_the_curve_has_the_surgeons_demonstrations_up_to_this_one(database: Data
     distances = [one.distance_mm for one in told.curve]
     assert distances == sorted(distances, reverse=True)
     assert distances[-1] == pytest.approx(told.deviation.distance_mm)
+
+
+def test_overlapping_cuts_of_one_motion_count_once(database: Database) -> None:
+    bent(0.0, "kestrel", database)
+    put(database, "plover", skill_level="novice")
+    put(database, "wren", skill_level="novice")
+    for number in range(LEAST_DEMOS):
+        bent(4.0 + number, "wren", database)
+    tip_mm = cases.points_mm(samples=40)
+    mine = cases.add_demo(database, cases.table(tip_mm), "plover")
+    cases.add_demo(database, cases.table(tip_mm), "plover", start_s=0.1)
+    another = cases.add_demo(database, cases.table(tip_mm), "wren", start_s=0.2)
+    told = scored(database, mine)
+    novice = next(one for one in told.percentiles if one.level == "novice")
+    assert (novice.demos, novice.surgeons) == (LEAST_DEMOS, 1)  # none of the motion's own cuts
+    assert [one.demo for one in told.curve] == [mine.sha256]
+    with database.writing() as session:
+        withdraw_demo(session, mine.sha256, "test")
+    novice = next(one for one in scored(database, another).percentiles if one.level == "novice")
+    assert novice.demos == LEAST_DEMOS
+
+
+def test_the_largest_differences_are_from_the_experts_other_motions(database: Database) -> None:
+    for number in range(4):
+        reference = bent(0.1 * number, "kestrel", database)
+    put(database, "plover")
+    told = scored(database, bent(20.0, "plover", database))
+    assert told.differences.expert_demos == 4
+    assert {"to the side"} <= {one.kind for one in told.differences.named}
+    told = scored(database, reference)
+    assert told.differences.expert_demos == 3 and told.reference.is_itself
+    assert told.differences.words == ("There is no difference beyond the expert's own spread, in 3 demonstrations.",)
+
+
+def test_the_only_motion_of_an_expert_is_not_compared_with_itself(database: Database) -> None:
+    assert scored(database, bent(0.0, "kestrel", database)).differences is None
+
+
+def test_progress_is_by_session_in_order_of_recording(database: Database) -> None:
+    bent(0.0, "kestrel", database)
+    put(database, "plover")
+    for way_mm, day in ((9.0, "monday"), (7.0, "monday"), (4.0, "tuesday"), (2.0, None)):
+        tip_mm = cases.points_mm() + way_mm * np.sin(np.linspace(0, np.pi, 60))[:, None] * np.array([0.0, 1.0, 0.3])
+        cases.add_demo(database, cases.table(tip_mm), "plover", session=day)
+    found = progress(database, "plover", cases.SUTURE, "kestrel")
+    assert [(one.session, one.demos) for one in found.sessions] == [("monday", 2), ("tuesday", 1), (None, 1)]
+    apart = [one.distance_mm for one in found.demos]
+    assert found.sessions[0].distance_mm == pytest.approx(np.mean(apart[:2])) and apart == sorted(apart, reverse=True)
+    assert not found.reference.is_itself and "not a credential" in found.use
+    with pytest.raises(NotFound, match="no surgeon 'plover2'"):
+        progress(database, "kestrel", cases.SUTURE, "plover2")
+    put(database, "plover", consent=NO_ATLAS)
+    with pytest.raises(Conflict):
+        progress(database, "plover", cases.SUTURE, "kestrel")
 
 
 def test_surgeons_without_consent_are_not_scored_compared_or_counted(database: Database) -> None:

@@ -46,6 +46,7 @@ from skills.schemas.given import (
     DemoPath,
     Nearest,
     Page,
+    Progress,
     Recording,
     RecordingPreview,
     RecordingSummary,
@@ -376,3 +377,18 @@ def score(body: ScoreIn, db: Db, tell: Tell) -> Response:
     Research use only; not a credential.
     """
     return say(scores.score(db, body, tell))
+
+
+@score_router.get("/surgeons/{surgeon}/progress", dependencies=[needs("reader")], **gives(Progress, 404, 409))
+def surgeon_progress(
+    surgeon: Slug,
+    db: Db,
+    give: Giving,
+    suture: Annotated[str, Query(pattern=SLUG, description="The suture type.")],
+    against: Annotated[str, Query(pattern=SLUG, description="The surgeon whose style is the reference.")],
+) -> Response:
+    """Compare a surgeon's demonstrations with a style's reference, session by session.
+
+    Research use only; not a credential.
+    """
+    return give(scores.progress(db, surgeon, suture, against))
