@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from sqlalchemy import ColumnElement, and_, select
+from sqlalchemy import ColumnElement, and_, func, select
 from sqlalchemy.orm import Session
 
 from skills.arrays import Ints
@@ -53,7 +53,9 @@ def members_of(session: Session, suture: str) -> tuple[list[Member], int]:
 def members_among(session: Session, suture: str, rows: Sequence[int]) -> list[Member]:
     """List the members cut from the same recordings as some demonstrations, given by their rows, the oldest first."""
     recordings = select(Demonstration.recording_row).where(Demonstration.row.in_(rows))
-    return _listed(session, and_(Demonstration.suture == suture, Demonstration.recording_row.in_(recordings)))[0]
+    # The function hides the suture type from the planner, which would read all of its demonstrations by that index.
+    of_suture = func.coalesce(Demonstration.suture, "") == suture
+    return _listed(session, and_(of_suture, Demonstration.recording_row.in_(recordings)))[0]
 
 
 def member_of(row: Demonstration) -> Member:
