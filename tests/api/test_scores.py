@@ -155,7 +155,7 @@ def test_the_page_draws_the_way_in_steps_and_says_where(scoring: Service, stored
 
 def test_differences_and_progress_are_given_and_shown(scoring: Service, stored: dict[str, str]) -> None:
     scored = scoring.client.score("kestrel", cases.SUTURE, demo=stored["plover"])
-    assert [one["kind"] for one in scored["differences"]["named"]][0] == "time in motion"
+    assert scored["differences"]["named"][0]["kind"] == "time in motion"
     shown = page(scoring, f"/pages/demos/{stored['plover']}/score?surgeon=kestrel")
     assert "What kestrel does differently" in shown
     assert all(words.split(";")[-1][:30] in shown for words in scored["differences"]["words"])
