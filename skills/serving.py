@@ -206,9 +206,8 @@ def environment(settings: Settings) -> dict[str, str]:
 
 def prepare(settings: Settings) -> None:
     """Migrate the database and seed its catalogue."""
-    database = Database(settings.database_url, signing_key=settings.signing_key)
-    prepare_database(database, settings)
-    database.close()
+    with closing(Database(settings.database_url, signing_key=settings.signing_key)) as database:
+        prepare_database(database, settings)
 
 
 def refuse_keyless(settings: Settings) -> None:

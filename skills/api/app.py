@@ -50,13 +50,15 @@ def create_app(settings: Settings) -> FastAPI:
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        await to_thread.run_sync(prepare_database, app.state.database, settings)
-        async with app.state.served.watching():
-            with confined_reader(settings) as app.state.reader:
-                yield
-        await to_thread.run_sync(app.state.engine.close)
-        app.state.access.close()
-        app.state.database.close()
+        try:
+            await to_thread.run_sync(prepare_database, app.state.database, settings)
+            async with app.state.served.watching():
+                with confined_reader(settings) as app.state.reader:
+                    yield
+        finally:
+            await to_thread.run_sync(app.state.engine.close)
+            app.state.access.close()
+            app.state.database.close()
 
     app = Service(
         title="suture-skills",

@@ -296,8 +296,9 @@ class Demonstration(Base):
 class MeasuredShape(Base):
     """A cache of the atlas's measurements of a demonstration.
 
-    A row may be deleted at any time and is then computed again. `version` is that of `skills.comparison.distances`;
-    rows of another version are not used.
+    A row may be deleted at any time and is then computed again. `version` is that of `skills.comparison.distances`,
+    negative for a row without distances, which no other demonstration's erasure deletes; rows of another version are
+    not used.
     """
 
     __tablename__ = "measured_shapes"

@@ -20,7 +20,7 @@ from threading import Lock
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import delete, func, insert, select
+from sqlalchemy import ColumnElement, delete, func, insert, select
 from sqlalchemy.orm import Session
 
 from skills.arrays import Floats, Ints
@@ -249,10 +249,15 @@ def _laid_out(kept: Mapping[int, Measured]) -> Apart:
 # ---- storage -----------------------------------------------------------------------------------------------------
 
 
+def is_current() -> ColumnElement[bool]:
+    """Return the condition of the stored rows of this version: of shapes alone, and of shapes with distances."""
+    return MeasuredShape.version.in_((VERSION, -VERSION))
+
+
 def kept_shapes(database: Database, rows: Sequence[int]) -> Kept:
     """Return the stored measurements of demonstrations, given by their rows, of those that have any."""
     query = select(MeasuredShape.demonstration_row, MeasuredShape.measured)
-    mine = MeasuredShape.version == VERSION, MeasuredShape.demonstration_row.in_(rows)
+    mine = is_current(), MeasuredShape.demonstration_row.in_(rows)
     with database.reading() as session:
         return {row: measured for row, measured in session.execute(query.where(*mine)).all()}  # noqa: C416 - mypy
 
@@ -264,7 +269,8 @@ def keep_shapes(database: Database, measured: Mapping[int, Measured]) -> None:
     remain.
     """
     packed = [
-        {"demonstration_row": row, "version": VERSION, "measured": pack(one)} for row, one in measured.items()
+        {"demonstration_row": row, "version": VERSION if len(one.others) else -VERSION, "measured": pack(one)}
+        for row, one in measured.items()
     ]  # packed before the transaction, which others wait for
     if not packed:
         return

@@ -197,10 +197,12 @@ def _erase(session: Session, which: ColumnElement[bool], surgeon: Surgeon, recor
     recordings = recordings | {*session.scalars(select(Demonstration.recording_row).where(which))}
     policies = session.scalars(_resting_on(which)).all()
     demos = select(Demonstration.row).where(which)
-    # Every cached row of distances of the suture type may hold one from an erased demonstration.
-    sutures = select(Demonstration.suture).where(which)
-    beside = select(Demonstration.row).where(Demonstration.suture.in_(sutures))
-    session.execute(delete(MeasuredShape).where(MeasuredShape.demonstration_row.in_(beside)), **UNSYNCHRONISED)
+    # Every cached row with distances of the suture type may hold one from an erased demonstration. Shapes alone, of
+    # which an index of neighbours has up to 100,000, stay.
+    cached = MeasuredShape.demonstration_row
+    beside = select(Demonstration.row).where(Demonstration.suture.in_(select(Demonstration.suture).where(which)))
+    touched = cached.in_(demos) | (cached.in_(beside) & (MeasuredShape.version >= 0))
+    session.execute(delete(MeasuredShape).where(touched), **UNSYNCHRONISED)
     for some in in_parts(policies):
         plans = select(Plan.row).where(Plan.policy_row.in_(some))
         playbacks = select(StoredPlayback.row).where(StoredPlayback.plan_row.in_(plans))

@@ -20,7 +20,7 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from skills.arrays import Floats
-from skills.comparison.distances import VERSION, distances, shape_of
+from skills.comparison.distances import distances, shape_of
 from skills.db.models import Demonstration, MeasuredShape, StoredRecording, Surgeon
 from skills.db.row_visibility import EVERYBODYS
 from skills.db.session import Database
@@ -28,6 +28,7 @@ from skills.demonstration.demonstration import Demo, cut_demo
 from skills.errors import BadInput, BadPath, Conflict, NotFound
 from skills.learning.evaluation import TIE_BREAK
 from skills.library import calibrations, releases
+from skills.library.atlas import is_current
 from skills.library.catalogue import find_surgeon, find_suture_type
 from skills.library.consent import may, require
 from skills.library.demos import find_demo, newest_demo
@@ -119,7 +120,7 @@ def others_of(
 def _shapes(session: Session, rows: Sequence[int]) -> dict[int, Floats]:
     """Return the shapes of demonstrations, by row: those stored for the atlas, and newly measured ones for the rest."""
     of_these = MeasuredShape.demonstration_row.in_(rows)
-    kept = session.scalars(select(MeasuredShape).where(of_these, MeasuredShape.version == VERSION))
+    kept = session.scalars(select(MeasuredShape).where(of_these, is_current()))
     shapes = {one.demonstration_row: one.measured.shape_mm for one in kept}
     recorded = select(Demonstration.row, Demonstration.demo).where(Demonstration.row.in_({*rows} - {*shapes}))
     for row, demo in session.execute(recorded):

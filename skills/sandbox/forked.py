@@ -22,6 +22,7 @@ arrival within a key. The queue as a whole and the share of each key are bounded
 once.
 """
 
+import errno
 import json
 import logging
 import os
@@ -47,6 +48,8 @@ from skills.sandbox.containment import LAYERS, code_folders
 from skills.sandbox.fork_server import BEGUN
 
 log = logging.getLogger(__name__)
+
+OF_THE_SYSTEM = {errno.EIO, errno.ENOSPC, errno.EDQUOT, errno.ESTALE, errno.EMFILE, errno.ENFILE}  # whatever was read
 
 Watch = Callable[[bytes], None]
 Answer = TypeVar("Answer")
@@ -342,6 +345,7 @@ def _value(answer: IO[bytes], returns: tuple[type[Answer], ...], classes: Known,
 
     Raises:
         Unanswered: It is too large, or none of the classes.
+        OSError: It cannot be read, such as where the disk fails: that says nothing about the fork.
     """
     if (size := answer.seek(0, os.SEEK_END)) > most_bytes:
         raise Unanswered("too much", f"returned {size >> 20} MiB, more than the limit of {most_bytes >> 20} MiB")
@@ -353,8 +357,19 @@ def _value(answer: IO[bytes], returns: tuple[type[Answer], ...], classes: Known,
         if not isinstance(value, returns):
             raise TypeError(type(value).__name__)
     except Exception as error:  # `read` raises exceptions of any class
+        if (failed := _failed_reading(error)) is not None:
+            raise failed from None
         raise Unanswered("nonsense", "returned unreadable data") from error
     return value
+
+
+def _failed_reading(error: BaseException | None) -> OSError | None:
+    """Return the error of the disk or of the system's limits behind an error, if any; zip readers hide it."""
+    while error is not None:
+        if isinstance(error, OSError) and error.errno in OF_THE_SYSTEM:
+            return error
+        error = error.__cause__ or error.__context__
+    return None
 
 
 def _start(modules: tuple[str, ...]) -> _Server:

@@ -13,13 +13,16 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from sqlalchemy import event, text
+from sqlalchemy import Pool, event, text
+from starlette.testclient import TestClient
 
+from skills import serving
+from skills.api.app import create_app
 from skills.db import session as sessions
 from skills.db.models import SutureType
 from skills.db.service_tables import Executor
 from skills.db.session import EXIT_CODE, Database, make_private
-from skills.errors import Busy, DatabaseUnusable, StorageFull
+from skills.errors import BadSettings, Busy, DatabaseUnusable, StorageFull
 from skills.jobs import prepare
 from skills.settings import Settings
 from tests import backends
@@ -287,6 +290,26 @@ def test_files_of_a_database_are_its_users_alone(tmp_path: Path):
         assert {path.name: mode(path) for path in files} == {path.name: 0o600 for path in files}
     assert mode(tmp_path / "made") == 0o700
     database.close()
+
+
+@pytest.mark.parametrize("backend", backends.BACKENDS)
+def test_a_service_that_cannot_make_its_key_leaves_no_connection_open(backend: str, tmp_path: Path):
+    (tmp_path / "a file").touch()
+    settings = Settings(database_url=backends.blank(backend, tmp_path), signing_key=tmp_path / "a file" / "key")
+    left: list[object] = []
+    opened, closed = (lambda connection, _: left.append(connection)), (lambda connection, _: left.remove(connection))
+    event.listen(Pool, "connect", opened)
+    event.listen(Pool, "close", closed)
+    try:
+        with pytest.raises(BadSettings, match="The signing key"):
+            serving.prepare(settings)
+        with pytest.raises(BadSettings, match="The signing key"), TestClient(create_app(settings)):
+            pass
+        assert left == []
+    finally:
+        event.remove(Pool, "connect", opened)
+        event.remove(Pool, "close", closed)
+        backends.drop(settings.database_url)
 
 
 def test_the_engines_file_waits_for_another_process_that_opens_it(tmp_path: Path):

@@ -313,7 +313,8 @@ def test_erasure_leaves_nothing(database: Database, whole: bool):
             erase_surgeon(session, cohorts.name(0), "test")
         else:
             erase_demo(session, names[0], "test")
-    assert kept(database) == {}  # a remaining demonstration's row had a distance to the erased one
+    with database.reading() as session:  # a remaining row had a distance to the erased one
+        assert all(len(one.measured.others) == 0 for one in session.scalars(select(MeasuredShape)))
     assert [one.id for one in atlas_of(database, SUTURE).demos] == names[2:] if whole else names[1:]
 
 

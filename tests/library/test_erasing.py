@@ -19,6 +19,7 @@ from skills.library.backup import back_up, erasures_of, restore
 from skills.library.catalogue import put_surgeon
 from skills.library.demos import add_demo, withdraw_demo
 from skills.library.erasure import delete_recording, erase_demo, erase_surgeon
+from skills.library.neighbours import nearest_to
 from skills.library.recordings import store_recording
 from skills.schemas.requests import DemoIn
 from tests import backends
@@ -58,6 +59,28 @@ def test_cached_distances_to_erased_demos_outside_the_atlas_are_deleted(
     atlas_of(database, cases.SUTURE)
     with database.reading() as session:
         assert len(session.scalars(select(MeasuredShape)).all()) == 2
+
+
+def test_an_erasure_deletes_no_shape_of_another_that_has_no_distances(database: Database):
+    cohorts.add_cohort(database, cohort(1, surgeons=3, sessions=1))
+    with database.reading() as session:
+        demos = {one.surgeon.slug: (one.row, one.sha256) for one in session.scalars(select(Demonstration))}
+    nearest_to(database, demos[cohorts.name(0)][1], 1)
+
+    def cached() -> set[int]:
+        with database.reading() as session:
+            return {*session.scalars(select(MeasuredShape.demonstration_row))}
+
+    assert cached() == {row for row, _ in demos.values()}
+    with database.writing() as session:
+        erase_surgeon(session, cohorts.name(0), "test")
+    assert cached() == {demos[cohorts.name(k)][0] for k in (1, 2)}
+    atlas_of(database, cases.SUTURE)  # now one of them has a distance from the other
+    with database.writing() as session:
+        erase_surgeon(session, cohorts.name(1), "test")
+    assert cached() <= {demos[cohorts.name(2)][0]}
+    with database.reading() as session:
+        assert all(len(one.measured.others) == 0 for one in session.scalars(select(MeasuredShape)))
 
 
 # ---- recordings without a demonstration ----------------------------------------------------------------------------

@@ -1,5 +1,7 @@
 """A fork server: a fork's fault is named, everything of it is removed, and the next fork is unaffected."""
 
+import errno
+import io
 import json
 import os
 import resource
@@ -20,7 +22,7 @@ from typing import IO, Any
 import pytest
 
 from skills.errors import Busy, Unanswered
-from skills.sandbox import ProcessLimits, fork_server
+from skills.sandbox import ProcessLimits, fork_server, forked
 from skills.sandbox.containment import Place
 from skills.sandbox.forked import ForkServer, layers_held
 from tests.measured import peak_mib
@@ -288,3 +290,14 @@ def test_an_asker_that_goes_without_reading_what_it_was_told_ends_it_without_a_w
         control.send(b"ready")
         asker.close()  # the kernel tells the other side of it as a reset connection
         fork_server._serve(control, events, {}, fork_server._Inherited(Place("", ()), (), 0))
+
+
+def test_a_disk_that_fails_is_not_said_to_be_an_unreadable_answer():
+    class Failing(io.BytesIO):
+        def read(self, *_: Any) -> bytes:
+            raise OSError(errno.EIO, "Input/output error")
+
+    with pytest.raises(OSError, match="Input/output error"):
+        forked._value(Failing(b"x" * 100), (int,), {}, 1000)
+    with pytest.raises(Unanswered, match="unreadable data"):
+        forked._value(io.BytesIO(b"x" * 100), (int,), {}, 1000)
