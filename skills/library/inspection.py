@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
-from sqlalchemy import Column, Table, exists, func, select, text, tuple_
+from sqlalchemy import Column, ColumnElement, ForeignKey, Table, case, exists, func, select, text, tuple_
 from sqlalchemy.orm import Mapper, Session, defer, object_session
 
 from skills.db import Base
@@ -144,13 +144,17 @@ def _file(session: Session, checked: Checked) -> None:
 def _references(session: Session, checked: Checked) -> None:
     """Find rows with a foreign key to a row that does not exist."""
     for table in Base.metadata.sorted_tables:
-        for key in table.foreign_keys:
-            child, parent = key.parent, key.column
-            other = parent.table.alias()
-            orphan = (child.is_not(None), ~exists().where(other.c[parent.name] == child))
-            checked.count += session.scalar(select(func.count()).select_from(table).where(child.is_not(None))) or 0
-            for row in session.execute(select(*table.primary_key).where(*orphan).limit(NAMED)):
-                checked.wrong.append((_name(table, row), f"its {child.name} has no row in {parent.table.name}"))
+        keys = list(table.foreign_keys)
+        if not keys:
+            continue
+        orphans = [key.parent.is_not(None) & ~_has_parent(key) for key in keys]
+        counts = [func.count(key.parent) for key in keys] + [func.count(case((orphan, 1))) for orphan in orphans]
+        found = session.execute(select(*counts).select_from(table)).one()
+        checked.count += sum(found[: len(keys)])
+        for key, orphan, lost in zip(keys, orphans, found[len(keys) :], strict=True):
+            for row in session.execute(select(*table.primary_key).where(orphan).limit(NAMED)) if lost else ():
+                why = f"its {key.parent.name} has no row in {key.column.table.name}"
+                checked.wrong.append((_name(table, row), why))
     # Without a foreign key, because they are deleted after the row to which they belong.
     for column, owner, late in (
         (RecordingChunk.recording, StoredRecording, LooseChunks.recording_row),
@@ -164,6 +168,11 @@ def _references(session: Session, checked: Checked) -> None:
         for number in session.scalars(select(late).where(exists().where(owner.row == late)).limit(NAMED)):
             why = f"it says that {owner.__tablename__} {number} was deleted, which exists"
             checked.wrong.append((_name(due, [number]), why))
+
+
+def _has_parent(key: ForeignKey) -> ColumnElement[bool]:
+    other = key.column.table.alias()
+    return exists().where(other.c[key.column.name] == key.parent)
 
 
 def _history(heads: Sequence[Note], database: Database, session: Session, checked: Checked) -> None:
@@ -196,10 +205,10 @@ def _rows(database: Database, mapper: Mapper[Any]) -> Iterator[Checked]:
         except Exception as error:  # such as a damaged page of the database file
             checked.wrong.append((table.name, f"after {last}: {_in_words(error)}"))
             break
-        if not page:
+        checked.count += len(page)
+        if len(page) < ROWS_AT_ONCE:
             break
         last = page[-1]
-        checked.count += len(page)
         yield checked
     yield checked
 
