@@ -25,7 +25,7 @@ OPERATIONS = {
     "list_versions", "make_key", "make_plan", "map_reach", "mark_demo", "metrics", "newest_head", "next_action", "play",
     "preview_recording",
     "put_surgeon", "put_suture_type",
-    "read_suture_points", "ready", "release", "retrain", "roll_out", "score", "served_at", "train",
+    "read_suture_points", "ready", "release", "retrain", "roll_out", "score", "served_at", "surgeon_progress", "train",
     "upload_demo", "watch_job",
     "withdraw", "withdraw_demo",
     "delete_dataset", "export_dataset", "get_dataset", "get_dataset_episodes",
