@@ -1,8 +1,11 @@
-"""The tests that run on PostgreSQL by day, too.
+"""The tests that run on PostgreSQL by day, too, and parameters of which some run by day.
 
 A test whose parameter names PostgreSQL is marked `nightly`, unless its file or its name is in `ON_BOTH`: there the SQL,
 the locks or the notifications of PostgreSQL decide the result. All others run on SQLite by day and on both at night.
 """
+
+from collections.abc import Iterable
+from typing import Any
 
 import pytest
 
@@ -65,6 +68,11 @@ ON_BOTH = {
     "test_consent_withdrawn_during_the_job_stores_nothing",
     "test_erasing_during_the_job_stores_nothing",
 }
+
+
+def some(values: Iterable[Any], of: int) -> list[Any]:
+    """Return parameters of a test: every `of`-th value runs by day, all of them at night."""
+    return [pytest.param(value, marks=[pytest.mark.nightly] * (at % of > 0)) for at, value in enumerate(values)]
 
 
 def mark(items: list[pytest.Item]) -> None:

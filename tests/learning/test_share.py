@@ -28,6 +28,7 @@ from skills.learning.dynamic_programming import ValueIteration, exact_values
 from skills.learning.policy import describe_learner, learn_tabular, learner_of, next_step, rollout_from
 from skills.learning.q_learning import PhaseQLearning
 from skills.learning.slip import enter_all, odds, start_all
+from tests.by_day import some
 from tests.gridworld.paths import WALKS, follow, joins_nearest, learnt, named_path, random_path, share_of
 from tests.learning.test_certificate import values_everywhere
 
@@ -156,7 +157,7 @@ def test_by_another_rule_exact_values_equal_value_iteration_everywhere(name, joi
     assert exact_values(slow)[inside] == pytest.approx(expected, rel=1e-9, abs=0)
 
 
-@every_walk
+@pytest.mark.parametrize("name", some(WALKS, 4))
 def test_with_slips_a_joining_rule_is_certified_and_finishes(name):
     learner = ValueIteration(slip=0.1, join_share=0.5)
     policy = learn_tabular(sparse_reward(named_path(name)), learner)
@@ -178,7 +179,7 @@ def test_many_runs_start_and_enter_as_one_does(name, join_share):
         assert [*zip(*entered, strict=True)] == [domain.enter(phase, state) for state in states]
 
 
-@every_walk
+@pytest.mark.parametrize("name", some(WALKS, 4))
 @pytest.mark.parametrize("join_share", [0.5, 1.0])
 def test_next_step_leads_along_the_same_walk_and_back_to_where_it_may_join(name, join_share):
     policy = learnt(name, join_share=join_share)
