@@ -236,6 +236,7 @@ def test_others_than_its_own_demonstrations_are_found(database: Database):
     ]
 
 
+@pytest.mark.nightly  # by day other restores
 def test_a_combined_policy_is_restored_with_its_demos_on_another_back_end(database: Database, tmp_path: Path):
     demos = add_three(database)
     train(database, demos, release=True)

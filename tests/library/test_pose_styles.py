@@ -158,6 +158,7 @@ def test_a_pose_style_is_erased_with_its_demonstration(database: Database):
     assert stored(database) == 0
 
 
+@pytest.mark.nightly  # by day tests/library/test_backup.py counts every table
 def test_a_backup_holds_the_pose_styles(database: Database, tmp_path: Path):
     cases.add_surgeon(database)
     add(database, turning())

@@ -165,6 +165,7 @@ def test_another_scene_or_cost_is_another_training_and_an_equal_one_is_not(datab
     assert len({first, *others}) == 4
 
 
+@pytest.mark.nightly  # by day a batch keeps joining rules
 def test_a_batch_keeps_the_scene_of_a_style_and_its_learner(database):
     with_demo(database)
     version = trained(database, release=True)

@@ -163,7 +163,6 @@ def test_code_that_is_older_than_the_tables_says_so_everywhere(release: Released
     place = {"SKILLS_DATABASE_URL": database.url, "SKILLS_PORT": "0"}
     told = (
         (["serve"], REFUSED),
-        (["worker"], REFUSED),
         (["train", "kestrel", "simple-running"], REFUSED),
         (["backup", str(tmp_path / "backup.zip")], "The tables are of another version"),
         (["verify"], "schema: it is at 9999"),
@@ -174,6 +173,16 @@ def test_code_that_is_older_than_the_tables_says_so_everywhere(release: Released
         assert said in errors, (words, errors)
         assert "Traceback" not in errors, (words, errors)
     assert rows(database) == before
+
+
+@pytest.mark.nightly  # by day the service is refused
+def test_a_worker_that_is_older_than_the_tables_says_so(release: Released):
+    database, _ = release
+    database.migrate()
+    with database.writing() as session:
+        session.execute(text("UPDATE alembic_version SET version_num = '9999'"))
+    code, errors = run(["worker"], {"SKILLS_DATABASE_URL": database.url})
+    assert (code, REFUSED in errors, "Traceback" in errors) == (1, True, False), errors
 
 
 def run(words: list[str], environment: dict[str, str]) -> tuple[int, str]:
