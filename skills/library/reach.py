@@ -17,7 +17,7 @@ from skills.planning.path_fit import ends_of
 from skills.schemas import PolicyName
 from skills.schemas.given import Reach
 from skills.schemas.reach import ReachIn
-from skills.verification.reach import MAX_PLACES, Place, map_reach
+from skills.verification.reach import MAX_PLACES, ReachPlace, map_reach
 
 
 def map_style(database: Database, request: ReachIn) -> Reach:
@@ -65,7 +65,7 @@ def _counts(size_mm: tuple[float, float, float], step_mm: float) -> list[int]:
     return [floor(size / step_mm + 1e-9) + 1 for size in size_mm]
 
 
-def in_words(places: list[Place]) -> str:
+def in_words(places: list[ReachPlace]) -> str:
     """Return the result as sentences: how many places are possible, and what limits most of the others."""
     yes = sum(one.reach == "yes" for one in places)
     words = f"{yes} of {len(places)} places can be planned, each in a plan of its own."

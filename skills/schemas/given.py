@@ -46,7 +46,7 @@ from skills.schemas.recordings import (
     SuturePoints,
 )
 from skills.verification.probabilities import Doubt, Probability
-from skills.verification.reach import Place
+from skills.verification.reach import ReachPlace
 from skills.verification.scene_clearance import SceneReport
 from skills.verification.verdict import PlaybackReport
 
@@ -114,7 +114,7 @@ class Reach(Given):
     step_mm: float
     counts: tuple[Count, Count, Count] = Field(description="Number of places along x, y and z.")
     rotations: Count
-    places: list[Place]
+    places: list[ReachPlace]
     in_words: str
 
 

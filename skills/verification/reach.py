@@ -1,6 +1,6 @@
 """Reach: where a pass can be planned, for many positions and rotations at once, in closed form.
 
-    SuturePlan with a pass for each rotation, positions --map_reach--> Reach: a `Place` for each of both
+    SuturePlan with a pass for each rotation, positions --map_reach--> Reach: a `ReachPlace` for each of both
 
 A pass at another suture point of the same rotation is the same motion moved in a straight line: so its poses are
 computed once for each rotation, and its joints, distances and margins for all positions together. A place is one of
@@ -71,7 +71,7 @@ Answer = Literal["yes", "no", "in doubt"]
 
 @schema
 @dataclass(frozen=True)
-class Place:
+class ReachPlace:
     """One suture point with a rotation.
 
     Attributes:
@@ -101,7 +101,7 @@ class Place:
     needle_mm: Figure
 
 
-def map_reach(plan: SuturePlan, positions_mm: Floats, limits: Limits | None = None) -> list[Place]:
+def map_reach(plan: SuturePlan, positions_mm: Floats, limits: Limits | None = None) -> list[ReachPlace]:
     """Return where each pass of a plan could be planned by itself.
 
     Args:
@@ -118,7 +118,7 @@ def map_reach(plan: SuturePlan, positions_mm: Floats, limits: Limits | None = No
     count = len(plan.passes) * len(positions_mm)
     if not 1 <= count <= MAX_PLACES:
         raise BadPlan(f"A map must have 1 to {MAX_PLACES} places: positions times rotations.", places=count)
-    found: list[Place] = []
+    found: list[ReachPlace] = []
     for one, path in zip(plan.passes, plan.pass_paths, strict=True):
         found += _Moved(plan, one, poses_along(path, plan.psm_m, STEP_MM), positions_mm, limits or Limits()).places()
     return found
@@ -157,7 +157,7 @@ class _Moved:
             rolls = [np.abs(q[:, :, ROLL]).max(axis=1) for q in either]
             self.other = np.where((rolls[0] <= rolls[1])[:, None, None], *either)
 
-    def places(self) -> list[Place]:
+    def places(self) -> list[ReachPlace]:
         """Return the answers at all positions."""
         rows = np.flatnonzero(~self.no)
         for every in SPARSE:
@@ -166,7 +166,7 @@ class _Moved:
         answers = np.where(self.no, "no", np.where(self.yes, "yes", "in doubt")).tolist()
         figures = {name: [_figure(value) for value in values.tolist()] for name, values in self.figures.items()}
         return [
-            Place(
+            ReachPlace(
                 position_mm=xyz(position),
                 rotation_xyzw=self.one.point.rotation_xyzw,
                 reach=answers[k],
