@@ -387,6 +387,18 @@ GUARDS = (
          "tests/library/test_parsed.py", "tests/library/test_what_remains.py", TOLD),
     ),
     Guard("skills/library/sweep.py", 14, ("tests/library/test_sweep.py", "tests/library/test_what_remains.py")),
+    Guard("skills/library/signatures.py", 12, ("tests/api/test_signatures.py",)),
+    Guard("skills/library/relearning.py", 16, ("tests/library/test_relearning.py",)),
+    Guard(
+        "skills/library/backup.py", 20, ("tests/library/test_restoring.py", "tests/library/test_backup.py"),
+        ("Erasures", "_latest", "_knows", "_later", "_listed", "_in_order", "_end_again", "_mark_again", "_here",
+         "_narrow", "_both"),
+    ),
+    Guard(
+        "skills/verification/probabilities.py", 10, ("tests/verification/test_monte_carlo.py",),
+        ("counted", "_pass", "share"),
+    ),
+    Guard("skills/verification/intent.py", 24, ("tests/verification/test_intent.py",)),
 )  # fmt: skip
 
 # By file and name (`Mutant.name`): why nobody can tell the mutant from the code.

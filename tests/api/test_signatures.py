@@ -5,6 +5,9 @@ from typing import Any
 
 import pytest
 
+from skills.errors import Busy
+from skills.library import signatures
+from skills.library.catalogue import find_surgeon, put_surgeon
 from skills.transparency import SigningKey
 from tests.api.service import KESTREL, POLICY, Service, assert_problem
 from tests.independent_history import check_envelope, root_in
@@ -58,6 +61,27 @@ def test_a_signature_is_made_once_and_again_after_a_release(trained: Service, mo
     trained.client.release(**KESTREL, version=1)
     files, _ = signed(trained, path)
     assert files["policy.json"] == digest(trained, POLICY)
+
+
+def test_new_rows_are_signed_first_and_keep_the_first_head_that_covers_them(
+    trained: Service, monkeypatch: pytest.MonkeyPatch
+):
+    def added(slug: str) -> tuple[str, int]:
+        with trained.database.writing() as session:
+            put_surgeon(session, slug, {}, "test")
+            return "surgeons", find_surgeon(session, slug).row
+
+    first = added("heron")
+    with monkeypatch.context() as busy:
+        busy.setattr(signatures, "sign_history", lambda *_: None)
+        with pytest.raises(Busy, match="not signed up to these rows yet"):
+            signatures.head_over(trained.database, [first])
+    head = signatures.head_over(trained.database, [first])
+    second = added("wren")
+    later = signatures.head_over(trained.database, [first, second])
+    assert later.checkpoint.size > head.checkpoint.size
+    assert signatures.head_over(trained.database, [first]) == head
+    assert signatures.head_over(trained.database, [second, first]) == later
 
 
 def test_the_card_has_the_history_on_it_and_is_signed(trained: Service):

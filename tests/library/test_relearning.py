@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from sqlalchemy import text, update
 
@@ -12,14 +13,18 @@ from skills.cli.installation import state_of
 from skills.comparison.combining import Corridor
 from skills.db.models import Demonstration, PolicyVersion
 from skills.db.session import Database
+from skills.errors import NotFound
 from skills.formats.reader_process import read_told
 from skills.learning.dynamic_programming import ValueIteration
+from skills.learning.networks import Network
 from skills.learning.policy import LEARNER_VERSION
 from skills.learning.q_learning import PhaseQLearning
+from skills.library import inspection
 from skills.library.catalogue import put_surgeon
 from skills.library.demos import mark_demo
 from skills.library.inspection import Checked, inspect_policies
 from skills.library.integrity import demo_identity, policy_identity
+from skills.library.relearning import compute_again, decoded
 from skills.library.training import GATE_VERSION, certified, lessons
 from skills.settings import Settings
 from tests import backends
@@ -180,6 +185,27 @@ def test_of_an_older_gate_only_the_values_are_compared(database):
     assert why.endswith("only its values were compared")
     rewritten(database, 1, replace(policy, q=policy.q * 2.0), manifest | {"grid_certificate": certificate})
     assert "its values" in str(parts(database)[RELEARNT].wrong)
+
+
+def test_a_policy_of_a_network_is_certified_again_and_not_learnt_again(database):
+    with database.reading() as session:
+        version = session.get_one(PolicyVersion, 1)
+        policy, manifest = version.learnt, version.manifest
+    rewritten(database, 1, replace(policy, network=Network.of([(np.zeros((27, 3)), np.zeros(27))])), manifest)
+    found = parts(database)
+    assert found[RELEARNT].left_out == [
+        ("policy_versions 1", "learnt by a network, whose values depend on the machine, not learnt again")
+    ]
+    assert (found[CERTIFICATES].count, found[CERTIFICATES].wrong, found[RELEARNT].wrong) == (1, [], [])
+
+
+def test_what_was_erased_meanwhile_is_not_called_wrong(database, monkeypatch):
+    with pytest.raises(NotFound):
+        compute_again(database, 99)
+    with pytest.raises(NotFound):
+        decoded(database, 99, read_told)
+    monkeypatch.setattr(inspection, "compute_again", lambda database, row: compute_again(database, 99))
+    assert parts(database, relearn=None)[CERTIFICATES].wrong == []
 
 
 def test_without_consent_nothing_is_learnt_again(database):

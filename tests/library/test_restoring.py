@@ -164,6 +164,20 @@ def test_a_deleted_recording_that_is_used_again_does_not_block_a_restore(
         assert session.scalars(select(StoredRecording.sha256)).all() == [sent.sha256]
 
 
+def test_a_recording_deleted_after_the_backup_is_deleted_again(
+    database: Database, restored: Callable[[], Database], tmp_path: Path
+):
+    kept, gone = (
+        store_recording(database, cases.upload(cases.hand_off((shift, 0.0, 0.0))), "test")[0].sha256
+        for shift in (0.0, 1.0)
+    )
+    back_up(database, tmp_path / "b.zip")
+    with database.writing() as session:
+        delete_recording(session, gone, "test", anybodys=True)
+    with restored().reading() as session:
+        assert session.scalars(select(StoredRecording.sha256)).all() == [kept]
+
+
 def test_a_key_that_was_revoked_stays_revoked(database: Database, restored: Callable[[], Database], tmp_path: Path):
     with database.writing() as session:
         ids = [create_key(session, owner, "reader", "test")[0].id for owner in ("anna", "bert")]
