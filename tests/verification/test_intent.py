@@ -16,6 +16,7 @@ from skills.kinematics import forward, instrument_of, inverse, joint_margins, ma
 from skills.planning.handoff import OtherArm, PsmM
 from skills.planning.plan import SuturePlan, SuturePoint, stack
 from skills.planning.trajectory import A1, A2, TRANSFER, PassPath, Trajectory, time_parametrise
+from skills.verification import intent
 from skills.verification.asked import Asked, asked_of
 from skills.verification.intent import LIMITS, Comparison, compare
 from skills.verification.playback import Playback
@@ -646,3 +647,12 @@ def test_of_200_sound_plans_half_near_a_limit_none_is_refused():
     assert [(k, why) for k, one in enumerate(plans) if (why := refused(one))] == []
     assert {one.plan.a2 for one in plans} == {"recorded", "paper"}
     assert {one.plan.orientation for one in plans} == {"recorded", "demonstrated", "assumed tool-down"}
+
+
+def test_a_joint_that_is_unknown_makes_the_whole_pose_unknown():
+    """The last joint turns the jaws: where it is unknown, the place of the tip is not trusted either."""
+    joints = np.tile([0.1, 0.2, 0.12, 0.3, 0.4, 0.5], (2, 1))
+    joints[1, 5] = np.nan
+    tip, rotation = intent._poses(joints, "400006")
+    assert np.isfinite(tip[0]).all() and np.isfinite(rotation[0]).all()
+    assert np.isnan(tip[1]).all() and np.isnan(rotation[1]).all()

@@ -15,7 +15,7 @@ from skills.errors import BadInput, BadSettings
 from skills.kinematics import JAW_TIP_MM, POINTING_DOWN
 from skills.planning.handoff import NEEDLE_RADIUS_MM, OtherArm, PsmM, realign
 from skills.planning.trajectory import PassPath, Trajectory, time_parametrise
-from skills.verification import monte_carlo
+from skills.verification import monte_carlo, probabilities
 from skills.verification.clearance import (
     FINGER_RADIUS_MM,
     NEEDLE_FREE_RAD,
@@ -446,3 +446,14 @@ def test_doubts_that_cannot_be_meant_are_refused():
         judged(pad_top_mm=nan)
     with pytest.raises(BadSettings, match="seed"):
         judged(seed=-1)
+
+
+def test_worlds_are_counted_by_hand():
+    """Of four worlds the first fails to reach, the second to place, both in the first pass; the third at the pad."""
+    world = np.eye(4, dtype=bool)
+    counted = probabilities.counted([{"reach": world[0], "place": world[1]}, {"pad": world[2]}], EXACT)
+    first, second = counted.passes
+    assert (counted.plan.count, counted.plan.of, counted.plan.probability) == (1, 4, 0.25)
+    assert (first.succeeds.count, first.clear.count, first.caught and first.caught.count) == (2, 3, 3)
+    assert (second.succeeds.count, second.clear.count, second.caught) == (3, 3, None)
+    assert (first.faults.reach, first.faults.place, first.faults.pad, second.faults.pad) == (1, 1, None, 1)
