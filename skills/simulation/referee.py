@@ -21,8 +21,8 @@ springs, which stand for servos and cables. Both fingers of a jaw are closed by 
 keeps their middle. Nothing else is in the scene: no tissue, no thread, no cable that stretches.
 
 **Units** inside the process are mm, kg and s, so forces are in mN: a needle of 0.07 g is no tiny number there. The
-needle has fifty times its inertia, and its own weight: motions are slow, and forces between jaws and needle are a
-thousand times its weight. `docs/contact.md` has the sources of the numbers, and the comparison.
+needle has fifty times its inertia, and its own weight: motions are slow, and the grip is ten thousand times that
+weight. `docs/contact.md` has the sources of the numbers, and the comparison.
 
 This is the only module that imports mujoco, in a confined process, of which nothing is trusted but numbers. All of
 this is ours.
@@ -77,7 +77,7 @@ class Physics:
         arm_n_mm: Stiffness of each arm at the hinge of its jaws, N/mm.
         wrist_nmm_rad: Stiffness of each wrist, N mm/rad.
         contact_s: Time constant of a contact, s; its stiffness is proportional to 1 / contact_s^2.
-        step_s: Time step, s. A contact needs two at the least, and is reliable with four.
+        step_s: Time step, s, at most 0.0005: with longer ones contacts bounce, and needles are missed that are held.
     """
 
     friction: float = 0.3
@@ -92,8 +92,12 @@ class Physics:
             value = getattr(self, field.name)
             if not (isfinite(value) and 0 <= value <= 1e6 and (value > 0 or field.name == "friction")):
                 raise BadSettings(f"{field.name} of the contacts must be more than 0, at most 1e6.", given=value)
-        if not self.contact_s >= 2 * self.step_s:
-            raise BadSettings("A contact needs at least two time steps: make step_s smaller.", given=self.step_s)
+        if not (self.step_s <= 0.0005 and self.contact_s >= 2.5 * self.step_s):
+            raise BadSettings(
+                "step_s must be at most 0.0005, and contact_s at least 2.5 times as long; make step_s smaller.",
+                step_s=self.step_s,
+                contact_s=self.contact_s,
+            )
 
     def times(self, quantity: str, factor: float) -> "Physics":
         """Return the same with one of `QUANTITIES` multiplied by a factor."""
@@ -316,6 +320,7 @@ def _worlds(trajectory: Trajectory, watched: Ints, drawn: Drawn, displaced: Disp
 
 # ---- inside the process: mm, kg, s, mN ---------------------------------------------------------------------------
 
+_AXES = {"x": "1 0 0", "y": "0 1 0", "z": "0 0 1"}
 _SEGMENTS = 24  # of the needle: the arc bends by 0.02 mm within one
 _STEEL_KG_MM3 = 7.9e-6
 _INERTIA = 50.0  # times the needle's own; its weight stays
@@ -401,7 +406,7 @@ def _arm(name: str, bit: int, physics: Physics) -> tuple[str, str, str]:
           </body>"""
         for side, sign in (("1", 1), ("2", -1))
     )
-    slides = "".join(f'<joint name="{name}{k}" type="slide" axis="{k}"/>' for k in _AXES)
+    slides = "".join(f'<joint name="{name}{k}" type="slide" axis="{axis}"/>' for k, axis in _AXES.items())
     body = f"""
       <body gravcomp="1">{slides}<inertial pos="0 0 0" mass="{_JAW_KG}" diaginertia="5 5 5"/>
         <body name="{name}" gravcomp="1">
@@ -415,13 +420,10 @@ def _arm(name: str, bit: int, physics: Physics) -> tuple[str, str, str]:
       <fixed stiffness="{wrist}" damping="{2 * sqrt(wrist * _FINGER_KG_MM2 / 2)}" springlength="0">{both[1]}</fixed>"""
     place, turn = f'kp="{arm}" kv="{2 * sqrt(arm * 2.2 * _JAW_KG)}"', f'kp="{wrist}" kv="{2 * sqrt(wrist * 11)}"'
     motors = "".join(f'<position joint="{name}{k}" {place}/>' for k in _AXES)
-    motors += "".join(f'<position joint="{name}" gear="{k} 0 0 0" {turn}/>' for k in _AXES)
+    motors += "".join(f'<position joint="{name}" gear="{axis} 0 0 0" {turn}/>' for axis in _AXES.values())
     grip = f'kp="{jaw}" kv="{2 * sqrt(jaw * _FINGER_KG_MM2 / 2)}" forcerange="{-torque} {torque}"'
     motors += f'<position tendon="{name}" {grip}/>'
     return body, tendons, motors
-
-
-_AXES = ("1 0 0", "0 1 0", "0 0 1")
 
 
 def _text(numbers: Floats) -> str:
@@ -429,7 +431,7 @@ def _text(numbers: Floats) -> str:
 
 
 class _Trial:
-    """One trial in a model; the poses are those of the request, and `at` in the order of its phases."""
+    """One trial in a model; the poses are those of one world of `_worlds`."""
 
     def __init__(
         self,

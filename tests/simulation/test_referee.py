@@ -138,7 +138,13 @@ def test_requests_that_make_no_sense_are_refused():
     for given in ({"trials": 0}, {"trials": 2, "varied": 3}, {"seed": -1}):
         with pytest.raises(BadSettings):
             referee(ONE, errors=EXACT, **given)
-    for numbers in ({"friction": -0.1}, {"grip_nmm": 0.0}, {"arm_n_mm": np.nan}, {"step_s": 0.0011}):
+    for numbers in (
+        {"friction": -0.1},
+        {"grip_nmm": 0.0},
+        {"arm_n_mm": np.nan},
+        {"step_s": 0.001},
+        {"contact_s": 0.001},
+    ):
         with pytest.raises(BadSettings):
             Physics(**numbers)
 
@@ -184,6 +190,8 @@ def test_of_50_plans_45_are_not_called_likelier_than_the_referee_finds_them():
     print(f"{sum(not one.too_hopeful for one in found)} of 50 plans, {min(closed):.2f} to {max(closed):.2f}")
     gaps = [one.gap for one in found]
     print(f"gap {np.mean(gaps):.3f} on average, {min(gaps):.2f} to {max(gaps):.2f}")
+    straight = [one.straight for one in found]
+    print(f"of those held straight {sum(p <= one.upper for p, one in zip(closed, straight, strict=True))} of 50 plans")
     print(f"agree {sum(one.agree for one in found)}, closed form alone {sum(one.only_closed_form for one in found)}")
     for k, name in enumerate((one.quantity, one.factor) for one in found[0].sensitivity):
         cases = [one.sensitivity[k] for one in found if one.sensitivity]
