@@ -19,7 +19,6 @@ import hashlib
 import io
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from math import radians
 from typing import Any, Literal
 
 import numpy as np
@@ -30,14 +29,13 @@ from skills.formats import writer
 from skills.formats.archive import pack
 from skills.formats.writer import Message, bag_folder
 from skills.kinematics import INSERTION, JOINTS, forward, instrument_of, quaternion_of
-from skills.planning.handoff import OPEN_RAD
-from skills.planning.motion_laws import PHASES
+from skills.planning.handoff import JAW_CLOSED_RAD, JAW_OPEN_RAD
+from skills.planning.motion_laws import A2, PHASES, TRANSFER
 from skills.planning.trajectory import Trajectory
 
 CRTK_ARMS = ("PSM1", "PSM2", "PSM3")  # the names that `dvrk_bag_replay.py -a` accepts
 EPOCH_NS = 1_000_000_000  # ours: a stamp of 0 is "invalid" to CRTK, and a plan has no date
 PAUSE_TICKS = 1.5  # stamps further apart than this many sample periods are a pause between passes
-JAW_CLOSED_RAD = radians(-20)  # as `close()` of dvrk_python's PSM: beyond closed, so that the jaw presses
 SUMS = "SHA256SUMS"
 
 Role = Literal["PSM_A", "PSM_M"]
@@ -130,8 +128,7 @@ def arms_of(
         arm: The plan's arm, see `arm_names`.
         frame: The plan's frame.
         other: The arm that took the needle in the demonstration.
-        jaw_rad: The angle of PSM_A's jaw, if the trajectory has none. PSM_M's jaw stays open: only a surgeon closes it
-            on the needle.
+        jaw_rad: The angle of PSM_A's jaw, if the trajectory has none.
         pass_index: A single pass, counted from 0 as in reports; its samples keep their stamps. None: all passes.
 
     Raises:
@@ -167,7 +164,7 @@ def arms_of(
         joints=_metric(psm_m.joints[rows]),
         tip_m=tip_mm / 1000.0,
         rotation_xyzw=quaternion_of(rotation),
-        jaw_rad=np.full(len(rows), 2 * OPEN_RAD),
+        jaw_rad=np.full(len(rows), JAW_OPEN_RAD) if psm_m.jaw_rad is None else psm_m.jaw_rad[rows],
         pass_index=pass_index,
     )
 
@@ -237,9 +234,11 @@ def notes_of(motion: ArmMotion, plan_sha256: str) -> dict[str, str]:
 def timetable(trajectory: Trajectory, arms: tuple[ArmMotion, ...]) -> list[dict[str, Any]]:
     """Return the passes of a bag on the one clock of its setpoints, for a program or a person that executes it.
 
-    For each pass: its index, the first and the last stamp of each of its phases, and `hand_over`: the stamp at which
-    the arms are where the needle is handed over, and the jaws to move there, in this order, before the next stamp is
-    sent. None without PSM_M. No setpoint moves these jaws: whoever sees the needle decides.
+    For each pass: its index, the first and the last stamp of each of its phases, `hand_over` and `take_back`. The first
+    of these is where PSM_M takes the needle, at the end of A2; the second where PSM_A has it again, at the end of a
+    transfer, before whose `at_ns` the surgeon inserts the needle and takes it (M1, M2). Both have the stamp at which
+    the arms stand and the jaws begin to move, and each jaw in the order in which they move, with the stamps between
+    which it does. None where the jaws do not move.
 
     Args:
         trajectory: The one that the bag is made of.
@@ -247,9 +246,6 @@ def timetable(trajectory: Trajectory, arms: tuple[ArmMotion, ...]) -> list[dict[
     """
     rows = rows_of_pass(trajectory, arms[0].pass_index)
     stamps_ns, number, phase = arms[0].stamps_ns, trajectory.pass_index[rows], trajectory.phase[rows]
-    jaws = [
-        {"arm": arm.name, "jaw_rad": to} for arm, to in zip(arms[::-1], (JAW_CLOSED_RAD, 2 * OPEN_RAD), strict=False)
-    ]
     found = []
     for one in np.unique(number).tolist():
         parts = [(name, stamps_ns[(number == one) & (phase == k)]) for k, name in enumerate(PHASES)]
@@ -261,12 +257,35 @@ def timetable(trajectory: Trajectory, arms: tuple[ArmMotion, ...]) -> list[dict[
                     for name, part in parts
                     if len(part)
                 ],
-                "hand_over": None
-                if len(arms) == 1
-                else {"at_ns": int(stamps_ns[number == one][-1]), "jaws_in_order": jaws},
+                "hand_over": _changes_hands(arms, np.flatnonzero((number == one) & (phase == A2))),
+                "take_back": _changes_hands(arms, _and_next(np.flatnonzero((number == one) & (phase == TRANSFER)))),
             }
         )
     return found
+
+
+def _and_next(rows: Ints) -> Ints:
+    """Return samples and the one after them, where what moves in them ends."""
+    return np.append(rows, rows[-1:] + 1)
+
+
+def _changes_hands(arms: tuple[ArmMotion, ...], rows: Ints) -> dict[str, Any] | None:
+    """Return when each jaw moves in some samples of a bag, the first first; None unless both do."""
+    moves = []
+    for arm in arms:
+        steps = np.flatnonzero(np.diff(arm.jaw_rad[rows]) != 0)
+        if len(steps):
+            first, last = rows[steps[0]], rows[steps[-1] + 1]
+            moves.append((int(arm.stamps_ns[first]), int(arm.stamps_ns[last]), arm.name, float(arm.jaw_rad[last])))
+    if len(moves) < 2:
+        return None
+    moves.sort()
+    return {
+        "at_ns": moves[0][0],
+        "jaws_in_order": [
+            {"arm": name, "jaw_rad": to, "from_ns": begins, "to_ns": ends} for begins, ends, name, to in moves
+        ],
+    }
 
 
 def seal(members: Mapping[str, bytes]) -> bytes:

@@ -27,7 +27,7 @@ from skills.library import locks, policies
 from skills.library.integrity import find_by_digest, learnt, plan_identity, planned, scene_digest
 from skills.library.policies import combined_of, learnt_from
 from skills.library.recordings import Reader, Upload, read_upload
-from skills.planning.hand import styled
+from skills.planning.hand import jaw_recorded, styled
 from skills.planning.handoff import PsmM
 from skills.planning.plan import SuturePlan, pose_xyzw, stack, turn_deg
 from skills.planning.trajectory import Trajectory, seams, seconds_by_phase, time_parametrise, transfers
@@ -295,7 +295,7 @@ def describe_plan(plan: SuturePlan, trajectory: Trajectory, learnt_in: Scene | N
             "seconds_by_phase": seconds_by_phase(trajectory),
             "speed_used_mm_s": trajectory.speed_mm_s,
             "tempo": trajectory.tempo,
-            "jaw": "constant" if trajectory.jaw_rad is None else "recorded",
+            "jaw": "recorded" if all(jaw_recorded(one.hand) for one in plan.passes) else "constant",
             "peak_joint_speed_ratio": trajectory.speed_ratio,
             "peak_joint_acceleration_ratio": trajectory.acceleration_ratio,
             "deviation_mm": trajectory.deviation_mm,

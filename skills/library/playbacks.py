@@ -167,7 +167,7 @@ def _percent(part: float | None) -> str:
     return f"{100 * part:.1f} %"
 
 
-CHECK_VERSION = 3  # part of the job's identity: raise it when verdicts change, so that plans can be played again
+CHECK_VERSION = 4  # part of the job's identity: raise it when verdicts change, so that plans can be played again
 
 
 def request_playback(
@@ -282,10 +282,12 @@ def standing_of(session: Session, playback: StoredPlayback) -> dict[str, Any]:
 
 
 def trajectory_digest(trajectory: Trajectory) -> str:
-    """Return the SHA-256 of a motion: of the stamps, joints and jaw that were checked, sample by sample."""
+    """Return the SHA-256 of a motion: of the stamps, joints and jaws that were checked, sample by sample."""
     parts = [trajectory.stamps_s, trajectory.joints]
     if trajectory.psm_m is not None:
         parts += [trajectory.psm_m.base_mm, trajectory.psm_m.base_xyzw, trajectory.psm_m.joints]
+        if trajectory.psm_m.jaw_rad is not None:
+            parts.append(trajectory.psm_m.jaw_rad)
     if trajectory.jaw_rad is not None:
         parts.append(trajectory.jaw_rad)
     return sha256(b"".join(part.tobytes() for part in parts))

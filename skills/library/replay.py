@@ -102,8 +102,9 @@ LIMITS = (
     "accuracy, of tissue, or of another arm, frame or instrument than these."
 )
 BY_HAND = (
-    "A surgeon inserts the needle and takes it again by hand (M1, M2), and closes PSM_A's jaw on it. Send no setpoint "
-    "of the pass before that is done."
+    "A surgeon inserts the needle and takes it again by hand (M1, M2): before the first setpoint of the first pass, "
+    "and in a further pass before the stamp of take_back, where PSM_A stands to take it. Send no later setpoint before "
+    "that is done. Jaws close on the needle and let it go by setpoints: whoever sees that they do not stops them."
 )
 USE = "Research use only; not a medical device. Never replay it on or near a person."
 
@@ -376,20 +377,21 @@ def _readme(plan: dict[str, Any], report: dict[str, Any], arms: tuple[ArmMotion,
             "The demonstration had no orientation. The tool is ASSUMED to point straight down: check its orientation.",
         ]
     for arm in arms:
-        about += ["", *_arm_lines(arm, plan["arm"])]
+        about += ["", *_arm_lines(arm, plan["arm"], hands=len(arms) > 1)]
     return "\n".join([*about, ""])
 
 
-def _arm_lines(arm: ArmMotion, planned_arm: str) -> list[str]:
+def _arm_lines(arm: ArmMotion, planned_arm: str, *, hands: bool) -> list[str]:
     low, high = arm.extent_mm.tolist()
     box = [f"   {axis}:[{a:f}, {b:f}]" for axis, a, b in zip("XYZ", low, high, strict=True)]
     least, most = float(arm.jaw_rad.min()), float(arm.jaw_rad.max())
     if arm.role == "PSM_M":
-        jaw = "stays open; the needle is not taken until a surgeon closes it"
+        jaw = "open as it comes in; closes on the needle at the end of A2"
         named = f"{arm.name}, PSM_M: it takes the needle."
     else:
-        jaw = "closed, with a holding force" if most == JAW_CLOSED_RAD else "as demonstrated"
+        jaw = "closed, with a holding force" if least == JAW_CLOSED_RAD else "as demonstrated"
         jaw += " (median)" if least == most != JAW_CLOSED_RAD else ""
+        jaw += "; opens once PSM_M's is closed" if hands else ""
         known = planned_arm.upper() == arm_names(planned_arm)[0]
         assumed = "" if known else f" ASSUMED: the demonstration calls its arm {planned_arm!r}."
         named = f"{arm.name}, PSM_A: it brings the needle.{assumed}"

@@ -197,6 +197,11 @@ def moved(hand: Hand, rotation: Floats, about_mm: Floats, to_mm: Floats) -> Hand
     return replace(hand, tip_mm=(hand.tip_mm - about_mm) @ rotation.T + to_mm, rotation_xyzw=turned)
 
 
+def jaw_recorded(hand: Hand | None) -> bool:
+    """Return whether a pass has the angles of the surgeon's jaw."""
+    return hand is not None and hand.jaw_rad is not None
+
+
 def jaw_within(demo: Demo) -> Floats | None:
     """Return the demonstrated angles of the jaw, shape (T,), within the range of the instrument.
 

@@ -21,7 +21,7 @@ reaches it from outside its circle.
 """
 
 from dataclasses import dataclass
-from math import pi, radians
+from math import ceil, pi, radians
 from typing import Literal, get_args
 
 import numpy as np
@@ -39,6 +39,9 @@ HELD_MM = 9.0  # from the hinge along the approach to the place where the jaws h
 TAKEN_MM = 7.0
 HOLDING_RAD = 0.06  # opening of each finger of jaws that hold a needle
 OPEN_RAD = radians(30)  # opening of each finger of PSM_M as it comes in: 60 degrees in all, as `open()` of dvrk_python
+JAW_CLOSED_RAD = radians(-20)  # as `close()` of dvrk_python's PSM: beyond closed, so that the jaw presses
+JAW_OPEN_RAD = 2 * OPEN_RAD
+JAW_S = 0.8  # ours: from open to closed; a finger then accelerates at half of its limit
 NEEDLE_FREE_RAD = 2 * pi / 3  # of the arc beyond PSM_A's grip: two thirds of a half circle, as in urdf/needle.urdf
 _NO_LENGTH = 1e-12
 _PARALLEL = 1e-9  # of a cosine: 45 microradians, for quaternions of six digits
@@ -102,18 +105,55 @@ class OtherArm:
         base_xyzw: The rotation of its base in that frame, unit quaternion, shape (4,).
         instrument: Number of its instrument.
         joints: Its joints at every sample of the trajectory, rad and mm, shape (T, 6).
+        jaw_rad: Angle of its jaw, shape (T,); None: not planned.
     """
 
     base_mm: Floats
     base_xyzw: Floats
     instrument: str
     joints: Floats
+    jaw_rad: Floats | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "base_mm", frozen(self.base_mm, np.float64, (3,), "base_mm"))
         object.__setattr__(self, "base_xyzw", frozen(self.base_xyzw, np.float64, (4,), "base_xyzw"))
         object.__setattr__(self, "joints", frozen(self.joints, np.float64, (None, 6), "joints"))
+        if self.jaw_rad is not None:
+            object.__setattr__(self, "jaw_rad", frozen(self.jaw_rad, np.float64, (len(self.joints),), "jaw_rad"))
         matrix_of(self.base_xyzw[None])
+
+
+@dataclass(frozen=True, eq=False)
+class Jaws:
+    """The angles of both jaws while both arms stand and the needle changes hands, shape (2 * ticks,) each.
+
+    First the one that takes the needle closes, then the one that gave it opens; each by a minimum-jerk move.
+    """
+
+    takes_rad: Floats
+    gives_rad: Floats
+
+    @classmethod
+    def between(cls, taker_rad: tuple[float, float], giver_rad: tuple[float, float], rate_hz: float) -> "Jaws":
+        """Return the angles after each tick.
+
+        Args:
+            taker_rad: The jaw that takes the needle, before and after.
+            giver_rad: The jaw that gives it.
+            rate_hz: Samples per second.
+        """
+        ticks = ceil(JAW_S * rate_hz)
+        u = np.arange(1, ticks + 1) / ticks
+        done = u**3 * (10 - 15 * u + 6 * u * u)
+        (open_rad, held_rad), (holds_rad, lets_rad) = taker_rad, giver_rad
+        still = np.ones(ticks)
+        closing, opening = open_rad + (held_rad - open_rad) * done, holds_rad + (lets_rad - holds_rad) * done
+        closing[-1], opening[-1] = held_rad, lets_rad  # without round-off
+        return cls(np.concatenate((closing, held_rad * still)), np.concatenate((holds_rad * still, opening)))
+
+    def __len__(self) -> int:
+        """The number of ticks."""
+        return len(self.takes_rad)
 
 
 def needle_tips_mm() -> Floats:

@@ -248,6 +248,7 @@ class Way:
         brought: Poses at the end of A1.
         handed: Poses at the end of A2; None for a pass without it.
         hand: Orientation, jaw and tempo of A1; None: held, at an even tempo.
+        further: Whether another pass comes before it.
     """
 
     transfer: tuple[Arms, ...]
@@ -255,6 +256,7 @@ class Way:
     brought: Arms
     handed: Arms | None
     hand: Hand | None = None
+    further: bool = False
 
     @property
     def last(self) -> Arms:
@@ -289,7 +291,7 @@ def ways(passes: Sequence[PassPath], psm_m: PsmM | None) -> list[Way]:
         if one.target_rotation is not None:
             handed = _arms(Pose(line[-1], one.target_rotation), None if meets is None else meets.taking)
         brought = (Pose(line[-1], one.last_rotation), *stations[-1][1:])
-        found.append(Way(stations, line, brought, handed, one.hand))
+        found.append(Way(stations, line, brought, handed, one.hand, number > 0))
         before = meets
     return found
 

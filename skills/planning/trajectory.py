@@ -16,8 +16,12 @@ The law of motion is ours; the paper only asks for no jerky movements:
   point is passed exactly, on a tick. Between points it leaves the straight move by at most 1.25 mm, because moves are
   divided until it does not (`skills.planning.motion_laws`). Stopping at every point would not leave it at all, but
   takes longer.
-* Transfers, A2 and all motion of PSM_M are minimum-jerk moves from rest to rest (`skills.planning.motion_laws`). The
-  jaw closes or opens evenly over a transfer, and stays as it is during A2.
+* Transfers, A2 and all motion of PSM_M are minimum-jerk moves from rest to rest (`skills.planning.motion_laws`).
+* With PSM_M the needle changes hands at the end of A2, while both arms stand: PSM_M's jaw, open until then, closes, and
+  then PSM_A's opens. So they stay through the transfer to a further pass. At its end, where A1 begins, the surgeon
+  brings the needle from PSM_M through the tissue to PSM_A (M1, M2): PSM_A's jaw closes and then PSM_M's opens. In A1
+  and until then PSM_A's jaw is as recorded, or closed where it was not. Without PSM_M it is as recorded, changes
+  evenly over a transfer, and stays as it is during A2.
 * If a joint of either arm would exceed its speed or acceleration limit, that phase of all passes is slowed until no
   joint does.
 
@@ -26,7 +30,7 @@ the place where one pass ends and the next begins: time passes there, and nothin
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from math import ceil, isfinite, radians, sqrt
 
@@ -37,7 +41,7 @@ from skills.arrays import Bytes, Floats, Ints, frozen
 from skills.errors import BadPlan, BadSpeed, NoMotion
 from skills.fields import Count, schema
 from skills.kinematics import DEFAULT_INSTRUMENT, angle_between, instrument_of, matrix_of, quaternion_of
-from skills.planning.handoff import OtherArm, PsmM
+from skills.planning.handoff import JAW_CLOSED_RAD, JAW_OPEN_RAD, Jaws, OtherArm, PsmM
 from skills.planning.motion_laws import (
     A1,
     A2,
@@ -84,7 +88,7 @@ class Trajectory:
         deviation_mm: Greatest distance of A1 from its straight moves.
         psm_m: Simultaneous motion of PSM_M; None if its place is not known.
         tempo: The part of the surgeon's tempo at which A1 follows a recorded hand, at most 1; None without one.
-        jaw_rad: Angle of PSM_A's jaw, shape (T,); None if it was not recorded, and so is constant.
+        jaw_rad: Angle of PSM_A's jaw, shape (T,); None without PSM_M if it was not recorded, and so is constant.
         taking: The recorded poses in which PSM_M takes the needle, one for each pass, in the PSM base frame; None where
             they follow from the jaw, as in the paper.
     """
@@ -291,10 +295,12 @@ class _Sampled:
     counts: tuple[int, int, int]
     deviation_mm: float
     jaw_rad: Floats | None
+    other_jaw_rad: Floats | None = None
 
 
 def _sample(one: Way, paces: Paces) -> _Sampled:
     """Sample one pass; the end of a phase and the beginning of the next are one tick, at rest."""
+    hands = len(one.transfer[-1]) == 2 and one.handed is not None
     legs = [move(start, end, paces[TRANSFER]) for start, end in pairwise(one.transfer)]
     parts = [tuple(poses[:-1] for poses in leg) for leg in legs]  # a leg's last pose is the first of the next part
     begin = one.transfer[-1]
@@ -306,10 +312,34 @@ def _sample(one: Way, paces: Paces) -> _Sampled:
         turned = move(one.brought, one.handed, paces[A2], least_ticks=1)
         parts.append(tuple(poses[1:] for poses in turned))
         turning = len(turned[0]) - 1
-    poses = tuple(joined(of_arm) for of_arm in zip(*parts, strict=True))
-    if jaw is not None:
+    other_jaw = None
+    if hands and one.handed is not None:
+        rate_hz = paces[A2].rate_hz
+        jaw = np.full(len(along), JAW_CLOSED_RAD) if jaw is None else jaw
+        given = Jaws.between((JAW_OPEN_RAD, JAW_CLOSED_RAD), (jaw[-1], _let_go(jaw)), rate_hz)
+        parts.append(tuple(held(pose, len(given)) for pose in one.handed))
+        first, first_other = np.full(before, jaw[0]), np.full(before, JAW_OPEN_RAD)
+        if one.further:
+            taken = Jaws.between((_let_go(jaw), jaw[0]), (JAW_CLOSED_RAD, JAW_OPEN_RAD), rate_hz)
+            parts.insert(len(legs), tuple(held(pose, len(taken)) for pose in begin))
+            # the last angles are those of A1's first tick
+            first = np.concatenate((np.full(before + 1, _let_go(jaw)), taken.takes_rad[:-1]))
+            first_other = np.concatenate((np.full(before + 1, JAW_CLOSED_RAD), taken.gives_rad[:-1]))
+        before = len(first)
+        jaw, other_jaw = (
+            np.concatenate((first, jaw, np.full(turning, jaw[-1]), given.gives_rad)),
+            np.concatenate((first_other, np.full(len(along) + turning, JAW_OPEN_RAD), given.takes_rad)),
+        )
+        turning += len(given)
+    elif jaw is not None:
         jaw = np.concatenate((np.full(before, jaw[0]), jaw, np.full(turning, jaw[-1])))
-    return _Sampled(poses, (before, len(along), turning), deviation_mm, jaw)
+    poses = tuple(joined(of_arm) for of_arm in zip(*parts, strict=True))
+    return _Sampled(poses, (before, len(along), turning), deviation_mm, jaw, other_jaw)
+
+
+def _let_go(jaw_rad: Floats) -> float:
+    """Return the angle at which PSM_A's jaw lets the needle go: open, and no less than at its recorded end."""
+    return max(JAW_OPEN_RAD, float(jaw_rad[-1]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -393,17 +423,21 @@ def _solved(sampled: Sequence[_Sampled], instrument: str, psm_m: PsmM | None) ->
     ticks = Ticks(np.repeat(np.arange(len(counts)), counts.sum(axis=1)), phase)
     poses = [joined(of_arm) for of_arm in zip(*(one.poses for one in sampled), strict=True)]
     joints = solve(poses[0], ticks, instrument)
-    other = None if psm_m is None or len(poses) == 1 else other_arm(poses[1], ticks, psm_m)
+    other = None
+    if psm_m is not None and len(poses) == 2:
+        jaws = [one.other_jaw_rad for one in sampled if one.other_jaw_rad is not None]
+        other = replace(other_arm(poses[1], ticks, psm_m), jaw_rad=np.concatenate(jaws))
     deviation_mm = max(one.deviation_mm for one in sampled)
     return _Motion(poses[0], ticks, joints, other, deviation_mm, _jaw(sampled))
 
 
 def _jaw(sampled: Sequence[_Sampled]) -> Floats | None:
-    """Concatenate the angles of the jaw; over a transfer it goes evenly from those of the pass before to its own."""
+    """Concatenate the angles of the jaw; alone, over a transfer it goes evenly from the pass before to its own."""
     angles = [one.jaw_rad for one in sampled if one.jaw_rad is not None]
     if len(angles) < len(sampled):
         return None
-    for before, after, one in zip(angles, angles[1:], sampled[1:], strict=False):
+    alone = all(one.other_jaw_rad is None for one in sampled)
+    for before, after, one in zip(angles, angles[1:], sampled[1:] if alone else (), strict=False):
         transfer = one.counts[0]
         after[:transfer] = np.linspace(before[-1], after[transfer], transfer + 1)[:-1]
     return np.concatenate(angles)

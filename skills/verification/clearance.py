@@ -51,6 +51,7 @@ from skills.verification.playback import LINKS, PAD_SIZE_MM, PSM_A, LinkPair, pa
 SHAFT_RADIUS_MM = 4.0
 WRIST_REACH_MM = WRIST_MM + 3.6
 FINGER_REACH_MM = 10.3  # the tip's cap is 10.22 from the hinge
+STANDS = 1e-6  # ours, rad and mm: joints that differ by no more are those of one pose
 RADIUS_MM = 0.33  # of the needle's wire
 # The arc from the place where it is held, two thirds from the tip: x along the needle, y towards the arc's centre.
 _TURN = np.linspace(-pi / 3, 2 * pi / 3, 49)
@@ -86,6 +87,20 @@ def openings(trajectory: Trajectory) -> Floats:
     if trajectory.jaw_rad is None:
         return np.full(len(trajectory), HOLDING_RAD)
     return np.maximum(trajectory.jaw_rad / 2, HOLDING_RAD)
+
+
+def stands_from(trajectory: Trajectory, end: int) -> int:
+    """Return the first of the samples up to an end at which both arms stand as they do there.
+
+    Args:
+        trajectory: The motion.
+        end: The index of a sample; NaN stands nowhere else.
+    """
+    moved = ~(np.abs(trajectory.joints[: end + 1] - trajectory.joints[end]) <= STANDS).all(axis=1)
+    if trajectory.psm_m is not None:
+        moved |= ~(np.abs(trajectory.psm_m.joints[: end + 1] - trajectory.psm_m.joints[end]) <= STANDS).all(axis=1)
+    moved[end] = False
+    return end - int(np.argmax(np.append(moved[::-1], True))) + 1
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,6 +14,9 @@ planning computed (`skills.verification.asked`). The poses are those of the play
   stood, an arm may stand; elsewhere it may not.
 * *Hand-off.* At the end of A2 the needle is where the definition of the hand-off puts it: in the recorded poses of both
   arms, or with PSM_A's hinge along PSM_M's approach and PSM_M a quarter of the needle's circle further on.
+* *Jaws.* The needle is always held. PSM_A's jaw is as recorded, or closed, from the start of A1 until both arms stand
+  at the end of A2 and PSM_M's, open until then, has closed; then it opens. In a transfer to a further pass it is the
+  other way round, once both arms stand where A1 begins. Otherwise no jaw moves.
 * *Between.* A2 turns the jaw the shorter way with the tip held, transfers are straight, and PSM_M leaves before PSM_A.
 
 All of this is ours. A deviation passes where it does not exceed its limit, so NaN never passes.
@@ -22,7 +25,7 @@ All of this is ours. A deviation passes where it does not exceed its limit, so N
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from math import nan
+from math import ceil, nan
 from types import MappingProxyType
 
 import numpy as np
@@ -30,13 +33,14 @@ from numpy.typing import ArrayLike
 
 from skills.arrays import Flags, Floats, Ints
 from skills.fields import Count, Figure, schema
-from skills.kinematics import angle_between, forward, matrix_of
+from skills.kinematics import angle_between, forward, instrument_of, matrix_of
 from skills.learning.policy import rollout
-from skills.planning.handoff import HELD_MM, NEEDLE_RADIUS_MM, TAKEN_MM
+from skills.planning.handoff import HELD_MM, JAW_CLOSED_RAD, JAW_OPEN_RAD, JAW_S, NEEDLE_RADIUS_MM, TAKEN_MM
 from skills.planning.motion_laws import A1, A2, TRANSFER
 from skills.planning.passes import STAND_OFF_MM
 from skills.planning.trajectory import Trajectory
 from skills.verification.asked import Asked
+from skills.verification.clearance import stands_from
 from skills.verification.moments import REST_S, Moments
 
 STILL = 0.002  # of the greatest speed of a pass: an arm below it stands
@@ -44,6 +48,7 @@ STAND_S = 0.25  # ours: so long it may, where the hand did not: more than a stro
 BETWEEN_SHARE = 0.025  # of a phase: at both ends a minimum-jerk move is below `STILL` of its peak for 0.0113 of it
 CELL_STEP = 0.1  # of a cell: between two places whose cells are compared
 _LEAST_MM = 1e-4  # of a step: below it a pass has no greatest speed
+_PAIRS = (("PSM_A", "PSM_M"), ("PSM_M", "PSM_A"))
 _FLIPPED = np.diag([-1.0, -1.0, 1.0])  # jaws are symmetric about their approach
 
 # Every kind of deviation with its unit and its limit, all ours. Poses that are stated exactly have the limits of a
@@ -65,6 +70,13 @@ LIMITS: Mapping[str, tuple[str, float]] = MappingProxyType(
         "jaw turned off the recording": ("deg", 3.0),
         "jaw off its stated rotation": ("deg", 0.1),
         "opening of the jaw off the recording": ("rad", 0.05),
+        "a jaw beyond its limits": ("rad", 1e-9),
+        "speed of a jaw": ("of its limit", 1.000001),
+        "a jaw moves with an arm": ("rad", 1e-6),
+        "PSM_A's jaw opens before PSM_M's holds": ("rad", 1e-6),
+        "PSM_M's jaw not open as it comes in": ("rad", 1e-6),
+        "PSM_M's jaw opens before PSM_A's holds": ("rad", 1e-6),
+        "needle has not changed hands": ("rad", 1e-6),
         "tip leaves the hand-off": ("mm", 0.05),
         "A2 leaves the shorter way": ("deg", 0.1),
         "A2 off the recorded hand-off": ("deg", 0.1),
@@ -339,13 +351,15 @@ class _Pass:
         """Compare the jaw's opening: recorded in A1, as it was then in A2, and in between over a transfer."""
         opened, kind = self.whole.motion.jaw_rad, "opening of the jaw off the recording"
         if opened is None or hand.opened is None:
-            if (opened is None) != (hand.opened is None):
+            if (opened is None and hand.opened is not None) or (opened is not None and self.other is None):
                 self.put(kind, self.a1[:1], nan)
             return
         recorded, spread, mine = hand.opened, hand.opened_spread, opened[self.a1]
         off = np.abs(mine - recorded[at]) - spread[at]
         off[~firm] = _nearest(lambda k: np.abs(mine[~firm] - recorded[k]) - spread[k], joining)
         self.put(kind, self.a1, np.maximum(off, 0.0))
+        if self.other is not None:
+            return  # the other phases are those of `_jaws`
         self.put(kind, self.a2, np.abs(opened[self.a2] - mine[-1]))
         if len(self.transfer):
             ends = np.array([opened[max(self.rows[0] - 1, 0)], mine[0]])
@@ -363,7 +377,7 @@ class _Pass:
     # ---- A2 and PSM_M ----------------------------------------------------------------------------------------------
 
     def _a2(self) -> None:
-        asked, a2, end = self.asked, self.a2, self.a2[-1:]
+        asked, a2, end = self.asked, self.a2, self.stood
         assert asked.psm_m is not None
         self.put("tip leaves the hand-off", a2, _far_mm(self.arm.tip_mm[a2], self.place_mm))
         brought, turned = self.arm.rotation[self.a1[-1:]], self.arm.rotation[end]
@@ -377,6 +391,7 @@ class _Pass:
         self._between_stands(a2)
         if self.other is not None:
             self._psm_m()
+            self._jaws()
 
     @cached_property
     def handed(self) -> Floats:
@@ -387,8 +402,13 @@ class _Pass:
         a = a / np.linalg.norm(a)
         return _nearer(self.last_rotation, np.stack([a_m, np.cross(a, a_m), a], axis=1))
 
+    @cached_property
+    def stood(self) -> Ints:
+        """The first sample from which on both arms stand until the end of A2, shape (1,)."""
+        return np.array([max(stands_from(self.whole.motion, int(self.a2[-1])), int(self.a2[0]))])
+
     def _papers_a2(self, turned: Floats) -> None:
-        end, n = self.a2[-1:], turned[:, 0]
+        end, n = self.stood, turned[:, 0]
         hinge = np.linalg.norm(np.cross(n, self.asked.approach)), abs(n @ self.asked.approach)
         self.put("A2's hinge off PSM_M's approach", end, np.degrees(np.arctan2(*hinge)))
         self.put("A2 off the paper's hand-off", end, _apart_deg(turned[None], self.handed))
@@ -407,7 +427,7 @@ class _Pass:
         return quarter - TAKEN_MM * asked.approach, jaws
 
     def _psm_m(self) -> None:
-        other, a1, a2, end = self.other, self.a1, self.a2, self.a2[-1:]
+        other, a1, a2, end = self.other, self.a1, self.a2, self.stood
         assert other is not None and self.asked.psm_m is not None
         taken_mm, jaws = self.taking()
         self.put("PSM_M off where it takes the needle", end, _far_mm(other.tip_mm[end], taken_mm))
@@ -429,6 +449,56 @@ class _Pass:
         left = np.maximum.accumulate(_far_mm(other.tip_mm[self.transfer], left_mm) <= 0.05)
         gone_mm = _far_mm(self.arm.tip_mm[self.transfer], self.arm.tip_mm[self.transfer[0] - 1])
         self.put("PSM_A leaves before PSM_M", self.transfer, np.where(left, 0.0, gone_mm))
+
+    # ---- jaws ------------------------------------------------------------------------------------------------------
+
+    def _jaws(self) -> None:
+        """Compare the angles of both jaws with the order in which the needle changes hands."""
+        motion, hand = self.whole.motion, self.asked.hand
+        mine, theirs = motion.jaw_rad, None if motion.psm_m is None else motion.psm_m.jaw_rad
+        changed, early, late = (
+            "needle has not changed hands",
+            *(f"{a}'s jaw opens before {b}'s holds" for a, b in _PAIRS),
+        )
+        if mine is None or theirs is None or motion.psm_m is None:
+            self.put(changed, self.a2[-1:], nan)
+            return
+        for jaw, name in ((mine, motion.instrument), (theirs, motion.psm_m.instrument)):
+            self._jaw_limits(jaw, name)
+        a1, a2, transfer = self.a1, self.a2, self.transfer
+        if hand is None or hand.opened is None:
+            self.put(early, a1, np.abs(mine[a1] - JAW_CLOSED_RAD))
+        begins, holds = mine[a1[0]], mine[a1[-1]]
+        lets_go = max(JAW_OPEN_RAD, holds)
+        # PSM_M comes in open, and closes while both stand
+        moving = a2 < self.stood
+        self.put("PSM_M's jaw not open as it comes in", a1, np.abs(theirs[a1] - JAW_OPEN_RAD))
+        self.put("PSM_M's jaw not open as it comes in", a2[moving], np.abs(theirs[a2[moving]] - JAW_OPEN_RAD))
+        closed = np.abs(theirs[a2] - JAW_CLOSED_RAD) <= LIMITS[early][1]
+        self.put(early, a2, np.where(closed & ~moving, 0.0, np.abs(mine[a2] - holds)))
+        self.put(changed, a2[-1:], max(abs(theirs[a2[-1]] - JAW_CLOSED_RAD), abs(mine[a2[-1]] - lets_go)))
+        if not len(transfer):
+            return
+        if self.before is None:
+            self.put(early, transfer, np.abs(mine[transfer] - begins))
+            self.put("PSM_M's jaw not open as it comes in", transfer, np.abs(theirs[transfer] - JAW_OPEN_RAD))
+            return
+        # ... and keeps the needle until PSM_A stands at the beginning of A1 and has closed
+        ends = np.append(transfer, a1[:1])
+        moving = ends < stands_from(motion, int(a1[0]))
+        was = mine[transfer[0] - 1]
+        held = np.abs(mine[ends] - begins) <= LIMITS[late][1]
+        self.put(late, ends, np.where(held & ~moving, 0.0, np.abs(theirs[ends] - JAW_CLOSED_RAD)))
+        self.put("a jaw moves with an arm", ends[moving], np.abs(mine[ends[moving]] - was))
+
+    def _jaw_limits(self, jaw_rad: Floats, instrument: str) -> None:
+        """Compare a jaw's angle with its limits, and its speed with that of the motors of its two fingers."""
+        tool, rows = instrument_of(instrument), self.rows
+        low, high = tool.jaw_rad
+        beyond = np.maximum(low - jaw_rad[rows], jaw_rad[rows] - high)
+        self.put("a jaw beyond its limits", rows, np.maximum(beyond, 0.0))
+        rate = np.abs(np.diff(jaw_rad[rows[0] : rows[-1] + 1], append=jaw_rad[rows[-1]])) / 2 * self.rate_hz
+        self.put("speed of a jaw", rows, rate / tool.speed[-1])
 
     # ---- transfers -------------------------------------------------------------------------------------------------
 
@@ -460,6 +530,9 @@ class _Pass:
                 active = np.maximum(active, np.maximum(speed / self.asked.speed_mm_s, rate / 45.0))
         allowed_s = STAND_S / 2 + BETWEEN_SHARE * len(rows) / self.rate_hz
         still = active <= STILL * active.max(initial=0.0)
+        if self.other is not None:  # while both stand the needle changes hands
+            begins = stands_from(self.whole.motion, int(rows[-1]))
+            still[(rows[:-1] >= begins) & (rows[:-1] < begins + 2 * ceil(JAW_S * self.rate_hz))] = False
         self.put("standing still", rows[:-1], _standing(still) / self.rate_hz / allowed_s)
 
 

@@ -275,6 +275,9 @@ class _Moved:
             links = [links_of(q[looks.rows], tool) for q, tool in arms]
             apart = clearance_between(links[0], links[1].seen_from(base, m.base_mm))
             apart[:, FINGERS] -= FINGER_REACH_MM * (openings(motion)[looks.rows, None, None] - HOLDING_RAD)
+            apart.reshape(looks.count, -1, *apart.shape[1:])[:, -1, FINGERS, FINGERS] = (
+                np.inf
+            )  # the needle changes hands
             ways = [looks.split(_with_last(travel_mm(q, tool))) for q, tool in arms]
             way = ways[0][:, :, :, None] + ways[1][:, :, None]
             yield looks.check("tools", apart, way, self.limits.clearance_psm_m_mm)

@@ -40,7 +40,14 @@ from skills.planning.handoff import HOLDING_RAD
 from skills.planning.motion_laws import A2, PHASES, TRANSFER
 from skills.planning.trajectory import Trajectory, joint_ratios
 from skills.verification.bodies import BodiesClearance, BodiesReport, bodies_clearance
-from skills.verification.clearance import FINGER_REACH_MM, Bounds, needle_to_pad_mm, openings, psm_m_poses
+from skills.verification.clearance import (
+    FINGER_REACH_MM,
+    Bounds,
+    needle_to_pad_mm,
+    openings,
+    psm_m_poses,
+    stands_from,
+)
 from skills.verification.intent import LIMITS, Comparison, Mismatch
 from skills.verification.playback import CLEARANCE_SEEN_MM, MEANS, PAD, PSM_A, PSM_M, Playback
 from skills.verification.scene_clearance import SceneClearance
@@ -321,11 +328,12 @@ def _clearance_gates(figures: Figures, playback: Playback, trajectory: Trajector
 def _handing_over(trajectory: Trajectory, apart: Floats, limit: float) -> Flags:
     """Mark the samples, shape (T,), at which fingers of both arms may touch: the hand-off, and until they part.
 
-    The hand-off is the last sample of A2. In the transfer after it the fingers may be near each other until they are
-    `limit` apart for the first time.
+    The hand-off is the end of A2, where both arms stand and only the jaws move. In the transfer after it the fingers
+    may be near each other until they are `limit` apart for the first time.
     """
     may = np.zeros(len(trajectory), dtype=bool)
     for end in trajectory.last_samples[trajectory.phase[trajectory.last_samples] == A2]:
+        may[stands_from(trajectory, int(end)) : end + 1] = True
         parted = (trajectory.phase[end + 1 :] != TRANSFER) | ~(apart[end + 1 :] < limit)
         may[end : end + 1 + int(np.argmax(np.append(parted, True)))] = True
     return may

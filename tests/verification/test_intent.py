@@ -13,7 +13,7 @@ import pytest
 from scipy.interpolate import CubicSpline
 
 from skills.kinematics import forward, instrument_of, inverse, joint_margins, matrix_of, quaternion_of
-from skills.planning.handoff import OtherArm, PsmM
+from skills.planning.handoff import JAW_CLOSED_RAD, JAW_OPEN_RAD, JAW_S, OtherArm, PsmM
 from skills.planning.plan import SuturePlan, SuturePoint, stack
 from skills.planning.trajectory import A1, A2, TRANSFER, PassPath, Trajectory, time_parametrise
 from skills.verification import intent
@@ -42,20 +42,29 @@ class Motion:
     passes: np.ndarray
     phase: np.ndarray
     jaw: np.ndarray
+    m_jaw: np.ndarray
+    still: np.ndarray  # where only the jaws move
 
     def rows(self, phase: int, number: int = 1) -> np.ndarray:
-        """Return the samples of a phase of a pass."""
-        return np.flatnonzero((self.passes == number) & (self.phase == phase))
+        """Return the samples of a phase of a pass in which arms move."""
+        return np.flatnonzero((self.passes == number) & (self.phase == phase) & ~self.still)
 
     def repeat(self, rows: np.ndarray) -> None:
         """Play only these samples, in this order."""
-        for name in ("tip", "turned", "m_tip", "m_turned", "passes", "phase", "jaw"):
+        for name in ("tip", "turned", "m_tip", "m_turned", "passes", "phase", "jaw", "m_jaw", "still"):
             setattr(self, name, getattr(self, name)[rows])
 
     def built(self, **more: object) -> Trajectory:
         """Solve the joints of both arms."""
         assert self.of.psm_m is not None
         count = len(self.tip)
+        # both arms stand where A2 has brought them, and before A1 where it begins
+        at, number = np.arange(count), np.flatnonzero(~self.still)
+        after = number[np.searchsorted(number, at).clip(max=len(number) - 1)]
+        before = number[(np.searchsorted(number, at, side="right") - 1).clip(0)]
+        stands = np.where(self.still, np.where(self.phase == A2, before, after), at)
+        for poses_of in (self.tip, self.turned, self.m_tip, self.m_turned):
+            poses_of[:] = poses_of[stands]
         other = inverse((self.m_tip - BASE_MM) @ BASE, BASE.T @ self.m_turned)
         whole = {
             "stamps_s": (np.arange(count) + self.passes * (RATE_HZ - 1)) / RATE_HZ,
@@ -65,7 +74,7 @@ class Motion:
             "pass_index": self.passes,
             "phase": self.phase,
             "jaw_rad": self.jaw,
-            "psm_m": OtherArm(np.array(BASE_MM), np.array(BASE_XYZW), "400006", other),
+            "psm_m": OtherArm(np.array(BASE_MM), np.array(BASE_XYZW), "400006", other, self.m_jaw),
         }
         return replace(self.of, **(whole | more))
 
@@ -124,7 +133,19 @@ def poses(trajectory: Trajectory) -> Motion:
         trajectory.pass_index.copy(),
         trajectory.phase.copy(),
         np.array(trajectory.jaw_rad),
+        np.array(trajectory.psm_m.jaw_rad),
+        stands(trajectory),
     )
+
+
+def stands(trajectory: Trajectory) -> np.ndarray:
+    """Return the samples at the ends of A2 and of further transfers in which only the jaws move."""
+    ticks = 2 * int(np.ceil(JAW_S * RATE_HZ))
+    still = np.zeros(len(trajectory), bool)
+    for number in range(trajectory.passes):
+        for phase in (A2,) if number == 0 else (TRANSFER, A2):
+            still[np.flatnonzero((trajectory.pass_index == number) & (trajectory.phase == phase))[-ticks:]] = True
+    return still
 
 
 def broken(comparison: Comparison) -> tuple[str, int] | None:
@@ -391,6 +412,86 @@ def own_start_ignored(motion: Motion) -> int:
 
 
 PATH = "path off the recording"
+A_LETS_GO = "PSM_A's jaw opens before PSM_M's holds"
+
+
+def changes(motion: Motion, phase: int = A2) -> np.ndarray:
+    """Return the samples at the end of a phase in which the jaws move."""
+    return np.flatnonzero((motion.passes == 1) & (motion.phase == phase) & motion.still)
+
+
+def lets_go_early(motion: Motion) -> int:
+    rows = changes(motion)
+    opened = motion.jaw[rows]
+    motion.jaw[rows] = np.append(opened[40:], np.full(40, opened[-1]))
+    return rows[40]
+
+
+def m_never_closes(motion: Motion) -> int:
+    rows = changes(motion)
+    motion.m_jaw[rows] = JAW_OPEN_RAD
+    return rows[len(rows) // 2]
+
+
+def m_closes_halfway(motion: Motion) -> int:
+    rows = changes(motion)
+    motion.m_jaw[rows] = (motion.m_jaw[rows] + JAW_OPEN_RAD) / 2
+    return rows[len(rows) // 2]
+
+
+def stuck(motion: Motion) -> int:
+    rows = changes(motion)
+    motion.jaw[rows] = motion.jaw[rows[0] - 1]
+    return rows[-1]
+
+
+def both_stuck(motion: Motion) -> int:
+    m_never_closes(motion)
+    return stuck(motion)
+
+
+def jaws_swapped(motion: Motion) -> int:
+    motion.jaw, motion.m_jaw = motion.m_jaw, motion.jaw
+    return 0
+
+
+def m_comes_closed(motion: Motion) -> int:
+    rows = motion.rows(A2)[50:]
+    motion.m_jaw[rows] = JAW_CLOSED_RAD
+    motion.m_jaw[rows[:40]] = np.linspace(JAW_OPEN_RAD, JAW_CLOSED_RAD, 40)
+    return rows[1]
+
+
+def m_snaps(motion: Motion) -> int:
+    rows = changes(motion)
+    motion.m_jaw[rows[1:]] = JAW_CLOSED_RAD
+    return rows[0]
+
+
+def m_too_far(motion: Motion) -> int:
+    rows = changes(motion)
+    motion.m_jaw[rows] = np.where(motion.m_jaw[rows] < 0, motion.m_jaw[rows] * 3, motion.m_jaw[rows])
+    return rows[np.flatnonzero(motion.m_jaw[rows] < instrument_of("400006").jaw_rad[0])[0]]
+
+
+def m_drops(motion: Motion) -> int:
+    rows = motion.rows(TRANSFER)[30:60]
+    motion.m_jaw[rows] += 0.3
+    return rows[0]
+
+
+def not_taken_back(motion: Motion) -> int:
+    rows = changes(motion, TRANSFER)
+    motion.jaw[rows] = motion.jaw[rows[0] - 1]
+    return rows[len(rows) // 2]
+
+
+def closes_on_the_way(motion: Motion) -> int:
+    rows = motion.rows(TRANSFER)[30:60]
+    motion.jaw[rows] -= 0.3
+    return rows[0]
+
+
 FAULTS: dict[str, tuple[Callable[[Motion], int], str, int]] = {  # the fault, its kind, and how many samples later
     "goal 10 mm off": (goal_off, PATH, 150),
     "goal 1 mm off": (goal_a_little_off, "end of A1 off the suture point", 0),
@@ -409,7 +510,19 @@ FAULTS: dict[str, tuple[Callable[[Motion], int], str, int]] = {  # the fault, it
     "jaw 10 degrees off": (jaw_off(10.0, A1, X), "jaw turned off the recording", 150),
     "jaw 1 degree off at the hand-off": (jaw_off_at_the_end, "jaw off its stated rotation", 0),
     "jaw opens in A1": (opens(A1), "opening of the jaw off the recording", 0),
-    "jaw opens in A2": (opens(A2), "opening of the jaw off the recording", 0),
+    "jaw opens in A2": (opens(A2), A_LETS_GO, 0),
+    "jaw opens 0.4 s too early": (lets_go_early, A_LETS_GO, 5),
+    "PSM_M's jaw never closes": (m_never_closes, A_LETS_GO, 5),
+    "PSM_M's jaw closes halfway": (m_closes_halfway, A_LETS_GO, 5),
+    "both jaws stuck": (both_stuck, "needle has not changed hands", 0),
+    "PSM_A's jaw stuck": (stuck, "needle has not changed hands", 0),
+    "jaws swapped": (jaws_swapped, "opening of the jaw off the recording", 0),
+    "PSM_M comes in closed": (m_comes_closed, "PSM_M's jaw not open as it comes in", 0),
+    "PSM_M's jaw closes in one tick": (m_snaps, "speed of a jaw", 0),
+    "PSM_M's jaw closes too far": (m_too_far, "a jaw beyond its limits", 0),
+    "PSM_M drops the needle in the transfer": (m_drops, "PSM_M's jaw opens before PSM_A's holds", 0),
+    "PSM_A does not take it again": (not_taken_back, "PSM_M's jaw opens before PSM_A's holds", 5),
+    "PSM_A's jaw closes on the way": (closes_on_the_way, "a jaw moves with an arm", 0),
     "A2 wrong by 30 degrees": (a2_wrong(30.0), "A2 off the paper's hand-off", 0),
     "A2 wrong by 90 degrees": (a2_wrong(90.0), "A2 off the paper's hand-off", 0),
     "A2 upside down": (a2_wrong(180.0, Z), "A2 off the paper's hand-off", 0),
@@ -574,7 +687,7 @@ def stalled() -> Trajectory:
         pass_index=passes,
         phase=motion.phase[nearest],
         jaw_rad=motion.jaw_rad[nearest],
-        psm_m=replace(motion.psm_m, joints=other),
+        psm_m=replace(motion.psm_m, joints=other, jaw_rad=motion.psm_m.jaw_rad[nearest]),
     )
 
 

@@ -88,7 +88,11 @@ def refused(plan: SuturePlan) -> str | None:
         other = links_of(m.joints, m.instrument).seen_from(matrix_of(m.base_xyzw[None])[0], m.base_mm)
         apart = clearance_between(links_of(motion.joints, motion.instrument), other)
         apart[:, FINGERS] -= FINGER_REACH_MM * (openings(motion)[:, None, None] - HOLDING_RAD)
-        apart[-1:, FINGERS, FINGERS] = np.inf  # at the hand-off itself
+        still = (np.abs(np.diff(motion.tip_mm, axis=0)) < 1e-9).all(axis=1) & (np.diff(m.joints, axis=0) == 0).all(
+            axis=1
+        )
+        at_the_end = len(motion) - 1 - int(np.argmin(still[::-1]))
+        apart[at_the_end:, FINGERS, FINGERS] = np.inf  # at the hand-off itself
         if not (apart >= limits.clearance_psm_m_mm).all():
             return "tools"
     assert plan.scene is not None
