@@ -356,7 +356,7 @@ GUARDS = (
         ("refusals", "_unlikely", "_not_the_style", "_driven", "_refusal", "_version"),
     ),
     Guard(
-        "skills/verification/verdict.py", 36,
+        "skills/verification/gates.py", 36,
         ("tests/verification/test_limits.py", "tests/verification/test_playback.py",
          "tests/verification/test_scene_clearance.py"),
         ("figures_of", "_arm", "_rotation_error_deg", "Limits", "_Gate", "first_failure", "_gates", "_joint_gates",
@@ -408,7 +408,7 @@ EQUIVALENT: dict[tuple[str, str], str] = {
         "_sweep_ended: return None  # parts of a batch that has not ended so long ago",
     ): "the last of the conditions of a loop, for which None ends it as False does",
     (
-        "skills/verification/verdict.py",
+        "skills/verification/gates.py",
         "figures_of: ticks=np.append(2.0, np.diff(trajectory.stamps_s) * trajectory.rate_hz),",
     ): "the first sample has none before it; its gate asks for 1 or more, and reports the number nowhere",
     (

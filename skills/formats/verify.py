@@ -16,6 +16,7 @@ import hashlib
 import json
 import re
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -194,16 +195,31 @@ def _check_papers(plan: dict[str, Any], verdict: dict[str, Any], policy: dict[st
 
 
 def _check_timetable(paper: dict[str, Any], plan: dict[str, Any], motions: list[ArmMotion]) -> None:
-    """Check that the timetable is this plan's, and that both arms have a setpoint at every one of its stamps."""
+    """Check that the timetable is this plan's, and that both arms have a setpoint at every one of its stamps.
+
+    Of a bag in which jaws move also that they are as stated when they have moved, each after the one before.
+    """
     try:
         parts = [part for one in paper["passes"] for part in one["phases"]]
         stamps = [part[end] for part in parts for end in ("from_ns", "to_ns")]
-        stamps += [one["hand_over"]["at_ns"] for one in paper["passes"] if one["hand_over"] is not None]
+        changes = [one.get(kind) for one in paper["passes"] for kind in ("hand_over", "take_back")]
+        stamps += [one["at_ns"] for one in changes if one is not None]
         known = all(np.isin(stamps, motion.stamps_ns).all() for motion in motions)
+        known = known and all(_in_order(one["jaws_in_order"], motions) for one in changes if one is not None)
         if paper["plan"] != plan["sha256"] or not stamps or not known:
             raise BadBag(f"{EXECUTOR} is not the timetable of this bag. Export the bag again.")
     except (LookupError, TypeError, ValueError) as error:
         raise BadBag(f"{EXECUTOR} has a missing or invalid field. Export the bag again.") from error
+
+
+def _in_order(jaws: list[dict[str, Any]], motions: list[ArmMotion]) -> bool:
+    """Return whether the jaws move one after the other to the stated angles; a bag of before moves none."""
+    timed, arms = [one for one in jaws if "to_ns" in one], {motion.name: motion for motion in motions}
+    for one in timed:
+        at = arms[one["arm"]].stamps_ns == one["to_ns"]
+        if not (at.any() and (arms[one["arm"]].jaw_rad[at] == one["jaw_rad"]).all()):
+            return False
+    return all(first["to_ns"] <= second["from_ns"] for first, second in pairwise(timed))
 
 
 # ---- one arm ----------------------------------------------------------------------------------------------------

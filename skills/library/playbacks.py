@@ -38,13 +38,14 @@ from skills.remedies import Action, Remedy
 from skills.settings import Settings
 from skills.verification.asked import asked_of
 from skills.verification.errors import CALLED, NAMED, ArmErrors
+from skills.verification.gates import SCENE, Failure
 from skills.verification.intent import compare
 from skills.verification.monte_carlo import doubt
 from skills.verification.playback import Pictures
 from skills.verification.probabilities import JUDGE_VERSION
 from skills.verification.probabilities import NEEDLE as NEEDLE_ERROR
 from skills.verification.scene_clearance import NEEDLE, SceneClearance, clearance_of, flat_tissue_mm
-from skills.verification.verdict import SCENE, Failure, judge
+from skills.verification.verdict import judge
 
 Level = Literal["good", "caution", "bad"]
 MORE_OFTEN_NOT = 0.5  # a plan whose upper bound is below this fails more often than it succeeds

@@ -20,7 +20,6 @@ from skills.db.models import Plan, PolicyVersion, StoredPlayback
 from skills.db.session import Database
 from skills.errors import BadPlan, Conflict, Corrupt
 from skills.formats.replay_bag import (
-    JAW_CLOSED_RAD,
     ArmMotion,
     arm_names,
     arms_of,
@@ -39,6 +38,7 @@ from skills.library.plans import describe_plan, find_plan, plan_in_words, trajec
 from skills.library.playbacks import costs_most, errors_in_words, judged_under, trajectory_digest
 from skills.library.policies import learnt_from
 from skills.packing import canonical, sha256
+from skills.planning.handoff import JAW_CLOSED_RAD
 from skills.planning.plan import CONSTANT_TURN_DEG, SuturePlan, departure_of
 from skills.planning.trajectory import Trajectory
 from skills.remedies import Action, Remedy

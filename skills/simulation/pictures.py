@@ -23,9 +23,10 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from skills.arrays import Flags, Floats, Ints
-from skills.kinematics import JOINTS, UNITS, instrument_of
+from skills.kinematics import JOINTS, UNITS, instrument_of, matrix_of
 from skills.planning.motion_laws import A2, PHASES, TRANSFER
 from skills.planning.trajectory import Trajectory
+from skills.verification.bodies import distances_at, names_of, parts_of, radii_of
 from skills.verification.playback import CLEARANCE_SEEN_MM, PAD, PSM_A, PSM_M, LinkPair, Playback
 
 if TYPE_CHECKING:
@@ -50,6 +51,9 @@ Report = Mapping[str, Any]  # the report on the playback, as a client receives i
 
 DPI = 110
 WIDE_INCH = 11.5
+BODIES_INCH = 5.2
+VIEWS = (("The arms' outer bodies from the side:\n{}", 1, 2), ("from above", 0, 1))
+FAILS = "#d55e00"
 DASHED: Any = (0, (4, 1.5))
 FINGERS_OF_BOTH, OTHERS = "fingers, which may touch at the hand-off", "all other links of both"
 LINES: dict[str, dict[str, Any]] = {
@@ -237,12 +241,22 @@ def draw_joints(trajectory: Trajectory, playback: Playback, report: Report) -> "
 
 
 def draw_clearance(trajectory: Trajectory, playback: Playback, report: Report) -> "Figure":
-    """Plot the distances between the nearest surfaces at the measured samples: from the pad, and between the arms."""
+    """Plot the distances between the nearest surfaces at the measured samples: from the pad, and between the arms.
+
+    Below are the outer bodies of both arms where they are nearest to each other, from the side and from above.
+    """
     from matplotlib.figure import Figure
 
     shown = DISTANCES[: 1 if trajectory.psm_m is None else 2]
-    figure = Figure((WIDE_INCH, 1.2 + 2.6 * len(shown)), layout="constrained")
-    panels = figure.subplots(len(shown), 1, sharex=True, squeeze=False)
+    nearest = None if trajectory.psm_m is None else _nearest_bodies(trajectory, report)
+    height = 1.2 + 2.6 * len(shown)
+    figure = Figure((WIDE_INCH, height + (BODIES_INCH if nearest else 0.0)), layout="constrained")
+    upper: Any = figure
+    lower: Any = None
+    if nearest:
+        both: Any = figure.subfigures(2, 1, height_ratios=(height, BODIES_INCH))
+        upper, lower = both
+    panels = upper.subplots(len(shown), 1, sharex=True, squeeze=False)
     kinds = [_kind(pair) for pair in playback.link_pairs]
     for axes, (name, allowed, labels) in zip(panels.flat, shown, strict=True):
         for label in labels:
@@ -252,7 +266,89 @@ def draw_clearance(trajectory: Trajectory, playback: Playback, report: Report) -
         axes.axhline(float(report["settings"][allowed]), label="limit", **LINES["limit"])
         axes.set_ylabel(f"{name} (mm)")
     title = f"Distances between the nearest surfaces, as far as {CLEARANCE_SEEN_MM:g} mm"
-    return _finished(figure, title, trajectory, report)
+    _finished(figure, title, trajectory, report)
+    if lower is not None and nearest is not None:
+        for axes, view in zip(lower.subplots(1, 2), VIEWS, strict=True):
+            _draw_bodies(axes, view, trajectory, nearest)
+    return figure
+
+
+def _nearest_bodies(trajectory: Trajectory, report: Report) -> Mapping[str, Any] | None:
+    """Return the nearest two outer bodies of a report; where all are far, those at the ends of the passes."""
+    bodies = report.get("bodies")
+    if bodies is None or trajectory.psm_m is None:
+        return None
+    if bodies["nearest"]:
+        return dict(bodies["nearest"][0])
+    ends = trajectory.last_samples
+    apart = distances_at(trajectory, ends)
+    end, part, other = np.unravel_index(int(apart.argmin()), apart.shape)
+    return {
+        "part": names_of(trajectory.instrument)[part],
+        "other": names_of(trajectory.psm_m.instrument)[other],
+        "least_mm": float(apart[end, part, other]),
+        "sample": int(ends[end]),
+        "stamp_s": float(trajectory.stamps_s[ends[end]]),
+    }
+
+
+def _draw_bodies(axes: Any, view: tuple[str, int, int], trajectory: Trajectory, nearest: Mapping[str, Any]) -> None:
+    """Draw the outer bodies of both arms at the sample where two are nearest, seen along one axis."""
+    from matplotlib.patches import Polygon
+
+    (title, across, up), m, at = view, trajectory.psm_m, [nearest["sample"]]
+    assert m is not None
+    parts = parts_of(trajectory.joints[at], trajectory.instrument)
+    other = parts_of(m.joints[at], m.instrument).seen_from(matrix_of(m.base_xyzw[None])[0], m.base_mm)
+    ends = []
+    for name, one, tool, part in (
+        (PSM_A, parts, trajectory.instrument, nearest["part"]),
+        (PSM_M, other, m.instrument, nearest["other"]),
+    ):
+        colour = LINES[name]["color"]
+        drawn = zip(names_of(tool), one.begin_mm[0], one.end_mm[0], radii_of(tool), strict=True)
+        for body, begin, end, radius in drawn:
+            outline = _outline(begin[[across, up]], end[[across, up]], float(radius))
+            axes.add_patch(Polygon(outline, facecolor=colour, alpha=0.18))
+            heavy = body == part
+            axes.add_patch(Polygon(outline, fill=False, edgecolor=colour, linewidth=2.4 if heavy else 0.7))
+            if heavy:
+                ends.append((begin, end, float(radius)))
+        centre = np.zeros(3) if name == PSM_A else m.base_mm
+        axes.plot(*centre[[across, up]], marker="+", color=colour, markersize=9)
+        axes.annotate(name, one.begin_mm[0, 0, [across, up]], color=colour, ha="center", va="center", fontsize=9)
+    first, second = _between_axes(*ends)
+    line = np.stack([first, second])[:, [across, up]]
+    axes.plot(*line.T, color=FAILS, linewidth=3, marker=".", zorder=5)
+    apart = f"{nearest['part']} and {nearest['other']}, {nearest['least_mm']:.1f} mm at {nearest['stamp_s']:.2f} s"
+    axes.set_title(title.format(apart), fontsize=9, loc="left")
+    axes.set_xlabel(f"{'xyz'[across]} (mm, base of PSM_A)")
+    axes.set_ylabel(f"{'xyz'[up]} (mm)")
+    axes.autoscale_view()
+    axes.set_aspect("equal")
+
+
+def _outline(begin: Floats, end: Floats, radius: float) -> Floats:
+    """Return the outline of a capsule seen along an axis, shape (N, 2)."""
+    way = end - begin
+    towards = np.arctan2(way[1], way[0])
+    half = np.linspace(-np.pi / 2, np.pi / 2, 24)
+    turned = np.concatenate((towards + half, towards + np.pi + half))
+    round_ends = radius * np.stack([np.cos(turned), np.sin(turned)], axis=1)
+    return np.concatenate((end + round_ends[:24], begin + round_ends[24:]))
+
+
+def _between_axes(one: tuple[Floats, Floats, float], other: tuple[Floats, Floats, float]) -> tuple[Floats, Floats]:
+    """Return the nearest points of two capsules' surfaces, as exactly as a line is drawn."""
+    share = np.linspace(0.0, 1.0, 201)[:, None]
+    (p, q), (radius, other_radius) = (
+        (begin + share * (end - begin) for begin, end, _ in (one, other)),
+        (one[2], other[2]),
+    )
+    apart = np.linalg.norm(p[:, None] - q, axis=2)
+    i, j = np.unravel_index(int(apart.argmin()), apart.shape)
+    way = (q[j] - p[i]) / max(float(apart[i, j]), 1e-9)
+    return p[i] + radius * way, q[j] - other_radius * way
 
 
 def png(figure: "Figure") -> bytes:

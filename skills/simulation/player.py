@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 from skills.arrays import Floats, Ints
 from skills.errors import BadInput, SimulationFailed, Unanswered
 from skills.kinematics import JAW_TIP_MM, matrix_of
+from skills.planning.handoff import HOLDING_RAD
 from skills.planning.trajectory import Trajectory
 from skills.sandbox import ProcessLimits
 from skills.sandbox.forked import call_alone
 from skills.simulation import scene
-from skills.verification.clearance import psm_m_poses
+from skills.verification.clearance import FINGER_REACH_MM, openings, psm_m_poses
 from skills.verification.playback import Playback, link_pairs
 
 SIMULATOR = "skills.simulation.scene:simulate"
@@ -78,11 +79,12 @@ def play(
 
 
 def default_pad_top(trajectory: Trajectory) -> float:
-    """Return a pad height, mm, a little under the lowest finger tip of either arm; `tip_mm` is the hinge."""
+    """Return a pad height, mm, a little under the lowest finger tip of either arm, however far PSM_A's jaw opens."""
     lowest = _lowest_finger(trajectory.tip_mm, matrix_of(trajectory.rotation_xyzw))
     if trajectory.psm_m is not None:
         lowest = min(lowest, _lowest_finger(*psm_m_poses(trajectory, np.arange(len(trajectory)))))
-    return lowest - PAD_BELOW_MM
+    opened = float(openings(trajectory).max()) - HOLDING_RAD
+    return lowest - PAD_BELOW_MM - FINGER_REACH_MM * opened  # as far as the gates allow for it
 
 
 def _lowest_finger(tip_mm: Floats, rotation: Floats) -> float:

@@ -70,6 +70,7 @@ from skills.verification.clearance import (
     travel_mm,
 )
 from skills.verification.errors import CALIBRATED, CALLED, UNCALIBRATED, ArmErrors, Displaced, Drawn, draw
+from skills.verification.gates import Limits
 from skills.verification.probabilities import (
     AT_THE_END,
     JUDGE_VERSION,
@@ -80,7 +81,6 @@ from skills.verification.probabilities import (
     counted,
     share,
 )
-from skills.verification.verdict import Limits
 
 _CHUNK = 64  # variations computed at once, so that they stay in the processor's cache; the results do not depend on it
 _STILL_MM = 1e-6  # with less total travel, a pass is one stretch

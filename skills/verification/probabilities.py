@@ -17,7 +17,7 @@ from skills.fields import Count, Figure, Fraction, schema, stored_schema
 from skills.learning.slip import wilson
 from skills.planning.handoff import OPEN_RAD
 from skills.verification.errors import ArmErrors
-from skills.verification.verdict import Limits
+from skills.verification.gates import Limits
 
 JUDGE_VERSION = 2  # 1: tip errors alone, stated as a mean length
 ON_THE_WAY, AT_THE_END = ("reach", "limits", "pad", "arms", "bodies"), ("place", "angle")

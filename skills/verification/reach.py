@@ -53,9 +53,9 @@ from skills.verification.clearance import (
     openings,
     travel_mm,
 )
+from skills.verification.gates import Limits
 from skills.verification.playback import PSM_A, PSM_M
 from skills.verification.scene_clearance import LOOK_MM, TISSUE, from_parts, groups_of, limit_of, needle_from_tissue
-from skills.verification.verdict import Limits
 
 MAX_PLACES = 1000
 STEP_MM = 1.0  # ours: of both tips together, or two degrees of a jaw

@@ -19,7 +19,7 @@ from tests.bench.kinematics import kinematics
 from tests.bench.learning import learning
 from tests.bench.million import million
 from tests.bench.neighbours import neighbours
-from tests.bench.playing import playing
+from tests.bench.playing import playing, verdicts
 from tests.bench.pose_styles import pose_styles
 from tests.bench.reading import reading
 from tests.bench.recognition import recognition
@@ -38,6 +38,7 @@ PARTS = {
     "learners": learners,
     "motion": kinematics,
     "playback": playing,
+    "verdict": verdicts,
     "doubt": doubting,
     "batches": batches,
     "scaling": scaling,

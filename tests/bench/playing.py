@@ -8,13 +8,22 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
+from skills.arrays import xyz
+from skills.gridworld.scene import Scene, Tissue
+from skills.library.plans import trajectory_of
 from skills.planning.handoff import HOLDING_RAD, PsmM
-from skills.planning.trajectory import Trajectory, time_parametrise
+from skills.planning.plan import SuturePoint, stack
+from skills.planning.trajectory import Trajectory, joint_ratios, time_parametrise
 from skills.simulation import player, scene
+from skills.verification.asked import asked_of
+from skills.verification.bodies import bodies_clearance
+from skills.verification.intent import compare
 from skills.verification.playback import CLEARANCE_SEEN_MM
+from skills.verification.scene_clearance import clearance_of
 from skills.verification.verdict import judge
 from tests.bench.timing import gain, in_turn
 from tests.planning.motions import PSM_M, hand_off
+from tests.planning.test_hand import turning
 
 PASSES, RATE_HZ = 20, 240.0
 ROUNDS = 3
@@ -46,6 +55,37 @@ def playing(table: Table) -> None:
     assert judge(playback, trajectory).feasible
     table.add_row("  the verdict", f"{time.perf_counter() - began:.2f} s", "")
     two_at_once(stacked(passes=PASSES // 4), table)
+
+
+def verdicts(table: Table) -> None:
+    """Judge twenty passes of a hand with both arms, their bodies, a scene, the needle and what was asked.
+
+    All is processor time: what needs no simulator, and the whole verdict beside the bare calls of the simulation.
+    """
+    demo, policy = turning()
+    points = [SuturePoint(xyz(demo.tip_mm[-1] - [0.0, 2.0 * k, 0.0])) for k in range(PASSES)]
+    plan = stack(policy, points, demo=demo, psm_m=BESIDE)
+    trajectory = trajectory_of(plan)
+    scene_mm = Scene(plan.frame, tissue=Tissue.plane((0.0, 0.0, -165.0), (0.0, 0.0, 1.0)))
+    given = asked_of(plan, policy, demo)
+    asked = player.request(trajectory, player.default_pad_top(trajectory))
+    playback = player.play(trajectory)
+
+    def closed_form() -> None:
+        joint_ratios(trajectory.joints, trajectory.pass_index, trajectory.rate_hz)
+        bodies_clearance(trajectory, 2.0)
+        clearance_of(trajectory, scene_mm)
+        compare(given, trajectory)
+
+    def judged() -> None:
+        measure(asked)
+        beside, intent = clearance_of(trajectory, scene_mm), compare(given, trajectory, playback.joints)
+        judge(playback, trajectory, beside=beside, pad_is_tissue=False, intent=intent)
+
+    alone, whole, bare = in_turn(closed_form, judged, lambda: plain(asked), rounds=ROUNDS)
+    table.add_row(f"verdict without a simulator, {PASSES} passes", f"{alone:.2f} s", f"{len(trajectory)} samples")
+    table.add_row("  with it, but for process and picture", f"{whole:.2f} s", "")
+    table.add_row("  PyBullet's calls alone", f"{bare:.2f} s", f"the verdict takes {whole / bare:.2f} of it")
 
 
 def two_at_once(trajectory: Trajectory, table: Table) -> None:

@@ -1,6 +1,7 @@
 """The pages in a real browser: from a recording to a playback, without complaints or external addresses."""
 
 import io
+import json
 import re
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
@@ -178,9 +179,11 @@ def plan_and_play(tab: Watched) -> None:
     picture = page.get_by_role("img", name="The simulated scene with all passes")
     picture.scroll_into_view_if_needed()
     page.wait_for_function("img => img.complete && img.naturalWidth > 100", arg=picture.element_handle())
-    with page.expect_download() as bag:
-        page.get_by_role("button", name="Replay bag").click()
-    assert Path(bag.value.path()).read_bytes()[:2] == b"PK"
+    page.get_by_role("button", name="Replay bag").click()
+    expect(page.locator("#take-said")).to_contain_text("states no tissue")
+    with page.expect_download() as samples:
+        page.get_by_role("button", name="Samples (JSON)").click()
+    assert "rows" in json.loads(Path(samples.value.path()).read_bytes())
     film = page.get_by_label("Film of the playback")
     expect(film).to_be_visible(timeout=WORK_MS)  # it is drawn after the verdict, and appears by itself
     page.wait_for_function("film => film.readyState > 0 && film.duration > 1", arg=film.element_handle())

@@ -15,7 +15,6 @@ from rosbags.highlevel import AnyReader
 from skills.errors import BadBag, BadPlan
 from skills.formats.replay_bag import (
     EPOCH_NS,
-    JAW_CLOSED_RAD,
     arm_names,
     arms_of,
     folder_of,
@@ -26,8 +25,11 @@ from skills.formats.replay_bag import (
     velocities_of,
 )
 from skills.kinematics import forward
-from skills.planning.handoff import OPEN_RAD
+from skills.planning.handoff import JAW_CLOSED_RAD, JAW_OPEN_RAD, JAW_S, OPEN_RAD
+from skills.planning.trajectory import time_parametrise
 from tests.formats.replays import FRAME, PSM1, PSM2, RATE_HZ, arm, checked, members, papers, trajectory, unpacked
+from tests.planning.motions import hand_off
+from tests.planning.test_transfers import BESIDE
 
 
 def kept_by_the_robots_script(read: list[tuple[str, Any]], topic: str) -> tuple[list[Any], int]:
@@ -134,14 +136,29 @@ def test_the_timetable_has_every_phase_and_hand_over_on_one_clock():
         {"phase": "A1", "from_ns": 1_000_000_000, "to_ns": 1_295_000_000},
         {"phase": "A2", "from_ns": 1_300_000_000, "to_ns": 1_400_000_000},
     ]
-    assert first["hand_over"]["at_ns"] == 1_400_000_000
+    assert first["hand_over"] is first["take_back"] is None  # the jaws of this motion do not move
     assert second["phases"][0]["from_ns"] == 2_405_000_000
-    # the arm that takes the needle closes on it before the other lets go
-    assert [one["arm"] for one in first["hand_over"]["jaws_in_order"]] == ["PSM1", "PSM2"]
-    taking, leaving = (one["jaw_rad"] for one in first["hand_over"]["jaws_in_order"])
-    assert taking < 0 < leaving
     alone = arms_of(trajectory(), arm="PSM2", frame=FRAME, other="PSM1", jaw_rad=0.1, pass_index=1)
     assert timetable(trajectory(), alone) == [second]
+
+
+def test_the_timetable_states_when_the_needle_changes_hands():
+    """PSM_M's jaw closes before PSM_A's opens, and in a further pass the other way round; both by the setpoints."""
+    motion = time_parametrise([hand_off(), hand_off(-8.0)], rate_hz=100.0, psm_m=BESIDE)
+    arms = arms_of(motion, arm="PSM2", frame=FRAME, other="PSM1")
+    first, second = timetable(motion, arms)
+    assert first["take_back"] is None
+    for change, order in ((first["hand_over"], ("PSM1", "PSM2")), (second["take_back"], ("PSM2", "PSM1"))):
+        closes, opens = change["jaws_in_order"]
+        assert (closes["arm"], opens["arm"]) == order
+        assert (closes["jaw_rad"], opens["jaw_rad"]) == (JAW_CLOSED_RAD, JAW_OPEN_RAD)
+        assert change["at_ns"] == closes["from_ns"] < closes["to_ns"] == opens["from_ns"] < opens["to_ns"]
+        assert opens["to_ns"] - closes["from_ns"] == pytest.approx(2e9 * JAW_S, abs=2.1e7)
+        for one in change["jaws_in_order"]:
+            (arm,) = (arm for arm in arms if arm.name == one["arm"])
+            assert arm.jaw_rad[arm.stamps_ns == one["to_ns"]] == one["jaw_rad"]
+    held = np.minimum(*(arm.jaw_rad for arm in arms))
+    assert (held == JAW_CLOSED_RAD).all()  # at every sample one of both holds the needle
 
 
 def test_sha256sum_itself_reads_the_checksums(tmp_path):

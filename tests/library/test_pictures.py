@@ -1,7 +1,9 @@
 """The pictures of a playback: requested with the verdict, drawn after it, erased with the playback."""
 
+from dataclasses import asdict
 from typing import Any
 
+import numpy as np
 import pytest
 from sqlalchemy import select
 from sqlalchemy.orm import Session
@@ -15,11 +17,14 @@ from skills.library.erasure import erase_demo, erase_surgeon
 from skills.library.integrity import planned
 from skills.library.jobs import cancel
 from skills.library.plans import trajectory_of
+from skills.planning.trajectory import time_parametrise
 from skills.settings import Settings
-from skills.simulation import film
+from skills.simulation import film, pictures
+from skills.verification.bodies import bodies_clearance, distances_at, names_of
 from skills.verification.playback import Pictures, Playback
 from tests.library import cases
-from tests.planning.motions import ideal_playback, small_trajectory
+from tests.planning.motions import hand_off, ideal_playback, small_trajectory
+from tests.planning.test_transfers import BESIDE
 
 REPORT = {
     "failure": None,
@@ -139,3 +144,19 @@ def test_they_are_erased_with_what_they_show(database: Database, playback: Store
             dropped = erase_demo(session, playback.plan.policy.manifest["demos"][0], "test")
     assert unfinished and set(unfinished) <= set(dropped)
     assert drawn(database) == asked(database) == []
+
+
+def test_the_plot_of_distances_shows_both_arms_bodies_and_the_line_between_the_nearest():
+    """The line's length is the least distance, by the planned joints, and it is drawn from the side and from above."""
+    motion = time_parametrise([hand_off()], rate_hz=60.0, psm_m=BESIDE)
+    outer = bodies_clearance(motion, 2.0)
+    report = REPORT | {"bodies": asdict(outer.report)}
+    figure = pictures.draw_clearance(motion, ideal_playback(motion), report)
+    views = [axes for axes in figure.axes if "PSM_A)" in axes.get_xlabel()]
+    assert [axes.get_xlabel()[0] for axes in views] == ["y", "x"]
+    (side, above) = (next(line for line in axes.lines if line.get_color() == pictures.FAILS) for axes in views)
+    (y, z), (x, again) = side.get_data(), above.get_data()
+    assert y == pytest.approx(again)
+    least = distances_at(motion, np.arange(len(motion))).min()
+    assert np.linalg.norm(np.ptp([x, y, z], axis=1)) == pytest.approx(least, abs=0.5)
+    assert len(views[0].patches) == 2 * (len(names_of("400006")) * 2)  # each filled, and its outline

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from skills.errors import BadInput, BadPlan, NoApproach, Unreachable
 from skills.kinematics import POINTING_DOWN, angle_between, forward, matrix_of
-from skills.planning.handoff import PsmM, hand_off, realign, unit_approach
+from skills.planning.handoff import JAW_S, PsmM, hand_off, realign, unit_approach
 from skills.planning.motion_laws import A1, A2, PEAK, TRANSFER
 from skills.planning.passes import STAND_OFF_MM
 from skills.planning.trajectory import PassPath, Trajectory, joint_ratios, time_parametrise
@@ -51,7 +51,7 @@ def test_psm_m_waits_behind_the_hand_off_in_a1_and_is_there_at_a2s_end():
 def test_it_comes_in_along_its_approach_while_psm_a_turns():
     motion = planned(1)
     tip, rotation = in_psm_a_frame(motion)
-    coming = tip[motion.phase == A2]
+    coming = tip[motion.phase == A2][: -2 * round(JAW_S * motion.rate_hz)]  # then the jaws move
     there, jaws = taking(motion, 0)
     behind = (there - coming) @ jaws[:, 2]
     assert np.abs(there - coming - behind[:, None] * jaws[:, 2]).max() < 1e-9
@@ -110,7 +110,7 @@ def test_a2_without_a_turn_still_lasts_as_long_as_it_needs_to_come_in():
     ready = realign(POINTING_DOWN, PSM_M).rotation
     motion = time_parametrise([PassPath(HAND_OFF_MM, ready, ready)], rate_hz=100.0, psm_m=BESIDE)
     seconds = np.count_nonzero(motion.phase == A2) / 100.0
-    assert seconds == pytest.approx(PEAK * STAND_OFF_MM / 20.0, abs=0.02)
+    assert seconds == pytest.approx(PEAK * STAND_OFF_MM / 20.0 + 2 * JAW_S, abs=0.02)
     still = time_parametrise([PassPath(HAND_OFF_MM, ready, ready)], rate_hz=100.0)
     assert np.count_nonzero(still.phase == A2) == 1
 

@@ -26,8 +26,9 @@ from skills.planning.trajectory import A1, PassPath, Trajectory, time_parametris
 from skills.schemas.requests import DemoIn, Reading
 from skills.settings import Settings
 from skills.simulation.player import play
+from skills.verification.gates import Limits
 from skills.verification.intent import LIMITS
-from skills.verification.verdict import Limits, PlaybackReport, judge
+from skills.verification.verdict import PlaybackReport, judge
 from tests import backends
 from tests.bench.playing import stacked
 from tests.library import cases

@@ -15,8 +15,9 @@ from skills.planning.handoff import OtherArm
 from skills.planning.trajectory import PassPath, Trajectory, time_parametrise
 from skills.simulation import scene
 from skills.simulation.player import default_pad_top, play
+from skills.verification.gates import Limits
 from skills.verification.playback import PSM_M, Playback
-from skills.verification.verdict import Limits, judge
+from skills.verification.verdict import judge
 from tests.bench.playing import stacked
 from tests.planning.motions import hand_off, small_trajectory
 from tests.planning.test_hand import at_home, recorded_psm_m, turning

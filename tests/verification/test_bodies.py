@@ -24,9 +24,10 @@ from skills.verification.bodies import (
 )
 from skills.verification.clearance import links_of
 from skills.verification.errors import CALIBRATED, UNCALIBRATED, draw
+from skills.verification.gates import Limits
 from skills.verification.monte_carlo import doubt, scene_of
 from skills.verification.probabilities import DoubtSettings
-from skills.verification.verdict import Limits, judge
+from skills.verification.verdict import judge
 from tests.arms import EXACT
 from tests.planning.motions import PSM_M, hand_off, ideal_playback
 from tests.planning.test_transfers import BESIDE

@@ -7,8 +7,9 @@ import pytest
 
 from skills.kinematics import CANNULA_MM, JOINTS, instrument_of
 from skills.planning.trajectory import TRANSFER
+from skills.verification.gates import Limits
 from skills.verification.playback import LINKS
-from skills.verification.verdict import Limits, judge
+from skills.verification.verdict import judge
 from tests.planning.motions import ideal_playback
 from tests.verification.test_playback import HAND_OFF, SAMPLE, TRAJECTORY, beside, failed, planted, with_psm_m
 

@@ -25,9 +25,9 @@ from skills.verification.clearance import (
     links_of,
 )
 from skills.verification.errors import CALIBRATED, MEAN_LENGTH, SIZES, UNCALIBRATED, ArmErrors, Displaced, draw
+from skills.verification.gates import Limits
 from skills.verification.monte_carlo import doubt, looked_at, scene_of
 from skills.verification.probabilities import Doubt, DoubtSettings, DoubtUnder
-from skills.verification.verdict import Limits
 from tests.arms import EXACT
 from tests.verification.test_catch import APPROACH, OPENING_RAD, PLANNED
 

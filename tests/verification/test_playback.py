@@ -9,8 +9,9 @@ from skills.errors import BadInput
 from skills.kinematics import POINTING_DOWN, forward, inverse, quaternion_of
 from skills.planning.handoff import OtherArm
 from skills.planning.trajectory import A1, A2, TRANSFER, Trajectory
+from skills.verification.gates import Limits
 from skills.verification.playback import LINKS, Playback, link_pairs
-from skills.verification.verdict import Limits, PlaybackReport, judge
+from skills.verification.verdict import PlaybackReport, judge
 from tests.planning.motions import PSM_M, ideal_playback, small_trajectory
 
 TRAJECTORY = small_trajectory(passes=2, rate_hz=60.0)

@@ -15,9 +15,9 @@ from skills.planning.plan import SuturePlan, SuturePoint, stack
 from skills.planning.trajectory import Trajectory, time_parametrise
 from skills.verification.bodies import bodies_clearance
 from skills.verification.clearance import FINGER_REACH_MM, FINGERS, clearance_between, links_of, openings
+from skills.verification.gates import Limits
 from skills.verification.reach import map_reach
 from skills.verification.scene_clearance import clearance_of
-from skills.verification.verdict import Limits
 from tests.verification.hands import BASE_MM, about, random_psm_m, random_style
 
 CELLS = 200

@@ -19,9 +19,10 @@ from skills.verification.clearance import (
     openings,
     travel_mm,
 )
+from skills.verification.gates import SCENE
 from skills.verification.playback import PSM_A, PSM_M
 from skills.verification.scene_clearance import LOOK_BODIES_MM, LOOK_MM, clearance_of
-from skills.verification.verdict import SCENE, judge
+from skills.verification.verdict import judge
 from tests.planning.motions import ideal_playback
 from tests.verification.test_playback import TRAJECTORY, beside, with_psm_m
 

@@ -10,9 +10,9 @@ from skills.learning.slip import wilson
 from skills.planning.handoff import realign
 from skills.planning.trajectory import PassPath, Trajectory, time_parametrise
 from skills.verification.errors import MEAN_LENGTH, SIZES, ArmErrors
+from skills.verification.gates import Limits
 from skills.verification.monte_carlo import doubt
 from skills.verification.probabilities import DoubtSettings
-from skills.verification.verdict import Limits
 from tests.verification import worlds
 from tests.verification.test_monte_carlo import PAD_TOP_MM, PATH_MM, PSM_M, motion
 

@@ -1,0 +1,327 @@
+"""The gates of a playback: its figures at every sample, and the first that breaks its limit.
+
+    Playback, Trajectory --figures_of--> Figures --first_failure--> Failure, or None
+
+The figures are arrays with one row per sample, which are gated and reported. A gate is one number per sample that must
+not exceed its limit, or must not fall below it. NaN passes no gate. All of this is ours.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from skills.arrays import Flags, Floats
+from skills.fields import Count, Figure, schema
+from skills.kinematics import (
+    CANNULA_MM,
+    INSERTION,
+    JOINTS,
+    UNITS,
+    InstrumentConstants,
+    angle_between,
+    instrument_of,
+    joint_margins,
+    matrix_of,
+)
+from skills.planning.handoff import HOLDING_RAD
+from skills.planning.motion_laws import A2, PHASES, TRANSFER
+from skills.planning.trajectory import Trajectory, joint_ratios
+from skills.verification.bodies import BodiesClearance
+from skills.verification.clearance import (
+    FINGER_REACH_MM,
+    Bounds,
+    needle_to_pad_mm,
+    openings,
+    psm_m_poses,
+    stands_from,
+)
+from skills.verification.intent import LIMITS, Comparison
+from skills.verification.playback import PAD, PSM_A, PSM_M, Playback
+from skills.verification.scene_clearance import SceneClearance
+
+SCENE = "clearance of the scene"  # the quantity of a failure beside tissue or an obstacle
+
+
+@dataclass(frozen=True, eq=False)
+class ArmSamples:
+    """The joints of one arm, each array of shape (T, 6).
+
+    `joints` are in rad and mm, `margins` are parts of the joints' ranges, `speed` and `acceleration` are parts of their
+    limits.
+    """
+
+    name: str
+    tool: InstrumentConstants
+    joints: Floats
+    margins: Floats
+    speed: Floats
+    acceleration: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Figures:
+    """The figures that are judged.
+
+    Attributes:
+        arms: PSM_A with its measured joints, and PSM_M with its commanded joints if it is in the scene.
+        fk_mm: Distance of the simulator's tip from the closed form, PSM_A, shape (T,).
+        fk_deg: The same for its rotation.
+        psm_m_fk_mm: The same for PSM_M's tip, shape (T,); 0 where it was not measured or is not in the scene.
+        ticks: Time since the previous sample, in sampling periods, shape (T,); 1 at the first.
+        effort: The largest of the motors' efforts, as a part of its limit, shape (T,).
+        apart: Lower bounds on the distances of each pair of links: measured, or bounded from measurements.
+        needle_mm: Distance of the needle from the pad at the samples of `Playback.looked_at`, shape (C,).
+    """
+
+    arms: tuple[ArmSamples, ...]
+    fk_mm: Floats
+    fk_deg: Floats
+    psm_m_fk_mm: Floats
+    ticks: Floats
+    effort: Floats
+    apart: Bounds
+    needle_mm: Floats
+
+
+def figures_of(playback: Playback, trajectory: Trajectory) -> Figures:
+    """Return the figures of a playback.
+
+    Args:
+        playback: The measurements.
+        trajectory: The trajectory that was played, with as many samples.
+    """
+    arms = [_arm(PSM_A, playback.joints, trajectory.instrument, trajectory.rate_hz)]
+    m, looked_at, count = trajectory.psm_m, playback.looked_at, len(trajectory)
+    psm_m_fk_mm = np.zeros(count)
+    if m is not None and playback.psm_m_tip_mm is not None:
+        arms.append(_arm(PSM_M, m.joints, m.instrument, trajectory.rate_hz))
+        psm_m_fk_mm[looked_at] = np.linalg.norm(playback.psm_m_tip_mm - psm_m_poses(trajectory, looked_at)[0], axis=1)
+    moving = {PSM_A: (trajectory.joints, trajectory.instrument)}
+    if m is not None:
+        moving[PSM_M] = (m.joints, m.instrument)
+    return Figures(
+        arms=tuple(arms),
+        fk_mm=np.linalg.norm(playback.tip_mm - trajectory.tip_mm, axis=1),
+        fk_deg=_rotation_error_deg(playback.rotation_xyzw, trajectory.rotation_xyzw),
+        psm_m_fk_mm=psm_m_fk_mm,
+        ticks=np.append(1.0, np.diff(trajectory.stamps_s) * trajectory.rate_hz),
+        effort=(np.abs(playback.efforts) / np.array(instrument_of(trajectory.instrument).arm.effort)).max(axis=1),
+        apart=replace(
+            Bounds.of(moving, playback.link_pairs, looked_at, playback.clearances_mm),
+            opened_mm=FINGER_REACH_MM * (openings(trajectory) - HOLDING_RAD),  # the simulator's fingers hold a needle
+        ),
+        needle_mm=needle_to_pad_mm(trajectory, looked_at, playback.pad_mm),
+    )
+
+
+def _arm(name: str, joints: Floats, instrument: str, rate_hz: float) -> ArmSamples:
+    """Return an arm's figures, all samples taken as one pass: the pose must not jump between passes either."""
+    tool = instrument_of(instrument)
+    speed, acceleration = joint_ratios(joints, np.zeros(len(joints), np.int64), rate_hz, instrument)
+    margins = joint_margins(joints, instrument) / (tool.upper - tool.lower)
+    return ArmSamples(name, tool, joints, margins, speed, acceleration)
+
+
+def _rotation_error_deg(measured: Floats, meant: Floats) -> Floats:
+    """Return the angle between quaternions, shape (T,); NaN where the measured one is not a unit quaternion."""
+    length = np.linalg.norm(measured, axis=1)
+    sound = np.abs(length - 1.0) < 1e-6
+    safe = np.where(sound[:, None], measured, meant)
+    angle = np.degrees(angle_between(matrix_of(safe), matrix_of(meant)))
+    return np.where(sound, angle, np.nan)
+
+
+@schema
+@dataclass(frozen=True)
+class Limits:
+    """The limits of the verdict. All of them are ours; each has its reason.
+
+    Attributes:
+        fk_mm: Greatest distance of the simulator's tip from the closed form; they agree to 1e-4 mm when the URDF is
+            right.
+        fk_deg: The same for the rotation.
+        joint_margin: Least distance of every joint from its limits, as a part of its range.
+        insertion_mm: Least insertion: with less the wrist is inside the cannula. On an arm of the other generation than
+            the tool's the insertion that puts the wrist at the same depth counts.
+        speed_ratio: Greatest joint speed as a part of its limit; a millionth is left for round-off.
+        acceleration_ratio: Greatest joint acceleration as a part of its limit; the same.
+        tracking_mm: Greatest servo error; the simulator's own is under 0.001 mm, and in contact it is millimetres.
+        goal_mm: Greatest servo error at the end of each pass.
+        alignment_deg: Greatest error of the jaw's rotation at the end of each pass.
+        clearance_pad_mm: Least distance of either arm from the pad: the error of a calibrated arm (0.65 mm) and half as
+            much again. Below 0 an arm may press into it, up to `contact_n`.
+        clearance_psm_m_mm: Least distance between the arms; their fingers may be nearer at the hand-off itself.
+        clearance_bodies_mm: Least distance between the arms' outer bodies, which are larger than the arms: a step of
+            the registration between the two bases.
+        contact_n: Greatest force between arm and pad: a light touch. The motors could press with twenty times as much.
+        contact_effort: Greatest effort of any motor while in contact, as a part of its limit: a motor at its limit no
+            longer holds the arm in its commanded place.
+    """
+
+    fk_mm: float = 0.01
+    fk_deg: float = 0.01
+    joint_margin: float = 0.0
+    insertion_mm: float = CANNULA_MM
+    speed_ratio: float = 1.000001
+    acceleration_ratio: float = 1.000001
+    tracking_mm: float = 0.1
+    goal_mm: float = 0.05
+    alignment_deg: float = 0.1
+    clearance_pad_mm: float = 1.0
+    clearance_psm_m_mm: float = 0.5
+    clearance_bodies_mm: float = 2.0
+    contact_n: float = 1.0
+    contact_effort: float = 0.95
+
+
+@schema
+@dataclass(frozen=True)
+class Failure:
+    """The first sample that is not allowed.
+
+    `quantity` names PSM_M if the sample fails because of it, and the links that are too near.
+    """
+
+    sample: Count
+    pass_index: Count
+    phase: Count
+    stamp_s: float
+    quantity: str
+    value: Figure
+    limit: float
+    unit: str
+
+    def __str__(self) -> str:
+        """Return the failure as a sentence."""
+        return (
+            f"Pass {self.pass_index}, {PHASES[self.phase]}, sample {self.sample} ({self.stamp_s:.3f} s): "
+            f"{self.quantity} is {self.value:.4g} {self.unit}, the limit is {self.limit:.4g}."
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Gate:
+    """One quantity along the trajectory and its limit: the greatest value allowed, or with `at_least` the least."""
+
+    quantity: str
+    unit: str
+    values: Floats
+    limit: float
+    at_least: bool = False
+
+    def broken(self) -> int | None:
+        """Return the index of the first sample that does not pass, or None; NaN does not pass."""
+        passes = self.values >= self.limit if self.at_least else self.values <= self.limit
+        return None if passes.all() else int(np.argmin(passes))
+
+
+def first_failure(
+    figures: Figures,
+    playback: Playback,
+    trajectory: Trajectory,
+    limits: Limits,
+    beside: SceneClearance | None = None,
+    outer: BodiesClearance | None = None,
+    intent: Comparison | None = None,
+) -> Failure | None:
+    """Return the earliest sample at which a gate is broken; of several gates broken there, the first listed.
+
+    Args:
+        figures: The figures of the playback.
+        playback: The measurements.
+        trajectory: The trajectory that was played.
+        limits: The limits of the gates.
+        beside: The motion's distances from a scene; None: they are no gate.
+        outer: The distances of the arms' outer bodies; None: they are no gate.
+        intent: The motion's deviations from what was asked; None: they are no gate.
+
+    Returns:
+        The failure, or None if every sample passes every gate.
+    """
+    gates = [*_gates(figures, playback, trajectory, limits)]
+    if outer is not None:
+        pair = "outer bodies" if outer.first is None else str(outer.first)
+        gates.append(_Gate(f"clearance of {pair}", "mm", outer.at_least_mm, outer.report.limit_mm, at_least=True))
+    if beside is not None:
+        gates.append(_Gate(SCENE, "mm", beside.at_least_mm, beside.report.limit_mm, at_least=True))
+        gates.append(_Gate("distance of the needle from the tissue", "mm", beside.needle_mm, 0.0, at_least=True))
+    if intent is not None:
+        gates += [_Gate(kind, LIMITS[kind][0], values, LIMITS[kind][1]) for kind, values in intent.values.items()]
+    broken = [(sample, gate) for gate in gates if (sample := gate.broken()) is not None]
+    if not broken:
+        return None
+    sample, gate = min(broken, key=lambda one: one[0])
+    return Failure(
+        sample=sample,
+        pass_index=int(trajectory.pass_index[sample]),
+        phase=int(trajectory.phase[sample]),
+        stamp_s=float(trajectory.stamps_s[sample]),
+        quantity=gate.quantity,
+        value=float(gate.values[sample]),
+        limit=gate.limit,
+        unit=gate.unit,
+    )
+
+
+def _gates(figures: Figures, playback: Playback, trajectory: Trajectory, limits: Limits) -> Iterator[_Gate]:
+    yield _Gate("time since the sample before", "samples", figures.ticks, 1 - 1e-6, at_least=True)
+    for arm in figures.arms:
+        yield from _joint_gates(arm, limits)
+    yield _Gate("tip off the closed form", "mm", figures.fk_mm, limits.fk_mm)
+    yield _Gate("rotation off the closed form", "deg", figures.fk_deg, limits.fk_deg)
+    yield _Gate("PSM_M's tip off the closed form", "mm", figures.psm_m_fk_mm, limits.fk_mm)
+    shaft = np.zeros(len(trajectory))
+    shaft[playback.looked_at] = playback.shaft_off_mm
+    yield _Gate("shaft off the remote centre", "mm", shaft, limits.fk_mm)
+    yield from _clearance_gates(figures, playback, trajectory, limits)
+    touches = ~(playback.contact_n <= 0)  # negated, so that NaN counts as contact
+    yield _Gate("force between arm and pad", "N", playback.contact_n, limits.contact_n)
+    yield _Gate("effort in contact", "of its limit", np.where(touches, figures.effort, 0.0), limits.contact_effort)
+    # The simulator's motors give no more than their limit, so more points to a mistake of ours.
+    yield _Gate("effort", "of its limit", figures.effort, 1.000001)
+    yield _Gate("servo error", "mm", playback.tracking_mm, limits.tracking_mm)
+    at_end = np.isin(np.arange(len(trajectory)), trajectory.last_samples)
+    yield _Gate("servo error at the goal", "mm", np.where(at_end, playback.tracking_mm, 0.0), limits.goal_mm)
+    yield _Gate("alignment error", "deg", np.where(at_end, figures.fk_deg, 0.0), limits.alignment_deg)
+
+
+def _joint_gates(arm: ArmSamples, limits: Limits) -> Iterator[_Gate]:
+    whose = "" if arm.name == PSM_A else f"{arm.name}'s "
+    spare = limits.joint_margin * (arm.tool.upper - arm.tool.lower)
+    for joint, name in enumerate(JOINTS):
+        values = arm.joints[:, joint]
+        yield _Gate(f"{whose}{name}", UNITS[joint], values, float(arm.tool.upper[joint] - spare[joint]) + 1e-9)
+        yield _Gate(f"{whose}{name}", UNITS[joint], values, float(arm.tool.lower[joint] + spare[joint]) - 1e-9, True)
+    least_mm = limits.insertion_mm + arm.tool.cannula_mm - CANNULA_MM
+    yield _Gate(f"{whose}insertion out of the cannula", "mm", arm.joints[:, INSERTION], least_mm, True)
+    for joint, name in enumerate(JOINTS):
+        yield _Gate(f"speed of {whose}{name}", "of its limit", arm.speed[:, joint], limits.speed_ratio)
+        accelerations = arm.acceleration[:, joint]
+        yield _Gate(f"acceleration of {whose}{name}", "of its limit", accelerations, limits.acceleration_ratio)
+
+
+def _clearance_gates(figures: Figures, playback: Playback, trajectory: Trajectory, limits: Limits) -> Iterator[_Gate]:
+    # The pair with the least measured distance comes first, because the first gate listed is reported; NaN before all.
+    nearest = np.nan_to_num(playback.clearances_mm, nan=-np.inf).min(axis=0)
+    for column in np.argsort(nearest, kind="stable").tolist():
+        pair, apart = playback.link_pairs[column], figures.apart.at_least_mm(column)
+        limit = limits.clearance_pad_mm if pair.other == PAD else limits.clearance_psm_m_mm
+        if pair.may_touch:
+            excused = _handing_over(trajectory, apart, limit) & ~np.isnan(apart)
+            apart = np.where(excused, np.inf, apart)
+        yield _Gate(f"clearance of {pair}", "mm", apart, limit, at_least=True)
+
+
+def _handing_over(trajectory: Trajectory, apart: Floats, limit: float) -> Flags:
+    """Mark the samples, shape (T,), at which fingers of both arms may touch: the hand-off, and until they part.
+
+    The hand-off is the end of A2, where both arms stand and only the jaws move. In the transfer after it the fingers
+    may be near each other until they are `limit` apart for the first time.
+    """
+    may = np.zeros(len(trajectory), dtype=bool)
+    for end in trajectory.last_samples[trajectory.phase[trajectory.last_samples] == A2]:
+        may[stands_from(trajectory, int(end)) : end + 1] = True
+        parted = (trajectory.phase[end + 1 :] != TRANSFER) | ~(apart[end + 1 :] < limit)
+        may[end : end + 1 + int(np.argmax(np.append(parted, True)))] = True
+    return may
