@@ -16,7 +16,8 @@ has the surgeon's actual place in each cell. All of this is ours; the paper driv
 * The *clock* of a path tells when the hand was where: times in the demonstration, and the index of the path's point at
   each, with a fraction. So orientation, jaw and tempo can be those of the hand (`skills.planning.hand`). What comes
   before the demonstration is joined was not demonstrated, and takes no time on this clock.
-* The path is the smoothest sequence of points near the guide, each in the cell of its visit:
+* The path is the smoothest sequence of points near the guide, each in the cell of its visit, or with hysteresis as far
+  outside of it as the recording may be (`GridWorld.cells_along`):
 
       minimise  sum |x_i - guide_i|^2 + STIFFNESS sum |x_(i-1) - 2 x_i + x_(i+1)|^2,  x_i in its cell, ends held
 
@@ -45,8 +46,6 @@ BLEND = 1.0
 MOVED = 0.02  # a hand that stays within this distance is at rest
 INSIDE = 0.001  # distance from the cell's faces, so that rounding never puts a point into the neighbouring cell
 STIFFNESS = 0.3  # halves waves that are 4 points long, 2 mm in the paper's cells; preserves longer ones
-# With hysteresis the hand leaves its cells, and their faces would cut corners into the path: waves of 20 points.
-STIFFNESS_CUT = 100.0
 _ROUNDS = 120
 
 
@@ -79,7 +78,7 @@ class Trace:
 
 @dataclass(frozen=True, eq=False)
 class FittedPath:
-    """A smooth path, each point in the cell of its visit.
+    """A smooth path, each point in the cell of its visit, as far as hysteresis lets it.
 
     Attributes:
         tip_mm: Points in the demonstration's frame, shape (K, 3).
@@ -162,12 +161,12 @@ def fit_to_demo(followed: Rollout, demonstrated: Trace, start_mm: Floats | None 
     at, visits = _touching(*_spread(along, visits, cell_mm), followed.path.grid.cells_of(followed.states))
     wanted = np.stack([np.interp(at, along, axis) for axis in guide.T], axis=1)
     centres = followed.tip_mm[visits]
-    half = cell_mm * (0.5 - INSIDE)
+    half = cell_mm * (0.5 + followed.path.hysteresis - INSIDE)
     low, high = centres - half, centres + half
     # The ends are fixed, because start and goal are promised to clients.
     low[0] = high[0] = guide[0]
     low[-1] = high[-1] = guide[-1]
-    tip = _smoothest(wanted, low, high, STIFFNESS_CUT if followed.path.hysteresis else STIFFNESS)
+    tip = _smoothest(wanted, low, high, STIFFNESS)
     tip[1:-1] = tip[1:-1].round(6)  # to a nanometre, so that every machine computes the same bytes
     return FittedPath(tip, visits, clock_s, np.interp(along, at, np.arange(len(at))))
 

@@ -298,7 +298,8 @@ class _Pass:
         places = self.in_grid(self.arm.tip_mm[self.a1])
         off, sound = np.full(len(places), nan), np.isfinite(places).all(axis=1)
         if gone.finished and sound.any():
-            off[sound] = _off_cells((places[sound] - grid.origin_mm) / grid.cell_mm, grid.cells_of(gone.states))
+            in_cells, reach = (places[sound] - grid.origin_mm) / grid.cell_mm, 0.5 + self.asked.policy.path.hysteresis
+            off[sound] = _off_cells(in_cells, grid.cells_of(gone.states), reach)
         self.put("path off the policy's cells", self.a1, off)
         return gone.states
 
@@ -564,7 +565,7 @@ def _nearest(off: Callable[[int], Floats], moments: Ints) -> Floats:
     return np.asarray(np.min([off(moment) for moment in moments.tolist()], axis=0))
 
 
-def _off_cells(places: Floats, cells: Ints) -> Floats:
+def _off_cells(places: Floats, cells: Ints, reach: float) -> Floats:
     """Return how far places in order are outside of cells that are passed in order, as parts of a cell, shape (T,).
 
     A place may be in any cell that is reached from one of the place before by going on through cells that it is near
@@ -573,6 +574,7 @@ def _off_cells(places: Floats, cells: Ints) -> Floats:
     Args:
         places: In units of cells, shape (T, 3).
         cells: Shape (V, 3).
+        reach: How far from its centre a cell reaches: half of it, and as far as hysteresis lets a recording leave it.
     """
     limit, number = LIMITS["path off the policy's cells"][1], np.arange(len(cells))
     moved = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1)))
@@ -581,7 +583,7 @@ def _off_cells(places: Floats, cells: Ints) -> Floats:
     off = np.zeros(len(places))
     within = number == 0
     for sample in looked.tolist():
-        away = np.linalg.norm(np.maximum(np.abs(places[sample] - cells) - 0.5, 0.0), axis=1)
+        away = np.linalg.norm(np.maximum(np.abs(places[sample] - cells) - reach, 0.0), axis=1)
         near = away <= limit
         seed = near & (within | np.append(False, within[:-1]))
         reached = near & (
