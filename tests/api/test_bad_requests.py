@@ -39,6 +39,10 @@ SOUND: dict[tuple[str, str], Any] = {
             "base": {"position_mm": [160.0, 20.0, 20.0], "rotation_xyzw": [0.0, 0.0, 0.38, 0.92]},
         },
     },
+    ("POST", "/reach"): {
+        **KESTREL, "version": 1, "centre_mm": [5.0, 55.0, -125.0], "size_mm": [20.0, 20.0, 0.0], "step_mm": 10.0,
+        "rotations_xyzw": [[0.0, 0.0, 0.0, 1.0]], "tip_offset_mm": 0.0, "handoff": "none",
+    },
     ("PUT", "/demos/{demo}/outcome"): {"outcome": "failure", "reason": "It fell."},
     ("POST", "/playbacks"): {"plan": "0" * 64},
     ("POST", "/datasets"): {
