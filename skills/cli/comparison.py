@@ -25,6 +25,7 @@ from skills.errors import BadInput
 from skills.remedies import did_you_mean
 
 if TYPE_CHECKING:
+    from skills.schemas.comparison import Recognition
     from skills.schemas.given import Atlas
 
 SHORT = 12  # characters of a digest: enough to distinguish it from the others in a table
@@ -79,8 +80,8 @@ def _tables(found: "Atlas") -> None:
     show(clusters, False, ("cluster", "demos", "spread", "medoid", "surgeons"))
 
 
-def _recognition(found: "Atlas") -> None:
-    for seen in found.recognition:
+def _tell_recognition(recognition: "list[Recognition]", because: str | None) -> None:
+    for seen in recognition:
         low, high = seen.interval
         out.print(
             f"recognition on {seen.arm}: {seen.right} of {seen.tested} with their session left out, "
@@ -88,8 +89,12 @@ def _recognition(found: "Atlas") -> None:
             f"{seen.log_loss:.2f} nat, guessing {seen.log_loss_of_guessing:.2f}; by {', '.join(seen.compared)}",
             soft_wrap=True,
         )
-    if found.no_recognition_because is not None:
-        out.print(f"no recognition: {found.no_recognition_because}", soft_wrap=True)
+    if because is not None:
+        out.print(f"no recognition: {because}", soft_wrap=True)
+
+
+def _recognition(found: "Atlas") -> None:
+    _tell_recognition(found.recognition, found.no_recognition_because)
     if found.votes is not None:
         out.print(
             f"votes of recordings: {found.votes.right} of {found.votes.recordings}, {found.votes.accuracy:.0%}",
@@ -106,6 +111,29 @@ def _recognition(found: "Atlas") -> None:
         )
     if found.recognition:
         out.print("Set-up and day are confounded with the surgeon: see docs/atlas.md.")
+
+
+@commands.command()
+@refusing
+def recognise(
+    recording: Annotated[str, typer.Argument(help="The digest of a recording that has a demonstration.")],
+    suture: Annotated[str, typer.Option(help="The suture type.", autocompletion=complete_sutures)],
+    as_json: AsJson = False,
+) -> None:
+    """Recognise the surgeon of a whole recording by all its movements, with its session left out."""
+    with service() as client:
+        found = client.recognise(recording, suture)
+    if as_json:
+        print_json(found)
+        return
+    out.print(f"{found.recording[:SHORT]} of {found.surgeon}: {found.voters} movements vote for {found.voted}")
+    low, high = found.votes.interval
+    out.print(
+        f"votes of recordings: {found.votes.right} of {found.votes.recordings}, {found.votes.accuracy:.0%} "
+        f"({low:.0%} to {high:.0%}), by chance {found.votes.chance:.0%}",
+        soft_wrap=True,
+    )
+    _tell_recognition(found.recognition, found.no_recognition_because)
 
 
 def _rounded(distance: float | None) -> str | None:

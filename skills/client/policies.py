@@ -38,6 +38,7 @@ from skills.schemas.given import (
     PolicySummary,
     PoseStyle,
     Progress,
+    RecognisedRecording,
     RetrainedStyle,
     Retraining,
     Rollout,
@@ -254,6 +255,16 @@ class Atlases(Connection):
             scaled: Normalise size too; distances are then in units of the distance from start to goal.
         """
         return await self._get(Nearest, at("demos", demo, "nearest"), count=count, scaled=scaled)
+
+    @call
+    async def recognise(self, recording: str, suture: str) -> RecognisedRecording:
+        """Recognise the surgeon of a whole recording by all its movements, with its session left out.
+
+        Args:
+            recording: Digest of a recording that has a demonstration of the suture type.
+            suture: The suture type.
+        """
+        return await self._get(RecognisedRecording, at("styles", suture, "recognition"), recording=recording)
 
 
 class Scores(Connection):

@@ -3,22 +3,36 @@
     members, signatures --recognise_arms--> Recognised --> the answers of an atlas
 
 A demonstration is compared with those of the same arm only, because the hands have different tasks. A recording's vote
-is of its demonstrations of all arms.
+in an atlas is of its demonstrations of all arms.
+
+    Database, recording --recognise_recording--> RecognisedRecording
+
+A whole recording is recognised by all its movements (`skills.demonstration.segments.movements_by_arm`), whichever of
+them were cut: by the movements of other recordings whose surgeons are known, as they have demonstrations in the atlas.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import log
 
 import numpy as np
+from sqlalchemy import func, select
 
 from skills.arrays import Floats, Ints
+from skills.comparison.distances import shape_of
 from skills.comparison.recognition import Validated, recognise, usable, validate, vote
-from skills.comparison.traits import NUMBERS
-from skills.errors import BadInput
+from skills.comparison.traits import NUMBERS, signature_of
+from skills.db.models import Demonstration, StoredRecording
+from skills.db.row_visibility import EVERYBODYS
+from skills.db.session import Database
+from skills.demonstration.demonstration import cut_demo
+from skills.demonstration.segments import movements_by_arm
+from skills.errors import BadInput, BadPath, BadRecording, Conflict, NotFound
 from skills.learning.slip import wilson
-from skills.library.members import Member, numbered, sessions_of
-from skills.schemas.comparison import Calibrated, Likely, Recognition, Votes, Whose
+from skills.library.catalogue import find_suture_type
+from skills.library.members import Member, members_of, numbered, sessions_of
+from skills.library.recordings import Teller, find_recording, stored_recording
+from skills.schemas.comparison import Calibrated, Likely, RecognisedRecording, Recognition, Votes, Whose
 
 BINS = 5  # of a calibration curve, with equally many demonstrations each
 
@@ -147,3 +161,98 @@ def whose(found: Recognised, member: Member) -> Whose | None:
         voted=voted,
         voters=voters,
     )
+
+
+# ---- whole recordings ----------------------------------------------------------------------------------------------
+
+MOST_RECORDINGS = 150  # read for one request: each takes up to a tenth of a second, and its movements as long again
+
+MOVEMENTS = (
+    "A recording is recognised by the votes of all its movements that resemble a hand-off, of all arms, cut or not."
+)
+
+
+def recognise_recording(database: Database, recording_sha256: str, suture: str, tell: Teller) -> RecognisedRecording:
+    """Recognise the surgeon of a recording by all its movements.
+
+    Args:
+        database: The database, restricted to the rows that the caller may see.
+        recording_sha256: Digest of the recording, with a demonstration in the atlas of the suture type.
+        suture: The suture type.
+        tell: The reader of recordings, possibly in another process.
+
+    Raises:
+        NotFound: There is no such recording or suture type, or it has no demonstration that may be compared.
+        Conflict: Several surgeons have demonstrations in the recording.
+        BadInput: There are not two surgeons with two sessions each, or no movement of the recording could be tested.
+    """
+    chosen = _known(database, recording_sha256, suture)
+    moved = {row: _movements(database, one, tell) for row, one in chosen.items()}
+    still = _known(database, recording_sha256, suture)  # consent may have ended while they were read
+    pairs = [pair for row, some in moved.items() if row in still for pair in some]
+    found = recognise_arms([member for member, _ in pairs], np.array([signature for _, signature in pairs]))
+    asked = next(one for one in still.values() if one.recording == recording_sha256)
+    named, voters = _voted(found, asked.member.recording_row)
+    counted = votes(found)
+    if named is None or counted is None:
+        raise BadInput(
+            "No movement of the recording could be compared. "
+            + (" ".join(found.because) or "Its surgeon has no other session, or it has no movement of a known arm.")
+        )
+    return RecognisedRecording(
+        recording=recording_sha256,
+        suture=suture,
+        surgeon=asked.member.surgeon,
+        voted=named,
+        voters=voters,
+        votes=counted,
+        recognition=recognitions(found),
+        no_recognition_because=" ".join(found.because) or None,
+        notes=[MOVEMENTS],
+    )
+
+
+@dataclass(frozen=True)
+class _Known:
+    """A recording of a known surgeon: its digest, and one of its demonstrations."""
+
+    recording: str
+    member: Member
+
+
+def _known(database: Database, recording_sha256: str, suture: str) -> dict[int, _Known]:
+    """Return recordings with demonstrations of one surgeon, who agreed, by row: the requested and the newest others."""
+    with database.reading() as session:
+        asked = find_recording(session, recording_sha256)
+        members, _ = members_of(session, find_suture_type(session, suture).slug)
+        by_row = {one.recording_row: one for one in members}
+        if asked.row not in by_row:
+            raise NotFound(f"This recording has no demonstration of '{suture}' that may be compared; cut one.")
+        rows = [asked.row, *sorted({*by_row} - {asked.row}, reverse=True)[:MOST_RECORDINGS]]
+        # Of all surgeons, also those whom the caller may not see: a movement of a recording may be of any of them.
+        of = Demonstration
+        query = select(of.recording_row, func.count(of.surgeon_row.distinct())).where(of.recording_row.in_(rows))
+        counts = session.execute(query.group_by(of.recording_row), execution_options=EVERYBODYS).all()
+        single = {row for row, surgeons in counts if surgeons == 1}
+        if asked.row not in single:
+            raise Conflict("Several surgeons have demonstrations in this recording, so it has no single one.")
+        digests = select(StoredRecording.row, StoredRecording.sha256).where(StoredRecording.row.in_(single))
+        return {row: _Known(sha256, by_row[row]) for row, sha256 in session.execute(digests).all()}
+
+
+def _movements(database: Database, known: _Known, tell: Teller) -> list[tuple[Member, Floats]]:
+    """Return the movements of a recording as members of its surgeon, with their signatures."""
+    try:
+        recording = stored_recording(database, known.recording, tell).recording
+    except BadRecording:  # this version does not read it; the others are compared
+        return []
+    found = []
+    for part in movements_by_arm(recording):
+        try:
+            demo = cut_demo(recording, arm=part.arm, start_s=part.start_s, end_s=part.end_s)
+            shape_of(demo)
+        except (BadRecording, BadPath):  # too short, or without a direction
+            continue
+        member = replace(known.member, arm=demo.arm, frame=demo.frame, start_s=demo.start_s, end_s=demo.end_s)
+        found.append((member, signature_of(demo)))
+    return found

@@ -251,6 +251,20 @@ class Whose(Given):
     voters: Count = Field(description="Their number.")
 
 
+class RecognisedRecording(Given):
+    """The surgeon of a whole recording, recognised by the votes of all its movements."""
+
+    recording: Sha256
+    suture: Slug
+    surgeon: Slug = Field(description="The surgeon that its demonstrations were stored under.")
+    voted: Slug = Field(description="The surgeon for whom its movements vote. A vote has no probability.")
+    voters: Count = Field(description="Number of the movements that were tested, without the recording's session.")
+    votes: Votes = Field(description="Of the recordings that it was compared with, and its own.")
+    recognition: list[Recognition] = Field(description="Of single movements, by arm.")
+    no_recognition_because: str | None = Field(default=None, description="For the arms without.")
+    notes: list[str]
+
+
 class Atlas(Given):
     """The demonstrations of a suture type, compared. Distances are in `unit`, about the mean difference per state."""
 

@@ -19,7 +19,7 @@ from skills.gridworld.scene import Scene
 from skills.planning.plan import Departure
 from skills.planning.trajectory import Seam, Transfer
 from skills.schemas import Given, Handedness, Page, PolicyName, SkillLevel
-from skills.schemas.comparison import Atlas, Nearest, Progress, Score
+from skills.schemas.comparison import Atlas, Nearest, Progress, RecognisedRecording, Score
 from skills.schemas.policies import (
     Job,
     NextPose,
@@ -76,6 +76,7 @@ __all__ = [
     "Progress",
     "Reach",
     "Ready",
+    "RecognisedRecording",
     "Recording",
     "RecordingPreview",
     "RecordingSummary",

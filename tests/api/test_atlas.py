@@ -50,6 +50,19 @@ def test_the_client_reads_it_and_asks_whose_style_one_is(compared: Service):
     assert sum(len(row) for row in found["distances"]) == 15
 
 
+def test_a_whole_recording_is_recognised_by_its_movements(compared: Service):
+    demos = compared.client.demos()
+    of = {one["recording"]: one["surgeon"] for one in demos}
+    for recording, surgeon in of.items():
+        found = compared.client.recognise(recording, cases.SUTURE)
+        assert (found["surgeon"], found["voted"]) == (surgeon, surgeon) and found["voters"] >= 1
+    assert (found["votes"]["recordings"], found["votes"]["right"]) == (6, 6)
+    assert found["recognition"][0]["tested"] >= 6 and found["recognition"][0]["curve"]
+    path = f"/styles/{cases.SUTURE}/recognition?recording="
+    assert_problem(compared.http.get(path + "0" * 64), 404, "not-found")
+    assert_problem(compared.http.get(path + "nothing"), 422, "invalid-request")
+
+
 def test_the_nearest_are_those_of_the_atlas(compared: Service):
     found = compared.client.atlas(cases.SUTURE)
     demo, rows = found["demos"][0]["id"], found["distances"]

@@ -39,6 +39,7 @@ from skills.library.demos import demo_json, path_json, reward_map_json
 from skills.library.neighbours import nearest_to
 from skills.library.recordings import recording_json
 from skills.library.sweep import drop_contents, sweep_erased
+from skills.library.whose import recognise_recording
 from skills.schemas import OutcomeAsked
 from skills.schemas.given import (
     Atlas,
@@ -47,6 +48,7 @@ from skills.schemas.given import (
     Nearest,
     Page,
     Progress,
+    RecognisedRecording,
     Recording,
     RecordingPreview,
     RecordingSummary,
@@ -312,6 +314,23 @@ def get_nearest(
     The first request after a start reads all shapes into memory, seconds for tens of thousands of demonstrations.
     """
     return give(nearest_to(db, demo, count, scaled=scaled))
+
+
+@atlas_router.get(
+    "/styles/{suture}/recognition", dependencies=[needs("reader")], **gives(RecognisedRecording, 404, 409)
+)
+def recognise(
+    suture: Slug,
+    db: Db,
+    tell: Tell,
+    give: Giving,
+    recording: Annotated[str, Query(pattern=DIGEST, description="Digest of a recording with a demonstration.")],
+) -> Response:
+    """Recognise the surgeon of a whole recording by all its movements, with its session left out.
+
+    It reads the recordings of the suture type, so it takes seconds for tens of recordings.
+    """
+    return give(recognise_recording(db, recording, suture, tell))
 
 
 MOST_PAIRS = 60  # of surgeons, shown on a page
