@@ -7,7 +7,7 @@ time warping, with the share of the path's length as one coordinate, so that a d
 deep one. At each state five numbers are compared: how far the tip is to the left and how high, the angle of the wrist
 in the frame of the hand-off, the time in motion, and the time at rest. An expert's motions differ too. So a difference
 counts in standard deviations of the expert's own motions there, and is named only if it exceeds `LEAST` of them, and
-the largest by which one of the expert's motions differs from the others. With few motions the spread is mostly an
+the largest number of them by which one of the expert's motions differs from the others in anything. With few motions the spread is mostly an
 assumed one (`Kind.usual`).
 
 All of this is ours, and so are the numbers. It says that motions differ, not which is better.
@@ -29,7 +29,6 @@ from skills.scoring.deviation import laid
 
 NAMED = 3
 LEAST = 3.2  # standard deviations of the expert's own motions
-OWN = 1.0
 ASSUMED = 1.5  # motions that the assumed spread counts for
 AROUND = 5  # states before and after one whose times belong to it
 PHASE = 2.0  # of the reference's length: weight of the share of the path
@@ -135,11 +134,11 @@ def differences(demo: Demo, expert: Sequence[Demo], reference: Demo) -> Differen
     onto_mm = shape_of(reference)
     mine, theirs = traced(demo, onto_mm), [traced(one, onto_mm) for one in expert]
     deviations = _deviations(mine, theirs)
-    least = _own_spread(theirs)
+    least = max(LEAST, *_own_spread(theirs))
     found = []
     for kind, (signed, spread) in enumerate(deviations):
         if signed is not None:
-            found += [(kind, *one) for one in _regions(np.abs(signed) / spread, max(LEAST, OWN * least[kind]))]
+            found += [(kind, *one) for one in _regions(np.abs(signed) / spread, least)]
     said = (_named(mine, theirs, deviations[kind][0], kind, where, spreads) for kind, where, spreads in _ranked(found))
     named = [one for one in said if one is not None][:NAMED]
     return Differences(len(theirs), tuple(named), tuple(one.words for one in named) or (_none(len(theirs)),))
