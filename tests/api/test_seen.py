@@ -61,7 +61,10 @@ def filled(path: str, about: dict[str, str]) -> str | None:
 
 def test_paths_to_kestrels_objects_are_404_for_heron_and_exist_for_admin(service: Service, admin: As, heron: As):
     kestrels, seen = ids(admin, "kestrel"), 0
-    query = {"/plans/{plan}/comparison": f"?demo={kestrels['demo']}"}
+    query = {
+        "/plans/{plan}/comparison": f"?demo={kestrels['demo']}",
+        "/surgeons/{surgeon}/progress": f"?suture={cases.SUTURE}&against=kestrel",
+    }
     for method, path, _ in routes(service):
         if (where := filled(path, kestrels)) is None:
             continue
