@@ -7,8 +7,8 @@ time warping, with the share of the path's length as one coordinate, so that a d
 deep one. At each state five numbers are compared: how far the tip is to the left and how high, the angle of the wrist
 in the frame of the hand-off, the time in motion, and the time at rest. An expert's motions differ too. So a difference
 counts in standard deviations of the expert's own motions there, and is named only if it exceeds `LEAST` of them, and
-the largest number of them by which one of the expert's motions differs from the others in anything. With few motions the spread is mostly an
-assumed one (`Kind.usual`).
+the largest number of them by which one of the expert's motions differs from the others in anything. With few motions
+the spread is mostly an assumed one (`Kind.usual`).
 
 All of this is ours, and so are the numbers. It says that motions differ, not which is better.
 """
