@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from skills.cli import arms, comparison, datasets, demos, installation, plans, policies, recordings
+from skills.cli import arms, comparison, datasets, demos, installation, plans, policies, recordings, tries
 from skills.cli.shell import err, out, tell
 from skills.remedies import did_you_mean
 
@@ -75,6 +75,7 @@ app = typer.Typer(
 for commands in (  # the order of the commands in `skills --help`
     installation.commands,
     installation.key_commands,
+    tries.commands,
     recordings.commands,
     demos.commands,
     datasets.commands,

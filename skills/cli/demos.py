@@ -101,7 +101,7 @@ def demo_add(
         raise BadInput("Use --segment or --proposal, not both.")
     from skills.client import Problem
 
-    part = proposal if segment is None else _part_of(segment)
+    part = proposal if segment is None else part_of(segment)
     with service() as client, ready_one(path, episode, column, tool) as (file, progress, sent_columns):
 
         def add(part: "Part") -> "Demonstration":
@@ -139,14 +139,14 @@ def demo_add(
             _list_proposals(problem.body["numbers"]["segments"])
             if not on_terminal():
                 raise
-            added = add(_part_of(typer.prompt("Which one? A number, or whole", err=True).strip()))
+            added = add(part_of(typer.prompt("Which one? A number, or whole", err=True).strip()))
     _measured(added, as_json)
     if added.segment is not None and not as_json:
         which = f"{added.segment.taken}, {added.segment.start_s:.2f} to {added.segment.end_s:.2f} s"
         out.print(f"Taken: {which}; {added.segment.because}", markup=False, soft_wrap=True)
 
 
-def _part_of(segment: str) -> "Part":
+def part_of(segment: str) -> "Part":
     """Return the value of --segment: a number, or "whole"."""
     if segment == "whole":
         return "whole"

@@ -90,7 +90,7 @@ def plan(
             "A plan needs suture points, from --point or from --scene.",
             "For each pass: --point X,Y,Z in mm; or --scene with a simulator's file that contains them.",
         )
-    psm_m = _psm_m(approach, base, no_handoff)
+    psm_m = psm_m_of(approach, base, no_handoff)
     with service() as client:
         points: list[dict[str, Any]] = [{"position_mm": triple(one)} for one in point or ()]
         if scene is not None:
@@ -115,7 +115,7 @@ def plan(
         out.print(made.in_words, markup=False, soft_wrap=True)
 
 
-def _psm_m(approach: str | None, base: str | None, no_handoff: bool) -> dict[str, Any] | None:
+def psm_m_of(approach: str | None, base: str | None, no_handoff: bool = False) -> dict[str, Any] | None:
     """Return PSM_M as a request states it; None: as demonstrated, or none.
 
     Raises:
@@ -153,7 +153,7 @@ def reach(
     as_json: AsJson = False,
 ) -> None:
     """Map where the released policy can be planned: reach and clearance over positions and rotations."""
-    psm_m = _psm_m(approach, base, no_handoff)
+    psm_m = psm_m_of(approach, base, no_handoff)
     with service() as client:
         found = client.reach(
             surgeon,
@@ -213,7 +213,7 @@ def play(
 ) -> None:
     """Play a plan in the simulator, and print the verdict; exit code 1 if it is not feasible."""
     with service(workers=1) as client:
-        playback = client.playback(result_of(finished(client, client.play(plan_id, _stated(errors))))["playback"])
+        playback = client.playback(result_of(finished(client, client.play(plan_id, stated_errors_of(errors))))["playback"])
         if picture is not None:
             picture.write_bytes(client.picture(playback.id))
         if pictures is not None:
@@ -243,7 +243,7 @@ def play(
         raise typer.Exit(1)
 
 
-def _stated(errors: str | None) -> Any:
+def stated_errors_of(errors: str | None) -> Any:
     """Return the errors of the arms as a request states them: a name, or the JSON of a file.
 
     Raises:

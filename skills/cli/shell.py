@@ -20,6 +20,7 @@ from datetime import datetime
 from functools import reduce, wraps
 from pathlib import Path
 from threading import Thread
+from time import monotonic
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn, ParamSpec
 
 import typer
@@ -351,12 +352,24 @@ def _plain(model: Any) -> Any:
 
 def finished(client: "Client", job: "Job", timeout_s: float = WAIT_S) -> "Job":
     """Wait for a job, with a status line on stderr."""
-    with err.status(f"{job.kind} {job.id} ...") as status:
+    with in_progress(job) as going:
+        return client.wait(job, timeout_s, progress=going)
+
+
+@contextmanager
+def in_progress(job: "Job") -> "Iterator[Callable[[Job], None]]":
+    """Show a status line of a job on stderr, and yield its callback: the kind, the state, and the time left."""
+    with err.status(f"{job.kind}: waits for a worker") as status:
+        began_s = monotonic()
 
         def tell(seen: "Job") -> None:
-            status.update(f"{seen.kind} {seen.id} {seen.state} {seen.progress:.0%}")
+            if seen.state == "queued":
+                return
+            done, went_s = seen.progress, monotonic() - began_s
+            left = f", about {went_s / done - went_s:.0f} s left" if 0 < done < 1 else ""
+            status.update(f"{seen.kind}: {seen.state}, {done:.0%} done{left}")
 
-        return client.wait(job, timeout_s, progress=tell)
+        yield tell
 
 
 def result_of(job: "Job") -> dict[str, Any]:

@@ -35,7 +35,7 @@ from skills.client.connection import (
 )
 from skills.client.datasets import Datasets
 from skills.client.plans import Plans
-from skills.client.policies import Atlases, Jobs, Policies, Scores
+from skills.client.policies import Atlases, Jobs, Policies, Scores, steps_of
 from skills.client.recordings import Catalogue, Recordings
 from skills.client.transport import Awaited, Blocking, Progress, Retrying, Transport
 from skills.errors import BadSettings
@@ -57,6 +57,7 @@ __all__ = [
     "Retrying",
     "SessionClosed",
     "UnprotectedKey",
+    "steps_of",
 ]
 
 

@@ -46,12 +46,13 @@ from skills.schemas.given import (
     SignedEnvelope,
     Version,
 )
+from skills.schemas.tries import TryStep
 
 if TYPE_CHECKING:
     from skills.learning.policy import Policy as LearntPolicy
 
 State = Literal["queued", "running", "succeeded", "failed", "cancelled"]
-Kind = Literal["training", "retraining", "playback", "pictures", "dataset"]
+Kind = Literal["training", "retraining", "playback", "pictures", "dataset", "try"]
 Combining = Literal["medoid", "barycentre", "corridor"]
 Watcher = Callable[[Job], None]
 
@@ -65,6 +66,11 @@ OF_THE_VERSION = (
     *("actions", "actions_joining", "live_actions", "live_actions_joining"),
 )
 FORMATS = (1, 2)  # of a policy, that this client can follow
+
+
+def steps_of(job: Job) -> list[TryStep]:
+    """Return the steps of a try so far."""
+    return [TryStep.model_validate(one) for one in (job.result or {}).get("steps", ())]
 
 
 class Jobs(Connection):
@@ -114,6 +120,51 @@ class Jobs(Connection):
         asked |= given({"demos": demos, "combine": how, "learner": learner, "outcomes": of, "depth_along": depth_along})
         asked |= given({"scene": scene, "scene_costs": scene_costs})
         return await self._ask(Job, "POST", at("trainings"), asked, harmless=not release)
+
+    @call
+    async def try_recording(
+        self,
+        recording: str,
+        surgeon: str,
+        suture: str,
+        *,
+        segment: Literal["whole"] | int | None = None,
+        loss_mm: float | None = None,
+        cell_mm: float | None = None,
+        hysteresis: float | None = None,
+        release: bool | None = None,
+        tissue_mm: float | Literal["none"] | None = None,
+        errors: Literal["calibrated", "uncalibrated"] | Mapping[str, Any] | None = None,
+        psm_m: Mapping[str, Any] | None = None,
+    ) -> Job:
+        """Request a stored recording's way to a verdict: cut, learnt, certified, released if wanted, planned, played.
+
+        The job's result has the `steps`, read by `steps_of`, also while it runs. The job ends with a question where one
+        is open: send it again with one of the step's choices, whose `change` has keywords of this call.
+
+        Args:
+            recording: The recording's digest.
+            surgeon: The surgeon's pseudonym.
+            suture: The suture type.
+            segment: The proposed hand-off, counted from 1, or "whole"; asked if there are several.
+            loss_mm: The coarsest cells are chosen that lose at most this much, RMSE in 3-D; default: 2.6.
+            cell_mm: Length of a cell's edge, in place of the choice.
+            hysteresis: In cells, in place of the choice.
+            release: Whether to release the version if it passes the gate; asked.
+            tissue_mm: Height of level tissue in the arm's frame, or "none"; asked.
+            errors: Errors of the arms that are to play it, as for `play`; asked.
+            psm_m: The arm that takes the needle, as for `plan`.
+        """
+        asked: dict[str, Any] = {
+            "recording": recording,
+            "surgeon": surgeon,
+            "suture": suture,
+            "segment": segment,
+            "psm_m": psm_m,
+        }
+        asked |= {"loss_mm": loss_mm, "cell_mm": cell_mm, "hysteresis": hysteresis, "release": release}
+        asked |= {"tissue_mm": tissue_mm, "errors": errors}
+        return await self._ask(Job, "POST", at("tries"), given(asked), harmless=release is not True)
 
     @call
     async def retrain(

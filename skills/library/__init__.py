@@ -20,6 +20,7 @@ from skills.library.datasets import export_dataset
 from skills.library.jobs import PART, Store, names_of
 from skills.library.playbacks import check_playback, draw_pictures
 from skills.library.training import train_style
+from skills.library.tries import TRY, perform_try
 from skills.settings import Settings
 
 __all__ = ["perform_job"]
@@ -30,6 +31,7 @@ MAKERS: dict[str, Callable[[Database, Any, Settings], Store]] = {
     "playback": check_playback,
     "pictures": draw_pictures,
     "dataset": export_dataset,
+    TRY: perform_try,
 }
 
 

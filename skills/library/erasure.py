@@ -115,7 +115,9 @@ def erase_demo(session: Session, demo_sha256: str, actor: str) -> Dropped:
     jobs = [
         (row, attempt, active)
         for row, attempt, active, request in session.execute(theirs)
-        if demo_sha256 in request.get("demos", ()) or request.get("plan") in plans
+        if demo_sha256 in request.get("demos", ())
+        or request.get("plan") in plans
+        or request.get("recording") == demo.recording.sha256  # a try, whose steps describe the demonstration
     ]
     forget_styles(session, select(Demonstration.row).where(of_demo), None)
     for some in in_parts([row for row, _, _ in jobs]):

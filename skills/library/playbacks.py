@@ -188,13 +188,18 @@ def request_playback(
     """
     plan = find_plan(session, plan_sha256)
     check_frame(plan.about["frame"])
-    request: PlaybackRequest = {
-        "plan": plan.sha256,
+    request = playback_request(plan.sha256, settings, errors)
+    return jobs.ask(session, "playback", request, plan.policy.surgeon, actor)
+
+
+def playback_request(plan_sha256: str, settings: Settings, errors: ArmErrors | None) -> PlaybackRequest:
+    """Return the request of a playback's job, all defaults resolved; the arguments are those of `request_playback`."""
+    return {
+        "plan": plan_sha256,
         "check_version": CHECK_VERSION,
         "errors": asdict(stated_errors(settings.arm_errors) if errors is None else errors),
         "stated_by": "installation" if errors is None else "request",
     }
-    return jobs.ask(session, "playback", request, plan.policy.surgeon, actor)
 
 
 def check_playback(

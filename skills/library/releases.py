@@ -168,8 +168,8 @@ _REMEDIES = (
         "Train it with value-iteration or a smaller slip, or record the hand-off further from the scene; the limits "
         "are SKILLS_SCENE_LEAST_FINISHING and SKILLS_SCENE_MOST_TOUCHING.",
     ),
-    ("joint limits", "Record the hand-off further inside the arm's reach, or with the arm's base elsewhere."),
     ("not the arm's base", "Record the arm's local/measured_cp, which is in its base, or its measured_js."),
+    ("joint limits", "Record the hand-off further inside the arm's reach, or with the arm's base elsewhere."),
 )
 
 

@@ -142,6 +142,18 @@ def request_training(
             scene is in another frame or is touched by the demonstration, or the learner does not learn in a scene.
         LearnerNotInstalled: The learner needs a library that is not installed.
     """
+    request, who = training_request(session, training, near, odds)
+    job, new = jobs.ask(session, "training", request, who, actor)
+    if new:
+        return Asked(job, True, QUEUED)
+    again = training.release and job.state == "succeeded"
+    return Asked(job, False, _release_again(session, job, actor) if again else did_nothing(job))
+
+
+def training_request(
+    session: Session, training: TrainingIn, near: NearLimits | None = None, odds: OddsLimits | None = None
+) -> tuple[TrainingRequest, Surgeon]:
+    """Return the request of a training's job with all defaults resolved, and the surgeon; see `request_training`."""
     learner = learner_to_train(training.chosen)
     who, what = find_surgeon(session, training.surgeon), find_suture_type(session, training.suture)
     require(who, "training")
@@ -182,11 +194,7 @@ def request_training(
             request["odds"] = asdict(odds)
     elif training.scene_costs is not None:
         raise BadInput("scene_costs are costs of a scene; give the scene too, or omit them.")
-    job, new = jobs.ask(session, "training", request, who, actor)
-    if new:
-        return Asked(job, True, QUEUED)
-    again = training.release and job.state == "succeeded"
-    return Asked(job, False, _release_again(session, job, actor) if again else did_nothing(job))
+    return request, who
 
 
 def learner_to_train(chosen: Learner | None) -> Learner:

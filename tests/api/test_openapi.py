@@ -26,7 +26,7 @@ OPERATIONS = {
     "preview_recording",
     "put_surgeon", "put_suture_type",
     "read_suture_points", "ready", "recognise", "release", "retrain", "roll_out", "score", "served_at",
-    "surgeon_progress", "train",
+    "surgeon_progress", "train", "try_recording",
     "upload_demo", "watch_job",
     "withdraw", "withdraw_demo",
     "delete_dataset", "export_dataset", "get_dataset", "get_dataset_episodes",

@@ -40,6 +40,7 @@ NEEDED = {
     "DELETE /demos/{demo}": RELEASER,
     "POST /trainings": TRAINER,
     "POST /retrainings": TRAINER,
+    "POST /tries": TRAINER,
     "DELETE /jobs/{job}": TRAINER,
     "POST /plans": TRAINER,
     "POST /reach": TRAINER,
@@ -133,7 +134,7 @@ def test_every_route_declares_its_role_and_an_undeclared_one_is_refused(service:
 def test_only_releasers_train_with_release_and_only_admins_erase_a_demo(service: Service):
     asked = {"surgeon": "nobody", "suture": "simple-running"}
     trainer, releaser, admin = (As(service, key(service, role, role)) for role in ("trainer", "releaser", "admin"))
-    for path, body in (("/trainings", asked), ("/retrainings", asked)):
+    for path, body in (("/trainings", asked), ("/retrainings", asked), ("/tries", asked | {"recording": "0" * 64})):
         assert trainer("POST", path, json=body).status_code == 404
         assert trainer("POST", path, json=body | {"release": True}).status_code == 403
         assert releaser("POST", path, json=body | {"release": True}).status_code == 404

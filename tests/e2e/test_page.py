@@ -21,7 +21,7 @@ from tests.api.service import GOAL_MM
 from tests.e2e.browsers import Watched, browsing
 from tests.e2e.conftest import Service, running
 from tests.formats import written
-from tests.library.cases import working
+from tests.library import cases
 from tests.waiting import END_S
 
 SAMPLE = next(s for s in sample_recordings() if len(s.segments) > 1)
@@ -41,7 +41,7 @@ def browser() -> Iterator[Browser]:
 def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
     """Yield a service whose jobs a thread carries out."""
     folder = tmp_path_factory.mktemp("service")
-    with running(folder, workers=0) as started, working(Settings(database_url=f"sqlite:///{started.database}")):
+    with running(folder, workers=0) as started, cases.working(Settings(database_url=f"sqlite:///{started.database}")):
         yield started
 
 
@@ -189,6 +189,63 @@ def plan_and_play(tab: Watched) -> None:
     page.wait_for_function("film => film.readyState > 0 && film.duration > 1", arg=film.element_handle())
     when_drawn(tab)
     tab.shoot("plan")
+
+
+class Clicks:
+    """The clicks of a user on a page; filling a field counts one too."""
+
+    def __init__(self) -> None:
+        self.count = 0
+
+    def click(self, at: Locator) -> None:
+        self.count += 1
+        at.click()
+
+    def fill(self, at: Locator, text: str) -> None:
+        self.count += 1
+        at.fill(text)
+
+
+def test_a_bag_comes_to_a_verdict_in_six_clicks(browser: Browser, tmp_path: Path) -> None:
+    bag = tmp_path / "session.mcap"
+    bag.write_bytes(SAMPLE.data)  # with five hand-offs, so that one is asked for
+    with running(tmp_path) as fresh, visiting(browser, fresh.url) as tab:
+        tab.open("/")
+        page, user, steps = tab.page, Clicks(), tab.page.locator("#try-steps")
+        user.count += 1  # the drop
+        page.get_by_label("Drop a recording here, or choose it").set_input_files(bag)
+        user.click(page.get_by_role("button", name="Try it"))
+        user.click(steps.get_by_role("button", name=re.compile("^Take proposal 2: ")))
+        user.fill(steps.get_by_label("Height in mm"), "-170")
+        user.click(steps.get_by_label("errors of a calibrated arm"))
+        expect(steps).to_contain_text("It passes the gate of a release.")
+        tab.shoot("try-questions")
+        user.click(steps.get_by_role("button", name="Release it"))
+        expect(steps).to_contain_text("feasible in an exact simulation", timeout=WORK_MS)
+        assert user.count <= 6
+        expect(steps).to_contain_text("Version 1 is served now.")
+        tab.shoot("try")
+        steps.get_by_role("link", name="See the plan").click()
+        page.wait_for_url(re.compile("/pages/plans/[0-9a-f]{64}"))
+        expect(page.locator(".verdict")).to_contain_text("feasible in an exact simulation")
+
+
+def test_a_refused_try_has_a_button_that_applies_the_remedy(browser: Browser, tmp_path: Path) -> None:
+    with running(tmp_path) as fresh, visiting(browser, fresh.url, view=False) as tab:
+        tab.open("/")
+        page, steps = tab.page, tab.page.locator("#try-steps")
+        page.get_by_label("Drop a recording here, or choose it").set_input_files(
+            files=[{"name": "hand-off.csv", "mimeType": "text/csv", "buffer": cases.hand_off()}]
+        )
+        page.get_by_label("Surgeon's pseudonym, never a name").fill("lark")
+        page.route(
+            "**/tries", lambda asked: asked.continue_(post_data={**asked.request.post_data_json, "loss_mm": 0.01})
+        )
+        page.get_by_role("button", name="Try it").click()
+        expect(steps.locator(".refused")).to_contain_text("the finest lose", timeout=WORK_MS)
+        page.unroute("**/tries")
+        steps.get_by_role("button", name=re.compile("^Accept a loss of ")).click()
+        expect(steps).to_contain_text("It passes the gate of a release.", timeout=WORK_MS)
 
 
 @pytest.mark.nightly  # 23 s: it is rendered in software

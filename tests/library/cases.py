@@ -110,7 +110,7 @@ def working(settings: Settings) -> Iterator[None]:
     over = Event()
 
     def work_on() -> None:
-        with closing(Database(settings.database_url)) as database:
+        with closing(Database(settings.database_url, signing_key=settings.signing_key)) as database:
             carried_out = Work(database, settings, perform_job)
             while not over.wait(0.02):
                 with database.reading() as session:

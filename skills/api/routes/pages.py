@@ -93,7 +93,8 @@ def show_catalogue(
     with db.reading() as session:
         found = overview.matrix(session, q, state or None, skill or None, cursor)
         asked = {"q": q, "state": state, "skill": skill}
-        return render(request, "catalogue.html", caller, found=found, asked=asked, most_counted=overview.MOST_COUNTED)
+        known: dict[str, Any] = {"sutures": overview.all_suture_types(session), "most_counted": overview.MOST_COUNTED}
+        return render(request, "catalogue.html", caller, found=found, asked=asked, **known)
 
 
 @router.get("/pages/styles/{surgeon}/{suture}", dependencies=[needs("reader")])

@@ -62,6 +62,7 @@ from skills.library.releases import outcomes_of, outcomes_of_styles
 from skills.library.retraining import find_retraining, list_styles, request_retraining, retrained_json
 from skills.library.signatures import head_over, sign_files
 from skills.library.training import near_limits, odds_limits, request_training
+from skills.library.tries import request_try
 from skills.schemas.given import (
     Job,
     NextPose,
@@ -77,6 +78,7 @@ from skills.schemas.given import (
 )
 from skills.schemas.given import Version as GivenVersion
 from skills.schemas.requests import JOB, SLUG, NextIn, RetrainingIn, RolloutIn, TrainingIn
+from skills.schemas.tries import TryIn
 from skills.settings import MEBIBYTE
 from skills.transparency import read_notes
 
@@ -108,12 +110,28 @@ def train(body: TrainingIn, db: Db, jobs: Jobs, actor: Actor, caller: Asking, se
     return answer
 
 
+@job_router.post("/tries", dependencies=[needs("trainer"), room_for_a_job], **starts_job(404, 409, 410))
+def try_recording(body: TryIn, db: Db, jobs: Jobs, actor: Actor, caller: Asking) -> Response:
+    """Take a stored recording to a verdict: cut, learn, certify, release if wanted, plan at its own place, play.
+
+    The job's `result.steps` has each step as it is done. What the request leaves open is asked: the job then ends with
+    the choices, and the request is sent again with one of them. Nothing is released without `release` true.
+    """
+    refuse_release(caller, body.release is True)
+    with db.writing([locks.surgeon(body.surgeon)]) as session:
+        job, new, did = request_try(session, body, actor)
+        answer = accepted(session, job, did)
+    if new:
+        jobs.tell(job.row, job.attempt, job.kind)
+    return answer
+
+
 @job_router.get("/jobs", dependencies=[needs("reader")], **gives_page(Page[Job]))
 def list_jobs(
     db: Db,
     give: Giving,
     state: Literal["queued", "running", "succeeded", "failed", "cancelled"] | None = None,
-    kind: Literal["training", "retraining", "playback", "pictures", "dataset"] | None = None,
+    kind: Literal["training", "retraining", "playback", "pictures", "dataset", "try"] | None = None,
     limit: Limit = 50,
     cursor: RowCursor = None,
 ) -> Response:

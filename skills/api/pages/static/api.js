@@ -25,8 +25,8 @@ export async function problemOf(status, text) {
   }
 }
 
-export async function ask(method, path, { json, accept = "application/json" } = {}) {
-  const headers = { Accept: accept, ...(method === "GET" ? {} : changing()) };
+export async function ask(method, path, { json, accept = "application/json", more = {} } = {}) {
+  const headers = { Accept: accept, ...more, ...(method === "GET" ? {} : changing()) };
   if (json !== undefined) headers["Content-Type"] = "application/json";
   const body = json === undefined ? undefined : JSON.stringify(json);
   let answer;
@@ -39,8 +39,8 @@ export async function ask(method, path, { json, accept = "application/json" } = 
   return answer;
 }
 
-export async function call(method, path, json) {
-  const answer = await ask(method, path, { json });
+export async function call(method, path, json, more) {
+  const answer = await ask(method, path, { json, more });
   return answer.status === 204 ? null : answer.json();
 }
 
@@ -52,6 +52,29 @@ export async function save(path, accept, name) {
   link.download = name;
   link.click();
   setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
+}
+
+const DIGESTED_BYTES = 512 * 2 ** 20; // the digest needs the complete file in memory; a larger file is sent without one
+
+export async function digestOf(file) {
+  if (file.size > DIGESTED_BYTES || !crypto.subtle) return {};
+  const digest = await crypto.subtle.digest("SHA-256", await file.arrayBuffer());
+  return { "Content-Digest": `sha-256=:${btoa(String.fromCharCode(...new Uint8Array(digest)))}:` };
+}
+
+// Send a file as the body; `tell` gets the bytes that went and all, and `request` can be aborted meanwhile.
+export function send(path, file, headers, query, tell, request = new XMLHttpRequest()) {
+  const done = new Promise((resolve, reject) => {
+    request.upload.onprogress = ({ loaded, total }) => tell(loaded, total);
+    request.onload = async () =>
+      request.status < 300 ? resolve(JSON.parse(request.responseText)) : reject(await problemOf(request.status, request.responseText));
+    request.onerror = () => reject(new Error("The connection was lost; send it again. Nothing was stored."));
+    request.onabort = () => reject(new Error("Stopped; nothing was stored."));
+  });
+  request.open("POST", `${root}${path}?${query}`);
+  for (const [name, value] of Object.entries({ ...headers, ...changing() })) request.setRequestHeader(name, value);
+  request.send(file);
+  return done;
 }
 
 export const ACTIVE = ["queued", "running"];

@@ -1,5 +1,5 @@
 // Upload of a recording as raw bytes with their digest: a preview of what is understood, and then, unchanged, its storage.
-import { changing, problemOf, root } from "./api.js";
+import { digestOf, root, send } from "./api.js";
 import { understood } from "./preview.js";
 
 const get = (id) => document.getElementById(id);
@@ -8,7 +8,6 @@ const said = get("said");
 const KINDS = Object.fromEntries([...get("kind").options].map((one) => [one.dataset.suffix, one.value]));
 const TABLE = "text/csv";
 const FRAMELESS = [TABLE, "application/zip"]; // the latter: LeRobot
-const DIGESTED_BYTES = 512 * 2 ** 20; // the digest needs the complete file in memory; a larger file is sent without one
 const mebibytes = (bytes) => `${(bytes / 2 ** 20).toFixed(bytes < 2 ** 20 ? 3 : 1)} MiB`;
 
 function chosen() {
@@ -48,12 +47,6 @@ for (const name of ["dragover", "dragleave", "drop"]) {
   });
 }
 
-async function digestOf(file) {
-  if (file.size > DIGESTED_BYTES || !crypto.subtle) return {};
-  const digest = await crypto.subtle.digest("SHA-256", await file.arrayBuffer());
-  return { "Content-Digest": `sha-256=:${btoa(String.fromCharCode(...new Uint8Array(digest)))}:` };
-}
-
 // The answers to what the file does not say, of the fields that its format has.
 function answers() {
   const query = new URLSearchParams();
@@ -65,23 +58,13 @@ function answers() {
   return query;
 }
 
-function send(path, file, headers, query) {
+function sending(path, file, headers, query) {
   const request = new XMLHttpRequest();
-  const done = new Promise((resolve, reject) => {
-    request.upload.onprogress = ({ loaded, total }) => {
-      get("progress").value = loaded / total;
-      get("sent").textContent = loaded < total ? `${mebibytes(loaded)} of ${mebibytes(total)}` : "Sent; it is being read and checked.";
-    };
-    request.onload = async () =>
-      request.status < 300 ? resolve(JSON.parse(request.responseText)) : reject(await problemOf(request.status, request.responseText));
-    request.onerror = () => reject(new Error("The connection was lost; send it again. Nothing was stored."));
-    request.onabort = () => reject(new Error("Stopped; nothing was stored."));
-  });
-  request.open("POST", `${root}${path}?${query}`);
-  for (const [name, value] of Object.entries({ ...headers, ...changing() })) request.setRequestHeader(name, value);
   get("stop").onclick = () => request.abort();
-  request.send(file);
-  return done;
+  return send(path, file, headers, query, (went, total) => {
+    get("progress").value = went / total;
+    get("sent").textContent = went < total ? `${mebibytes(went)} of ${mebibytes(total)}` : "Sent; it is being read and checked.";
+  }, request);
 }
 
 // Send the file with everything locked, so that what is stored is what was previewed.
@@ -96,7 +79,7 @@ async function sent(path, where, then, more = {}) {
   get("progress").hidden = get("stop").hidden = false;
   tell(where, "");
   try {
-    const answer = await send(path, file, { "Content-Type": kind, ...(await digestOf(file)) }, query);
+    const answer = await sending(path, file, { "Content-Type": kind, ...(await digestOf(file)) }, query);
     for (const one of fields) one.disabled = false;
     then(answer);
   } catch (problem) {

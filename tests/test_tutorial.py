@@ -1,0 +1,123 @@
+"""The commands of docs/tutorial.md run, and print the transcript on the page; the questions are asked at a terminal.
+
+`python -m tests.test_tutorial` writes the transcript into the page again.
+"""
+
+import doctest
+import re
+import shlex
+from collections.abc import Iterator
+from contextlib import chdir
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from skills.cli import app
+from skills.cli.shell import out
+from skills.seeds.recordings import sample_recordings
+from skills.settings import settings
+from tests.formats import bags
+from tests.library import cases
+from tests.needs import need
+
+WIDTH = 110  # of the page
+PAGE = Path(__file__).parent.parent / "docs" / "tutorial.md"
+MADE = re.compile(r"/\S*skills-try-\w+")
+AS_SHOWN, HOW = doctest.OutputChecker(), doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
+COMMAND = re.compile(r"^\$ (.*?)(?:  # exits with (\d))?\n((?:(?!\$ |```).*\n)*)", re.MULTILINE)
+
+
+@pytest.fixture
+def bare(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Stand in a folder with two bags and nothing else, on an installation that names no database."""
+    need("simulator")
+    for name in ("SKILLS_SERVER", "SKILLS_DATABASE_URL", "SKILLS_API_KEY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+    monkeypatch.setattr("skills.serving.working", cases.working)
+    monkeypatch.setattr("skills.library.playbacks.request_pictures", lambda *_: None)  # nobody looks at the film
+    monkeypatch.setattr(out, "width", WIDTH)
+    place(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    settings.cache_clear()
+    yield
+    settings.cache_clear()
+    assert not (tmp_path / "data").exists()
+
+
+def place(folder: Path) -> None:
+    samples = sample_recordings()
+    (folder / "hand-off.mcap").write_bytes(next(one for one in samples if one.surgeon == "wren").data)
+    (folder / "session.mcap").write_bytes(next(one for one in samples if len(one.segments) > 1).data)
+
+
+def run(command: str, typed: str | None = None) -> Result:
+    return CliRunner().invoke(app, shlex.split(command)[1:], input=typed)
+
+
+def lasting(printed: str) -> str:
+    return MADE.sub("/tmp/skills-try", printed)
+
+
+def test_every_command_of_the_tutorial_prints_its_transcript(bare: None) -> None:
+    shown = COMMAND.findall(PAGE.read_text())
+    assert len(shown) == 5
+    for command, code, printed in shown:
+        result = run(command)
+        assert result.exit_code == int(code or 0), result.output
+        assert AS_SHOWN.check_output(lasting(printed), lasting(result.stdout), HOW), f"{command}\n{result.stdout}"
+        for made in MADE.findall(result.stdout):
+            assert not Path(made.rstrip(",")).exists()
+
+
+def test_a_user_at_a_terminal_is_asked_what_is_open(bare: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("skills.cli.tries.on_terminal", lambda: True)
+    result = run("skills try session.mcap --folder kept --suture simple-interrupted", "2\n-165\n1\ny\n")
+    assert result.exit_code == 0, result.output
+    assert "Taken: proposal 2 of 5" in result.stdout and "Version 1 is served now." in result.stdout
+    assert result.stdout.count("A recording of") == 1  # a step is printed once, though the request is sent three times
+    assert "--errors" not in result.stdout  # choices are numbers there, not commands
+    assert Path("kept/skills.sqlite").is_file()
+    assert run("skills try session.mcap --folder kept --segment 9").exit_code == 1
+    refused = run("skills try session.mcap --folder kept --tissue high")
+    assert (refused.exit_code, "neither a height in mm nor none" in refused.output) == (1, True)
+
+
+def test_the_command_of_a_choice_keeps_what_was_typed(bare: None) -> None:
+    given = "--surgeon lark --folder 'my folder' --cell-mm 4 --column x=a --column y=b"
+    result = run(f"skills try session.mcap {given} --json")
+    assert result.exit_code == 1 and "column" in result.output  # an MCAP file takes no columns
+    result = run("skills try session.mcap --surgeon lark --folder 'my folder' --cell-mm 4 --no-release")
+    assert result.exit_code == 3
+    said = "skills try session.mcap --surgeon=lark --no-release --cell-mm=4 '--folder=my folder' --segment=2\n"
+    assert said in result.stdout, result.stdout
+
+
+@pytest.mark.nightly
+def test_the_real_sample_bag_comes_to_a_verdict(bare: None) -> None:
+    bag = bags.sample_folder() / "rosbag2"
+    result = run(f"skills try {shlex.quote(str(bag))} --tissue=-190 --errors calibrated --release")
+    assert result.exit_code == 0, result.output
+    assert "4 mm cells with hysteresis 0.25" in result.stdout and "feasible in an exact simulation" in result.stdout
+
+
+def write_transcript() -> None:
+    """Write what the commands print now into the page."""
+    out.width = WIDTH
+    with TemporaryDirectory() as made, chdir(made):
+        place(Path(made))
+
+        def again(found: re.Match[str]) -> str:
+            first = found[0].partition("\n")[0]
+            lines = lasting(run(found[1]).stdout).splitlines()
+            return "\n".join([first, *(line.rstrip() for line in lines), ""])
+
+        page = COMMAND.sub(again, PAGE.read_text())
+    PAGE.write_text(page)
+
+
+if __name__ == "__main__":
+    write_transcript()
