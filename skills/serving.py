@@ -275,6 +275,9 @@ def serve(settings: Settings, *, samples: bool = False) -> None:
     def then() -> None:
         gc.freeze()  # everything imported so far stays, so later collections skip it
         gc.enable()
+        if settings.port:
+            scheme = "http" if settings.tls_cert is None else "https"
+            print(f"The page: {scheme}://{settings.host}:{settings.port}{settings.root_path}/", flush=True)
         if samples:
             threading.Thread(target=_load, args=(settings, app.state.access.own_key), daemon=True).start()
         warm_up(align_once)
@@ -427,4 +430,4 @@ def _load(settings: Settings, key: str) -> None:
     with Client(f"http://{settings.host}:{settings.port}", api_key=key) as client:
         for demo in load_samples(client):
             client.train(demo.surgeon, demo.suture, release=True)
-    print(f"The samples are loaded: http://{settings.host}:{settings.port}/policies", flush=True)
+    print("The samples are loaded.", flush=True)

@@ -216,6 +216,14 @@ def test_a_plan_is_played_drawn_exported_and_its_bag_verified(
     assert (tmp_path / "pictures" / "playback.mp4").read_bytes()[4:8] == b"ftyp"
     bag = tmp_path / "bag.zip"
     assert skills("export", plan, str(bag))[0] == 0
+    code, said = skills("export", plan, str(bag))
+    assert (code, "Replace it: --force" in said) == (1, True), said
+    assert skills("export", plan, str(bag), "--force")[0] == 0
+    code, said = skills("plans", "--json")
+    (listed,) = json.loads(said)
+    assert (listed["id"], listed["passes"], listed["feasible"]) == (plan, 1, True)
+    code, said = skills("plans", plan[:8])
+    assert (code, "hands the needle to PSM_M" in said) == (0, True), said
     code, said = skills("verify", str(bag))
     assert code == 0, said
     damaged = bytearray(bag.read_bytes())
@@ -678,3 +686,11 @@ def test_tab_is_silent_if_a_library_is_still_at_work_when_time_is_up() -> None:
 
 def test_the_commands_know_every_learner_that_has_a_joining_rule() -> None:
     assert set(PHASED) == {kind for kind, learner in LEARNERS.items() if learner.phased}
+
+
+def test_every_command_explains_each_option_within_eighty_columns() -> None:
+    for path, command in groups(get_command(app)):
+        assert [one.name for one in command.params if not getattr(one, "help", "")] == [], path
+        result = CliRunner().invoke(app, [*path, "--help"], terminal_width=80, env={"COLUMNS": "80"})
+        assert result.exit_code == 0, result.output
+        assert [line for line in result.output.splitlines() if len(line) > 80 or "…" in line] == [], path

@@ -51,7 +51,7 @@ def bare(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 def place(folder: Path) -> None:
     samples = sample_recordings()
     (folder / "hand-off.mcap").write_bytes(next(one for one in samples if one.surgeon == "wren").data)
-    (folder / "session.mcap").write_bytes(next(one for one in samples if len(one.segments) > 1).data)
+    (folder / "five-hand-offs.mcap").write_bytes(next(one for one in samples if len(one.segments) > 1).data)
 
 
 def run(command: str, typed: str | None = None) -> Result:
@@ -75,24 +75,24 @@ def test_every_command_of_the_tutorial_prints_its_transcript(bare: None) -> None
 
 def test_a_user_at_a_terminal_is_asked_what_is_open(bare: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("skills.cli.tries.on_terminal", lambda: True)
-    result = run("skills try session.mcap --folder kept --suture simple-interrupted", "2\n-165\n1\ny\n")
+    result = run("skills try five-hand-offs.mcap --folder kept --suture simple-interrupted", "2\n-165\n1\ny\n")
     assert result.exit_code == 0, result.output
     assert "Taken: proposal 2 of 5" in result.stdout and "Version 1 is served now." in result.stdout
     assert result.stdout.count("A recording of") == 1  # a step is printed once, though the request is sent three times
     assert "--errors" not in result.stdout  # choices are numbers there, not commands
     assert Path("kept/skills.sqlite").is_file()
-    assert run("skills try session.mcap --folder kept --segment 9").exit_code == 1
-    refused = run("skills try session.mcap --folder kept --tissue high")
+    assert run("skills try five-hand-offs.mcap --folder kept --segment 9").exit_code == 1
+    refused = run("skills try five-hand-offs.mcap --folder kept --tissue high")
     assert (refused.exit_code, "neither a height in mm nor none" in refused.output) == (1, True)
 
 
 def test_the_command_of_a_choice_keeps_what_was_typed(bare: None) -> None:
     given = "--surgeon lark --folder 'my folder' --cell-mm 4 --column x=a --column y=b"
-    result = run(f"skills try session.mcap {given} --json")
+    result = run(f"skills try five-hand-offs.mcap {given} --json")
     assert result.exit_code == 1 and "column" in result.output  # an MCAP file takes no columns
-    result = run("skills try session.mcap --surgeon lark --folder 'my folder' --cell-mm 4 --no-release")
+    result = run("skills try five-hand-offs.mcap --surgeon lark --folder 'my folder' --cell-mm 4 --no-release")
     assert result.exit_code == 3
-    said = "skills try session.mcap --surgeon=lark --no-release --cell-mm=4 '--folder=my folder' --segment=2\n"
+    said = "skills try five-hand-offs.mcap --surgeon=lark --no-release --cell-mm=4 '--folder=my folder' --segment=2\n"
     assert said in result.stdout, result.stdout
 
 

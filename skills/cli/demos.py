@@ -59,10 +59,12 @@ ABOUT = ("id", "surgeon", "suture", "arm", "state", "outcome", "created_at")
 @refusing
 def demo_add(
     path: RecordingPath,
-    surgeon: Annotated[str, typer.Option(autocompletion=complete_surgeons)],
-    suture: Annotated[str, typer.Option(autocompletion=complete_sutures)],
+    surgeon: Annotated[str, typer.Option(help="The surgeon's pseudonym.", autocompletion=complete_surgeons)],
+    suture: Annotated[
+        str, typer.Option(help="The suture type, such as simple-running.", autocompletion=complete_sutures)
+    ],
     arm: Annotated[str | None, typer.Option(help="Needed if a recording has several arms.")] = None,
-    topic: Annotated[str | None, typer.Option()] = None,
+    topic: Annotated[str | None, typer.Option(help="Needed if an arm has several topics.")] = None,
     start_s: Annotated[float | None, typer.Option(help="Start of the hand-off in the recording.")] = None,
     end_s: Annotated[float | None, typer.Option(help="End of the hand-off in the recording.")] = None,
     segment: Annotated[
@@ -74,7 +76,7 @@ def demo_add(
     ] = None,
     proposal: Annotated[int | None, typer.Option(help="The same as --segment with a number.")] = None,
     grid: Annotated[Literal["auto", "paper", "fit"], typer.Option(help="auto, paper or fit.")] = "auto",
-    cell_mm: Annotated[float | None, typer.Option()] = None,
+    cell_mm: Annotated[float | None, typer.Option(help="Length of a cell's edge, mm; 5 by default.")] = None,
     hysteresis: Annotated[
         float,
         typer.Option(
@@ -82,7 +84,7 @@ def demo_add(
             "tremor."
         ),
     ] = 0.0,
-    session: Annotated[str | None, typer.Option()] = None,
+    session: Annotated[str | None, typer.Option(help="Name of the session, such as 2026-11-23-a.")] = None,
     outcome: Annotated[Outcome | None, typer.Option(help="What became of the hand-off, if it is known.")] = None,
     reason: Annotated[str | None, typer.Option(help="Why; needed for a recovery or a failure.")] = None,
     rate_hz: RateHz = None,
@@ -226,7 +228,9 @@ def demo_report(
 
 @demos.command("save")
 @refusing
-def demo_save(demo: Demo, to: Annotated[Path, typer.Argument(dir_okay=False)], as_json: AsJson = False) -> None:
+def demo_save(
+    demo: Demo, to: Annotated[Path, typer.Argument(help="The file to write.", dir_okay=False)], as_json: AsJson = False
+) -> None:
     """Write the recording of a demonstration to a file, exactly as it was uploaded."""
     with service() as client, bar("fetching") as progress:
         client.save_recording(demo, to, progress)

@@ -197,6 +197,26 @@ def _drawn(found: "Reach") -> list[str]:
 
 @commands.command()
 @refusing
+def plans(
+    plan_id: Annotated[
+        str | None, typer.Argument(metavar="PLAN", help="Show this plan; without it the plans are listed.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """List plans, the newest first, or show one."""
+    with service() as client:
+        if plan_id is None:
+            about = ("id", "surgeon", "suture", "policy.version", "passes", "hands_over", "feasible", "created_at")
+            show(client.plans(), as_json, about)
+            return
+        shown = client.plan_of(plan_id)
+    show(shown, as_json, ("id", "surgeon", "suture", "policy.version", "trajectory.duration_s", "created_at"))
+    if not as_json:
+        out.print(shown.in_words, markup=False, soft_wrap=True)
+
+
+@commands.command()
+@refusing
 def play(
     plan_id: PlanId,
     errors: Annotated[
@@ -213,7 +233,9 @@ def play(
 ) -> None:
     """Play a plan in the simulator, and print the verdict; exit code 1 if it is not feasible."""
     with service(workers=1) as client:
-        playback = client.playback(result_of(finished(client, client.play(plan_id, stated_errors_of(errors))))["playback"])
+        playback = client.playback(
+            result_of(finished(client, client.play(plan_id, stated_errors_of(errors))))["playback"]
+        )
         if picture is not None:
             picture.write_bytes(client.picture(playback.id))
         if pictures is not None:
@@ -272,9 +294,12 @@ def export(
     no_handoff: Annotated[
         bool, typer.Option("--no-handoff", help="Needed for a plan without a hand-off: no PSM_M, no A2.")
     ] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace the file if it exists.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Write the bag of a plan that a robot or a simulator replays; read docs/replay.md first."""
+    if to.exists() and not force:
+        raise BadInput(f"{to} exists already, and may be the bag of another plan.", "Replace it: --force")
     with service() as client, bar("fetching") as progress:
         client.save_replay_bag(plan_id, to, pass_index, progress, handoff="none" if no_handoff else None)
     size = to.stat().st_size

@@ -58,6 +58,10 @@ Rule = Annotated[
 SceneFile = Annotated[
     Path | None, typer.Option("--scene", help="JSON file of what must not be touched, as `Scene.as_json` writes it.")
 ]
+OneVersion = Annotated[
+    int | None, typer.Option("--version", help="The version, released or not; else the released one.")
+]
+TheVersion = Annotated[int, typer.Argument(help="The number of the version.")]
 JOINING = {"nearest": 0.0, "start": 1.0}
 DEFAULT_LEARNER = "phase-q-learning"
 PHASED = (DEFAULT_LEARNER, "value-iteration")  # the learners that have a joining rule; a test compares them with all
@@ -86,7 +90,9 @@ def train(
         list[str] | None, typer.Option(help="Cost of the scene, as name=number; repeatable. Example: touch=100.")
     ] = None,
     release: Annotated[bool, typer.Option(help="Release the version if it passes the gate.")] = False,
-    seed: int = 0,
+    seed: Annotated[
+        int, typer.Option(help="Seed of the random numbers; the phase learner's result is independent of it.")
+    ] = 0,
     learner: Kind = None,
     setting: Chosen = None,
     join: Rule = None,
@@ -299,7 +305,7 @@ def policy_versions(surgeon: Surgeon, suture: Suture, as_json: AsJson = False) -
 
 @policies.command("show")
 @refusing
-def policy_show(surgeon: Surgeon, suture: Suture, version: int | None = None, as_json: AsJson = False) -> None:
+def policy_show(surgeon: Surgeon, suture: Suture, version: OneVersion = None, as_json: AsJson = False) -> None:
     """Show the released policy of a style, or one of its versions."""
     with service() as client:
         policy = client.policy(surgeon, suture, version)
@@ -344,7 +350,7 @@ def _share(coverage: "Coverage") -> str:
 
 @policies.command("release")
 @refusing
-def policy_release(surgeon: Surgeon, suture: Suture, version: int, as_json: AsJson = False) -> None:
+def policy_release(surgeon: Surgeon, suture: Suture, version: TheVersion, as_json: AsJson = False) -> None:
     """Release a version if it passes the gate; an older version may be released again."""
     with service() as client:
         released = client.release(surgeon, suture, version)
@@ -372,7 +378,7 @@ def policy_export(
     surgeon: Surgeon,
     suture: Suture,
     to: Annotated[Path, typer.Argument(help="A file that ends in .json, or in .npz for the Q values.", dir_okay=False)],
-    version: int | None = None,
+    version: OneVersion = None,
     as_json: AsJson = False,
 ) -> None:
     """Write the released policy, or a version, to a file, after verifying every number of it against its digest."""
@@ -389,7 +395,7 @@ def policy_export(
 def policy_card(
     surgeon: Surgeon,
     suture: Suture,
-    version: int,
+    version: TheVersion,
     to: Annotated[Path, typer.Argument(help="A file that ends in .html, or in .json.", dir_okay=False)],
     as_json: AsJson = False,
 ) -> None:
@@ -454,7 +460,7 @@ def rollout(
     surgeon: Surgeon,
     suture: Suture,
     start: Annotated[str, typer.Option(help="The start, as x,y,z in mm in the policy's frame.")],
-    version: Annotated[int | None, typer.Option(help="The version, released or not.")] = None,
+    version: OneVersion = None,
     as_json: AsJson = False,
 ) -> None:
     """Follow the released policy from a position to the goal."""

@@ -47,8 +47,12 @@ ABOUT_SURGEON = ("surgeon", "skill_level", "handedness", "protocol", "created_at
 @refusing
 def surgeon_put(
     surgeon: Annotated[str, typer.Argument(help="A pseudonym: lower-case letters, digits, - and _.")],
-    skill_level: Annotated[Literal["novice", "intermediate", "expert"] | None, typer.Option()] = None,
-    handedness: Annotated[Literal["right", "left", "ambidextrous"] | None, typer.Option()] = None,
+    skill_level: Annotated[
+        Literal["novice", "intermediate", "expert"] | None, typer.Option(help="The surgeon's experience.")
+    ] = None,
+    handedness: Annotated[
+        Literal["right", "left", "ambidextrous"] | None, typer.Option(help="The hand that the surgeon prefers.")
+    ] = None,
     protocol: Annotated[str | None, typer.Option(help="The study's protocol, such as an ethics number.")] = None,
     consent: Annotated[
         list[str] | None, typer.Option(help="A use that the surgeon agreed to: training, export or atlas; repeatable.")
@@ -135,7 +139,7 @@ Columns = Annotated[
     typer.Option(
         "--column",
         help="A column under another name, of a table as x_mm=PosX (docs/tables.md), of a LeRobot dataset as "
-        "psm1_jaw=observation.state[7]; repeatable.",
+        "psm1_jaw=THEIRS[7]; repeatable.",
     ),
 ]
 Units = Annotated[

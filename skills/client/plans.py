@@ -9,7 +9,7 @@ from skills.client.policies import Position
 from skills.client.transport import Progress
 from skills.errors import BadInput
 from skills.remedies import did_you_mean
-from skills.schemas.given import Comparison, Job, Plan, Playback, Reach, SuturePoints, Trajectory
+from skills.schemas.given import Comparison, Job, Plan, PlanSummary, Playback, Reach, SuturePoints, Trajectory
 
 BAG = "application/zip"
 
@@ -133,6 +133,11 @@ class Plans(Connection):
     ) -> SuturePoints:
         """Read the Entry and Exit marks of a simulator's MCAP file, in an arm's base frame."""
         return await self._upload(SuturePoints, at("suture-points"), scene, None, None, {"arm": arm, "frame": frame})
+
+    @call
+    async def plans(self) -> list[PlanSummary]:
+        """List plans, the newest first, each with its newest playback."""
+        return await self._all(PlanSummary, at("plans"))
 
     @call
     async def plan_of(self, plan: str) -> Plan:

@@ -12,7 +12,7 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from skills.db import rfc3339
-from skills.db.models import Plan, PolicyVersion
+from skills.db.models import Plan, PolicyVersion, StoredPlayback
 from skills.db.service_tables import record_event
 from skills.db.session import Database
 from skills.demonstration.demonstration import Demo
@@ -427,6 +427,21 @@ def motion_of(session: Session, plan_sha256: str) -> SuturePlan:
 def find_plan(session: Session, plan_sha256: str) -> Plan:
     """Return a plan by its digest."""
     return find_by_digest(session, Plan, plan_sha256, "plan", Remedy(Action.MAKE_PLAN))
+
+
+def plan_summary_json(row: Plan, played: StoredPlayback | None) -> dict[str, Any]:
+    """Return the JSON of a plan in a list, with its newest playback."""
+    return {
+        "id": row.sha256,
+        "surgeon": row.policy.surgeon.slug,
+        "suture": row.policy.suture,
+        "policy": {"version": row.policy.version, "sha256": row.policy.sha256},
+        "passes": len(row.about["passes"]),
+        "hands_over": hands_over(row.about),
+        "playback": None if played is None else played.sha256,
+        "feasible": None if played is None else played.feasible,
+        "created_at": rfc3339(row.created_at),
+    }
 
 
 def plan_json(row: Plan) -> dict[str, Any]:

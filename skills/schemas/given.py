@@ -67,6 +67,7 @@ __all__ = [
     "NextStep",
     "Page",
     "Plan",
+    "PlanSummary",
     "Playback",
     "Policy",
     "PolicyCard",
@@ -240,6 +241,20 @@ class Plan(Given):
     trajectory: Timetable
     hands_over: bool = Field(default=True, description="Whether a hand-off is planned: A2 towards PSM_M.")
     in_words: str = Field(default="", description="What the plan does and what it leaves out.")
+    created_at: datetime
+
+
+class PlanSummary(Given):
+    """A plan in a list."""
+
+    id: Sha256
+    surgeon: Slug
+    suture: Slug
+    policy: PolicyName
+    passes: Count
+    hands_over: bool
+    playback: Sha256 | None = Field(description="Its newest playback; null where it was not played.")
+    feasible: bool | None = Field(description="Of that playback.")
     created_at: datetime
 
 

@@ -37,6 +37,20 @@ def test_every_pass_ends_on_its_suture_point(still: Service):
     assert still.client.plan_of(made["id"]) == made
 
 
+def test_plans_are_listed_the_newest_first_with_their_newest_playback(trained: Service):
+    made = [plan(trained, point, rate_hz=100) for point in POINTS[:2]]
+    listed = trained.client.plans()
+    assert [one["id"] for one in listed] == [one["id"] for one in reversed(made)]
+    assert all((one["playback"], one["feasible"], one["passes"]) == (None, None, 1) for one in listed)
+    first = trained.http.get("/plans?limit=1").json()
+    assert [one["id"] for one in first["items"]] == [made[1]["id"]]
+    assert trained.http.get(f"/plans?cursor={first['next']}").json()["items"] == listed[1:]
+    trained.client.play(made[0]["id"])
+    trained.work()
+    playback = next(job["result"]["playback"] for job in trained.client.jobs(kind="playback"))
+    assert (trained.client.plans()[1]["playback"], trained.client.plans()[0]["playback"]) == (playback, None)
+
+
 def test_a_turned_suture_point_turns_the_pass_about_it(still: Service):
     straight = plan(still, POINTS[0])["passes"][0]
     points = [{"position_mm": POINTS[0], "rotation_xyzw": QUARTER}]

@@ -16,8 +16,20 @@ from fastapi import Query, Response
 from pydantic import Field
 
 from skills.api.authorisation import needs
-from skills.api.dependencies import Actor, Configured, Db, Digest, Incoming, Jobs, Read, Strict, room_for_a_job
-from skills.api.openapi import gives, gives_file, makes, router_of, says, starts_job
+from skills.api.dependencies import (
+    Actor,
+    Configured,
+    Db,
+    Digest,
+    Incoming,
+    Jobs,
+    Limit,
+    Read,
+    RowCursor,
+    Strict,
+    room_for_a_job,
+)
+from skills.api.openapi import gives, gives_file, gives_page, makes, router_of, says, starts_job
 from skills.api.responses import JSON, Giving, accepted, as_asked, say, stored
 from skills.api.routes.demos import RAW_BODY
 from skills.api.routes.policies import Accept
@@ -25,16 +37,16 @@ from skills.db.session import Database
 from skills.errors import UnknownFormat
 from skills.formats import BYTES
 from skills.formats.replay_bag import rows_of_pass
-from skills.library import locks, plans, playbacks
+from skills.library import locks, overview, plans, playbacks
 from skills.library.arm_errors import stated_errors
 from skills.library.jobs import QUEUED, did_nothing
-from skills.library.plans import find_suture_points, motion_of, plan_json, trajectory_of
+from skills.library.plans import find_suture_points, motion_of, plan_json, plan_summary_json, trajectory_of
 from skills.library.playbacks import find_playback, playback_json
 from skills.library.reach import map_style
 from skills.library.replay import compare_with_plan, replay_bag
 from skills.planning.plan import MAX_PASSES
 from skills.planning.trajectory import Trajectory
-from skills.schemas.given import Comparison, Plan, Playback, Reach, SuturePoints
+from skills.schemas.given import Comparison, Page, Plan, PlanSummary, Playback, Reach, SuturePoints
 from skills.schemas.given import Trajectory as GivenTrajectory
 from skills.schemas.reach import ReachIn
 from skills.schemas.requests import DIGEST, FRAME, Name, PlanIn, PlaybackIn, Schema
@@ -50,6 +62,15 @@ def make_plan(body: PlanIn, db: Db, actor: Actor) -> Response:
     row, created = plans.plan_sutures(db, body, actor)
     with db.reading() as session:
         return stored(plan_json(plans.find_plan(session, row.sha256)), created, f"/plans/{row.sha256}")
+
+
+@router.get("/plans", dependencies=[needs("reader")], **gives_page(Page[PlanSummary], 410))
+def list_plans(db: Db, give: Giving, limit: Limit = 50, cursor: RowCursor = None) -> Response:
+    """List plans, the newest first, each with its newest playback."""
+    with db.reading() as session:
+        found = overview.newest_plans(session, cursor, limit)
+        written = [plan_summary_json(plan, played) for plan, played in found]
+        return give.page(written, limit, found[-1][0].row if found else None)
 
 
 @router.get("/plans/{plan}", dependencies=[needs("reader")], **gives(Plan, 404))
