@@ -13,7 +13,7 @@ export SKILLS_PAPER_DATA ?= $(abspath $(wildcard ../shared/paper/data))
 export SKILLS_TEST_JIGSAWS ?= $(abspath $(wildcard ../shared/jigsaws))
 export SKILLS_TEST_BENCHMARKS ?= $(abspath $(wildcard ../shared/benchmarks))
 
-.PHONY: demo test serve bench faults nightly mutants deep lint lock wheelhouse fixture clean
+.PHONY: demo test serve bench faults nightly mutants deep lint lock wheelhouse wheel-check fixture clean
 
 # uv where it is present, venv and pip otherwise; either way the same versions, checked by their hashes. One package,
 # movement-primitives, comes as source: setuptools is there first, and it is built before Cython, a need of python-fcl, is
@@ -108,6 +108,11 @@ wheelhouse:
 	@$(PYTHON) -m venv build/pip
 	@$(SETUPTOOLS) | build/pip/bin/python -m pip install -q --require-hashes -r /dev/stdin
 	@build/pip/bin/python -m pip download -q --no-deps --no-build-isolation --require-hashes -d build/wheelhouse -r requirements.lock
+
+# The wheel in bare environments of each Python, without a compiler; the packages come from pip's index.
+PYTHONS ?= $(PYTHON)
+wheel-check:
+	@sh tests/wheel.sh $(PYTHONS)
 
 # A populated installation of this version, which later ones must take over: once at each release (CONTRIBUTING.md).
 fixture: $(READY)

@@ -2,6 +2,7 @@
 
 import re
 from contextlib import closing
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -422,6 +423,11 @@ def report(
     as_json: AsJson = False,
 ) -> None:
     """Redraw the paper's Figures 5 to 9 and Table I, compared with rivals: pictures and one HTML page."""
+    if find_spec("movement_primitives") is None:
+        raise BadInput(
+            "The figures have a movement primitive as a rival, whose library is not installed here.",
+            "Install the extra 'report': pip install 'suture-skills[report]'",
+        )
     from skills.report import ABSENT, Effort, write_report
     from skills.settings import settings
 

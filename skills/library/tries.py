@@ -26,7 +26,6 @@ from skills.db.models import PolicyVersion
 from skills.db.service_tables import Job
 from skills.db.session import Database
 from skills.demonstration.demonstration import Demo, cut_demo
-from skills.demonstration.quality import times_in_words
 from skills.demonstration.segments import Segment
 from skills.errors import BadSettings, Conflict, SkillsError
 from skills.formats.reader_process import Told
@@ -236,7 +235,7 @@ def choose_cells(demo: Demo, asked: TryIn) -> tuple[Cells, list[Cells]]:
     beside = "" if coarser is best else f"; {coarser.named} lose {coarser.loss_mm:.2f} mm"
     because = (
         f"{best.named}, {rule}: {best.loss_mm:.2f} mm (RMSE, 3-D){beside}. The path has {best.report.path_states} "
-        f"states and crosses itself {times_in_words(best.report.revisits)}."
+        f"states and {best.report.revisits} crossing{'' if best.report.revisits == 1 else 's'}."
     )
     return Cells(best.cell_mm, best.hysteresis, best.report, because), measured
 
