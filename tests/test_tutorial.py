@@ -73,6 +73,7 @@ def test_every_command_of_the_tutorial_prints_its_transcript(bare: None) -> None
             assert not Path(made.rstrip(",")).exists()
 
 
+@pytest.mark.nightly  # 3 s of processor time
 def test_a_user_at_a_terminal_is_asked_what_is_open(bare: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("skills.cli.tries.on_terminal", lambda: True)
     result = run("skills try five-hand-offs.mcap --folder kept --suture simple-interrupted", "2\n-165\n1\ny\n")

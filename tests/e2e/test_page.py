@@ -230,6 +230,7 @@ def test_a_bag_comes_to_a_verdict_in_six_clicks(browser: Browser, tmp_path: Path
         expect(page.locator(".verdict")).to_contain_text("feasible in an exact simulation")
 
 
+@pytest.mark.nightly  # the choices themselves are tested by day in tests/library/test_tries.py
 def test_a_refused_try_has_a_button_that_applies_the_remedy(browser: Browser, tmp_path: Path) -> None:
     with running(tmp_path) as fresh, visiting(browser, fresh.url, view=False) as tab:
         tab.open("/")
