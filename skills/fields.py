@@ -5,11 +5,14 @@ OpenAPI document takes its descriptions from the docstring. Lengths are mm; a po
 """
 
 import re
+from base64 import b64decode, b64encode
 from functools import cache
 from inspect import cleandoc
 from typing import Annotated, Any, TypeVar
 
-from pydantic import ConfigDict, Field, TypeAdapter
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ConfigDict, Field, PlainSerializer, PlainValidator, TypeAdapter, WithJsonSchema
 from pydantic import computed_field as computed_field  # a property that is part of the JSON
 
 Slug = Annotated[str, Field(description="Lower-case letters, digits, - and _.")]
@@ -22,6 +25,21 @@ Count = Annotated[int, Field(ge=0)]
 Six = Annotated[tuple[float, ...], Field(min_length=6, max_length=6)]
 # NaN where it could not be measured, which is null in JSON.
 Figure = float | None
+
+
+def _column(given: Any) -> NDArray[np.float32]:
+    if isinstance(given, str):
+        return np.frombuffer(b64decode(given, validate=True), "<f4").astype(np.float32)
+    return np.asarray(given, np.float32)
+
+
+# Many numbers in one field of JSON, a sixth of the bytes and of the time of a list of them. NaN where there is none.
+Column = Annotated[
+    NDArray[np.float32],
+    PlainValidator(_column),
+    PlainSerializer(lambda column: b64encode(np.ascontiguousarray(column, "<f4").tobytes()).decode()),
+    WithJsonSchema({"type": "string", "contentEncoding": "base64", "contentMediaType": "application/octet-stream"}),
+]
 
 T = TypeVar("T")
 _ATTRIBUTE = re.compile(r"^ {4}(\w+): (.*(?:\n {8,}.*)*)", re.MULTILINE)

@@ -9,9 +9,20 @@ from skills.client.policies import Position
 from skills.client.transport import Progress
 from skills.errors import BadInput
 from skills.remedies import did_you_mean
-from skills.schemas.given import Comparison, Job, Plan, PlanSummary, Playback, Reach, SuturePoints, Trajectory
+from skills.schemas.given import (
+    Comparison,
+    Job,
+    MotionTimeline,
+    Plan,
+    PlanSummary,
+    Playback,
+    Reach,
+    SuturePoints,
+    Trajectory,
+)
 
-BAG = "application/zip"
+BAG, MCAP = "application/zip", "application/vnd.mcap"
+Source = Literal["recordings", "demos", "policy-versions", "plans"]
 
 
 class Plans(Connection):
@@ -143,6 +154,21 @@ class Plans(Connection):
     async def plan_of(self, plan: str) -> Plan:
         """Return a plan."""
         return await self._get(Plan, at("plans", plan))
+
+    @call
+    async def timeline(self, source: Source, sha256: str) -> MotionTimeline:
+        """Return a recording, a demonstration, a policy version's learnt path or a plan as columns on one clock.
+
+        Args:
+            source: The kind of resource, as in its address.
+            sha256: Its digest.
+        """
+        return await self._get(MotionTimeline, at("timelines", source, sha256))
+
+    @call
+    async def timeline_mcap(self, source: Source, sha256: str) -> bytes:
+        """Return the same as an MCAP file for viewers such as Foxglove; it is not for execution."""
+        return await self._bytes(at("timelines", source, sha256), MCAP)
 
     @call
     async def trajectory(self, plan: str, pass_index: int | None = None) -> Trajectory:

@@ -48,6 +48,7 @@ from skills.schemas.recordings import (
 from skills.verification.probabilities import Doubt, Probability
 from skills.verification.reach import ReachPlace
 from skills.verification.scene_clearance import SceneReport
+from skills.verification.timeline import Timeline
 from skills.verification.verdict import PlaybackReport
 
 __all__ = [
@@ -61,6 +62,7 @@ __all__ = [
     "Job",
     "Key",
     "LeafProof",
+    "MotionTimeline",
     "Nearest",
     "NewKey",
     "NextPose",
@@ -264,6 +266,14 @@ class Trajectory(Given):
     rate_hz: float
     columns: list[str]
     rows: list[list[float]]
+
+
+class MotionTimeline(Given):
+    """A recording, a demonstration, a learnt path or a plan as columns on one clock, to be played."""
+
+    source: Literal["recordings", "demos", "policy-versions", "plans"]
+    sha256: Sha256
+    timeline: Timeline
 
 
 class StandingPolicy(PolicyName):

@@ -12,7 +12,7 @@ import pytest
 from sqlalchemy import select
 from starlette.testclient import TestClient
 
-from skills.api.pages import BORROWED, PLOTLY, PLOTLY_MAP_STYLE, assets, build, number, share, size
+from skills.api.pages import BORROWED, assets, build, number, share, size
 from skills.db.models import Demonstration, Plan, PolicyVersion, StoredRecording
 from skills.db.service_tables import Job
 from skills.learning.policy import rollout_from
@@ -73,6 +73,8 @@ def every_page(service: Service) -> list[str]:
         *(f"/pages/styles/{surgeon}/{suture}" for surgeon, suture in sorted(styles)),
         *(f"/pages/demos/{one}/score" for one in scored),
         *(f"/pages/recordings/{one}" for one in recordings),
+        *(f"/pages/player/recordings/{one}" for one in recordings),
+        *(f"/pages/player/plans/{one}" for one in plans),
         *(f"/pages/plans/{one}" for one in plans),
         *(f"/pages/plans/new?like={one}" for one in plans),
         *(f"/pages/jobs/{one}" for one in jobs),
@@ -265,10 +267,25 @@ def test_our_files_know_no_outside_address() -> None:
         assert addresses <= {b"http://www.w3.org/2000/svg"}, name
 
 
-def test_the_script_of_plotly_still_leaves_its_maps_style_out_where_asked() -> None:
-    script = assets()[PLOTLY].content
-    assert f'getElementById("{PLOTLY_MAP_STYLE}")'.encode() in script
-    assert b".no-inline-styles" in script
+def scripts_of(page: Html) -> set[str]:
+    """Return the names of the scripts that a page loads, with those that they import."""
+    found: set[str] = set()
+    new = {(about.get("src") or "").rpartition("/")[2] for tag, about in page.tags if tag == "script"}
+    while new:
+        found |= new
+        texts = [assets()[name].content.decode() for name in new]
+        new = {name for text in texts for name in re.findall(r'from "\./([\w.]+)"', text)} - found
+    return found
+
+
+def test_the_scripts_of_no_page_exceed_800_kilobytes(told: Service) -> None:
+    heaviest = 0
+    for path in [*every_page(told), "/docs"]:
+        scripts = scripts_of(page_of(told, path))
+        assert "site.js" in scripts or path == "/docs"
+        heaviest = max(heaviest, sum(len(assets()[name].packed) for name in scripts))
+        assert not scripts & BORROWED.keys() or path == "/docs", "no library is loaded for a page of data"
+    assert 0 < heaviest <= 800_000
 
 
 def test_numbers_are_written_with_their_units_and_never_rounded_up_to_all() -> None:

@@ -14,11 +14,8 @@ SCREENS = Path("build/screens")
 # No sandbox, because tests may run as root in a container; the 3-D view is drawn without a graphics card.
 ARGUMENTS = ["--no-sandbox", "--enable-unsafe-swiftshader", "--disable-gpu-vsync"]
 DESK, PHONE = {"width": 1280, "height": 860}, {"width": 360, "height": 740}
-# In the place of the script that draws the 3-D view in software, which takes a second or more for each page.
-WITHOUT_VIEW = """window.Plotly = {
-  react: async (place) => { place.on = () => {}; place._fullLayout = { scene: {} }; },
-  relayout: async () => {},
-};"""
+# In the place of the script that draws the 3-D view, in software here.
+WITHOUT_VIEW = "export class Renderer { buffers = new Map(); draw() {} }"
 HARMLESS = ("GL Driver Message", "Multiple readback operations")  # messages of the software renderer
 
 
@@ -54,8 +51,8 @@ class Watched:
         self.context.set_default_timeout(1000 * END_S)
         self.page: Page = self.context.new_page()
         if not view:
-            script = "application/javascript"
-            self.page.route("**/plotly.min.js*", lambda asked: asked.fulfill(content_type=script, body=WITHOUT_VIEW))
+            script = "text/javascript"
+            self.page.route("**/webgl.js", lambda asked: asked.fulfill(content_type=script, body=WITHOUT_VIEW))
         self.complaints: list[str] = []
         self.asked: list[str] = []
         self.page.on("console", lambda said: self._heard(said.type, said.text))

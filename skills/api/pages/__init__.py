@@ -3,7 +3,7 @@
 There are two kinds of pages. `render` renders a page of the site from a template; it loads its scripts, style and data
 from this server only. `standalone` renders a document to be stored or sent; a browser runs and fetches nothing for it.
 
-Assets are our scripts and styles, and those of plotly and Swagger UI from their packages. They are read once, and their
+Assets are our scripts and styles, and those of Swagger UI from its package. They are read once, and their
 URL contains a digest of all of them: a browser may cache a file permanently and never mixes two versions. Our scripts
 import each other by relative URLs, and so stay within a version.
 """
@@ -52,14 +52,10 @@ def wants_page(accept: str, what: str) -> bool:
 
 
 TYPES = {".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
-PLOTLY = "plotly.min.js"
 BORROWED = {  # from their packages: name, package, folder in it
-    PLOTLY: ("plotly", "package_data"),
     "swagger-ui-bundle.js": ("fastapi_swagger", "resources"),
     "swagger-ui.css": ("fastapi_swagger", "resources"),
 }
-# The script injects a style for maps, which no page draws, unless the document has an element with this id.
-PLOTLY_MAP_STYLE = "ce8d464691048653ffe3a57c6c18ab566e8366f186677868cf724621a857b4fe"
 
 
 @dataclass(frozen=True)
@@ -216,10 +212,9 @@ FILTERS = {
 }
 
 
-# Scripts and styles only from our files, none inline. For images, plotly probes the browser with `data:` URLs, and
-# saves a view by way of a `blob:`.
+# Scripts and styles only from our files, none inline. Swagger UI has images at `data:` URLs.
 SITE_POLICY = (
-    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; media-src 'self'; "
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; media-src 'self'; "
     "connect-src 'self'; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
 )
 SITE_HEADERS = {
@@ -240,7 +235,6 @@ def templates() -> Environment:
         lstrip_blocks=True,
     )
     made.filters |= FILTERS
-    made.globals |= {"plotly_map_style": PLOTLY_MAP_STYLE}
     return made
 
 

@@ -1,6 +1,6 @@
 // The 3-D view of a plan, the live view of its playback, and the film once it is drawn.
 import { call, watch } from "./api.js";
-import { Scene, box, colour, dots, layerList, line } from "./scene.js";
+import { Scene, box, dots, layerList, line } from "./scene.js";
 import { jobLine, say } from "./site.js";
 
 const place = document.getElementById("plan");
@@ -31,14 +31,14 @@ function traces() {
     const name = COLOURS[index % COLOURS.length];
     const drawn = [];
     if (on.passes) {
-      drawn.push(line(pass.path_mm, { name: `pass ${index}`, colour: name, width: 6 }));
-      drawn.push(dots([pass.path_mm[0]], { name: `start of pass ${index}`, colour: name, symbol: "diamond-open", size: 4 }));
+      drawn.push(line(pass.path_mm, { name: `pass ${index}`, colour: name, width: 3.5 }));
+      drawn.push(dots([pass.path_mm[0]], { name: `start of pass ${index}`, colour: name, symbol: "diamond-open", size: 5 }));
     }
-    if (on.points) drawn.push(dots([pass.position_mm], { name: `suture point ${index}`, colour: name, symbol: "cross", size: 5, mode: "markers+text", text: [`${index}`], textfont: { size: 13, color: colour(name) }, textposition: "top center" }));
-    if (on.transfers && index > 0) drawn.push(line([passes[index - 1].path_mm.at(-1), pass.path_mm[0]], { name: `to pass ${index}`, colour: "box", width: 2, dash: "dash" }));
+    if (on.points) drawn.push(dots([pass.position_mm], { name: `suture point ${index}`, colour: name, symbol: "cross", size: 5, text: [`${index}`] }));
+    if (on.transfers && index > 0) drawn.push(line([passes[index - 1].path_mm.at(-1), pass.path_mm[0]], { name: `to pass ${index}`, colour: "box", width: 1.5, dash: "dash" }));
     if (on.boxes) {
       const moved = (corner) => turned(pass.rotation_xyzw, corner.map((value, i) => value - goal[i])).map((value, i) => value + pass.position_mm[i]);
-      drawn.push(line(box(grid, moved), { name: `grid world ${index}`, colour: "box", width: 1, hoverinfo: "skip" }));
+      drawn.push(line(box(grid, moved), { colour: "box", width: 1 }));
     }
     return drawn;
   });

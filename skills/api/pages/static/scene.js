@@ -1,30 +1,50 @@
-// A 3-D view, rotated by mouse, touch, keys and buttons. Drawn by plotly; coordinates are mm.
+// A 3-D view, rotated by mouse, touch, keys and buttons. Coordinates are mm.
+import { Renderer } from "./webgl.js";
 import { say } from "./site.js";
 
-const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
-const LOOKS = {
-  home: { eye: { x: -0.72, y: -1.85, z: 0.85 }, up: { x: 0, y: 0, z: 1 } },
-  top: { eye: { x: 0, y: 0, z: 2.1 }, up: { x: 0, y: 1, z: 0 } },
-  front: { eye: { x: 0, y: -2.1, z: 0 }, up: { x: 0, y: 0, z: 1 } },
-  side: { eye: { x: 2.1, y: 0, z: 0 }, up: { x: 0, y: 0, z: 1 } },
-};
-const TURN = Math.PI / 18;
+const colours = new Map();
+export function colour(name) {
+  if (!colours.has(name)) colours.set(name, getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim());
+  return colours.get(name);
+}
+document.addEventListener("theme", () => colours.clear());
 
-export const columns = (points) => [0, 1, 2].map((axis) => points.map((point) => point && point[axis]));
-
-export function line(points, { name, width = 4, dash = "solid", ...more }) {
-  const [x, y, z] = columns(points);
-  return { type: "scatter3d", mode: "lines", x, y, z, name, line: { width, dash, color: colour(more.colour) }, hoverinfo: "name", ...more };
+function rgb(name) {
+  if (typeof name !== "string") return name;
+  const hex = name.startsWith("#") ? name : colour(name);
+  const digits = hex.length === 4 ? [...hex.slice(1)].map((one) => one + one) : hex.slice(1).match(/../g);
+  return digits.map((two) => parseInt(two, 16) / 255);
 }
 
+// The colour of a share on a scale: shares in ascending order, each with its colour.
+export function shade(scale, share) {
+  const after = Math.max(1, scale.findIndex(([at]) => at >= share));
+  const [[low, from], [high, to]] = [scale[after - 1], scale[after]];
+  const part = Math.min(1, Math.max(0, (share - low) / (high - low)));
+  const [a, b] = [rgb(from), rgb(to)];
+  return a.map((one, i) => one + part * (b[i] - one));
+}
+
+const LOOKS = { home: [-0.72, -1.85, 0.85], top: [0, -0.002, 2.1], front: [0, -2.1, 0], side: [2.1, 0, 0] };
+const TURN = Math.PI / 18;
+const VIEW = (40 * Math.PI) / 180; // the angle of view
+const GRAB_PX = 14;
+
+const flat = (points) => (ArrayBuffer.isView(points) ? points : Float32Array.from(points.flatMap((one) => one ?? [NaN, NaN, NaN])));
+
+// A line through points, [x, y, z] each, or all numbers in a Float32Array; null or NaN is a gap.
+export function line(points, { name, width = 2, dash = "solid", ...more }) {
+  return { kind: "line", points: flat(points), name, width, dash, ...more };
+}
+
+// Marks at points; `hover(i)` returns what is said of one beside its name, `picks[i]` what a click on it gives.
 export function dots(points, { name, size = 4, symbol = "circle", ...more }) {
-  const [x, y, z] = columns(points);
-  return {
-    type: "scatter3d", mode: "markers", x, y, z, name,
-    marker: { size, symbol, color: more.colour && colour(more.colour), ...more.marker },
-    hovertemplate: "%{x:.1f}, %{y:.1f}, %{z:.1f} mm<extra>%{fullData.name}</extra>",
-    ...Object.fromEntries(Object.entries(more).filter(([key]) => key !== "marker")),
-  };
+  return { kind: "dots", points: flat(points), name, size, symbol, ...more };
+}
+
+// Capsules: seven numbers each, both ends of the axis and the radius.
+export function bodies(segments, more) {
+  return { kind: "bodies", segments, ...more };
 }
 
 // The twelve edges of a grid world, at the outer faces of its cells; `place` moves a corner to the position of the box.
@@ -36,79 +56,298 @@ export function box(grid, place = (point) => point) {
   return edges.flatMap(([a, b]) => [at(a), at(b), null]);
 }
 
+const minus = (a, b) => a.map((one, i) => one - b[i]);
+const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+const unit = (a) => a.map((one) => one / Math.hypot(...a));
+
+// The box around the points of lines and marks, and around the axes of capsules of which `bounds` is true.
+function boundsOf(things) {
+  const [low, high] = [[Infinity, Infinity, Infinity], [-Infinity, -Infinity, -Infinity]];
+  for (const { kind, points, segments, bounds = kind !== "bodies" } of things) {
+    if (!bounds) continue;
+    const [values, width] = kind === "bodies" ? [segments, 7] : [points, 3];
+    for (let i = 0; i < values.length; i += 1) {
+      if (i % width === 6) continue;
+      const k = (i % width) % 3;
+      if (values[i] < low[k]) low[k] = values[i];
+      if (values[i] > high[k]) high[k] = values[i];
+    }
+  }
+  return Number.isFinite(low[0]) ? [low, high] : [[-50, -50, -50], [50, 50, 50]];
+}
+
 export class Scene {
-  // `traces` returns new traces at every call, so that they have the colours of the current theme.
-  constructor(traces, { frame, picked } = {}) {
+  // `traces` returns what to draw at every call; `picked` is called with what a click gives.
+  constructor(traces, { picked } = {}) {
     this.place = document.getElementById("view");
     this.traces = traces;
-    this.frame = frame;
-    this.drawn = this.draw(LOOKS.home).then(() => {
-      if (picked) this.place.on("plotly_click", ({ points }) => picked(points[0]));
-      this.listen();
-      this.place.dataset.drawn = "true";
-    });
+    this.eye = LOOKS.home;
+    this.shift = [0, 0, 0];
+    this.drawn = this.begin(picked);
     this.drawn.catch((failed) => say(this.place, `The view cannot be drawn: ${failed.message}. The numbers below are valid.`));
   }
 
-  draw(camera) {
-    const axis = (title) => ({
-      title: { text: `${title} (mm)`, font: { size: 12, color: colour("soft") } }, color: colour("soft"), showbackground: false,
-      gridcolor: colour("line"), zeroline: false, linecolor: colour("strong"), tickfont: { size: 10 }, showspikes: false, nticks: 7,
-    });
-    const layout = {
-      margin: { l: 0, r: 0, t: 0, b: 0 }, paper_bgcolor: colour("card"), font: { color: colour("ink"), family: "system-ui, sans-serif" },
-      showlegend: false, uirevision: "kept", hoverlabel: { bgcolor: colour("sunk"), font: { color: colour("ink") } },
-      scene: { xaxis: axis("x"), yaxis: axis("y"), zaxis: axis("z"), aspectmode: "data", uirevision: "kept", bgcolor: colour("card"),
-        ...(camera && { camera: { ...camera, center: { x: 0, y: 0, z: -0.08 } } }) },
-    };
-    return window.Plotly.react(this.place, this.traces(), layout, { displayModeBar: false, responsive: true, scrollZoom: true });
+  async begin(picked) {
+    [this.canvas, this.paper] = ["canvas", "canvas"].map((name) => document.createElement(name));
+    this.hint = document.createElement("p");
+    this.hint.className = "hint";
+    this.hint.hidden = true;
+    this.place.replaceChildren(this.canvas, this.paper, this.hint);
+    this.ink = this.paper.getContext("2d");
+    this.renderer = new Renderer(this.canvas, rgb);
+    new ResizeObserver(() => this.paint()).observe(this.place);
+    this.listen(picked);
+    this.redraw();
+    this.place.dataset.drawn = "true";
   }
 
+  // Take new things to draw; the view stays, and holds what was drawn first and everything that is larger.
   redraw() {
-    return this.draw(this.camera());
+    this.things = this.traces();
+    this.renderer.buffers.forEach((_, thing) => this.things.includes(thing) || (thing.changed = true));
+    const [low, high] = boundsOf(this.things);
+    this.bounds = this.bounds ? [this.bounds[0].map((one, i) => Math.min(one, low[i])), this.bounds[1].map((one, i) => Math.max(one, high[i]))] : [low, high];
+    this.paint();
+    return this.drawn;
   }
 
-  camera() {
-    const { eye, up } = this.place._fullLayout.scene._scene?.getCamera() ?? LOOKS.home;
-    return { eye, up };
+  // Draw before the next frame, once however often it is asked for.
+  paint() {
+    this.waiting ??= requestAnimationFrame(() => {
+      this.waiting = null;
+      this.paintNow();
+    });
   }
 
-  look(camera) {
-    this.place.dataset.eye = [camera.eye.x, camera.eye.y, camera.eye.z].map((one) => one.toFixed(3)).join(" ");
-    return window.Plotly.relayout(this.place, { "scene.camera": { ...camera, center: { x: 0, y: 0, z: -0.08 } } });
+  paintNow() {
+    const ratio = Math.min(2, window.devicePixelRatio || 1);
+    const [wide, high] = [this.place.clientWidth, this.place.clientHeight];
+    if (!wide || !high || !this.things) return;
+    for (const one of [this.canvas, this.paper]) {
+      if (one.width === Math.round(wide * ratio) && one.height === Math.round(high * ratio)) continue;
+      one.width = Math.round(wide * ratio);
+      one.height = Math.round(high * ratio);
+    }
+    this.draw(ratio);
+    this.place.dataset.painted = Number(this.place.dataset.painted ?? 0) + 1;
+  }
+
+  draw(ratio) {
+    const { canvas, ink, bounds: [low, high] } = this;
+    const aspect = canvas.width / canvas.height;
+    const reach = Math.max(10, Math.hypot(...minus(high, low)) / 2);
+    const middle = low.map((one, i) => (one + high[i]) / 2 + this.shift[i]);
+    const from = this.eye.map((one, i) => middle[i] + one * reach * 1.4 * Math.max(1, 1 / aspect));
+    const z = unit(minus(from, middle));
+    const x = unit(cross([0, 0, 1], z));
+    const y = cross(z, x);
+    const far = Math.hypot(...minus(from, middle));
+    const [near, end] = [far / 100, far + 40 * reach];
+    const f = 1 / Math.tan(VIEW / 2);
+    const view = [x.map((one) => (one * f) / aspect), y.map((one) => one * f), z.map((one) => (-one * (end + near)) / (end - near)), z.map((one) => -one)];
+    const last = view.map((row, i) => -dot(row, from) - (i === 2 ? (2 * end * near) / (end - near) : 0));
+    this.matrix = [0, 1, 2, 3].flatMap((column) => view.map((row, i) => (column === 3 ? last[i] : row[column])));
+    this.axes = { x, y, perPx: (2 * far * Math.tan(VIEW / 2)) / (canvas.height / ratio) };
+    const edges = this.frame(low, high, from);
+    for (const thing of [...this.things, ...edges.lines]) thing.mmPerPx = this.axes.perPx;
+    this.renderer.draw([...this.things, ...edges.lines], new Float32Array(this.matrix), unit(z.map((one, i) => one + 0.5 * y[i] - 0.3 * x[i])), ratio);
+    ink.setTransform(ratio, 0, 0, ratio, 0, 0);
+    ink.clearRect(0, 0, this.paper.width, this.paper.height);
+    this.write(edges.words, "11px system-ui, sans-serif", "soft");
+    for (const { text, points, colour: name } of this.things.filter((thing) => thing.text)) {
+      const words = text.map((one, i) => [one, points.subarray(3 * i, 3 * i + 3), 0, -12]);
+      this.write(words, "600 13px system-ui, sans-serif", name);
+    }
+  }
+
+  // Where a point is on the screen, in CSS pixels; null behind the camera.
+  at([x, y, z]) {
+    const m = this.matrix;
+    const w = m[3] * x + m[7] * y + m[11] * z + m[15];
+    if (!(w > 0)) return null;
+    const across = (m[0] * x + m[4] * y + m[8] * z + m[12]) / w;
+    const up = (m[1] * x + m[5] * y + m[9] * z + m[13]) / w;
+    return [((1 + across) / 2) * this.place.clientWidth, ((1 - up) / 2) * this.place.clientHeight];
+  }
+
+  write(words, font, name) {
+    this.ink.font = font;
+    this.ink.fillStyle = colour(name);
+    this.ink.textAlign = "center";
+    this.ink.textBaseline = "middle";
+    for (const [text, point, right, down] of words) {
+      const at = this.at(point);
+      if (at) this.ink.fillText(text, at[0] + right, at[1] + down);
+    }
+  }
+
+  // The floor as a grid, an upright, and their numbers, at the edges that are nearer to the camera.
+  frame(low, high, from) {
+    const widest = Math.max(...minus(high, low));
+    const step = [1, 2, 5, 10, 20, 50, 100, 200, 500].find((one) => widest / one <= 7) ?? 1000;
+    const ticks = [0, 1, 2].map((axis) => {
+      const found = [];
+      for (let one = Math.ceil(low[axis] / step) * step; one <= high[axis] + 1e-9; one += step) found.push(one);
+      return found;
+    });
+    const key = [low, high, step].join();
+    if (this.floor?.key !== key) {
+      const rows = ticks[0].flatMap((one) => [[one, low[1], low[2]], [one, high[1], low[2]], null]);
+      const columns = ticks[1].flatMap((one) => [[low[0], one, low[2]], [high[0], one, low[2]], null]);
+      this.floor = { key, lines: [line([...rows, ...columns], { colour: "line", width: 1, bounds: false }), null] };
+    }
+    const [front, beside] = [from[1] < (low[1] + high[1]) / 2 ? low[1] : high[1], from[0] < (low[0] + high[0]) / 2 ? low[0] : high[0]];
+    const away = (axis, at) => (at === low[axis] ? -1 : 1) * 0.045 * widest;
+    // The upright stands where the outline of the floor is furthest to the left.
+    const posts = [[low[0], low[1]], [low[0], high[1]], [high[0], low[1]], [high[0], high[1]]];
+    const left = posts.reduce((best, post) => ((this.at([...post, low[2]])?.[0] ?? 1e9) < (this.at([...best, low[2]])?.[0] ?? 1e9) ? post : best));
+    if (this.floor.post !== left.join()) this.floor.lines[1] = line([[...left, low[2]], [...left, high[2]]], { colour: "line", width: 1, bounds: false });
+    this.floor.post = left.join();
+    const tidy = (one) => String(Math.round(one * 100) / 100);
+    const middle = (axis) => (low[axis] + high[axis]) / 2;
+    const words = [];
+    const upright = this.eye[2] / Math.hypot(...this.eye) < 0.99;
+    if (Math.abs(this.eye[1]) > 0.25 * Math.hypot(...this.eye) || !upright) {
+      words.push(...ticks[0].map((one) => [tidy(one), [one, front + away(1, front), low[2]], 0, 3]), ["x (mm)", [middle(0), front + 2.2 * away(1, front), low[2]], 0, 6]);
+    }
+    if (Math.abs(this.eye[0]) > 0.25 * Math.hypot(...this.eye) || !upright) {
+      words.push(...ticks[1].map((one) => [tidy(one), [beside + away(0, beside), one, low[2]], 0, 3]), ["y (mm)", [beside + 2.2 * away(0, beside), middle(1), low[2]], 0, 6]);
+    }
+    if (upright) words.push(...ticks[2].slice(1).map((one) => [tidy(one), [...left, one], -20, 0]), ["z (mm)", [...left, high[2]], -8, -14]);
+    return { lines: this.floor.lines, words };
+  }
+
+  look(eye) {
+    this.eye = eye;
+    this.place.dataset.eye = eye.map((one) => one.toFixed(3)).join(" ");
+    this.paint();
   }
 
   turn(how) {
-    const { eye, up } = this.camera();
-    const far = Math.hypot(eye.x, eye.y, eye.z);
-    let [around, height, distance] = [Math.atan2(eye.y, eye.x), Math.asin(eye.z / far), far];
-    if (how === "left") around -= TURN;
-    if (how === "right") around += TURN;
-    if (how === "up") height = Math.min(height + TURN, 1.5);
-    if (how === "down") height = Math.max(height - TURN, -1.5);
-    if (how === "near") distance = Math.max(far / 1.2, 0.3);
-    if (how === "away") distance = Math.min(far * 1.2, 6);
-    const flat = Math.cos(height) * distance;
-    const upright = Math.abs(height) < 1.49 ? { x: 0, y: 0, z: 1 } : up;
-    this.look({ eye: { x: flat * Math.cos(around), y: flat * Math.sin(around), z: Math.sin(height) * distance }, up: upright });
+    const steps = { left: [-TURN, 0, 1], right: [TURN, 0, 1], up: [0, TURN, 1], down: [0, -TURN, 1], near: [0, 0, 1 / 1.2], away: [0, 0, 1.2] };
+    this.swing(...steps[how]);
   }
 
-  listen() {
+  swing(around, above, closer) {
+    const far = Math.hypot(...this.eye);
+    const height = Math.max(-1.57, Math.min(1.57, Math.asin(this.eye[2] / far) + above));
+    const angle = Math.atan2(this.eye[1], this.eye[0]) + around;
+    const distance = Math.max(0.1, Math.min(8, far * closer));
+    this.look([distance * Math.cos(height) * Math.cos(angle), distance * Math.cos(height) * Math.sin(angle), distance * Math.sin(height)]);
+  }
+
+  reset(eye) {
+    this.shift = [0, 0, 0];
+    this.bounds = boundsOf(this.things);
+    this.look(eye);
+  }
+
+  listen(picked) {
     const keys = { ArrowLeft: "left", ArrowRight: "right", ArrowUp: "up", ArrowDown: "down", "+": "near", "=": "near", "-": "away" };
     this.place.addEventListener("keydown", (event) => {
       if (event.ctrlKey || event.metaKey || event.altKey) return;
-      if (event.key === "0") this.look(LOOKS.home);
+      if (event.key === "0") this.reset(LOOKS.home);
       else if (keys[event.key]) this.turn(keys[event.key]);
       else return;
       event.preventDefault();
+      event.stopPropagation();
     });
     this.place.closest(".scene").addEventListener("click", (event) => {
       const { look, turn, save } = event.target.closest("button")?.dataset ?? {};
-      if (look) this.look(LOOKS[look]);
+      if (look) this.reset(LOOKS[look]);
       if (turn) this.turn(turn);
-      if (save !== undefined) window.Plotly.downloadImage(this.place, { format: "png", width: 1600, height: 1000, filename: "style" });
+      if (save !== undefined) this.save();
     });
+    this.place.addEventListener("wheel", (event) => {
+      event.preventDefault();
+      this.swing(0, 0, Math.exp(Math.max(-100, Math.min(100, event.deltaY)) / 400));
+    }, { passive: false });
+    this.drag(picked);
     document.addEventListener("theme", () => this.redraw());
+  }
+
+  // One pointer turns, with shift or the right button it moves; two zoom. A press without a drag picks.
+  drag(picked) {
+    const held = new Map();
+    let moved = 0;
+    this.place.addEventListener("contextmenu", (event) => event.preventDefault());
+    this.place.addEventListener("pointerdown", (event) => {
+      held.set(event.pointerId, [event.clientX, event.clientY]);
+      this.place.setPointerCapture(event.pointerId);
+      moved = 0;
+    });
+    this.place.addEventListener("pointermove", (event) => {
+      const before = held.get(event.pointerId);
+      if (!before) return this.tell(event);
+      const now = [event.clientX, event.clientY];
+      const [right, down] = minus(now, before);
+      moved += Math.abs(right) + Math.abs(down);
+      const other = [...held].find(([id]) => id !== event.pointerId)?.[1];
+      if (other) this.swing(0, 0, Math.hypot(...minus(before, other)) / Math.max(1, Math.hypot(...minus(now, other))));
+      else if (event.shiftKey || event.buttons === 2) this.move(right, down);
+      else this.swing(-right / 150, down / 150, 1);
+      held.set(event.pointerId, now);
+    });
+    const end = (event) => {
+      if (held.delete(event.pointerId) && picked && moved < 4 && event.type === "pointerup") {
+        const found = this.nearest(event, (thing) => thing.picks);
+        if (found) picked(found.thing.picks[found.i]);
+      }
+    };
+    this.place.addEventListener("pointerup", end);
+    this.place.addEventListener("pointercancel", end);
+    this.place.addEventListener("pointerleave", () => (this.hint.hidden = true));
+  }
+
+  move(right, down) {
+    const { x, y, perPx } = this.axes;
+    this.shift = this.shift.map((one, i) => one - perPx * (right * x[i] - down * y[i]));
+    this.paint();
+  }
+
+  // The nearest point on the screen of the things that fit.
+  nearest(event, fits) {
+    const frame = this.place.getBoundingClientRect();
+    const [u, v] = [event.clientX - frame.left, event.clientY - frame.top];
+    let best = null;
+    for (const thing of this.things) {
+      if (!thing.points || !fits(thing)) continue;
+      for (let i = 0; i < thing.points.length / 3; i += 1) {
+        const at = this.at(thing.points.subarray(3 * i, 3 * i + 3));
+        const far = at ? Math.hypot(at[0] - u, at[1] - v) : Infinity;
+        if (far < (best?.far ?? GRAB_PX)) best = { thing, i, far, at };
+      }
+    }
+    return best;
+  }
+
+  tell(event) {
+    const found = event.pointerType === "mouse" && this.nearest(event, (thing) => thing.name && thing.hover !== null);
+    this.hint.hidden = !found;
+    if (!found) return;
+    const { thing, i, at } = found;
+    const place = [...thing.points.subarray(3 * i, 3 * i + 3)].map((one) => one.toFixed(1)).join(", ");
+    this.hint.textContent = [thing.name, `${place} mm`, thing.hover?.(i)].filter(Boolean).join("\n");
+    this.hint.style.left = `${Math.min(at[0] + 12, this.place.clientWidth - this.hint.offsetWidth)}px`;
+    this.hint.style.top = `${Math.max(0, at[1] - this.hint.offsetHeight - 6)}px`;
+  }
+
+  save() {
+    this.paintNow();
+    const whole = document.createElement("canvas");
+    [whole.width, whole.height] = [this.canvas.width, this.canvas.height];
+    const ink = whole.getContext("2d");
+    ink.fillStyle = colour("card");
+    ink.fillRect(0, 0, whole.width, whole.height);
+    for (const one of [this.canvas, this.paper]) ink.drawImage(one, 0, 0);
+    whole.toBlob((picture) => {
+      const link = document.createElement("a");
+      link.href = URL.createObjectURL(picture);
+      link.download = "view.png";
+      link.click();
+      setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
+    });
   }
 }
 
@@ -139,6 +378,7 @@ function mark(svg, { shape, colour: name }) {
     cells: '<path d="M2 6h4v4h-4zM11 6h4v4h-4zM20 6h4v4h-4z" fill-opacity=".6"/>',
     box: '<path d="M3 13v-9h15v9zM3 4l5-3h15v9l-5 3M18 4l5-3" fill="none" stroke-width="1.2"/>',
     ends: '<path d="M7 3l5 5-5 5-5-5z"/><path d="M19 3v10M14 8h10" stroke-width="2.4"/>',
+    body: '<path d="M5 8h16" stroke-width="9" stroke-linecap="round"/>',
   };
   svg.innerHTML = shapes[shape];
   const paint = () => {
@@ -148,5 +388,3 @@ function mark(svg, { shape, colour: name }) {
   paint();
   document.addEventListener("theme", paint);
 }
-
-export { colour };

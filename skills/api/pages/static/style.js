@@ -1,6 +1,6 @@
 // The 3-D view of a style: the recorded motion, its path in the grid, and the learnt policy, by layers.
 import { call } from "./api.js";
-import { Scene, box, colour, dots, layerList, line } from "./scene.js";
+import { Scene, box, dots, layerList, line, shade } from "./scene.js";
 import { say } from "./site.js";
 
 const place = document.getElementById("style");
@@ -32,7 +32,7 @@ try {
   if (!version) for (const id of ["learnt", "starts"]) layers.splice(layers.findIndex((one) => one.id === id), 1);
   layerList(get("layers"), layers, () => scene.redraw());
   if (version) prepareStarts();
-  scene = new Scene(traces, { frame: view.frame, picked });
+  scene = new Scene(traces, { picked: (at) => follow([...at]) });
   await scene.drawn;
   if (version) await follow(view.path_mm[0], "the demonstrated start");
 } catch (problem) {
@@ -42,10 +42,10 @@ try {
 function traces() {
   const on = Object.fromEntries(layers.map((layer) => [layer.id, layer.on]));
   const drawn = [];
-  if (on.box) drawn.push(line(box(view.grid), { name: "the grid world", colour: "box", width: 1.5, hoverinfo: "skip" }));
+  if (on.box) drawn.push(line(box(view.grid), { colour: "box", width: 1 }));
   if (on.starts) drawn.push(...starts());
   if (on.rewards) drawn.push(rewards());
-  if (on.recorded) drawn.push(line(view.recorded_mm, { name: "recorded", colour: "recorded", width: 4 }));
+  if (on.recorded) drawn.push(line(view.recorded_mm, { name: "recorded", colour: "recorded", width: 2.5 }));
   if (on.path) drawn.push(...path());
   if (on.learnt) drawn.push(...followed.flatMap(learnt));
   if (on.ends) drawn.push(...ends());
@@ -54,7 +54,7 @@ function traces() {
 
 function path() {
   return [
-    line(view.path_mm, { name: "path in the grid", colour: "path", width: 6 }),
+    line(view.path_mm, { colour: "path", width: 3.5 }),
     dots(view.path_mm, { name: "path in the grid", colour: "path", symbol: "square", size: 3.5 }),
   ];
 }
@@ -69,15 +69,15 @@ function ends() {
 
 function rewards() {
   const { at_mm: at, of, goal } = view.rewards;
-  const marker = { size: of.map((value) => (value === goal ? 18 : 9)), opacity: 0.55 };
-  return dots(at, { name: "reward", colour: "reward", marker, text: of.map((value) => `reward ${value}`), hovertemplate: "%{x:.1f}, %{y:.1f}, %{z:.1f} mm<br>%{text}<extra></extra>" });
+  const size = of.map((value) => (value === goal ? 9 : 5));
+  return dots(at, { name: "reward", colour: "reward", size, opacity: 0.55, hover: (i) => `reward ${of[i]}` });
 }
 
 function learnt({ path_mm: points, number }) {
   const [name, dash] = WAYS[(number - 1) % WAYS.length];
   return [
-    line(points, { name: `learnt path ${number}`, colour: name, width: 7, dash }),
-    dots([points[0]], { name: `start ${number}`, colour: name, size: 6, symbol: "diamond-open", mode: "markers+text", text: [`${number}`], textposition: "top center", textfont: { size: 13, color: colour(name) } }),
+    line(points, { name: `learnt path ${number}`, colour: name, width: 4, dash }),
+    dots([points[0]], { name: `start ${number}`, colour: name, size: 6, symbol: "diamond-open", text: [`${number}`] }),
   ];
 }
 
@@ -94,20 +94,20 @@ function starts() {
   const some = (wanted) => shown.filter(wanted);
   const narrow = get("view").clientWidth < 500;
   const size = height !== undefined ? 6 : narrow ? 1.6 : 2.6;
-  const told = (which, name, marker) => dots(which.map((i) => at[i]), {
-    name, marker: { size, opacity: height === undefined ? 0.4 : 0.9, line: { width: 0 }, ...marker }, customdata: which.map((i) => [at[i], moves[i], percent(share[i])]),
-    hovertemplate: "%{x:.1f}, %{y:.1f}, %{z:.1f} mm<br>%{customdata[2]} of the demonstration<br>%{customdata[1]} moves to the goal<extra>%{fullData.name}</extra>", legendgroup: "starts",
+  const told = (which, name, look) => dots(which.map((i) => at[i]), {
+    name, size, opacity: height === undefined ? 0.4 : 0.9, ...look, picks: which.map((i) => at[i]),
+    hover: (i) => `${percent(share[which[i]])} of the demonstration\n${moves[which[i]]} moves to the goal`,
   });
-  const lost = told(some((i) => !reaches[i]), "does not reach the goal", { color: colour("learnt"), symbol: "x", opacity: 1, size: 4 });
+  const lost = told(some((i) => !reaches[i]), "does not reach the goal", { colour: "learnt", symbol: "x", opacity: 1, size: 4 });
   const by = get("starts-of").value;
   if (by !== "kind") {
     const covered = some((i) => reaches[i]);
     const [value, most] = by === "share" ? [share, 1] : [moves, Math.max(1, ...moves)];
-    return [told(covered, "reaches the goal", { color: covered.map((i) => value[i]), colorscale: scale(), cmin: 0, cmax: most, symbol: "square" }), lost];
+    return [told(covered, "reaches the goal", { colours: covered.map((i) => shade(scale(), value[i] / most)), symbol: "square" }), lost];
   }
   return [
-    told(some((i) => reaches[i] && nearest[i]), "joins in the fewest moves", { color: colour("path"), symbol: "square" }),
-    told(some((i) => reaches[i] && !nearest[i]), "takes a longer way", { color: colour("reward"), symbol: "diamond", opacity: 0.8 }),
+    told(some((i) => reaches[i] && nearest[i]), "joins in the fewest moves", { colour: "path", symbol: "square" }),
+    told(some((i) => reaches[i] && !nearest[i]), "takes a longer way", { colour: "reward", symbol: "diamond", opacity: 0.8 }),
     lost,
   ];
 }
@@ -142,11 +142,6 @@ function prepareStarts() {
     const form = new FormData(event.target);
     follow(["x", "y", "z"].map((axis) => Number(form.get(axis))));
   });
-}
-
-function picked(point) {
-  const at = point.customdata?.[0];
-  if (at) follow(at);
 }
 
 async function follow(start_mm, words) {

@@ -1,0 +1,135 @@
+"""Timelines of what is stored: recordings, demonstrations, policy versions and plans, and which of them to compare.
+
+A timeline is computed at each request and stored nowhere; what takes long, the decoding of a recording, is cached with
+the recording (`skills.library.recordings`). What may be seen is what a reader may see of the same resource in another
+form: the path of a demonstration, the trajectory of a plan. A file of it is an export.
+"""
+
+from collections.abc import Sequence
+from typing import Any, Literal, NamedTuple
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from skills.db.models import Demonstration, Plan, PolicyVersion, RecordingSurgeon, StoredPlayback, Surgeon
+from skills.db.row_visibility import EVERYBODYS
+from skills.db.session import Database
+from skills.errors import Conflict
+from skills.library import consent, policies
+from skills.library.demos import exported_recording, find_demo
+from skills.library.plans import find_plan, motion_of, trajectory_of
+from skills.library.pose_styles import poses_of
+from skills.library.recordings import Teller, find_recording, stored_recording
+from skills.verification.timeline import Timeline
+from skills.verification.timelines import (
+    timeline_of_demo,
+    timeline_of_path,
+    timeline_of_plan,
+    timeline_of_recording,
+)
+
+Source = Literal["recordings", "demos", "policy-versions", "plans"]
+MOST_CHOICES = 50
+
+
+def timeline_of(database: Database, source: Source, sha256: str, tell: Teller) -> Timeline:
+    """Return the timeline of a resource; no transaction is open while it is computed.
+
+    Raises:
+        NotFound: There is no such resource, or the policy version has no pose style.
+        Conflict: The surgeon's consent does not cover training, for a policy version or a plan.
+        Corrupt: What is stored does not match its digest.
+    """
+    if source == "recordings":
+        return timeline_of_recording(stored_recording(database, sha256, tell).recording)
+    if source == "demos":
+        with database.reading() as session:
+            found = find_demo(session, sha256)
+            demo, recording = found.demo, found.recording.sha256
+        return timeline_of_demo(stored_recording(database, recording, tell).recording, demo)
+    if source == "policy-versions":
+        with database.reading() as session:
+            poses = poses_of(policies.followable(policies.find_by_digest(session, sha256)))
+        return timeline_of_path(poses.path, arm=poses.arm, frame=poses.frame)
+    with database.reading() as session:
+        plan = find_plan(session, sha256)
+        motion = motion_of(session, sha256)
+        newest = select(StoredPlayback).where(StoredPlayback.plan_row == plan.row)
+        played = session.scalar(newest.order_by(StoredPlayback.row.desc()).limit(1))
+        measured, report = (None, {}) if played is None else (played.measured, played.report)
+    under = report.get("doubt", {}).get("under", [])
+    odds = {number: one["succeeds"]["probability"] for number, one in enumerate(under[0]["passes"])} if under else {}
+    return timeline_of_plan(trajectory_of(motion), arm=motion.arm, frame=motion.frame, played=measured, odds=odds)
+
+
+def check_export(session: Session, source: Source, sha256: str) -> None:
+    """Refuse a file of a recorded motion that a surgeon's consent does not cover; others are checked as they are read.
+
+    Raises:
+        Conflict: The consent of a surgeon in the recording does not cover an export.
+    """
+    if source == "demos":
+        exported_recording(session, sha256)
+    if source == "recordings":
+        row = find_recording(session, sha256).row
+        cut = select(Demonstration.surgeon_row).where(Demonstration.recording_row == row)
+        named = select(RecordingSurgeon.surgeon_row).where(RecordingSurgeon.recording_row == row)
+        theirs = select(Surgeon).where(Surgeon.row.in_(cut) | Surgeon.row.in_(named))
+        if not all(consent.may(one, "export") for one in session.scalars(theirs, execution_options=EVERYBODYS)):
+            raise Conflict("The recording contains a surgeon whose consent does not cover an export.")
+
+
+class Choice(NamedTuple):
+    """A resource with a timeline, and its name on a page."""
+
+    source: Source
+    sha256: str
+    name: str
+
+
+def chosen(session: Session, source: Source, sha256: str) -> tuple[Choice, Sequence[Choice]]:
+    """Return a resource under its name, and those to play beside it: of the same suture type, its own surgeon's first.
+
+    Raises:
+        NotFound: There is no such resource.
+    """
+    if source == "recordings":
+        recording = find_recording(session, sha256)
+        cut = select(Demonstration).where(Demonstration.recording_row == recording.row)
+        demos = session.scalars(cut.order_by(Demonstration.start_s).limit(MOST_CHOICES)).all()
+        return Choice(source, sha256, f"Recording {sha256[:12]}"), [_demo(one) for one in demos]
+    if source == "demos":
+        found = find_demo(session, sha256)
+        here, surgeon_row, suture = _demo(found), found.surgeon_row, found.suture
+    elif source == "policy-versions":
+        version = policies.find_by_digest(session, sha256)
+        here, surgeon_row, suture = _path(version), version.surgeon_row, version.suture
+    else:
+        plan = find_plan(session, sha256)
+        here, surgeon_row, suture = _plan(plan), plan.policy.surgeon_row, plan.policy.suture
+    others = [_demo(one) for one in _newest(session, Demonstration, suture, surgeon_row)]
+    others += [_path(one) for one in _newest(session, PolicyVersion, suture, surgeon_row) if one.poses is not None]
+    of = select(Plan).join(PolicyVersion).where(PolicyVersion.suture == suture).order_by(Plan.row.desc())
+    others += [_plan(one) for one in session.scalars(of.limit(MOST_CHOICES))]
+    return here, [one for one in others if one != here]
+
+
+def _newest(
+    session: Session, of: type[Demonstration] | type[PolicyVersion], suture: str, surgeon_row: int
+) -> Sequence[Any]:
+    query = select(of).where(of.suture == suture).order_by(of.surgeon_row != surgeon_row, of.row.desc())
+    if of is Demonstration:
+        query = query.where(Demonstration.withdrawn_at.is_(None))
+    return session.scalars(query.limit(MOST_CHOICES)).all()
+
+
+def _demo(row: Demonstration) -> Choice:
+    return Choice("demos", row.sha256, f"{row.surgeon.slug}, demonstration {row.sha256[:8]}")
+
+
+def _path(row: PolicyVersion) -> Choice:
+    return Choice("policy-versions", row.sha256, f"{row.surgeon.slug}, learnt path of version {row.version}")
+
+
+def _plan(row: Plan) -> Choice:
+    return Choice("plans", row.sha256, f"{row.policy.surgeon.slug}, plan {row.sha256[:8]}")
