@@ -62,8 +62,8 @@ function path() {
 function ends() {
   const [first, last] = [view.path_mm[0], view.path_mm.at(-1)];
   return [
-    dots([first], { name: "start", colour: "start", symbol: "diamond", size: 7 }),
-    dots([last], { name: "goal: the hand-off", colour: "goal", symbol: "cross", size: 7 }),
+    dots([first], { name: "start", colour: "start", symbol: "diamond", size: 9 }),
+    dots([last], { name: "goal: the hand-off", colour: "goal", symbol: "cross", size: 9 }),
   ];
 }
 
