@@ -50,7 +50,7 @@ from skills.remedies import Remedy
 from skills.schemas.requests import DemoIn, PlanIn, SuturePointIn, TrainingIn
 from skills.schemas.tries import Choice, StepName, TryIn, TryStep
 from skills.settings import Settings
-from skills.verification.verdict import SCENE
+from skills.verification.gates import SCENE
 
 TRY = "try"
 CELLS_MM = (paper.CELL_MM, 4.0, 3.0, 2.5, 2.0, 1.5, 1.0)  # ours, from the paper's to what a recording can resolve

@@ -28,9 +28,9 @@ from skills.planning.motion_laws import PHASES
 from skills.planning.trajectory import Trajectory
 from skills.verification.bodies import Parts, between, names_of, parts_of, radii_of
 from skills.verification.clearance import FINGER_MM
+from skills.verification.gates import Limits
 from skills.verification.playback import PSM_A, PSM_M, Playback
 from skills.verification.timeline import ArmTrack, Kind, Stage, Timeline, Trace
-from skills.verification.verdict import Limits
 
 RATE_HZ = 200.0  # ours: faster samples of a hand are not visible
 MOST_ROWS = 24_000  # ours: two minutes at that rate, 4 MB for two arms with joints; longer motions get a lower rate
