@@ -52,8 +52,8 @@ def test_a_needle_handed_over_as_planned_is_held_and_hardly_slips():
     [
         elsewhere((0, 0, -5)),  # 5 mm short: the needle is beyond the tips
         elsewhere((0, 7, 0)),  # beside the open finger
-        elsewhere((9, 0, 0)),  # beyond the end of the needle, or where it runs into the fingers
-        elsewhere(axis=0, angle_deg=90),
+        pytest.param(elsewhere((9, 0, 0)), marks=pytest.mark.nightly),  # where the needle does not pass the fingers
+        pytest.param(elsewhere(axis=0, angle_deg=90), marks=pytest.mark.nightly),
         elsewhere(axis=2, angle_deg=90),  # the needle lies from finger to finger
     ],
     ids=["short", "aside", "along", "turned about the hinge", "turned about the approach"],
@@ -184,7 +184,7 @@ def caught_at(trajectory, errors, settings: DoubtSettings) -> float:
 
 
 def test_a_plan_is_not_called_likelier_than_the_referee_finds_it():
-    (found,) = refereed(plans=(0, 0, 1, 0), trials=8)
+    (found,) = refereed(plans=(0, 0, 1, 0), trials=4)
     assert not found.too_hopeful and found.only_closed_form == 0
 
 
