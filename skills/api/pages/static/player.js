@@ -121,7 +121,7 @@ function stage(motions) {
       still.push({ layer: "marks", thing: dots(trail.slice(first, first + 3), { colour: "start", symbol: "diamond", size: 6, name: `start of ${name}` }) });
       still.push({ layer: "marks", thing: dots(trail.slice(last, last + 3), { colour: "goal", symbol: "cross", size: 6, name: `end of ${name}` }) });
     }
-    const jaws = bodies(new Float32Array(7), { colour });
+    const jaws = bodies(new Float32Array(7), { colour, bounds: true });
     const shaft = bodies(new Float32Array(7), { colour: "box" });
     const arms = bodies(new Float32Array(7), { colour: "box", opacity: 0.35, bounds: true });
     moving.push({ motion, arm, rows, seen, jaws, shaft, arms });
