@@ -5,15 +5,14 @@ Two arms of either generation, their joints anywhere within the published limits
 along the line between the remote centres, to where the nearest parts are within 2 mm of contact.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
 
 from skills.kinematics import instrument_of, matrix_of
-from skills.verification.bodies import Parts, between, bodies_clearance, distances_at, parts_of, radii_of
+from skills.verification.bodies import Parts, between, parts_of, radii_of
 from tests.needs import need
-from tests.verification.hands import sound_plans
 
 need("fcl")
 
@@ -109,49 +108,3 @@ def test_two_thousand_set_ups_collide_where_a_collision_library_says_so():
     collide, near = compare(range(2000))
     assert collide >= 600
     assert near >= 300
-
-
-def planned_set_ups(count: int) -> list[tuple[SetUp, float]]:
-    """Return planned motions at the sample where the arms are nearest, with PSM_M's base moved along a line to there.
-
-    Each comes with the least distance that `bodies_clearance` finds along the whole motion.
-    """
-    rng, found = np.random.default_rng(7), []
-    for one in sound_plans(11, 40 * count):
-        motion = one.trajectory
-        if motion.psm_m is None:
-            continue
-        wanted = float(rng.uniform(-NEAR_MM, NEAR_MM)) if len(found) % 2 else float(rng.uniform(-40.0, 60.0))
-        away = np.array(motion.psm_m.base_mm) * [1, 1, 0]
-        near, far = -1.0, 3.0
-        # PSM_A and PSM_M's joints stay; the base that the motion is judged with is moved
-        for _ in range(30):
-            share = (near + far) / 2
-            moved = replace(motion, psm_m=replace(motion.psm_m, base_mm=motion.psm_m.base_mm + share * away))
-            least = distances_at(moved, np.arange(0, len(moved), 25)).min()
-            near, far = (share, far) if least < wanted else (near, share)
-        apart = distances_at(moved, np.arange(len(moved))).min(axis=(1, 2))
-        at = int(apart.argmin())
-        m = moved.psm_m
-        parts = parts_of(moved.joints[[at]], moved.instrument), parts_of(m.joints[[at]], m.instrument)
-        placed = parts[1].seen_from(matrix_of(m.base_xyzw[None])[0], m.base_mm)
-        set_up = SetUp((parts[0], placed), (radii_of(moved.instrument), radii_of(m.instrument)), float(apart[at]))
-        found.append((set_up, bodies_clearance(moved, 2.0).report.at_least_mm))
-        if len(found) == count:
-            return found
-    raise AssertionError
-
-
-@pytest.mark.nightly
-def test_sixty_planned_motions_collide_where_a_collision_library_says_so():
-    """The least distance of a whole planned motion decides as the library does at the sample where it is."""
-    found = planned_set_ups(60)
-    theirs = np.array([touches(one) for one, _ in found])
-    ours = np.array([one.least_mm for one, _ in found])
-    bounds = np.array([bound for _, bound in found])
-    assert (bounds <= ours + 1e-9).all()
-    clear = np.abs(ours) > IN_DOUBT_MM
-    assert (theirs == (ours <= 0))[clear].all()
-    assert not (theirs & (ours > 1e-6)).any()
-    assert np.count_nonzero(theirs) >= 18
-    assert np.count_nonzero(np.abs(ours) <= NEAR_MM) >= 20
