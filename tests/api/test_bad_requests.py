@@ -25,6 +25,10 @@ SOUND: dict[tuple[str, str], Any] = {
         **KESTREL, "demos": ["0" * 64], "combine": {"kind": "medoid"}, "seed": 0, "release": True,
         "learner": {"kind": "phase-q-learning", "alpha": 1.0, "gamma": 0.1, "max_steps": 1},
     },
+    ("POST", "/tries"): {
+        **KESTREL, "recording": "0" * 64, "segment": 1, "loss_mm": 2.6, "cell_mm": 5.0, "hysteresis": 0.25,
+        "release": False, "tissue_mm": -165.0, "errors": "calibrated",
+    },
     ("POST", "/retrainings"): {
         **KESTREL, "only_stale": False, "release": False, "learner": {"kind": "phase-q-learning", "alpha": 1.0},
     },
@@ -243,7 +247,7 @@ def lists() -> list[str]:
 
 
 def test_no_limit_and_no_cursor_is_ours_to_blame(still: Service, untouched: None):
-    assert len(lists()) == 9
+    assert len(lists()) == 10
     for path in lists():
         for name, values in (("limit", LIMITS), ("cursor", CURSORS)):
             for value in values:
