@@ -426,8 +426,12 @@ def _leave(_signal: int, _frame: FrameType | None) -> None:
 
 
 def _load(settings: Settings, key: str) -> None:
-    """Load the samples and train them, over HTTP."""
-    with Client(f"http://{settings.host}:{settings.port}", api_key=key) as client:
-        for demo in load_samples(client):
-            client.train(demo.surgeon, demo.suture, release=True)
-    print("The samples are loaded.", flush=True)
+    """Load the samples and train them, over HTTP; print what came of it."""
+    try:
+        with Client(f"http://{settings.host}:{settings.port}", api_key=key) as client:
+            for demo in load_samples(client):
+                client.train(demo.surgeon, demo.suture, release=True)
+    except SkillsError as error:
+        print(f"The samples are not loaded: {error}", flush=True)
+    else:
+        print("The samples are loaded.", flush=True)

@@ -20,6 +20,7 @@ from skills.errors import NotReady
 from skills.jobs.readiness import refuse_left_over, refuse_unready
 from skills.sandbox.containment import LAYERS
 from skills.sandbox.forked import layers_held
+from skills.serving import _load
 from skills.settings import Settings
 from tests import backends
 from tests.api.conformance import conformance
@@ -90,6 +91,17 @@ def test_a_signing_key_that_is_missing_or_unreadable_is_named(installation: Sett
         problem = assert_problem(service.http.get("/readyz"), 503, "not-ready")
     assert "signing.key is missing" in problem["detail"]
     assert "SKILLS_SIGNING_KEY" in problem["detail"]
+
+
+def test_samples_that_cannot_be_loaded_are_told_in_a_sentence(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    def refuse(_client: object) -> None:
+        raise NotReady("The signing key is missing.")
+
+    monkeypatch.setattr("skills.serving.load_samples", refuse)  # only a service that was damaged refuses them
+    _load(Settings(), "")
+    assert capsys.readouterr().out == "The samples are not loaded: The signing key is missing.\n"
 
 
 def test_what_is_not_ready_is_a_problem_with_a_name(service: Service):

@@ -147,6 +147,12 @@ def test_an_empty_service_says_how_to_begin(service: Service) -> None:
         page_of(service, path)
 
 
+def test_a_dropped_recording_belongs_to_nobody_until_its_surgeon_is_named(told: Service, service: Service) -> None:
+    for one, suggested in ((told, ""), (service, "surgeon-1")):  # a service without surgeons cannot mistake them
+        fields = [about for _, about in Html(one.http.get("/").text).tags if about.get("id") == "try-surgeon"]
+        assert [about["value"] for about in fields] == [suggested]
+
+
 def test_what_is_not_there_is_said_on_a_page(told: Service) -> None:
     for path in (
         "/pages/styles/nobody/simple-running",
