@@ -5,7 +5,7 @@
 
 A version names all that it follows from: demonstrations, learner, settings, seed, and the versions of learner and gate.
 Another version of either may give another result without anybody having changed anything, so that is left out, with
-the reason. Nothing is stored.
+the reason; likewise a version whose row has other demonstrations than its manifest. Nothing is stored.
 """
 
 import tempfile
@@ -68,9 +68,7 @@ def compute_again(database: Database, row: int) -> Again:
     """
     with database.reading() as session:
         version = _found(session, row)
-        if (other := _other_learner(version)) is not None:
-            return Again(left_out=f"{other}, its certificate was not computed again")
-        if (other := _other_gate(version)) is not None:
+        if (other := _other_learner(version) or _other_demos(version) or _other_gate(version)) is not None:
             return Again(left_out=f"{other}, its certificate was not computed again")
         stored, found = _Stored.of(version), lessons(session, [one.row for one in version.demonstrations])
     lesson = stored.lesson(found)
@@ -92,7 +90,7 @@ def learn_again(database: Database, row: int, recordings: "Recordings", settings
     """
     with database.reading() as session:
         version = _found(session, row)
-        if (other := _other_learner(version)) is not None:
+        if (other := _other_learner(version) or _other_demos(version)) is not None:
             return Again(left_out=f"{other}, not learnt again")
         stored, gate = _Stored.of(version), _other_gate(version)
         if stored.policy.network is not None:
@@ -248,6 +246,13 @@ def _other_learner(version: PolicyVersion) -> str | None:
     made = version.manifest["learner_version"]
     age = "an older" if made < LEARNER_VERSION else "a newer"
     return None if made == LEARNER_VERSION else f"made by {age} learner (version {made}, now {LEARNER_VERSION})"
+
+
+def _other_demos(version: PolicyVersion) -> str | None:
+    """Return that the row has other demonstrations than its manifest, which `verify` reports with the row."""
+    if version.manifest["demos"] == [one.sha256 for one in version.demonstrations]:
+        return None
+    return "stored with other demonstrations than its manifest names"
 
 
 def _unequal(stored: dict[str, Any], made: dict[str, Any], prefix: str = "") -> Iterable[str]:

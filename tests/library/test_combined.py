@@ -11,13 +11,14 @@ from skills.db.models import Demonstration, PolicyDemonstration, PolicyVersion, 
 from skills.db.packed import digest
 from skills.db.session import Database
 from skills.errors import BadInput, Conflict, NotFound
+from skills.formats.reader_process import read_told
 from skills.learning.evaluation import dtw
 from skills.library import training
 from skills.library.backup import back_up, restore
 from skills.library.cards import card_of
 from skills.library.demos import upload_demo, withdraw_demo
 from skills.library.erasure import erase_demo, erase_surgeon
-from skills.library.inspection import inspect_installation
+from skills.library.inspection import inspect_installation, inspect_policies
 from skills.library.integrity import learnt
 from skills.library.overview import matrix
 from skills.library.plans import hand_of, trajectory_of
@@ -234,6 +235,13 @@ def test_others_than_its_own_demonstrations_are_found(database: Database):
         "it was learnt from another demonstration",
         "its path differs from that of its demonstration",
     ]
+    other = "stored with other demonstrations than its manifest names"
+    relearn = Settings(database_url=database.url)
+    parts = {part.what: part.left_out for part in inspect_policies(database, read_told, relearn)}
+    assert parts == {
+        "policies learnt again": [("policy_versions 1", f"{other}, not learnt again")],
+        "certificates": [("policy_versions 1", f"{other}, its certificate was not computed again")],
+    }
 
 
 @pytest.mark.nightly  # by day other restores

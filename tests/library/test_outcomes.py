@@ -357,7 +357,7 @@ def test_a_failure_is_compared_only_if_named_and_in_no_percentile(database: Data
     cases.add_surgeon(database, "plover", skill_level="novice")
     cases.add_surgeon(database, "wren", skill_level="novice")
     for number in range(LEAST_DEMOS):
-        cases.add_demo(database, cases.hand_off((0.0, 0.5 * number, 0.0)), ("plover", "wren")[number % 2])
+        cases.add_demo(database, cases.hand_off((0.0, 0.5 * (number + 1), 0.0)), ("plover", "wren")[number % 2])
     fell = cases.add_demo(database, cases.hand_off((0.0, 4.0, 0.0)), "wren")
     for demos in (LEAST_DEMOS + 1, LEAST_DEMOS):
         levels = score(database, ScoreIn(**asked), read_told).percentiles
