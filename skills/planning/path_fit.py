@@ -16,8 +16,8 @@ has the surgeon's actual place in each cell. All of this is ours; the paper driv
 * The *clock* of a path tells when the hand was where: times in the demonstration, and the index of the path's point at
   each, with a fraction. So orientation, jaw and tempo can be those of the hand (`skills.planning.hand`). What comes
   before the demonstration is joined was not demonstrated, and takes no time on this clock.
-* The path is the smoothest sequence of points near the guide, each in the cell of its visit, or with hysteresis as far
-  outside of it as the recording may be (`GridWorld.cells_along`):
+* The path is the smoothest sequence of points near the guide, each in the grid and in the cell of its visit. With
+  hysteresis a point may be as far outside of that cell as the recording may be (`GridWorld.cells_along`):
 
       minimise  sum |x_i - guide_i|^2 + STIFFNESS sum |x_(i-1) - 2 x_i + x_(i+1)|^2,  x_i in its cell, ends held
 
@@ -78,7 +78,7 @@ class Trace:
 
 @dataclass(frozen=True, eq=False)
 class FittedPath:
-    """A smooth path, each point in the cell of its visit, as far as hysteresis lets it.
+    """A smooth path in the grid; along each axis a point is at most 0.5 + hysteresis cells from its visit's centre.
 
     Attributes:
         tip_mm: Points in the demonstration's frame, shape (K, 3).
@@ -141,7 +141,9 @@ def ends_of(demo: Demo, path: GridPath) -> Floats:
 
 
 def fit_to_demo(followed: Rollout, demonstrated: Trace, start_mm: Floats | None = None) -> FittedPath:
-    """Fit a smooth path to the demonstration that a rollout follows, within the rollout's cells.
+    """Fit a smooth path to the demonstration that a rollout follows, within the rollout's cells in their order.
+
+    With hysteresis a point may be outside of its cell by as much, but not outside of the grid.
 
     Args:
         followed: A rollout that reaches the goal.
@@ -157,12 +159,14 @@ def fit_to_demo(followed: Rollout, demonstrated: Trace, start_mm: Floats | None 
     along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(guide, axis=0), axis=1)))
     if along[-1] == 0:
         return FittedPath(guide[:1], visits[:1], clock_s[[0, -1]], np.zeros(2))
-    cell_mm = followed.path.grid.cell_mm
-    at, visits = _touching(*_spread(along, visits, cell_mm), followed.path.grid.cells_of(followed.states))
+    grid, cell_mm = followed.path.grid, followed.path.grid.cell_mm
+    at, visits = _touching(*_spread(along, visits, cell_mm), grid.cells_of(followed.states))
     wanted = np.stack([np.interp(at, along, axis) for axis in guide.T], axis=1)
     centres = followed.tip_mm[visits]
-    half = cell_mm * (0.5 + followed.path.hysteresis - INSIDE)
-    low, high = centres - half, centres + half
+    half = cell_mm * (0.5 - INSIDE)
+    away = half + cell_mm * followed.path.hysteresis
+    first, last = grid.centres_mm([0, grid.n_states - 1])
+    low, high = np.maximum(centres - away, first - half), np.minimum(centres + away, last + half)
     # The ends are fixed, because start and goal are promised to clients.
     low[0] = high[0] = guide[0]
     low[-1] = high[-1] = guide[-1]

@@ -12,7 +12,11 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 
+from skills.gridworld.grid import discretize
+from skills.gridworld.reward import sparse_reward
 from skills.kinematics import forward, instrument_of, inverse, joint_margins, matrix_of, quaternion_of
+from skills.learning.policy import learn_tabular
+from skills.learning.q_learning import PhaseQLearning
 from skills.planning.handoff import JAW_CLOSED_RAD, JAW_OPEN_RAD, JAW_S, OtherArm, PsmM
 from skills.planning.plan import SuturePlan, SuturePoint, stack
 from skills.planning.trajectory import A1, A2, TRANSFER, PassPath, Trajectory, time_parametrise
@@ -715,6 +719,30 @@ def test_the_verdict_names_it_though_the_arms_did_as_the_trajectory_says(name):
     assert (report.failure.quantity, report.failure.phase) == (kind, phase)
     assert f"the limit is {LIMITS[kind][1]:.4g}" in str(report.failure)
     assert {one.kind for one in report.intent} == set(LIMITS)
+
+
+@pytest.mark.parametrize("hysteresis", [0.0, 0.25, 0.5])
+def test_cells_reach_as_far_as_hysteresis_and_a_path_farther_out_is_named(hysteresis):
+    """A path that is bent aside is as far off as from the nearest cell, widened by hysteresis on every side."""
+    demo, straight = turning()
+    grid, kind = straight.path.grid, "path off the policy's cells"
+    policy = learn_tabular(sparse_reward(discretize(demo.tip_mm, grid, hysteresis)), PhaseQLearning(), seed=0)
+    point = SuturePoint(tuple(demo.tip_mm[-1].tolist()))
+    psm_m = PsmM(PSM_M, BASE_MM, BASE_XYZW)
+    plan = stack(policy, [point], demo=demo, psm_m=psm_m, rate_hz=RATE_HZ, speed_mm_s=20.0)
+    asked, sound_motion = asked_of(plan, policy, demo), timed(plan.pass_paths, plan.psm_m)
+    assert compare(asked, sound_motion).values[kind].max() < 0.05  # bends are rounded off by the arm
+    for bent_mm, named in ((7.0, False), (12.0, True)):
+        motion = poses(sound_motion)
+        rows = motion.rows(A1, 0)
+        rows = rows[len(rows) // 2 - 110 : len(rows) // 2 + 110]
+        shift(motion, rows, bump(220)[:, None] * bent_mm * Z)
+        off = compare(asked, motion.built()).values[kind]
+        places = (motion.tip[rows] - grid.origin_mm) / grid.cell_mm
+        beyond = np.abs(places[:, None] - policy.path.cells) - 0.5 - hysteresis
+        expected = np.linalg.norm(beyond.clip(min=0), axis=2).min(axis=1)
+        assert off.max() == pytest.approx(expected.max(), abs=0.1)  # looked at every tenth of a cell
+        assert (off.max() > LIMITS[kind][1]) == named
 
 
 def test_a_sound_motion_is_feasible_with_its_intent_and_without():
