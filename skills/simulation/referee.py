@@ -7,8 +7,9 @@ One trial is one world of `skills.verification.errors`: PSM_M's base, both wrist
 the same draws as in the closed form. What happens then is decided by forces alone:
 
 1. PSM_A closes on the needle, and gravity begins.
-2. Both arms follow the planned motion from where PSM_M's fingers cannot have touched anything yet, to the hand-off.
-3. PSM_M closes; both hold the needle. PSM_A opens, and PSM_M goes straight back with the needle, as plans do.
+2. Both arms follow the planned motion from where PSM_M's fingers cannot have touched anything yet, until both stand.
+3. PSM_M closes; both hold the needle. PSM_A opens, and PSM_M goes straight back with the needle, as plans do. The jaws
+   move in the planned order, PSM_M's from the planned opening and PSM_A's to it, but faster than in the planned 0.8 s.
 
 The needle is *held* if at the end both of PSM_M's fingers touch it, and neither of PSM_A's. A trial is lost "before" if
 PSM_A has lost the needle by the time PSM_M has closed, "missed" if PSM_M has closed without it between its fingers, and
@@ -54,6 +55,7 @@ from skills.verification.clearance import (
     needle_arc_mm,
     needle_poses,
     psm_m_poses,
+    stands_from,
 )
 from skills.verification.errors import ArmErrors, Displaced, Drawn, draw
 from skills.verification.monte_carlo import at_hand_off, caught_by, scene_of
@@ -271,7 +273,7 @@ def _median_and_most(values: Floats) -> tuple[float, float]:
 
 
 def _watched(trajectory: Trajectory, number: int) -> Ints:
-    """Return the samples of a pass from where PSM_M's fingers can have touched nothing, to the hand-off."""
+    """Return the samples of a pass from where PSM_M's fingers can have touched nothing, to where both arms stand."""
     samples = np.flatnonzero(trajectory.pass_index == number)
     if trajectory.psm_m is None or not len(samples) or trajectory.phase[samples[-1]] != A2:
         raise BadInput(
@@ -281,7 +283,9 @@ def _watched(trajectory: Trajectory, number: int) -> Ints:
     needle = np.linalg.norm(needle_arc_mm(trajectory, samples) - hinge[:, None], axis=2).min(axis=1)
     fingers = np.linalg.norm(trajectory.tip_mm[samples] - hinge, axis=1) - FINGER_REACH_MM
     free = np.flatnonzero(np.minimum(needle, fingers) > FINGER_REACH_MM + _FREE_MM)
-    return samples[free[-1] if len(free) else int(np.argmax(trajectory.phase[samples] == A2)) :]
+    stand = stands_from(trajectory, int(samples[-1])) - int(samples[0])  # the first sample; then only the jaws move
+    begin = int(free[-1]) if len(free) else int(np.argmax(trajectory.phase[samples] == A2))
+    return samples[min(begin, stand) : stand + 1]
 
 
 def _closed_form(

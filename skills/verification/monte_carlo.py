@@ -12,8 +12,8 @@ A *variation* of a pass draws the errors of `verification.errors`, independently
   through the grip.
 
 A variation is *clear* if every checked pose of the pass keeps to the playback's limits: joints, cannula, pad, and the
-other arm with its outer bodies, if its place is known; fingers may touch fingers at the hand-off itself. Speeds are not
-judged: a plan made for the shifted point has its own.
+other arm with its outer bodies, if its place is known; fingers may touch fingers at the hand-off itself, where both
+arms stand and only the jaws move. Speeds are not judged: a plan made for the shifted point has its own.
 
 The needle is *caught* if its arc crosses the plane in which PSM_M's fingers close, at the end of A2, within the sector
 that they sweep, with needle to spare on both sides of them, and its tangent there is within the stated angle of their
@@ -60,6 +60,7 @@ from skills.verification.bodies import too_near
 from skills.verification.clearance import (
     FINGER_REACH_MM,
     FINGERS,
+    STANDS,
     HandOff,
     Links,
     catch,
@@ -169,8 +170,10 @@ class PlannedPass:
 
     @property
     def handing_over(self) -> Flags:
-        """Samples, (S,), in which fingers may touch fingers: the last sample of A2."""
-        return np.asarray((self.phase == A2) & (np.arange(len(self.phase)) == len(self.phase) - 1))
+        """Samples, (S,), in which fingers may touch fingers: the end of A2, where all arms stand as in the last one."""
+        stands = [(np.abs(arm.joints - arm.joints[-1]) <= STANDS).all(axis=1) for arm in self.arms]
+        there = np.logical_and.reduce([self.phase == A2, *stands])
+        return np.asarray(np.logical_and.accumulate(there[::-1])[::-1])
 
 
 def scene_of(trajectory: Trajectory, number: int, pad_top_mm: float, opening_rad: float) -> PlannedPass:

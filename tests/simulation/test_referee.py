@@ -8,7 +8,7 @@ import pytest
 
 from skills.errors import BadInput, BadSettings, SimulationFailed
 from skills.kinematics import matrix_of, quaternion_of
-from skills.planning.handoff import HELD_MM, TAKEN_MM
+from skills.planning.handoff import HELD_MM, JAW_CLOSED_RAD, OPEN_RAD, TAKEN_MM
 from skills.simulation import referee as refereeing
 from skills.simulation.referee import Physics, Refereed, referee
 from skills.verification.clearance import RADIUS_MM, needle_poses, psm_m_poses
@@ -107,9 +107,25 @@ def test_the_worlds_of_the_trials_are_those_of_the_closed_form():
 
 def test_the_trial_begins_where_no_finger_can_have_touched_the_needle():
     watched = refereeing._watched(ONE, 0)
-    assert watched[-1] == ONE.last_samples[0] and ONE.stamps_s[watched[-1]] - ONE.stamps_s[watched[0]] < 2.0
+    assert 1.0 < ONE.stamps_s[watched[-1]] - ONE.stamps_s[watched[0]] < 2.0
     hinge, _ = psm_m_poses(ONE, watched[:1])
     assert np.linalg.norm(needle_poses(ONE, watched[:1])[0] - hinge) > 16
+
+
+def test_the_arms_are_followed_until_they_stand_and_the_jaws_then_move_as_planned():
+    end, last = refereeing._watched(ONE, 0)[-1], ONE.last_samples[0]
+    for planned in (ONE.joints, ONE.psm_m.joints):
+        np.testing.assert_allclose(planned[end : last + 1] - planned[last], 0, atol=1e-9)
+    # PSM_A holds and PSM_M is open; then PSM_M closes, and PSM_A opens only when it has: the order of a trial.
+    theirs, mine = ONE.psm_m.jaw_rad[end : last + 1], ONE.jaw_rad[end : last + 1]
+    assert (mine[0], theirs[0]) == (JAW_CLOSED_RAD, 2 * OPEN_RAD)
+    assert (mine[-1], theirs[-1]) == (2 * OPEN_RAD, JAW_CLOSED_RAD)
+    assert theirs[1] < theirs[0] and (theirs[mine > mine[0]] == JAW_CLOSED_RAD).all()
+
+
+def test_fingers_that_come_never_near_are_watched_for_one_sample():
+    away = elsewhere((0, 0, -60))
+    assert refereeing._watched(away, 0).tolist() == refereeing._watched(ONE, 0)[-1:].tolist()
 
 
 def test_each_quantity_of_the_physics_is_halved_and_doubled():

@@ -13,7 +13,7 @@ import pytest
 import skills
 from skills.errors import BadInput, BadSettings
 from skills.kinematics import JAW_TIP_MM, POINTING_DOWN
-from skills.planning.handoff import NEEDLE_RADIUS_MM, OtherArm, PsmM, realign
+from skills.planning.handoff import JAW_OPEN_RAD, NEEDLE_RADIUS_MM, OtherArm, PsmM, realign
 from skills.planning.trajectory import PassPath, Trajectory, time_parametrise
 from skills.verification import monte_carlo, probabilities
 from skills.verification.clearance import (
@@ -181,7 +181,11 @@ def test_the_pad_is_cleared_as_often_as_the_error_function_says():
 
 def test_only_fingers_may_touch_and_only_at_the_hand_off():
     scene = scene_of(BESIDE, 0, PAD_TOP_MM, OPENING_RAD)
-    assert np.flatnonzero(scene.handing_over).tolist() == [len(scene.phase) - 1]
+    assert BESIDE.psm_m is not None and BESIDE.psm_m.jaw_rad is not None
+    closing = int(np.argmax(BESIDE.psm_m.jaw_rad < JAW_OPEN_RAD))  # one tick after both arms have come to stand
+    assert np.flatnonzero(scene.handing_over).tolist() == list(range(closing - 1, len(scene.phase)))
+    thin = looked_at(scene, 8)
+    assert np.array_equal(thin.handing_over, thin.stamps_s >= BESIDE.stamps_s[closing - 1])
     assert not scene_of(motion(1, with_a2=False), 0, PAD_TOP_MM, OPENING_RAD).handing_over.any()
     # Two arms 20 mm apart, the fingers of one drawn over to the other.
     arm = links_of(ALONE.joints[:1])

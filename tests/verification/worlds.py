@@ -61,8 +61,9 @@ def segments(tip, turn, opening, jaw_turn) -> tuple[np.ndarray, np.ndarray]:
     wrist = tip - WRIST_MM * across / np.linalg.norm(across, axis=1, keepdims=True)
     shaft = wrist / np.linalg.norm(wrist, axis=1, keepdims=True)
     begins, ends = [wrist - SHAFT_MM * shaft, wrist], [wrist, tip]
+    cosine, sine = (np.reshape(one(opening), (-1, 1)) for one in (np.cos, np.sin))
     for side in (1.0, -1.0):
-        along, aside = cos(opening) * a + side * sin(opening) * o, side * cos(opening) * o - sin(opening) * a
+        along, aside = cosine * a + side * sine * o, side * cosine * o - sine * a
         begins.append(tip + 0.6 * aside @ jaw_turn.T)
         ends.append(begins[-1] + (REACH_MM - WIDTH_MM) * along @ jaw_turn.T)
     return np.stack(begins, axis=1), np.stack(ends, axis=1)
@@ -111,6 +112,9 @@ def successes(trajectory, errors, pad_top_mm: float, worlds: int, seed: int, ste
     x, y, z, w = trajectory.psm_m.base_xyzw
     base = rodrigues(2 * np.arctan2(np.linalg.norm([x, y, z]), w) * np.array([x, y, z]) / np.linalg.norm([x, y, z]))
     base_mm = trajectory.psm_m.base_mm
+    moving = np.concatenate([trajectory.joints, trajectory.psm_m.joints], axis=1)
+    stands = np.array([np.ptp(moving[k:], axis=0).max() < 1e-6 for k in at])
+    opening = np.maximum(trajectory.jaw_rad[at] / 2, HOLDING_RAD)
     planned = [chain(joints[at]) for joints in (trajectory.joints, trajectory.psm_m.joints)]
     seen = planned[0], (planned[1][0] @ base.T + base_mm, base @ planned[1][1])  # in PSM_A's base frame
     jaw_a, jaw_m = seen[0][1][-1], seen[1][1][-1]
@@ -124,14 +128,14 @@ def successes(trajectory, errors, pad_top_mm: float, worlds: int, seed: int, ste
         base_turn = rodrigues(radians(errors.registration_deg) * rng.standard_normal(3))
         turns = [rodrigues(radians(errors.wrist_deg) * rng.standard_normal(3)) for _ in range(2)]
         noise = [_noise(rng, stamps, errors) + errors.tip_bias_mm * rng.standard_normal(3) for _ in range(2)]
-        links = [segments(seen[0][0] + shift, seen[0][1], HOLDING_RAD, turns[0])]
+        links = [segments(seen[0][0] + shift, seen[0][1], opening, turns[0])]
         own = (seen[1][0] + shift - base_mm) @ base, np.swapaxes(base, 0, 1) @ seen[1][1]
         links.append(segments(*own, OPEN_RAD, base.T @ turns[1] @ base))
         placed = [tuple(ends + noise[0][:, None] for ends in links[0])]
         placed.append(tuple(ends @ (base_turn @ base).T + base_mm + base_off + noise[1][:, None] for ends in links[1]))
         low = min((np.minimum(b, e)[:, :, 2] - THICK_MM).min() for b, e in placed)
         near = apart(*placed)
-        near[-1, 2:, 2:] = np.inf  # at the hand-off itself
+        near[stands, 2:, 2:] = np.inf  # at the hand-off itself
         if not (low - pad_top_mm - shift[2] >= PAD_MM and near.min() >= ARMS_MM):
             continue
         tip_a, tip_m = placed[0][1][-1, 1], placed[1][1][-1, 1]
