@@ -26,6 +26,9 @@ TABLE = cases.hand_off()
 def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
     limits = {"max_upload_bytes": LIMIT, "upload_patience_s": PATIENCE_S, "upload_bytes_per_s": 100_000}
     with running(tmp_path_factory.mktemp("raw"), workers=0, **limits) as service:
+        with connected(service) as sent:  # the first reader of an upload opens files that stay
+            sent.sendall(head("Content-Length: 9", "Connection: close") + b"not,a\n1,2"[:9])
+            assert 400 <= status(sent) < 500
         yield service
 
 
