@@ -59,7 +59,7 @@ def run(command: str, typed: str | None = None) -> Result:
 
 
 def lasting(printed: str) -> str:
-    return MADE.sub("/tmp/skills-try", printed)
+    return MADE.sub("<temporary folder>", printed)
 
 
 def test_every_command_of_the_tutorial_prints_its_transcript(bare: None) -> None:
