@@ -206,7 +206,8 @@ class ColumnSetpoints:
         if not np.array_equal(tip.stamps_ns, measured.stamps_ns):  # samples were dropped
             _, here, there = np.intersect1d(tip.stamps_ns, measured.stamps_ns, assume_unique=True, return_indices=True)
             commanded_mm, measured_mm = commanded_mm[here], measured_mm[there]
-        away_mm = np.linalg.norm(commanded_mm - measured_mm, axis=1)
+        offset_mm = commanded_mm - measured_mm
+        away_mm = np.sqrt(np.einsum("ij,ij->i", offset_mm, offset_mm))
         if not (len(away_mm) and np.median(away_mm) <= APART_MM):
             far_mm = float(np.median(away_mm)) if len(away_mm) else float("nan")
             why = f"Its median distance from the measured tip is {far_mm:.3g} mm, above {APART_MM:g} mm: another frame."

@@ -101,6 +101,8 @@ def read_columns(file: BinaryIO, columns: Sequence[ParquetColumn], *, most_rows:
         UnreadableRecording: The file is damaged or claims too much; or a column is missing, of another type or length,
             or has gaps.
     """
+    from pyarrow import types
+
     opened = open_parquet(file)
     rows = _checked_rows(opened, [one.name for one in columns], file.seek(0, os.SEEK_END), most_rows)
     numbers: dict[str, NDArray[np.floating]] = {}
@@ -115,12 +117,12 @@ def read_columns(file: BinaryIO, columns: Sequence[ParquetColumn], *, most_rows:
                 values = _flat(batch.column(one.name), one)
                 if one.is_text:
                     for position, found in enumerate(texts[one.name]):
-                        found.update(values[:, position].tolist())
+                        found.update(values[position :: one.width].unique().to_pylist())
                 else:
                     if one.name not in numbers:  # the type is that of the whole column
-                        single = values.dtype.kind == "f" and values.dtype.itemsize < 8
+                        single = types.is_floating(values.type) and values.type.bit_width < 64
                         numbers[one.name] = np.empty((rows, one.width), np.float32 if single else np.float64)
-                    numbers[one.name][at:end] = values
+                    numbers[one.name][at:end] = values.to_numpy(zero_copy_only=False).reshape(-1, one.width)
             at = end
     if at != rows:
         raise UnreadableRecording(f"{_WHAT} has {at} rows and claims {rows}. {_ADVICE}")
@@ -191,7 +193,7 @@ def _is_below(path: str, names: Collection[str]) -> bool:
 
 
 def _flat(values: Any, column: ParquetColumn) -> Any:
-    """Return a column of a batch as an array, shape (rows, width).
+    """Return the values of a column of a batch, one after another, row by row.
 
     Raises:
         UnreadableRecording: It has another type or length, or gaps.
@@ -214,7 +216,7 @@ def _flat(values: Any, column: ParquetColumn) -> Any:
         raise UnreadableRecording(
             f"{_WHAT}: the column {printable(column.name)} does not have {column.width} {what} in every row."
         )
-    return values.to_numpy(zero_copy_only=False).reshape(rows, column.width)
+    return values
 
 
 def printable(value: object) -> str:
