@@ -19,6 +19,7 @@ from hashlib import file_digest
 from json import load
 from shutil import copyfileobj
 from tempfile import TemporaryFile
+from time import monotonic
 from typing import IO, Any, NamedTuple, cast
 from zipfile import ZipFile, ZipInfo
 
@@ -69,7 +70,7 @@ from skills.schemas.requests import DatasetIn
 from skills.settings import Settings
 
 MOST = 20_000  # demonstrations of a dataset, ours: their rows are in memory at once
-TOLD_STEPS = 100  # progress is stored about so often, each time in a transaction
+TOLD_S = 0.5  # progress is stored about so often, each time in a transaction
 
 _EXPORTED, _DEMOS, _NAMED = (
     cast(Table, one.__table__).alias() for one in (DatasetDemonstration, Demonstration, RecordingSurgeon)
@@ -440,10 +441,11 @@ def _exported(
     database: Database, read: Teller, episodes: Sequence[_Episode], tell: Callable[[float], None]
 ) -> Iterator[ExportedEpisode]:
     """Read the recordings one after another, and yield their episodes."""
-    at, recording = None, None
+    at, recording, due_s = None, None, 0.0
     for number, episode in enumerate(episodes):
-        if number % max(1, len(episodes) // TOLD_STEPS) == 0:
+        if (now_s := monotonic()) >= due_s:
             tell(number / (len(episodes) + 1))
+            due_s = now_s + TOLD_S
         if recording is None or at != episode.recording:
             recording = None  # before the next one is read, so that only one is in memory
             try:

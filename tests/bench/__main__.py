@@ -11,6 +11,7 @@ from tests.bench.beyond import learners
 from tests.bench.combining import combining
 from tests.bench.containing import containing
 from tests.bench.doubt import doubting
+from tests.bench.exporting import exporting
 from tests.bench.geometry import geometry
 from tests.bench.hands import hands
 from tests.bench.history import history
@@ -32,6 +33,7 @@ from tests.bench.writers import writers
 
 PARTS = {
     "reading": reading,
+    "exporting": exporting,
     "containment": containing,
     "learning": learning,
     "ties": ties,

@@ -101,15 +101,18 @@ def test_what_is_written_is_read_as_the_same_bits(tmp_path, version):
         assert dict(again.notes)["splits"] == episode.split
 
 
-def test_both_versions_have_the_same_data_and_statistics(tmp_path):
+@pytest.mark.parametrize(("most", "files"), [(1000, [0, 0, 0]), (2, [0, 0, 1])])
+def test_both_versions_have_the_same_data_and_statistics(tmp_path, monkeypatch, most, files):
+    monkeypatch.setattr("skills.formats.lerobot.writer.FILE_EPISODES", most)
     old, new = (written(tmp_path / version, episodes(), version) for version in VERSIONS)
-    whole = pq.read_table(new / "data/chunk-000/file-000.parquet")
+    whole = pq.read_table(new / "data/chunk-000")
     parts = [pq.read_table(old / f"data/chunk-000/episode_{k:06d}.parquet") for k in range(3)]
     assert whole.num_rows == 150
     for name in whole.column_names:
         assert whole[name].to_pylist() == [value for part in parts for value in part[name].to_pylist()]
     lines = [json.loads(line) for line in (old / "meta/episodes_stats.jsonl").read_text().splitlines()]
     rows = pq.read_table(new / "meta/episodes").to_pylist()
+    assert [row["data/file_index"] for row in rows] == files
     for line, row in zip(lines, rows, strict=True):
         for feature, stats in line["stats"].items():
             assert stats == {name: row[f"stats/{feature}/{name}"] for name in stats}

@@ -54,9 +54,15 @@ def ask(database: Database, **asked: Any) -> Job:
 
 def export(database: Database, **asked: Any) -> str:
     """Export a dataset as a worker does, and return its digest."""
-    job = cases.work(database, ask(database, **asked))
-    assert job.state == "succeeded", job.error
-    return str(job.result["dataset"])
+    return dataset_of(database, cases.work(database, ask(database, **asked)))
+
+
+def dataset_of(database: Database, job: Job) -> str:
+    """Return the digest of the dataset that a job has made."""
+    with database.reading() as session:
+        done = session.get_one(Job, job.row)
+    assert done.state == "succeeded", done.error
+    return str(done.result["dataset"])
 
 
 def zip_of(database: Database, dataset: str) -> bytes:

@@ -40,7 +40,8 @@ Split = Literal["train", "val", "test", "recovery", "failure"]
 SPLITS: tuple[Split, ...] = ("train", "val", "test", "recovery", "failure")
 SHARES = {"train": 0.8, "val": 0.1, "test": 0.1}  # of the episodes; a surgeon is in one of them
 CHUNK = 1000  # episodes or files in a folder
-FILE_BYTES = 32 << 20  # of numbers in a data file of v3.0: the places of its row groups are in memory until it ends
+FILE_BYTES = 32 << 20  # of numbers in a data file of v3.0
+FILE_EPISODES = 1000  # in it at most, for the places of their row groups are in memory until it ends
 TABLE_ROWS = 100  # episodes that are written to the table of v3.0 together, since its columns are many
 PARTS = (*(f"position.{axis}" for axis in "xyz"), *(f"orientation.{axis}" for axis in "xyzw"))
 QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
@@ -274,7 +275,7 @@ class _Total:
             "index": np.arange(self.rows, self.rows + rows),
             "task_index": np.full(rows, task),
         }
-        stats = {name: _stats_of(column) for name, column in columns.items() if not isinstance(column, list)}
+        stats = _stats_of({name: column for name, column in columns.items() if not isinstance(column, list)})
         self.stats = {name: joined_stats(self.stats[name], one) for name, one in stats.items()} if number else stats
         taken = _Taken(number, (episode.task,), task, self.rows, columns, stats)
         self.episodes, self.rows = number + 1, self.rows + rows
@@ -428,17 +429,20 @@ def _stages(recording: Recording, times_ns: Ints) -> list[str]:
 # ---- statistics ----------------------------------------------------------------------------------------------------
 
 
-def _stats_of(column: Numbers) -> dict[str, list[float]]:
-    """Return the statistics of a column, for each of its numbers."""
-    values = column.reshape(len(column), -1).astype(np.float64)
-    stats = {
-        "min": values.min(axis=0),
-        "max": values.max(axis=0),
-        "mean": values.mean(axis=0),
-        "std": values.std(axis=0),
-    }
-    quantiles = dict(zip(QUANTILES, np.quantile(values, list(QUANTILES.values()), axis=0), strict=True))
-    return {name: one.tolist() for name, one in (stats | quantiles).items()} | {"count": [len(values)]}
+def _stats_of(columns: Mapping[str, Numbers]) -> Stats:
+    """Return the statistics of some columns with equal numbers of rows, for each of their numbers."""
+    wide = {name: column.reshape(len(column), -1).astype(np.float64) for name, column in columns.items()}
+    # One call for all, because it takes longer than what it computes for an episode.
+    quantiles = np.quantile(np.concatenate([*wide.values()], axis=1), list(QUANTILES.values()), axis=0)
+    stats: Stats = {}
+    at = 0
+    for name, values in wide.items():
+        of = {"min": values.min(axis=0), "max": values.max(axis=0)}
+        of |= {"mean": values.mean(axis=0), "std": values.std(axis=0)}
+        of |= dict(zip(QUANTILES, quantiles[:, at : at + values.shape[1]], strict=True))
+        stats[name] = {what: one.tolist() for what, one in of.items()} | {"count": [len(values)]}
+        at += values.shape[1]
+    return stats
 
 
 def joined_stats(one: Mapping[str, list[float]], other: Mapping[str, list[float]]) -> dict[str, list[float]]:
@@ -495,7 +499,7 @@ class _SharedFiles:
         self._writer: Any = None
         self._table_writer: Any = None
         self._waiting: list[Json] = []
-        self._file, self._bytes = 0, 0
+        self._file, self._bytes, self._episodes = 0, 0, 0
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -507,12 +511,13 @@ class _SharedFiles:
         from pyarrow import parquet
 
         table = _table(taken)
-        if self._writer is not None and self._bytes + table.nbytes > FILE_BYTES:
+        full = self._bytes + table.nbytes > FILE_BYTES or self._episodes == FILE_EPISODES
+        if self._writer is not None and full:
             yield from self._finished_file()
         if self._writer is None:
             self._writer = parquet.ParquetWriter(self._data, table.schema)
         self._writer.write_table(table, row_group_size=max(1, taken.rows))
-        self._bytes += table.nbytes
+        self._bytes, self._episodes = self._bytes + table.nbytes, self._episodes + 1
         place = {
             "episode_index": taken.number,
             "tasks": list(taken.tasks),
@@ -550,7 +555,7 @@ class _SharedFiles:
         yield _V30_DATA.format(chunk_index=self._file // CHUNK, file_index=self._file % CHUNK), self._data
         self._data.seek(0)
         self._data.truncate()
-        self._writer, self._file, self._bytes = None, self._file + 1, 0
+        self._writer, self._file, self._bytes, self._episodes = None, self._file + 1, 0, 0
 
     def _write_places(self) -> None:
         import pyarrow as pa
