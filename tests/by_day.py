@@ -1,4 +1,4 @@
-"""The tests that run on PostgreSQL by day, too, and parameters of which some run by day.
+"""The tests that run on PostgreSQL by day, too, and parameters and examples of which some run by day.
 
 A test whose parameter names PostgreSQL is marked `nightly`, unless its file or its name is in `ON_BOTH`: there the SQL,
 the locks or the notifications of PostgreSQL decide the result. All others run on SQLite by day and on both at night.
@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from typing import Any
 
 import pytest
+from hypothesis import settings
 
 ON_BOTH = {
     # the tables, transactions and queries themselves
@@ -73,6 +74,11 @@ ON_BOTH = {
 def some(values: Iterable[Any], of: int) -> list[Any]:
     """Return parameters of a test: every `of`-th value runs by day, all of them at night."""
     return [pytest.param(value, marks=[pytest.mark.nightly] * (at % of > 0)) for at, value in enumerate(values)]
+
+
+def examples(at_night: int) -> settings:
+    """Return the settings of a law: so many random examples at night, a fifth of them by day, the same in every run."""
+    return settings(max_examples=max(at_night // 5, 5) if settings.default.derandomize else at_night)
 
 
 def mark(items: list[pytest.Item]) -> None:

@@ -33,8 +33,8 @@ SMALL_BYTES = 100_000
 STATEMENTS = 2000  # more than all tests of a process have; SQLAlchemy's own limit is 500 for each database
 
 # No deadlines, because on a busy machine an example may take any time. By day every run has the same examples, so it is
-# red only for a change; `make nightly` searches at random, with 100 examples in the place of 20.
-hypothesis_settings.register_profile("tests", deadline=None, derandomize=True, max_examples=20)
+# red only for a change; `make nightly` searches at random, with 100 examples in the place of 10.
+hypothesis_settings.register_profile("tests", deadline=None, derandomize=True, max_examples=10)
 hypothesis_settings.register_profile("nightly", deadline=None)
 hypothesis_settings.load_profile("tests")
 

@@ -3,12 +3,13 @@
 import re
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from skills.api.pages import drawings
 from skills.gridworld.grid import GridPath, GridWorld
 from skills.learning.certificate import Coverage
+from tests.by_day import examples
 
 
 def path_in(shape: tuple[int, int, int]) -> GridPath:
@@ -24,7 +25,7 @@ def drawn(coverage: Coverage, path: GridPath) -> dict[str, float]:
     return area
 
 
-@settings(max_examples=50, deadline=None)
+@examples(50)
 @given(st.tuples(*[st.integers(1, 5)] * 2, st.integers(2, 5)), st.randoms(use_true_random=False))
 def test_every_start_is_drawn_as_what_it_is(shape: tuple[int, int, int], random):
     n = int(np.prod(shape))

@@ -1,10 +1,11 @@
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from skills.demonstration.demonstration import Motion, Recording, Signal, cut_demo, recorded_motion
 from skills.errors import BadInput, BadSegment, NotFinite, NotMetres, NoUsableTopic
+from tests.by_day import examples
 from tests.demonstration.strokes import RATE, line, motion, recording
 
 # ---- values -----------------------------------------------------------------------------------------------------
@@ -43,7 +44,7 @@ def test_a_cut_counts_its_own_seconds_from_its_first_sample():
     assert demo.instrument == "400006"
 
 
-@settings(max_examples=30, deadline=None)
+@examples(30)
 @given(st.integers(0, 300), st.integers(10, 100))
 def test_cutting_a_cut_at_its_own_times_gives_the_same_demonstration(first, length):
     whole = recording(motion(line(4, 50), start_ns=1_760_000_000_000_000_000))

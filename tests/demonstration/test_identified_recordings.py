@@ -181,7 +181,7 @@ def test_the_camera_of_a_real_bag_is_found():
 
 
 @pytest.mark.needs("recordings")
-@pytest.mark.parametrize("count", [4, pytest.param(40, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("count", [2, pytest.param(40, marks=pytest.mark.nightly)])
 @pytest.mark.parametrize("mistake", [None, *MISTAKES])
 def test_a_file_says_what_its_joints_show_and_no_planted_mistake_is_silent(mistake, count):
     for seed in range(count):

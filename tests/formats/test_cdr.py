@@ -4,7 +4,7 @@ import struct
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from mcap.records import Schema
 from mcap_ros2._dynamic import generate_dynamic, serialize_dynamic
@@ -15,6 +15,7 @@ from skills.errors import UnreadableRecording
 from skills.formats import topics
 from skills.formats.mcap import _WANTED, cdr
 from skills.formats.mcap.cdr import SHAPES_LIMIT, SLACK_BYTES, Decoder, Wanted, fields_of
+from tests.by_day import examples
 from tests.formats import records
 from tests.formats.definitions import DEFINITIONS
 
@@ -86,7 +87,7 @@ def encoded(messages, name):
 
 
 @pytest.mark.parametrize("name", MESSAGES)
-@settings(max_examples=40, deadline=None)
+@examples(40)
 @given(data=st.data())
 def test_every_message_says_what_the_library_says_it_says(name, data):
     messages = encoded(data.draw(st.lists(MESSAGES[name], min_size=1, max_size=12)), name)
@@ -103,7 +104,7 @@ def test_every_message_says_what_the_library_says_it_says(name, data):
         assert [got.labels[k] for k in got.label_of] == [value_at(message, wanted.text) for message in expected]
 
 
-@settings(max_examples=30, deadline=None)
+@examples(30)
 @given(st.lists(MESSAGES[topics.POSE], min_size=1, max_size=6), st.data())
 def test_big_endian_messages_say_the_same(poses, data):
     store = get_typestore(Stores.ROS2_JAZZY)
@@ -155,7 +156,7 @@ def defined(draw, outer="a/T"):
     return lines, others, st.fixed_dictionaries(fields)
 
 
-@settings(max_examples=60, deadline=None)
+@examples(60)
 @given(defined(), st.data())
 def test_any_definition_is_read_as_the_library_reads_it(one, data):
     lines, others, values = one

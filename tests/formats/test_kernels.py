@@ -5,11 +5,12 @@ import struct
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from skills.formats import write_mcap
 from skills.formats.mcap import _kernels, read_mcap
+from tests.by_day import examples
 from tests.formats import bags, hostile, large
 from tests.formats.records import message
 
@@ -52,14 +53,14 @@ def followed(data: bytes, begin=0, count=0, room=None):
 # ---- following
 
 
-@settings(max_examples=200, deadline=None)
+@examples(200)
 @given(st.binary(max_size=200), st.integers(0, 300))
 def test_any_bytes_are_followed_alike_and_never_beyond_their_end(data, begin):
     (_, end), _ = followed(data, begin)
     assert end == begin or begin < end <= len(data)
 
 
-@settings(max_examples=200, deadline=None)
+@examples(200)
 @given(st.lists(st.binary(max_size=40), min_size=1, max_size=20), st.data())
 def test_messages_with_some_bytes_changed_are_followed_alike(contents, data):
     said = bytearray(b"".join(message(k, k, content) for k, content in enumerate(contents)))
@@ -97,7 +98,7 @@ def test_no_more_are_found_than_find_a_place():
 U64 = st.integers(0, 2**64 - 1)
 
 
-@settings(max_examples=300, deadline=None)
+@examples(300)
 @given(st.data())
 def test_both_kernels_take_the_same_words_and_never_read_past_the_end(data):
     said = data.draw(st.binary(max_size=120))

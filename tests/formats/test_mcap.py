@@ -3,7 +3,7 @@ import struct
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from mcap.writer import CompressionType
 from rosbags.highlevel import AnyReader
@@ -24,6 +24,7 @@ from skills.errors import (
 )
 from skills.formats import read_recording, topics, write_mcap
 from skills.formats.mcap import NeedsRosbags, read_mcap
+from tests.by_day import examples
 from tests.formats.bags import (
     LOCAL,
     START_NS,
@@ -92,7 +93,7 @@ def recordings(draw):
     return Recording(format="mcap", integrity="full", motions=(motion,))
 
 
-@settings(max_examples=30, deadline=None)
+@examples(30)
 @given(recordings())
 def test_any_motion_survives_being_written_and_read(one):
     assert_same(read(write_mcap(one)), one, tolerance_mm=1e-12)

@@ -3,7 +3,7 @@ import io
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from skills.errors import (
@@ -21,6 +21,7 @@ from skills.formats import read_recording
 from skills.formats.columns import OUTSIDE_MM, quaternion_of_rpy
 from skills.formats.tables import read_table
 from skills.kinematics import INSERTION, INSTRUMENTS, forward
+from tests.by_day import examples
 
 
 def read(text, **how):
@@ -81,7 +82,7 @@ def test_roll_pitch_yaw_turn_about_fixed_axes_x_then_y_then_z():
     np.testing.assert_allclose(matrix, by_hand, rtol=0, atol=1e-15)
 
 
-@settings(max_examples=50, deadline=None)
+@examples(50)
 @given(
     st.lists(
         st.tuples(st.integers(1, 10**12), *[st.floats(-1000, 1000)] * 3),

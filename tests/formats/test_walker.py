@@ -7,7 +7,7 @@ import zlib
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from skills.errors import UnreadableRecording
@@ -16,6 +16,7 @@ from skills.formats.mcap import reader
 from skills.formats.mcap import records as mcap_records
 from skills.formats.mcap.reader import Walker
 from skills.formats.mcap.records import Chain, follow, unpack
+from tests.by_day import examples
 from tests.formats import records
 from tests.formats.definitions import DEFINITIONS
 from tests.formats.records import Part, channel, chunk, message, record, schema, whole
@@ -54,7 +55,7 @@ def followed(data: bytes):
     return follow(np.frombuffer(data, np.uint8))
 
 
-@settings(max_examples=200, deadline=None)
+@examples(200)
 @given(st.lists(st.tuples(st.sampled_from([5, 5, 3, 4, 0x80, 0xFF]), CONTENTS), max_size=40), ENDS)
 def test_what_was_put_one_behind_the_other_is_found_and_nothing_else(said, end):
     pieces = [
@@ -286,7 +287,7 @@ def test_what_an_index_says_changes_nothing(indexed):
     assert walked(whole(chunk(BODY) + indexed + chunk(3 * ONE) + indexed))[1] == walked(bare)[1]
 
 
-@settings(max_examples=50, deadline=None)
+@examples(50)
 @given(st.binary(max_size=60), st.integers(0, 2))
 def test_no_bytes_of_an_index_change_anything(said, before):
     parts = [chunk(BODY), chunk(3 * ONE), chunk(ONE)]

@@ -5,13 +5,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from skills.errors import BadSettings
 from skills.gridworld.grid import MOVES, GridPath, GridWorld
 from skills.gridworld.scene import STAY, Box, Capsule, Scene, SceneCosts, Tissue, hazards_of
 from skills.packing import canonical, sha256
+from tests.by_day import examples
 
 BOX = Box((0.0, 0.0, 0.0), (10.0, 10.0, 1.0))
 ARM = Capsule((0.0, 0.0, 0.0), (0.0, 0.0, 10.0), 2.0)
@@ -60,7 +61,7 @@ def test_a_line_touches_also_when_it_is_compared_together_with_longer_ones():
     assert Scene("base", boxes=(BOX,)).touches([np.nan, 1, 9], [1, 1, 9])
 
 
-@settings(deadline=None, max_examples=150)
+@examples(150)
 @given(points, points)
 def test_touching_agrees_with_points_along_the_line(a, b):
     """Points in steps of 1/2000 never enter what is not touched, and come near to what is."""
@@ -146,7 +147,7 @@ def test_impossible_costs_are_refused(wrong):
         SceneCosts(**wrong)
 
 
-@settings(deadline=None, max_examples=100)
+@examples(100)
 @given(points, points)
 def test_distances_of_lines_are_the_least_of_points_along_them(a, b):
     """Points in steps of 1/2000 are at most 0.03 mm from any point of the line."""
@@ -163,7 +164,7 @@ SURFACE = np.stack(np.meshgrid(np.linspace(-20, 20, 81), np.linspace(-20, 20, 81
 SURFACE[:, 2] = -RIDGE.above_mm(SURFACE)
 
 
-@settings(deadline=None, max_examples=40)
+@examples(40)
 @given(points, points)
 def test_the_distance_from_a_height_map_is_a_lower_bound(a, b):
     a, b = np.array(a), np.array(b)

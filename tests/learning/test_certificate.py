@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from skills.errors import BadSettings
@@ -12,6 +12,7 @@ from skills.learning.certificate import certify, coverage, mdp_of
 from skills.learning.dynamic_programming import ValueIteration, exact_values
 from skills.learning.policy import learn_tabular, rollout_from
 from skills.learning.q_learning import CellQLearning, PhaseQLearning
+from tests.by_day import examples
 from tests.gridworld.paths import WALKS, follow, joins_nearest, learnt, named_path
 
 STAY = 13
@@ -114,7 +115,7 @@ def test_coverage_agrees_with_rolling_out_from_every_single_start(name, phased):
     check_coverage(policy, path)
 
 
-@settings(deadline=None, max_examples=40)
+@examples(40)
 @given(st.sampled_from([*WALKS]), st.booleans(), st.integers(0, 2**32), st.floats(0.02, 0.5))
 def test_coverage_agrees_with_rollouts_also_where_the_policy_is_bad(name, phased, seed, share):
     policy = learnt(name, phased=phased)
@@ -135,7 +136,7 @@ def check_coverage(policy, path):
             assert one.states.tolist() == states
 
 
-@settings(deadline=None, max_examples=60)
+@examples(60)
 @given(st.sampled_from([*WALKS]), st.booleans(), st.integers(0, 2**32), st.integers(0, 26))
 def test_one_worse_action_is_found_and_an_equally_good_one_is_accepted(name, phased, place, action):
     policy = learnt(name, phased=phased)

@@ -11,6 +11,7 @@ from skills.learning.certificate import certify
 from skills.learning.evaluation import dtw
 from skills.learning.policy import Policy, learn_tabular, rollout_from
 from skills.learning.q_learning import PhaseQLearning
+from tests.by_day import some
 from tests.demonstration.synthetic import crossing_path, crossings, edge_path, winding_path
 from tests.gridworld.paths import follow, joins_nearest
 
@@ -75,7 +76,7 @@ def check_as_a_client(policy: Policy, starts: np.ndarray) -> None:
 # ---- the demonstrations themselves
 
 
-@pytest.mark.parametrize("n_crossings", range(6))
+@pytest.mark.parametrize("n_crossings", some(range(6), 3))
 def test_a_synthetic_demonstration_crosses_itself_as_often_as_was_asked(n_crossings):
     paths = [crossing_path(seed, n_crossings) for seed in range(4)]
     for path in paths:
@@ -94,6 +95,7 @@ def test_crossings_are_counted_by_hand():
     assert crossings(GridPath(grid, np.array([*around, 0, 1, 2, 4]))) == 2
 
 
+@pytest.mark.nightly  # of the test's own generator
 def test_they_are_of_all_lengths():
     lengths = [len(demonstration(number).states) for number in range(30)]
     assert min(lengths) < 20
@@ -113,26 +115,26 @@ def test_a_path_along_the_edges_touches_every_corner_and_leaves_no_margin():
 # ---- learning from them
 
 
-@pytest.mark.parametrize("number", range(12))
+@pytest.mark.parametrize("number", some(range(12), 4))
 def test_12_demos_on_5_seeds_are_exact_from_all_starts(number):
     for seed in SEEDS:
         check(demonstration(number), seed)
 
 
-@pytest.mark.parametrize("number", range(0, 40, 13))
+@pytest.mark.parametrize("number", some(range(0, 40, 13), 2))
 def test_a_client_that_knows_the_text_alone_says_so_too(number):
     policy = check(demonstration(number), seed=0)
     check_as_a_client(policy, np.arange(PAPER_GRID.n_states))
 
 
-@pytest.mark.parametrize("name", SHAPES)
+@pytest.mark.parametrize("name", some(SHAPES, 2))
 def test_a_demonstration_and_a_grid_of_any_shape_are_learnt_exactly(name):
     path = SHAPES[name]()
     policy = check(path, seed=0)
     check_as_a_client(policy, np.random.default_rng(0).permutation(path.grid.n_states)[:100])
 
 
-@pytest.mark.parametrize("name", LARGE)
+@pytest.mark.parametrize("name", some(LARGE, 3))
 def test_a_demonstration_in_cells_of_1_mm_is_learnt_exactly(name):
     check(LARGE[name](), seed=0)
 

@@ -61,7 +61,7 @@ def test_odds_and_value_in_a_corridor_are_those_worked_by_hand(slip):
     assert certificate.most_touching == odds.touches[1]
 
 
-@pytest.mark.parametrize("slip", [0.0, 0.2])
+@pytest.mark.parametrize("slip", [pytest.param(0.0, marks=pytest.mark.nightly), 0.2])
 def test_exact_values_satisfy_bellmans_equation_written_out(slip):
     path, hazards = room(close=0.2, deeper_per_mm=0.03, touch=30.0)
     gamma, domain, grid = 0.9, Domain(path, phased=True), path.grid

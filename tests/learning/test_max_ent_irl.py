@@ -3,7 +3,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from skills.errors import BadSettings
@@ -13,7 +13,7 @@ from skills.learning.certificate import certify, coverage
 from skills.learning.dynamic_programming import Mdp, exact_q
 from skills.learning.max_ent_irl import MaxEntIRL, recover_reward, soft_visits
 from skills.learning.policy import learn_tabular, rollout_from
-from tests.by_day import some
+from tests.by_day import examples, some
 from tests.gridworld.paths import WALKS, named_path, random_path
 
 STAY, ONWARD = 13, 16  # the last move of "an angle" is one along y
@@ -73,7 +73,7 @@ def test_two_moves_between_two_cells_by_hand():
     assert likelihood == pytest.approx(-np.log(3 / 4) / 2)
 
 
-@settings(deadline=None, max_examples=40)
+@examples(40)
 @given(st.integers(0, 500), st.floats(-50, 50))
 def test_visits_add_up_to_the_moves_and_a_constant_changes_nothing(seed, constant):
     path = random_path(seed)
@@ -99,7 +99,7 @@ def test_nothing_overflows_or_vanishes(scale):
 # ---- the recovered reward ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", some((name for name in WALKS if name != "two cells"), 3))
+@pytest.mark.parametrize("name", some((name for name in WALKS if name != "two cells"), 7))
 def test_it_explains_the_demonstration_and_pays_on_its_path(name):
     path = named_path(name)
     recovered = recover_reward(path, MaxEntIRL())
@@ -156,7 +156,7 @@ def test_the_cause_the_same_reward_less_a_constant_arrives_from_everywhere():
         assert coverage(replace(policy, q=q)).reaches.sum() == reaching
 
 
-@pytest.mark.parametrize("name", WALKS)
+@pytest.mark.parametrize("name", some(WALKS, 4))
 @pytest.mark.parametrize("gamma", [0.5, *(pytest.param(one, marks=pytest.mark.nightly) for one in (0.01, 0.89))])
 def test_the_policy_on_it_is_never_certified(name, gamma):
     policy = learn_tabular(sparse_reward(named_path(name)), MaxEntIRL(iterations=60, gamma=gamma))
@@ -166,7 +166,7 @@ def test_the_policy_on_it_is_never_certified(name, gamma):
     assert not certificate.demonstration_reproduced or name == "two cells"
 
 
-@pytest.mark.parametrize("number", [0, 1, 2, *(pytest.param(one, marks=pytest.mark.nightly) for one in range(3, 10))])
+@pytest.mark.parametrize("number", some(range(10), 10))
 def test_nor_on_self_crossing_paths(number):
     certificate, _ = certify(learn_tabular(sparse_reward(random_path(number)), MaxEntIRL(iterations=60)))
     assert certificate.starts_reaching < certificate.starts / 2

@@ -11,6 +11,7 @@ from skills.learning.certificate import certify
 from skills.learning.dynamic_programming import ValueIteration
 from skills.learning.policy import MAX_SEED, learn_tabular, rollout_from
 from skills.learning.q_learning import CellQLearning, PhaseQLearning
+from tests.by_day import some
 from tests.gridworld.paths import follow, joins_nearest, named_path, random_path
 
 REWARD = sparse_reward(named_path("a figure of eight"))
@@ -53,7 +54,7 @@ def check_path(path, seeds):
             assert joins_nearest(path, states)
 
 
-@pytest.mark.parametrize("number", range(50))
+@pytest.mark.parametrize("number", some(range(50), 5))
 def test_on_each_of_50_self_crossing_paths_every_state_and_every_start(number):
     check_path(random_path(number), seeds=(number, number + 100))
 
@@ -137,6 +138,7 @@ def test_exact_values_of_a_world_that_slips_are_those_of_a_second_method(slippin
     assert exact.q.max(axis=1)[live] == pytest.approx(values[live], rel=1e-9, abs=0)
 
 
+@pytest.mark.nightly  # by day one rate below 1 and 1 are compared (the next test)
 def test_learning_rates_below_1_approach_the_exact_values_and_1_does_not(slipping):
     exact, live = slipping
     best = exact.q[live].max(axis=1)
@@ -149,7 +151,7 @@ def test_learning_rates_below_1_approach_the_exact_values_and_1_does_not(slippin
     assert apart[0.02] < 0.05
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", some(range(3), 3))
 def test_what_is_learnt_while_moves_slip_follows_from_everywhere(seed):
     certificate, _ = certify(learn_slipping(0.02, 1000, seed))
     assert certificate.demonstration_reproduced
@@ -158,6 +160,7 @@ def test_what_is_learnt_while_moves_slip_follows_from_everywhere(seed):
     assert certify(learn_slipping(1.0, 100, seed))[0].starts_joining_nearest < certificate.starts
 
 
+@pytest.mark.nightly  # a statement about the learner's choice, not a guard
 def test_slip_makes_near_ties_so_only_the_exact_policy_passes(slipping):
     exact, live = slipping
     assert certify(exact)[0].every_action_optimal

@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from skills.errors import BadSettings
@@ -18,12 +18,13 @@ from skills.learning.dynamic_programming import ValueIteration, exact_q
 from skills.learning.policy import Policy, learn_tabular, rollout_from
 from skills.learning.q_learning import PhaseQLearning
 from skills.learning.ties import REMOTE_CENTRE, ShortestWay, rule_in
+from tests.by_day import examples, some
 from tests.gridworld.paths import WALKS, learnt, named_path, random_path
 
 STEPS = [Decimal(n).sqrt() for n in range(4)]
 DOWN = ShortestWay(depth_along=(0.0, -1.0, -2.0))
 FLAT = ShortestWay()
-every_walk = pytest.mark.parametrize("name", WALKS)
+every_walk = pytest.mark.parametrize("name", some(WALKS, 4))
 
 
 def by_the_rule(policy, way=lambda length, depth, joined, action: (length, depth, joined, action)):
@@ -97,7 +98,7 @@ def test_every_action_is_the_one_of_a_second_method(name, rule):
     assert certificate.demonstration_reproduced
 
 
-@settings(deadline=None, max_examples=12)
+@examples(12)
 @given(st.integers(0, 10_000), st.sampled_from([0.1, 0.4, 0.9]), st.sampled_from([0.0, 0.2]))
 def test_it_is_the_one_of_a_second_method_on_random_paths(seed, gamma, slip):
     policy = with_ties(random_path(seed), DOWN, ValueIteration(gamma=gamma, slip=slip))
@@ -153,7 +154,7 @@ def test_a_rule_that_is_broken_fails_the_certificate(order, monkeypatch):
     assert certificate.every_action_optimal
 
 
-@settings(deadline=None, max_examples=25)
+@examples(25)
 @given(st.integers(0, 2**32))
 def test_one_action_off_the_rule_is_found(place):
     policy = learnt("an angle")

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from skills.errors import BadInput, BadPlan, NoApproach, Unreachable
@@ -11,6 +11,7 @@ from skills.planning.handoff import JAW_S, PsmM, hand_off, realign, unit_approac
 from skills.planning.motion_laws import A1, A2, PEAK, TRANSFER
 from skills.planning.passes import STAND_OFF_MM
 from skills.planning.trajectory import PassPath, Trajectory, joint_ratios, time_parametrise
+from tests.by_day import examples
 from tests.planning.motions import HAND_OFF_MM, PSM_M
 from tests.planning.motions import hand_off as one_pass
 from tests.planning.test_transfers import BESIDE
@@ -79,7 +80,7 @@ def test_told_to_it_is_at_the_hand_off_from_the_start():
         assert np.abs(tip[here] - there).max() < 1e-9
 
 
-@settings(max_examples=20, deadline=None)
+@examples(20)
 @given(st.floats(-15, 15), st.floats(-15, 15), st.floats(-15, 15), st.floats(-25, 25))  # within 20 not all are in reach
 def test_wherever_its_base_is_its_tip_is_at_the_same_place(dx, dy, dz, tilt_deg):
     half = np.radians(35 + tilt_deg) / 2

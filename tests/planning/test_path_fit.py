@@ -14,7 +14,7 @@ from math import dist
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from skills.demonstration.demonstration import Demo, cut_demo, propose_segments
@@ -29,6 +29,7 @@ from skills.learning.q_learning import CellQLearning, PhaseQLearning
 from skills.planning.path_fit import FittedPath, fit_to_demo, trace
 from skills.planning.trajectory import PassPath, time_parametrise
 from skills.seeds.recordings import sample_recordings
+from tests.by_day import examples
 
 HAND_OFFS = [(s.name, k) for s in sample_recordings() for k in range(len(s.segments))]
 STEP_MM = 0.5
@@ -174,7 +175,7 @@ def test_the_arm_follows_it_sooner_and_closer_than_the_cells(name):
 # ---- other starts -----------------------------------------------------------------------------------------------
 
 
-@settings(deadline=None, max_examples=60)
+@examples(60)
 @given(
     st.sampled_from(["wren-simple-running", "plover-simple-running"]),
     st.integers(0, 1330),
@@ -194,7 +195,7 @@ def test_from_any_start_it_goes_through_the_rollouts_cells_and_blends_in(name, s
     assert away.max(initial=0) < 1.0
 
 
-@settings(deadline=None, max_examples=30)
+@examples(30)
 @given(st.sampled_from([0.25, 0.5]), st.integers(0, 1330), st.tuples(*[st.floats(-2.49, 2.49)] * 3))
 def test_with_hysteresis_it_goes_through_the_cells_from_any_start_as_well(hysteresis, start, off_mm):
     demo, policy = shipped("plover-simple-running", 0, hysteresis)
@@ -279,7 +280,7 @@ def test_cells_that_no_sample_lies_in_are_crossed_in_a_straight_line():
     assert between[:, 1] == pytest.approx(21 + (between[:, 0] - 11) / 2, abs=0.8)  # mm; the line leaves a cell's corner
 
 
-@settings(deadline=None, max_examples=60)
+@examples(60)
 @given(st.integers(0, 10**6), st.sampled_from([1.0, 5.0, 40.0]), st.sampled_from([0.0, 0.25, 0.5]))
 def test_any_recording_whatever_is_followed_through_its_cells(seed, pace_mm, hysteresis):
     rng = np.random.default_rng(seed)

@@ -14,6 +14,7 @@ from skills.planning.handoff import PsmM
 from skills.planning.path_fit import fit_to_demo, trace
 from skills.planning.plan import MAX_OUTSIDE_MM, MAX_PASSES, SuturePoint, pose_xyzw, rotation_of, stack
 from skills.planning.trajectory import PassPath
+from tests.by_day import examples
 from tests.gridworld.paths import learnt, named_path
 
 NAME = "through its goal"
@@ -124,7 +125,7 @@ def hand_along(name):
     return Demo("PSM2", "/t", "PSM2_base", 0.0, float(stamps[-1]), stamps, tip_mm)
 
 
-@settings(deadline=None, max_examples=30)
+@examples(30)
 @given(places_mm, turns_xyzw, st.integers(0, 1000), st.tuples(*[st.floats(-2.4, 2.4)] * 3))
 def test_with_its_demonstration_a_pass_is_the_fitted_path_moved(place_mm, turn_xyzw, start, off_mm):
     policy, grid, demo = learnt(NAME), named_path(NAME).grid, hand_along(NAME)
@@ -144,7 +145,7 @@ def test_with_its_demonstration_a_pass_is_the_fitted_path_moved(place_mm, turn_x
 # ---- starts outside, and the place of the tip -------------------------------------------------------------------
 
 
-@settings(deadline=None, max_examples=40)
+@examples(40)
 @given(places_mm, turns_xyzw, st.tuples(*[st.floats(-75, 75)] * 3))
 def test_a_pass_from_outside_its_grid_enters_at_the_nearest_place(place, turn, off_mm):
     policy, grid = learnt(NAME), named_path(NAME).grid

@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from skills.errors import BadInput, ImproperRotation, NoApproach
 from skills.kinematics import POINTING_DOWN, matrix_of
 from skills.planning.handoff import realign, turn
+from tests.by_day import examples
 
 PSM_M = np.array([-0.94, 0.10, -0.33]) / np.linalg.norm([-0.94, 0.10, -0.33])
 
@@ -30,7 +31,7 @@ def assert_aligned(rotation: np.ndarray, approach_m: np.ndarray) -> None:
     np.testing.assert_allclose(rotation.T @ rotation, np.eye(3), atol=1e-12)
 
 
-@settings(max_examples=150, deadline=None)
+@examples(150)
 @given(rotation=rotations, approach_m=vectors, toward=st.none() | vectors)
 def test_any_jaw_ends_with_n_along_the_other_arms_approach(rotation, approach_m, toward):
     found = realign(rotation, approach_m, toward)

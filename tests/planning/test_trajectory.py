@@ -4,12 +4,13 @@ from dataclasses import fields
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from skills.errors import BadPlan, BadSpeed, ImproperRotation, NoMotion, Unreachable
 from skills.kinematics import POINTING_DOWN, angle_between, forward, matrix_of
 from skills.planning.trajectory import A1, A2, PassPath, Trajectory, joint_ratios, time_parametrise
+from tests.by_day import examples
 from tests.planning.motions import HAND_OFF_MM, hand_off, small_trajectory
 
 START_CELL = (4, 6, 1)
@@ -29,7 +30,7 @@ def assert_equal(one: Trajectory, other: Trajectory) -> None:
         assert np.asarray(a).tobytes() == np.asarray(b).tobytes(), field.name
 
 
-@settings(max_examples=25, deadline=None)
+@examples(25)
 @given(moves=walks)
 def test_any_grid_walk_is_followed_within_limits_and_ends_on_its_goal(moves):
     cells = np.clip(np.cumsum([START_CELL, *moves], axis=0), 0, 10)

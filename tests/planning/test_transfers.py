@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from skills.errors import BadPlan, Unreachable
@@ -18,6 +18,7 @@ from skills.planning.trajectory import (
     time_parametrise,
     transfers,
 )
+from tests.by_day import examples
 from tests.planning.motions import HAND_OFF_MM, PSM_M, hand_off
 
 BESIDE = PsmM(PSM_M, (160.0, 20.0, 20.0), (0.0, 0.0, float(np.sin(np.radians(22.5))), float(np.cos(np.radians(22.5)))))
@@ -45,7 +46,7 @@ def assert_nothing_leaps(motion: Trajectory) -> None:
         assert (np.abs(np.diff(joints, axis=0)) <= tick * (1 + 1e-9)).all()
 
 
-@settings(max_examples=25, deadline=None)
+@examples(25)
 @given(
     shifts=st.lists(st.tuples(*[st.floats(-15, 15)] * 3), min_size=2, max_size=4),
     turns=st.lists(st.floats(-60, 60), min_size=4, max_size=4),

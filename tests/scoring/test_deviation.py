@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from skills.demonstration.demonstration import Demo
 from skills.errors import BadPath
 from skills.scoring.deviation import as_recorded, deviation, laid_on
+from tests.by_day import examples
 from tests.comparison.cohort import demo_of
 
 FLAT = np.zeros((3, 2))
@@ -39,7 +40,7 @@ def test_left_is_left_of_the_way() -> None:
         assert "to the left" in " ".join(found.words)
 
 
-@settings(deadline=None, max_examples=25)  # the first call compiles
+@examples(25)  # the first call compiles
 @given(st.floats(-3.1, 3.1), st.floats(-50, 50), st.floats(0.5, 2.0), st.floats(2.0, 5.0))
 def test_place_direction_size_and_tempo_say_nothing(turn: float, shift: float, times: float, lasts: float) -> None:
     reference, demo = made(hump(6.0, 3.0)), made(hump(4.0, -8.0))
