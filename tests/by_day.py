@@ -72,8 +72,9 @@ ON_BOTH = {
 
 
 def some(values: Iterable[Any], of: int) -> list[Any]:
-    """Return parameters of a test: every `of`-th value runs by day, all of them at night."""
-    return [pytest.param(value, marks=[pytest.mark.nightly] * (at % of > 0)) for at, value in enumerate(values)]
+    """Return parameters of a test, a tuple for several: every `of`-th value runs by day, all of them at night."""
+    each = (value if isinstance(value, tuple) else (value,) for value in values)
+    return [pytest.param(*one, marks=[pytest.mark.nightly] * (at % of > 0)) for at, one in enumerate(each)]
 
 
 def examples(at_night: int) -> settings:

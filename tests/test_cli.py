@@ -34,6 +34,7 @@ from skills.settings import Settings, settings
 from skills.simulation import film
 from tests import backends
 from tests.arms import ARMS
+from tests.by_day import some
 from tests.formats import bags, lerobots, trials, videos
 from tests.library import cases, exports
 
@@ -608,7 +609,7 @@ HEAVY = {  # pydantic is not among them: typer itself uses it to parse arguments
 }
 
 
-@pytest.mark.parametrize("words", [["--help"], ["train", "--help"], ["policy", "--help"]])
+@pytest.mark.parametrize("words", some([["--help"], ["train", "--help"], ["policy", "--help"]], 3))
 def test_help_is_quick_because_nothing_heavy_is_imported_for_it(words: list[str]) -> None:
     script = (
         "import sys; from skills.cli import app\n"
@@ -688,9 +689,12 @@ def test_the_commands_know_every_learner_that_has_a_joining_rule() -> None:
     assert set(PHASED) == {kind for kind, learner in LEARNERS.items() if learner.phased}
 
 
-def test_every_command_explains_each_option_within_eighty_columns() -> None:
-    for path, command in groups(get_command(app)):
+@pytest.mark.parametrize("of", [6, pytest.param(1, marks=pytest.mark.nightly)])
+def test_every_command_explains_each_option_within_eighty_columns(of: int) -> None:
+    for number, (path, command) in enumerate(groups(get_command(app))):
         assert [one.name for one in command.params if not getattr(one, "help", "")] == [], path
+        if number % of:
+            continue  # by day every sixth is printed
         result = CliRunner().invoke(app, [*path, "--help"], terminal_width=80, env={"COLUMNS": "80"})
         assert result.exit_code == 0, result.output
         assert [line for line in result.output.splitlines() if len(line) > 80 or "…" in line] == [], path

@@ -28,7 +28,7 @@ from tests.library import cases
 from tests.waiting import END_S, until
 
 RELEASE = f"{POLICY}/release"
-BY_DAY_S, AT_NIGHT_S = 1.0, 10.0  # of changes and readers as fast as they can
+BY_DAY_S, AT_NIGHT_S = 0.4, 10.0  # of changes and readers as fast as they can
 
 
 @dataclass(frozen=True)

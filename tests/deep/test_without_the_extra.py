@@ -20,6 +20,7 @@ from skills.learning.networks import DDPG
 from skills.learning.policy import Policy
 from tests.api.conftest import service, still, trained  # noqa: F401 - fixtures
 from tests.api.service import KESTREL, Service, assert_problem
+from tests.by_day import some
 from tests.deep.networks import towards
 
 PROJECT = Path(__file__).parents[2]
@@ -56,13 +57,13 @@ def test_a_lesson_goes_to_the_training_process_and_a_network_comes_back(trained_
 
 @pytest.mark.parametrize(
     ("fault", "cause", "advice"),
-    [
+    some([
         ("crash", "crashed", "SIGSEGV; train again"),
         ("fail", "failed", "code 1; its last output is in the log"),
         ("garbage", "nonsense", "returned unreadable data; train again"),
         ("a_number", "nonsense", "returned unreadable data; train again"),
-    ],
-)
+    ], 4),
+)  # fmt: skip
 def test_a_training_process_without_a_network_fails_with_advice(trained_by, fault, cause, advice):
     with pytest.raises(LearningFailed, match=f"^The learning process .*{advice}") as caught:
         trained_by(f"tests.sandbox.faults:{fault}")

@@ -104,6 +104,7 @@ def unmasked(connection: socket.socket) -> None:
     connection.sendall(bytes([0x81, len(POSE)]) + POSE)
 
 
+@pytest.mark.nightly  # by day tests/api/test_sessions.py closes sessions for the same reasons, without a server
 @pytest.mark.parametrize("leave", [reset, half_a_frame, stalled, flood, too_long, unmasked])
 def test_sessions_that_go_wrong_leave_nothing_behind(running: Service, leave: Callable[[socket.socket], None]):
     assert running.process is not None

@@ -18,6 +18,7 @@ import pytest
 from skills.client import Client
 from skills.formats import BYTES
 from tests.api.service import KESTREL, MCAP, assert_problem
+from tests.by_day import some
 from tests.e2e.conftest import FORK_SERVER, Service, running
 from tests.formats import hostile, lerobots
 from tests.formats.test_tables_hostile import FILES, mutations
@@ -170,6 +171,7 @@ def test_bombs_are_refused_in_seconds_and_nobody_else_notices(service, http):
     defuse(service, http, QUICK_BOMBS)
 
 
+@pytest.mark.nightly  # by day tests/formats/test_lerobot_hostile.py
 def test_damaged_and_hostile_lerobot_episodes_are_refused(service, http):
     assert sweep(service, http, hostile.truncations(EPISODE, 10, seed=1)) == 0
     same_or_refused(http, hostile.flips(EPISODE, 10, seed=1), EPISODE)
@@ -193,7 +195,7 @@ def test_damaged_and_misassembled_tables_are_refused_or_stored(service, http, co
         sweep(service, http, mutations(text, count, seed=count), how)
 
 
-@pytest.mark.parametrize("name", TABLE_BOMBS)
+@pytest.mark.parametrize("name", some(TABLE_BOMBS, 4))
 def test_table_bombs_are_refused_or_read_within_the_limits(service, http, name):
     began = reading_s(service)
     answer = send(http, TABLE_BOMBS[name], table={"rate_hz": 100, "frame": "ECM"})

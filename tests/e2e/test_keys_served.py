@@ -71,6 +71,7 @@ def wait_until_alive(http: httpx.Client, process: subprocess.Popen[bytes]) -> No
             time.sleep(0.1)
 
 
+@pytest.mark.nightly  # uvicorn's own; the settings are tested by day
 @pytest.mark.needs("openssl")
 def test_it_speaks_tls_itself_and_its_cookie_then_goes_over_tls_alone(tmp_path: Path):
     cert, secret = tmp_path / "cert.pem", tmp_path / "key.pem"

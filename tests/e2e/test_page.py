@@ -37,11 +37,17 @@ def browser() -> Iterator[Browser]:
         yield started
 
 
+@contextmanager
+def by_a_thread(folder: Path) -> Iterator[Service]:
+    """Start a service whose jobs a thread carries out: a worker takes three seconds to start."""
+    with running(folder, workers=0) as started, cases.working(Settings(database_url=f"sqlite:///{started.database}")):
+        yield started
+
+
 @pytest.fixture(scope="module")
 def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
     """Yield a service whose jobs a thread carries out."""
-    folder = tmp_path_factory.mktemp("service")
-    with running(folder, workers=0) as started, cases.working(Settings(database_url=f"sqlite:///{started.database}")):
+    with by_a_thread(tmp_path_factory.mktemp("service")) as started:
         yield started
 
 
@@ -208,7 +214,7 @@ class Clicks:
 def test_a_bag_comes_to_a_verdict_in_six_clicks(browser: Browser, tmp_path: Path) -> None:
     bag = tmp_path / "session.mcap"
     bag.write_bytes(SAMPLE.data)  # with five hand-offs, so that one is asked for
-    with running(tmp_path) as fresh, visiting(browser, fresh.url) as tab:
+    with by_a_thread(tmp_path) as fresh, visiting(browser, fresh.url, view=False) as tab:
         tab.open("/")
         page, user, steps = tab.page, Clicks(), tab.page.locator("#try-steps")
         user.count += 1  # the drop

@@ -140,7 +140,7 @@ def test_a_zipped_folder_with_a_db3_or_a_ros_1_bag_is_read(folder3, bag1):
         assert (got.format, got.integrity) == (kind, "full")
 
 
-@pytest.mark.parametrize("count", [40, pytest.param(200, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("count", [15, pytest.param(200, marks=pytest.mark.nightly)])
 @pytest.mark.parametrize("kind", ["bag1", "bag3"])
 def test_a_damaged_bag_is_read_or_refused_and_nothing_else(kind, count, request):
     data, refused = request.getfixturevalue(kind), 0

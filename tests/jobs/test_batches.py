@@ -102,6 +102,7 @@ def done(database: Database, job: Job) -> int:
     return states_of(database, job).count("done")
 
 
+@pytest.mark.nightly  # four processes; by day tests/library/test_batch_work.py, and test_one_worker takes over
 @pytest.mark.parametrize("database", backends.BACKENDS, indirect=True)
 def test_a_batch_survives_a_dead_worker_a_bad_style_and_eight_requests(database: Database):
     """Eight requests run at once.

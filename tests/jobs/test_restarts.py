@@ -328,9 +328,3 @@ def test_what_a_worker_took_without_hearing_so_is_done_all_the_same(house: House
         session.get_one(Job, row).state = "queued"
     assert house.ended(row).state == "succeeded"
     assert len(house.noted("begins", row)) == 1
-
-
-def test_a_job_longer_than_a_lease_is_begun_once(house: House):
-    row = house.ask("slow", seconds=house.settings.lease_s + 2.0)
-    assert house.ended(row).state == "succeeded"
-    assert len(house.noted("begins", row)) == 1

@@ -108,7 +108,8 @@ def test_a_named_cache_folder_that_is_not_writable_is_refused(folder, monkeypatc
     check_kept(folder)
 
 
-@pytest.mark.parametrize("command", ["serve", pytest.param("worker", marks=pytest.mark.nightly)])
+@pytest.mark.nightly  # by day tests/formats/test_confined.py, of the readers
+@pytest.mark.parametrize("command", ["serve", "worker"])
 def test_no_command_starts_with_a_world_writable_machine_code_cache(tmp_path, command):
     open_to_all = tmp_path / "cache"
     open_to_all.mkdir()

@@ -81,6 +81,7 @@ def test_three_processes_fill_an_empty_cache_and_a_fourth_loads_it(read_only, tm
     assert Path(after["kept"]).parent == tmp_path
 
 
+@pytest.mark.nightly  # starts two interpreters
 def test_a_read_only_installation_uses_the_users_cache_folder_by_default(read_only, tmp_path):
     kept = told(start("tell()", read_only, home=str(tmp_path)))["kept"]
     assert Path(kept).is_relative_to(tmp_path / ".cache" / "numba")

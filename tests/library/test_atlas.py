@@ -69,6 +69,7 @@ def far(found: atlas.Atlas) -> np.ndarray:
     return whole
 
 
+@pytest.mark.nightly  # by day tests/comparison/test_recognition.py
 def test_eight_surgeons_in_five_sessions_are_recognised_and_told_apart(database: Database):
     names = cohorts.add_cohort(database)
     found = atlas_of(database, SUTURE)

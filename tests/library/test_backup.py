@@ -169,6 +169,7 @@ def test_jobs_that_had_not_ended_are_told_again_and_done(
         assert cases.work(restored, job).state == "succeeded"
 
 
+@pytest.mark.nightly  # a worker's start; by day the next test's jobs are told again
 def test_a_worker_of_the_restored_installation_carries_on(tmp_path: Path):
     """The database's engine knew the jobs; the restored one has a new engine that does not."""
     before = House(backends.fresh("sqlite", tmp_path), tmp_path)

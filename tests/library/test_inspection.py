@@ -15,6 +15,7 @@ from skills.library import inspection
 from skills.library.atlas import far_apart
 from skills.library.inspection import AGREES, WITH_OTHERS, inspect_installation, packed_values
 from tests import backends
+from tests.by_day import some
 from tests.library import cases
 
 MAPPERS = sorted(Base.registry.mappers, key=lambda one: one.local_table.name)
@@ -176,7 +177,7 @@ CHANGES = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("statement", "what", "why"), CHANGES)
+@pytest.mark.parametrize(("statement", "what", "why"), some(CHANGES, 3))
 def test_whatever_is_changed_is_named(damaged: Database, statement: str, what: str, why: str):
     tamper(damaged, statement)
     wrong = looked_at(damaged)[1]
@@ -184,6 +185,7 @@ def test_whatever_is_changed_is_named(damaged: Database, statement: str, what: s
     assert not any("kestrel" in said or "heron" in said for one in wrong for said in one)
 
 
+@pytest.mark.nightly  # some thirty inspections; by day every third change
 def test_every_packed_value_is_read(damaged: Database):
     packed = [(m.local_table.name, name) for m in MAPPERS for name in packed_values(m)]
     assert len(packed) == sum(isinstance(c.type, Packed) for t in Base.metadata.tables.values() for c in t.columns)

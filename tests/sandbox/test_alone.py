@@ -15,6 +15,7 @@ import pytest
 from skills.errors import BadInput, Unanswered
 from skills.sandbox import ProcessLimits
 from skills.sandbox.forked import call_alone
+from tests.by_day import some
 from tests.waiting import alive, children, crowded, until
 
 GIB = 1 << 30
@@ -39,7 +40,7 @@ def test_it_sees_none_of_our_settings(monkeypatch):
 
 @pytest.mark.parametrize(
     ("fault", "cause", "word"),
-    [
+    some([
         ("crash", "crashed", "SIGSEGV"),
         ("leave", "failed", "code 3"),
         ("fail", "failed", "code 1"),
@@ -51,8 +52,8 @@ def test_it_sees_none_of_our_settings(monkeypatch):
         ("with_pickles", "nonsense", "unreadable data"),
         ("a_number", "nonsense", "unreadable data"),
         ("a_class_that_is_not_named", "nonsense", "unreadable data"),
-    ],
-)
+    ], 4),  # each is a new interpreter; test_forked has all by day
+)  # fmt: skip
 def test_what_went_wrong_is_named(fault, cause, word):
     with pytest.raises(Unanswered, match=word) as caught:
         call(fault)

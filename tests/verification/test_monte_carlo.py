@@ -29,6 +29,7 @@ from skills.verification.gates import Limits
 from skills.verification.monte_carlo import doubt, looked_at, scene_of
 from skills.verification.probabilities import Doubt, DoubtSettings, DoubtUnder
 from tests.arms import EXACT
+from tests.by_day import some
 from tests.verification.test_catch import APPROACH, OPENING_RAD, PLANNED
 
 PAD_TOP_MM = -150.0  # 5 mm under the lowest finger tips
@@ -74,7 +75,9 @@ def under(found: Doubt) -> DoubtUnder:
     return found.under[0]
 
 
-@pytest.mark.parametrize("errors", [of_tips(0.65), of_tips(3.0), only(registration_mm=1.5), only(tip_noise_mm=0.5)])
+@pytest.mark.parametrize(
+    "errors", some([of_tips(0.65), of_tips(3.0), only(registration_mm=1.5), only(tip_noise_mm=0.5)], 2)
+)
 def test_catching_is_as_likely_as_the_integral_over_all_offsets(errors):
     # Without any turn the place is y = e_y and z = 7 + e_z + r (1 - sin phi), where r cos phi = -e_x.
     sigma = sqrt(errors.registration_mm**2 + 2 * errors.tip_bias_mm**2 + 2 * errors.tip_noise_mm**2)
@@ -278,7 +281,9 @@ def test_psm_m_beside_catches_what_its_wanted_pose_alone_catches():
         assert [one.caught for one in under(beside).passes] == [one.caught for one in under(alone).passes]
 
 
-@pytest.mark.parametrize("size", ["registration_mm", "registration_deg", "wrist_deg", "tip_bias_mm", "tip_noise_mm"])
+@pytest.mark.parametrize(
+    "size", some(["registration_mm", "registration_deg", "wrist_deg", "tip_bias_mm", "tip_noise_mm"], 3)
+)
 def test_more_error_never_helps_where_nothing_else_is_in_doubt(size):
     settings = DoubtSettings(variations=100, suture_point_mm=0.0, needle_rad=0.0)
     asked = {"settings": settings, "trajectory": motion(1, PSM_M)}

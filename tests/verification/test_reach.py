@@ -118,8 +118,8 @@ def compared(seed: int, count: int) -> Counter[tuple[str, str | None]]:
 
 
 def test_no_place_is_reached_where_its_plan_is_refused():
-    met = compared(seed=5, count=40)
-    assert met["yes", None] >= 8
+    met = compared(seed=5, count=20)
+    assert met["yes", None] >= 4
     assert sum(n for (answer, _), n in met.items() if answer == "in doubt") <= 4
 
 
