@@ -13,7 +13,7 @@ from hypothesis import settings
 ON_BOTH = {
     # the tables, transactions and queries themselves
     *("test_base", "test_changes", "test_query_plans", "test_session", "test_tables"),
-    *("test_library", "test_erasing", "test_watching"),
+    *("test_library", "test_erasing", "test_a_revoked_key_is_told_no_more_and_signs_of_life_come_meanwhile"),
     "test_an_upload_that_dies_anywhere_leaves_nothing_to_see_and_is_swept",
     "test_an_erased_surgeons_jobs_are_gone_at_once_and_swept_later",
     "test_a_deleted_recording_is_gone_at_once_and_swept_later",
@@ -41,27 +41,20 @@ ON_BOTH = {
     "test_a_migration_that_fails_half_way_leaves_nothing",
     "test_two_services_that_start_together_migrate_once",
     "test_a_release_is_taken_over_and_serves_the_same_bytes",
-    "test_down_and_up_again_keeps_every_row_and_every_answer",
     # the history
     "test_the_triggers_note_every_logged_table",
     "test_what_the_service_wrote_is_whole_and_signed",
-    "test_random_edits_are_found_and_named",
     "test_a_transaction_that_changes_many_rows_one_by_one_is_logged_whole",
     "test_signing_and_writing_do_not_wait_for_each_other",
     "test_uploads_in_pieces_erasures_in_steps_and_retentions_keep_the_history_whole",
-    "test_proofs_are_checked_offline_and_stay_valid_after_an_erasure",
     "test_a_row_written_past_the_service_is_not_logged_for_its_author",
     # backups that are restored
     "test_a_demonstration_erased_after_the_backup_leaves_nothing_served",
-    "test_a_deleted_recording_that_is_used_again_does_not_block_a_restore",
-    "test_a_key_that_was_revoked_stays_revoked",
     "test_the_service_keeps_the_list_up_while_it_runs",
     # outcomes
     "test_the_newest_mark_counts_and_every_mark_says_who_and_why",
-    "test_demonstrations_are_listed_by_outcome_with_one_statement",
     "test_a_mark_made_while_a_style_is_learnt",
     # cached recordings
-    "test_a_large_content_is_stored_in_chunks",
     "test_a_recording_that_is_erased_while_it_is_read_is_not_cached",
     "test_concurrent_first_uses_leave_one_entry",
     # datasets

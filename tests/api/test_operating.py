@@ -67,6 +67,7 @@ def beat(settings: Settings, **late: float) -> None:
         session.merge(Executor(id="one", beat_at=now() - timedelta(**late)))
 
 
+@pytest.mark.nightly  # a worker; by day tests/e2e/test_service.py waits for it to be ready
 def test_with_a_database_a_queue_and_a_worker_it_is_ready(house: House):
     assert refuse_unready(house.settings) == 1
     with serving(house.settings.database_url) as service:

@@ -37,6 +37,7 @@ def test_a_recording_over_a_limit_of_the_settings_is_refused_in_words(tmp_path, 
         assert service.counts() == before
 
 
+@pytest.mark.nightly  # four servers; by day tests/e2e kills one
 def test_files_are_read_in_another_process_and_a_killed_one_is_replaced(own_fork_server, tmp_path):
     with serving(backends.fresh("sqlite", tmp_path)) as service:
         service.client.put_surgeon("kestrel")

@@ -96,16 +96,19 @@ def test_planted_losses_are_found(told: Told):
         assert any(one.startswith(said) for one in lost), said
 
 
+@pytest.mark.nightly  # of the audit of `make faults`; by day planted losses are found
 def test_a_job_that_never_ends_is_lost(told: Told):
     told.service.tamper("UPDATE jobs SET state = 'running'")
     assert any("still running" in one for one in told.audit().lost)
 
 
+@pytest.mark.nightly  # of the audit of `make faults`; by day planted losses are found
 def test_a_failed_training_is_told_and_is_not_lost(told: Told):
     told.service.tamper("UPDATE jobs SET state = 'failed', error = 'Nobody knows.', result = NULL")
     assert told.audit().given_up == ["Nobody knows."]
 
 
+@pytest.mark.nightly  # of the audit of `make faults`; by day planted losses are found
 def test_a_backup_that_lacks_something_or_is_damaged_is_found(told: Told):
     told.back_up()
     (backup,) = told.backups.iterdir()
@@ -117,6 +120,7 @@ def test_a_backup_that_lacks_something_or_is_damaged_is_found(told: Told):
     assert any(one.startswith(f"backup {backup.name}") for one in told.audit().lost)
 
 
+@pytest.mark.nightly  # of the audit of `make faults`; by day planted losses are found
 def test_planted_doublings_are_found(told: Told):
     job = (
         "kind, identity, progress, request, result, error, attempt, surgeon_row, plan, asked_by, told_at, created_at, "
@@ -137,6 +141,7 @@ def test_planted_doublings_are_found(told: Told):
         assert any(one.startswith(said) for one in doubled), said
 
 
+@pytest.mark.nightly  # of the audit of `make faults`; by day planted losses are found
 def test_what_was_served_wrongly_is_found(told: Told):
     """A policy after its acknowledged withdrawal, and a document with other numbers."""
     (name,) = told.ledger.bodies

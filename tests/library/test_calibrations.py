@@ -54,6 +54,7 @@ def copied(small: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(small, tmp_path / "copied"))
 
 
+@pytest.mark.nightly  # by day tests/scoring/test_validation.py
 def test_eight_surgeons_are_rated_well_by_a_model_that_has_not_seen_them(read: Rated, about: dict[str, Any]) -> None:
     judged = about["validated"]["tasks"]["Suturing"]
     print(judged)

@@ -19,6 +19,7 @@ from skills.verification.gates import Limits
 from skills.verification.playback import PSM_M, Playback
 from skills.verification.verdict import judge
 from tests.bench.playing import stacked
+from tests.by_day import some
 from tests.planning.motions import hand_off, small_trajectory
 from tests.planning.test_hand import at_home, recorded_psm_m, turning
 from tests.planning.test_transfers import BESIDE
@@ -126,6 +127,7 @@ def test_a_two_arm_hand_off_is_feasible_and_reports_its_nearest_links():
     assert {one.phase for one in report.needle} == {"transfer", "A1", "A2"}
 
 
+@pytest.mark.nightly  # by day test_clearance compares bounds with every sample
 @needs_simulator
 def test_looking_at_every_sample_finds_nothing_nearer_than_the_bounds():
     both = stacked(passes=1, rate_hz=100.0)
@@ -170,7 +172,7 @@ def test_the_si_plays_beyond_the_classics_limits():
 
 
 @needs_simulator
-@pytest.mark.parametrize(("instrument", "further_in_mm"), [("400006-Si", 50.8), ("420006-Classic", -50.8)])
+@pytest.mark.parametrize(("instrument", "further_in_mm"), some([("400006-Si", 50.8), ("420006-Classic", -50.8)], 2))
 def test_an_instrument_on_the_other_arm_plays_the_same_motion(played, instrument, further_in_mm):
     motion = time_parametrise([hand_off(-8.0 * k) for k in range(2)], instrument=instrument, rate_hz=60.0)
     np.testing.assert_allclose(motion.joints[:, 2], TRAJECTORY.joints[:, 2] + further_in_mm, atol=1e-9)

