@@ -187,6 +187,24 @@ def shared_tables() -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="session", autouse=True)
+def shared_document() -> Iterator[None]:
+    """Let all applications of a process share its OpenAPI document, which takes most of a second to build."""
+    from skills.api.app import Service
+
+    build = Service.openapi
+    built: list[dict[str, Any]] = []
+
+    def openapi(application: Service) -> dict[str, Any]:
+        if not built:
+            built.append(build(application))
+        return built[0]
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(Service, "openapi", openapi)
+        yield
+
+
 @pytest.fixture(scope="module", autouse=True)
 def forgotten() -> None:
     """Let no file of tests find in this process's caches the settings or the policies of another."""

@@ -56,6 +56,7 @@ def test_with_labels_shuffled_recognition_falls_to_chance(shuffles: int):
     assert np.mean(losses) > 0.95 * np.log(8)  # and its confidence is not above chance
 
 
+@pytest.mark.nightly  # by day an untestable demonstration ignores its session
 def test_what_only_the_session_tells_is_not_recognised():
     """All surgeons are alike, two demonstrations per session: nearest neighbours are right, but of the same session."""
     drawn = cohort(2, surgeons=4, sessions=4, own=0.0, day=5.0)

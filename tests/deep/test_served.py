@@ -102,6 +102,7 @@ def test_inspection_accepts_the_installation_and_finds_a_changed_network(served:
     assert [wrong for checked in inspect_installation(served.database) for wrong in checked.wrong]
 
 
+@pytest.mark.nightly  # a plan does not know by which learner its policy was learnt
 @pytest.mark.needs("simulator")
 def test_its_plan_is_played_in_the_simulator(served: Service):
     plan = served.client.plan(**KESTREL, suture_points=[{"position_mm": GOAL_MM}], handoff="none")
@@ -124,6 +125,7 @@ def test_a_continuous_policy_reports_its_rollouts_and_is_not_released(service: S
     assert Client(service.http).learnt(**KESTREL, version=1).network == always((0.0, 0.0, 0.0))
 
 
+@pytest.mark.nightly  # a page; by day tests/api/test_pages.py
 def test_the_page_sets_learners_beside_each_other(served: Service):
     store(served, DDPG(), always((0.0, 0.0, 0.0)))
     page = served.http.get(f"/pages/styles/kestrel/{KESTREL['suture']}?version=1&beside=2").text

@@ -15,16 +15,23 @@ from skills.client import Client
 from skills.db.session import Database
 from skills.library.keys import create_key, revoke_key
 from tests import backends
+from tests.api.service import serving
 from tests.e2e.conftest import Service, running
 from tests.waiting import END_S
 
 
-@pytest.fixture(params=backends.BACKENDS)
-def installation(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[Service, Database]]:
-    """Yield a service, and its database in this process."""
+@pytest.fixture(params=["here", *(pytest.param(one, marks=pytest.mark.nightly) for one in backends.BACKENDS)])
+def installation(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[httpx.Client, Database]]:
+    """Yield a client of a service, and another connection to its database; by day the service is in this process."""
+    if request.param == "here":
+        url = backends.fresh("sqlite", tmp_path)
+        with serving(url) as service, closing(Database(url)) as database:
+            yield service.http, database
+        return
     url = backends.fresh(request.param, tmp_path)
-    with running(tmp_path, database_url=url, workers=0) as service, closing(Database(url)) as database:
-        yield service, database
+    apart = running(tmp_path, database_url=url, workers=0)
+    with apart as service, httpx.Client(base_url=service.url) as http, closing(Database(url)) as database:
+        yield http, database
     backends.drop(url)
 
 
@@ -39,23 +46,22 @@ def asked(http: httpx.Client, wanted: int, **headers: str) -> list[tuple[float, 
 
 
 def test_a_key_made_or_revoked_in_one_process_counts_in_another_within_1_s(
-    installation: tuple[Service, Database],
+    installation: tuple[httpx.Client, Database],
 ):
-    service, database = installation
-    with httpx.Client(base_url=service.url) as http:
-        assert http.get("/surgeons").status_code == 200
-        with database.writing() as session:
-            key, text = create_key(session, "anna", "reader", "local")
-        made = time.monotonic()
-        let_in = [began for began, status in asked(http, 401) if status == 200]
-        assert all(began < made + REMEMBERED_S for began in let_in)
-        assert asked(http, 200, **{"X-API-Key": text})[0][1] == 200  # a key is valid from its creation on
-        with database.writing() as session:
-            revoke_key(session, key.id, "local")
-        revoked = time.monotonic()
-        let_in = [began for began, status in asked(http, 401, **{"X-API-Key": text}) if status == 200]
-        assert all(began < revoked + REMEMBERED_S for began in let_in)
-        print(f"let in for {max([revoked, *let_in]) - revoked:.2f} s after it was revoked")
+    http, database = installation
+    assert http.get("/surgeons").status_code == 200
+    with database.writing() as session:
+        key, text = create_key(session, "anna", "reader", "local")
+    made = time.monotonic()
+    let_in = [began for began, status in asked(http, 401) if status == 200]
+    assert all(began < made + REMEMBERED_S for began in let_in)
+    assert asked(http, 200, **{"X-API-Key": text})[0][1] == 200  # a key is valid from its creation on
+    with database.writing() as session:
+        revoke_key(session, key.id, "local")
+    revoked = time.monotonic()
+    let_in = [began for began, status in asked(http, 401, **{"X-API-Key": text}) if status == 200]
+    assert all(began < revoked + REMEMBERED_S for began in let_in)
+    print(f"let in for {max([revoked, *let_in]) - revoked:.2f} s after it was revoked")
 
 
 def wait_until_alive(http: httpx.Client, process: subprocess.Popen[bytes]) -> None:

@@ -17,6 +17,8 @@ from tests.e2e.test_hostile_uploads import others_are_served, rows
 from tests.library import cases
 from tests.waiting import END_S, crowded
 
+# A service of its own, for requests that uvicorn refuses; by day tests/e2e/test_hostile_clients.py stalls and aborts.
+pytestmark = pytest.mark.nightly
 LIMIT = 1_000_000
 PATIENCE_S = 1.0
 TABLE = cases.hand_off()

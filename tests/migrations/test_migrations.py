@@ -128,6 +128,7 @@ def test_what_the_first_version_stored_is_kept_whole_and_still_guarded(database:
     assert_guarded(database, "withdrawn_at", "NULL")
 
 
+@pytest.mark.nightly  # of a migration that never changes again; by day every one goes down and up
 def test_a_policy_of_several_demos_cannot_be_downgraded_to_one_demo(database: Database):
     database.migrate()
     cases.add_surgeon(database)
@@ -139,6 +140,7 @@ def test_a_policy_of_several_demos_cannot_be_downgraded_to_one_demo(database: Da
         assert session.scalar(text("SELECT count(*) FROM policy_demonstrations")) == 1
 
 
+@pytest.mark.nightly  # of a migration that never changes again; by day every one goes down and up
 def test_failures_block_the_downgrade_that_would_learn_from_them(database: Database):
     database.migrate()
     cases.add_surgeon(database)
@@ -154,6 +156,7 @@ def test_failures_block_the_downgrade_that_would_learn_from_them(database: Datab
     go(database, command.downgrade, "0010")
 
 
+@pytest.mark.nightly  # of a migration that never changes again; by day every one goes down and up
 def test_a_downgrade_forgets_datasets_with_their_jobs(database: Database, monkeypatch: pytest.MonkeyPatch):
     database.migrate()
     cases.add_surgeon(database)
@@ -167,6 +170,7 @@ def test_a_downgrade_forgets_datasets_with_their_jobs(database: Database, monkey
     exports.export(database)
 
 
+@pytest.mark.nightly  # of a migration that never changes again; by day every one goes down and up
 def test_a_downgrade_drops_batches_and_cancels_the_unfinished_ones(database: Database):
     database.migrate()
     cases.add_surgeon(database)
@@ -197,6 +201,7 @@ def assert_guarded(database: Database, column: str, new: str | None = None) -> N
         session.execute(text(f"UPDATE demonstrations SET {column} = {new or other}"))
 
 
+@pytest.mark.nightly  # of a migration that never changes again; by day every one goes down and up
 def test_a_demo_with_hysteresis_blocks_the_downgrade_without_changes(database: Database):
     database.migrate()
     cases.add_surgeon(database)

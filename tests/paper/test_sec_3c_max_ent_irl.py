@@ -11,6 +11,7 @@ from skills.learning.evaluation import measure
 from skills.learning.max_ent_irl import MaxEntIRL, recover_reward
 from skills.learning.policy import learn_tabular, rollout_from
 
+pytestmark = pytest.mark.nightly  # it reproduces a result; by day tests/learning/test_max_ent_irl.py
 STAY = 13
 
 

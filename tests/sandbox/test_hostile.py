@@ -100,6 +100,7 @@ def ordinary() -> int:
     return NOBODY if os.geteuid() == 0 else os.geteuid()
 
 
+@pytest.mark.nightly  # by day with every layer
 @pytest.mark.parametrize(
     "missing", [{"own network", "own files"}, {"file rights", "signals"}], ids=["spaces", "Landlock"]
 )
