@@ -3,16 +3,21 @@
 Two arms of either generation, their joints anywhere within the published limits, the second arm's base anywhere within
 0.4 m and turned in any way up to 30 degrees from upright. In a third of the set-ups the second base is then brought,
 along the line between the remote centres, to where the nearest parts are within 2 mm of contact.
+
+Whole motions are planned ones, with PSM_M's base moved sideways to where the bodies meet or just miss each other.
 """
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 
 from skills.kinematics import instrument_of, matrix_of
-from skills.verification.bodies import Parts, between, parts_of, radii_of
+from skills.planning.trajectory import Trajectory
+from skills.verification.bodies import Parts, between, bodies_clearance, distances_at, parts_of, radii_of
 from tests.needs import need
+from tests.verification.hands import sound_plans
 
 need("fcl")
 
@@ -108,3 +113,64 @@ def test_two_thousand_set_ups_collide_where_a_collision_library_says_so():
     collide, near = compare(range(2000))
     assert collide >= 600
     assert near >= 300
+
+
+def planned_motions() -> Iterator[Trajectory]:
+    """Yield planned motions of two arms; every other one comes within `NEAR_MM` of contact, on either side of it."""
+    rng = np.random.default_rng(7)
+    planned = (one.trajectory for one in sound_plans(seed=11, count=1000))
+    for number, motion in enumerate(one for one in planned if one.psm_m is not None):
+        wanted = rng.uniform(-NEAR_MM, NEAR_MM) if number % 2 else rng.uniform(-40.0, 60.0)
+        some, near, far, moved = np.linspace(0, len(motion) - 1, 60).astype(int), 0.0, 4.0, motion
+        for _ in range(25):
+            share = (near + far) / 2
+            base_mm = motion.psm_m.base_mm * [share, share, 1.0]
+            moved = replace(motion, psm_m=replace(motion.psm_m, base_mm=base_mm))
+            near, far = (share, far) if distances_at(moved, some).min() < wanted else (near, share)
+        yield moved
+
+
+def at_sample(motion: Trajectory, sample: int) -> SetUp:
+    arm, other = motion, motion.psm_m
+    parts = [parts_of(one.joints[[sample]], one.instrument) for one in (arm, other)]
+    parts[1] = parts[1].seen_from(matrix_of(other.base_xyzw[None])[0], other.base_mm)
+    least_mm = float(distances_at(motion, np.array([sample])).min())
+    return SetUp((parts[0], parts[1]), (radii_of(arm.instrument), radii_of(other.instrument)), least_mm)
+
+
+def compare_motions(count: int) -> tuple[int, int]:
+    """Compare whole motions with the library; return how many touch, and how many come within `NEAR_MM` of contact.
+
+    Samples all along a motion are compared, those about its nearest one, and the first at which the verdict has them
+    collide.
+    """
+    collide = near = 0
+    for _, motion in zip(range(count), planned_motions(), strict=False):
+        verdict = bodies_clearance(motion, 0.0)
+        every = np.linspace(0, len(motion) - 1, 60).astype(int)
+        nearest = int(every[distances_at(motion, every).min(axis=(1, 2)).argmin()])
+        looks = {*every.tolist(), *range(max(nearest - 5, 0), min(nearest + 6, len(motion)))}
+        if verdict.first is not None:
+            looks.add(verdict.first.sample)
+        found = {look: at_sample(motion, look) for look in looks}
+        theirs = {look for look, one in found.items() if touches(one)}
+        assert {look for look in theirs if found[look].least_mm > 1e-6} == set()
+        assert {look for look, one in found.items() if one.least_mm < -IN_DOUBT_MM} <= theirs
+        assert verdict.first is not None or not theirs
+        assert verdict.first is None or min(theirs, default=len(motion)) >= verdict.first.sample
+        collide += bool(theirs)
+        near += abs(min(one.least_mm for one in found.values())) <= NEAR_MM
+    return collide, near
+
+
+def test_planned_motions_collide_where_a_collision_library_says_so():
+    collide, near = compare_motions(4)
+    assert 1 <= collide <= 3
+    assert near >= 1
+
+
+@pytest.mark.nightly
+def test_sixty_planned_motions_collide_where_a_collision_library_says_so():
+    collide, near = compare_motions(60)
+    assert 18 <= collide <= 42
+    assert near >= 25
