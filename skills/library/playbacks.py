@@ -42,9 +42,9 @@ from skills.verification.gates import SCENE, Failure
 from skills.verification.intent import compare
 from skills.verification.monte_carlo import doubt
 from skills.verification.playback import Pictures
-from skills.verification.probabilities import JUDGE_VERSION
+from skills.verification.probabilities import JUDGE_VERSION, UPWARDS
 from skills.verification.probabilities import NEEDLE as NEEDLE_ERROR
-from skills.verification.scene_clearance import NEEDLE, SceneClearance, clearance_of, flat_tissue_mm
+from skills.verification.scene_clearance import NEEDLE, SceneClearance, clearance_of, flat_tissue
 from skills.verification.verdict import judge
 
 Level = Literal["good", "caution", "bad"]
@@ -93,7 +93,7 @@ def judged_under(report: dict[str, Any], errors: ArmErrors) -> dict[str, Any]:
     doubted = report.get("doubt") or {}
     if not (doubted.get("version", 1) >= JUDGE_VERSION and doubted.get("under")):
         raise Conflict(
-            "How often this plan succeeds was judged by an older version, without errors of registration and wrist; "
+            "How often this plan succeeds was judged by an older version, which had other errors, jaws or tissue; "
             "play it again."
         )
     stated: dict[str, Any] = doubted["under"][0]
@@ -168,7 +168,7 @@ def _percent(part: float | None) -> str:
     return f"{100 * part:.1f} %"
 
 
-CHECK_VERSION = 4  # part of the job's identity: raise it when verdicts change, so that plans can be played again
+CHECK_VERSION = 5  # part of the job's identity: raise it when verdicts change, so that plans can be played again
 
 
 def request_playback(
@@ -223,16 +223,16 @@ def check_playback(
     intent = compare(asked, trajectory, measured.joints)
     # The simulator's pad lies below the motion wherever that goes, so it is no tissue and no gate.
     verdict = judge(measured, trajectory, approach_m=approach_m, beside=beside, pad_is_tissue=False, intent=intent)
-    tissue = plan.scene is not None and plan.scene.tissue is not None
-    top_mm = flat_tissue_mm(trajectory, beside.report) if tissue and beside is not None else None
+    tissue = None if plan.scene is None else plan.scene.tissue
+    pad = (None, UPWARDS) if tissue is None or beside is None else flat_tissue(trajectory, beside.report, tissue)
     errors = ArmErrors(**request["errors"]) if "errors" in request else stated_errors(settings.arm_errors)
-    doubted = doubt(trajectory, approach_m=approach_m, pad_top_mm=top_mm, errors=errors)
+    doubted = doubt(trajectory, approach_m=approach_m, pad_top_mm=pad[0], pad_normal=pad[1], errors=errors)
     report = _finite(asdict(verdict)) | {
         "doubt": _finite(asdict(doubted)),
         "stated_by": request.get("stated_by", "installation"),
         "failure_in_words": failure_in_words(verdict.failure, beside),
         "scene": None if beside is None else _finite(asdict(beside.report)),
-        "tissue": "judged" if tissue else "not given",
+        "tissue": "not given" if tissue is None else "judged",
         "plan": request["plan"],
         "trajectory": trajectory_digest(trajectory),
         "policy": policy,

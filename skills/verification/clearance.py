@@ -42,7 +42,7 @@ from numpy.typing import ArrayLike
 
 from skills.arrays import Flags, Floats, Ints
 from skills.kinematics import DEFAULT_INSTRUMENT, INSERTION, JAW_TIP_MM, WRIST_MM, forward, instrument_of, matrix_of
-from skills.planning.handoff import HELD_MM, HOLDING_RAD, NEEDLE_FREE_RAD, NEEDLE_RADIUS_MM
+from skills.planning.handoff import HELD_MM, HOLDING_RAD, NEEDLE_FREE_RAD, NEEDLE_RADIUS_MM, OtherArm
 from skills.planning.trajectory import TRANSFER, Trajectory
 from skills.verification.playback import FINGERS as FINGER_LINKS
 from skills.verification.playback import LINKS, PAD_SIZE_MM, PSM_A, LinkPair, pad_scale
@@ -82,11 +82,16 @@ def travel_mm(joints: Floats, instrument: str) -> Floats:
     return np.stack([shaft, wrists, fingers, fingers], axis=1)
 
 
-def openings(trajectory: Trajectory) -> Floats:
-    """Return the opening of each of PSM_A's fingers, rad, shape (T,): at least that of jaws that hold a needle."""
-    if trajectory.jaw_rad is None:
-        return np.full(len(trajectory), HOLDING_RAD)
-    return np.maximum(trajectory.jaw_rad / 2, HOLDING_RAD)
+def openings(arm: Trajectory | OtherArm, unplanned_rad: float = HOLDING_RAD) -> Floats:
+    """Return the opening of each of an arm's fingers, rad, shape (T,): at least that of jaws that hold a needle.
+
+    Args:
+        arm: The motion: of PSM_A, or of PSM_M.
+        unplanned_rad: The opening where the motion states no angle of the jaw.
+    """
+    if arm.jaw_rad is None:
+        return np.full(len(arm.joints), unplanned_rad)
+    return np.maximum(arm.jaw_rad / 2, HOLDING_RAD)
 
 
 def stands_from(trajectory: Trajectory, end: int) -> int:
@@ -228,17 +233,19 @@ def links_of(joints: ArrayLike, instrument: str = DEFAULT_INSTRUMENT, opening_ra
     return Links(np.stack(begins, axis=1), np.stack(ends, axis=1))
 
 
-def clearance_to_pad(arm: Links, pad_top_mm: ArrayLike) -> Floats:
+def clearance_to_pad(arm: Links, pad_top_mm: ArrayLike, normal: ArrayLike = (0.0, 0.0, 1.0)) -> Floats:
     """Return the height of each link above everything that is no higher than the pad's top; negative is below.
 
     Args:
-        arm: The arm, in a frame whose z points up.
-        pad_top_mm: Height of the pad's top, one for all poses, or one for each, shape (T,).
+        arm: The arm.
+        pad_top_mm: Height of the pad's top along its normal, one for all poses, or one for each, shape (T,).
+        normal: The unit direction out of the pad, shape (3,).
 
     Returns:
         Distances in mm, shape (T, 4); the columns are `LINKS`.
     """
-    lowest = np.minimum(arm.begin_mm[:, :, 2], arm.end_mm[:, :, 2]) - RADII_MM
+    up = np.asarray(normal, np.float64)
+    lowest = np.minimum(arm.begin_mm @ up, arm.end_mm @ up) - RADII_MM
     return np.asarray(lowest - np.asarray(pad_top_mm, np.float64).reshape(-1, 1))
 
 

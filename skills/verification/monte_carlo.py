@@ -41,6 +41,7 @@ from numpy.typing import ArrayLike
 
 from skills.arrays import Bytes, Flags, Floats, Ints
 from skills.errors import BadInput, BadSettings
+from skills.fields import Point
 from skills.kinematics import (
     CANNULA_MM,
     DEFAULT_INSTRUMENT,
@@ -76,6 +77,7 @@ from skills.verification.probabilities import (
     AT_THE_END,
     JUDGE_VERSION,
     NEEDLE,
+    UPWARDS,
     Cost,
     Doubt,
     DoubtSettings,
@@ -157,9 +159,10 @@ class PlannedPass:
     Attributes:
         arms: PSM_A and, if its place is known, PSM_M.
         phase: Phase of each sample, shape (S,).
-        pad_top_mm: Height of the pad's top in the PSM_A base frame; -inf: there is no pad.
+        pad_top_mm: Height of the pad's top along its normal in the PSM_A base frame; -inf: there is no pad.
         stamps_s: Time of each sample, shape (S,).
         taking: The recorded pose in which PSM_M takes the needle, in that frame; None: that of the paper's A2.
+        pad_normal: Unit direction out of the pad in that frame.
     """
 
     arms: tuple[Planned, ...]
@@ -167,6 +170,7 @@ class PlannedPass:
     pad_top_mm: float
     stamps_s: Floats
     taking: Pose | None = None
+    pad_normal: Point = UPWARDS
 
     @property
     def handing_over(self) -> Flags:
@@ -176,14 +180,17 @@ class PlannedPass:
         return np.asarray(np.logical_and.accumulate(there[::-1])[::-1])
 
 
-def scene_of(trajectory: Trajectory, number: int, pad_top_mm: float, opening_rad: float) -> PlannedPass:
+def scene_of(
+    trajectory: Trajectory, number: int, pad_top_mm: float, opening_rad: float, pad_normal: Point = UPWARDS
+) -> PlannedPass:
     """Return a pass with all its samples.
 
     Args:
         trajectory: The planned motion.
         number: Number of the pass, from 0.
-        pad_top_mm: Height of the pad's top in the PSM_A base frame.
-        opening_rad: Opening of PSM_M's fingers as it comes for the needle.
+        pad_top_mm: Height of the pad's top along its normal in the PSM_A base frame.
+        opening_rad: Opening of each of PSM_M's fingers if the motion states no angle of its jaw.
+        pad_normal: Unit direction out of the pad.
     """
     samples = np.flatnonzero(trajectory.pass_index == number)
     rotation = matrix_of(trajectory.rotation_xyzw[samples])
@@ -192,11 +199,12 @@ def scene_of(trajectory: Trajectory, number: int, pad_top_mm: float, opening_rad
     other = trajectory.psm_m
     if other is not None:
         joints, base = other.joints[samples], matrix_of(other.base_xyzw[None])[0]
-        opened = np.full(len(samples), opening_rad)
+        opened = openings(other, opening_rad)[samples]
         arms.append(Planned(*forward(joints, other.instrument), joints, other.instrument, base, other.base_mm, opened))
     recorded = trajectory.taking
     taking = None if recorded is None else Pose(recorded.tip_mm[number], recorded.rotation[number])
-    return PlannedPass(tuple(arms), trajectory.phase[samples], pad_top_mm, trajectory.stamps_s[samples], taking)
+    phase, stamps_s = trajectory.phase[samples], trajectory.stamps_s[samples]
+    return PlannedPass(tuple(arms), phase, pad_top_mm, stamps_s, taking, pad_normal)
 
 
 def looked_at(scene: PlannedPass, stretches: int) -> PlannedPass:
@@ -210,7 +218,7 @@ def looked_at(scene: PlannedPass, stretches: int) -> PlannedPass:
         stretches: Number of stretches per pass.
     """
     seen = [arm.links(arm.joints) for arm in scene.arms]
-    margins = [clearance_to_pad(one, scene.pad_top_mm).min(axis=1) for one in seen]
+    margins = [clearance_to_pad(one, scene.pad_top_mm, scene.pad_normal).min(axis=1) for one in seen]
     margins += [arm.margins(arm.joints).min(axis=1) for arm in scene.arms]
     if len(seen) == 2:
         margins.append(_apart(seen[0], seen[1], scene.handing_over))
@@ -271,10 +279,10 @@ def _spoiled(
         "limits": (margin >= limits.joint_margin - _ROUND_OFF) & (insertion >= limits.insertion_mm),
     }
     found = {name: ~good & wanted for name, good in kept.items()}
-    top = scene.pad_top_mm + np.repeat(shift_mm[:, 2], samples)  # the pad moves with the pass
+    top = scene.pad_top_mm + np.repeat(shift_mm @ scene.pad_normal, samples)  # the pad moves with the pass
     handing_over = np.concatenate([scene.handing_over] * count)
     links = [arm.links(q) for arm, q in zip(scene.arms, joints, strict=True)]
-    above = [clearance_to_pad(one, top).min(axis=1) for one in links]
+    above = [clearance_to_pad(one, top, scene.pad_normal).min(axis=1) for one in links]
     between = _apart(links[0], links[1], handing_over) if len(links) == 2 else np.full(count * samples, np.inf)
     levers = [_lever_mm(arm, one) for arm, one in zip(scene.arms, links, strict=True)]
     if scene.pad_top_mm > -inf:
@@ -293,7 +301,8 @@ def _spoiled(
             for k, arm in enumerate(scene.arms)
         ]
         if "pad" in found:
-            near = np.minimum.reduce([clearance_to_pad(one, top[rows]).min(axis=1) for one in moved])
+            over = [clearance_to_pad(one, top[rows], scene.pad_normal).min(axis=1) for one in moved]
+            near = np.minimum.reduce(over)
             found["pad"][number, variations[~(near >= limits.clearance_pad_mm)]] = True
         if len(moved) == 2:
             near = _apart(moved[0], moved[1], handing_over[rows])
@@ -359,6 +368,7 @@ def doubt(
     *,
     approach_m: ArrayLike | None,
     pad_top_mm: float | None,
+    pad_normal: Point = UPWARDS,
     errors: ArmErrors = UNCALIBRATED,
     seed: int = 0,
     settings: DoubtSettings | None = None,
@@ -370,8 +380,9 @@ def doubt(
         trajectory: The planned motion, with PSM_M's if its place is known.
         approach_m: PSM_M's approach in the PSM_A base frame, shape (3,); None if it is not known. Not used if the
             trajectory has PSM_M or its recorded pose: then the last pose of that arm counts.
-        pad_top_mm: Height of the pad's top in the PSM_A base frame; the pad is assumed to be infinite. None: there is
-            no pad, and nothing is compared with one.
+        pad_top_mm: Height of the pad's top along its normal in the PSM_A base frame; the pad is assumed to be infinite.
+            None: there is no pad, and nothing is compared with one.
+        pad_normal: Unit direction out of the pad, such as that of sloping tissue.
         errors: The stated errors of the arms. Those of both defaults are judged beside them.
         seed: Seed of the random numbers.
         settings: The other errors to draw, and the conditions of a catch.
@@ -381,16 +392,19 @@ def doubt(
         The counts and probabilities of every pass and of the plan, and the cost of each of the stated errors.
 
     Raises:
-        BadInput: The pad's height is not finite, or a jaw's last pose is not turned to `approach_m`.
+        BadInput: The pad's height is not finite, its normal is no unit direction, or a jaw's last pose is not turned to
+            `approach_m`.
         BadSettings: The seed is negative.
     """
     if pad_top_mm is not None and not isfinite(pad_top_mm):
         raise BadInput("The pad's height must be a number; give it in mm in the PSM base frame.", pad_top_mm=pad_top_mm)
+    if not abs(np.linalg.norm(pad_normal) - 1.0) <= _ROUND_OFF:
+        raise BadInput("The pad's normal must be a direction of length 1.", pad_normal=list(pad_normal))
     if seed < 0:
         raise BadSettings("A seed must be 0 or more.", seed=seed)
     varied, allowed = settings or DoubtSettings(), limits or Limits()
     top_mm = -inf if pad_top_mm is None else float(pad_top_mm)
-    scenes = [scene_of(trajectory, k, top_mm, varied.opening_rad) for k in range(trajectory.passes)]
+    scenes = [scene_of(trajectory, k, top_mm, varied.opening_rad, pad_normal) for k in range(trajectory.passes)]
     thin = [looked_at(scene, varied.stretches) for scene in scenes]
     under = [errors, *(one for one in (CALIBRATED, UNCALIBRATED) if one != errors)]
     spared = [size for size in CALLED if getattr(errors, size) > 0]
@@ -414,6 +428,7 @@ def doubt(
         limits=allowed,
         costs=tuple(sorted(costs, key=lambda one: -one.without.count)),
         version=JUDGE_VERSION,
+        pad_normal=pad_normal,
     )
 
 

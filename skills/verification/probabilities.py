@@ -13,13 +13,16 @@ import numpy as np
 
 from skills.arrays import Flags
 from skills.errors import BadSettings
-from skills.fields import Count, Figure, Fraction, schema, stored_schema
+from skills.fields import Count, Figure, Fraction, Point, schema, stored_schema
 from skills.learning.slip import wilson
 from skills.planning.handoff import OPEN_RAD
 from skills.verification.errors import ArmErrors
 from skills.verification.gates import Limits
 
-JUDGE_VERSION = 2  # 1: tip errors alone, stated as a mean length
+# 1: tip errors alone, stated as a mean length. 2: PSM_M's jaw open throughout, fingers touch in the last sample alone,
+# sloping tissue level.
+JUDGE_VERSION = 3
+UPWARDS = (0.0, 0.0, 1.0)
 ON_THE_WAY, AT_THE_END = ("reach", "limits", "pad", "arms", "bodies"), ("place", "angle")
 NEEDLE = "needle"  # of a `Cost`: the needle's angle in the jaws, which is no error of the arms
 
@@ -36,7 +39,7 @@ class DoubtSettings:
         needle_rad: Greatest rotation of the needle in PSM_A's jaws.
         stated_rad: Greatest angle between the needle's tangent and PSM_M's hinge: the angle by which the needle itself
             bends within jaws that are 2.2 mm wide, so they close on it as on a straight one.
-        opening_rad: Opening of each of PSM_M's fingers as it comes in.
+        opening_rad: Opening of each of PSM_M's fingers as it comes in, and throughout where its jaw is not planned.
         stretches: Number of stretches of equal travel into which a pass is divided; some poses of each are checked
             (`looked_at`). With 20, about 50 poses per pass, no other pose was nearer to the pad, nor by more than 0.2
             mm to the other arm.
@@ -145,7 +148,7 @@ class Doubt:
 
     Attributes:
         seed: Seed of the random numbers.
-        pad_top_mm: Height of the pad's top; None: nothing was compared with one.
+        pad_top_mm: Height of the pad's top along its normal; None: nothing was compared with one.
         with_psm_m: Whether PSM_M's arm was in the scene.
         hand_offs: Number of passes in which a catch was judged.
         looked_at: Number of checked poses of each pass.
@@ -154,6 +157,7 @@ class Doubt:
         limits: The playback's limits.
         costs: The errors that the stated ones consist of, the one that costs the most first.
         version: Version of the judge; verdicts of the first one do not state it.
+        pad_normal: Unit direction out of the pad.
     """
 
     seed: Count
@@ -166,6 +170,7 @@ class Doubt:
     limits: Limits = field(default_factory=Limits)
     costs: tuple[Cost, ...] = ()
     version: Count = 1
+    pad_normal: Point = UPWARDS
 
 
 def counted(found: list[dict[str, Flags]], errors: ArmErrors) -> DoubtUnder:

@@ -352,20 +352,23 @@ def _by_hand(trajectory: Trajectory, needle_mm: Floats) -> Flags:
     return np.asarray(may)
 
 
-def flat_tissue_mm(trajectory: Trajectory, report: SceneReport) -> float:
-    """Return the height of level tissue as far below the lowest place of both tools as the scene's is from them.
+def flat_tissue(trajectory: Trajectory, report: SceneReport, tissue: Tissue) -> tuple[float, Point]:
+    """Return flat tissue, above which the estimate of success varies a motion: its height and its normal, of length 1.
 
-    Of level tissue it is the height itself; the estimate of success varies a motion above it.
+    Of a height map it is as far below the lowest place of both tools, along the map's normal, as the map is from them.
     """
+    up = np.array(tissue.normal) / np.linalg.norm(tissue.normal)
+    if tissue.flat:
+        return float(up @ tissue.at_mm) + tissue.heights_mm[0][0], xyz(up)
     every = np.arange(len(trajectory))
     arms = (PSM_A, PSM_M) if trajectory.psm_m is not None else (PSM_A,)
     lowest = min(
-        float((np.minimum(one.begin_mm[..., 2], one.end_mm[..., 2]) - RADII_MM).min())
+        float((np.minimum(one.begin_mm @ up, one.end_mm @ up) - RADII_MM).min())
         for body in arms
         for one in links_at(trajectory, body, every)
     )
     apart = [one.least_mm for one in report.nearest if one.part == TISSUE and one.link in LINKS]
-    return lowest - min((nan if one is None else one for one in apart), default=CLEARANCE_SEEN_MM)
+    return lowest - min((nan if one is None else one for one in apart), default=CLEARANCE_SEEN_MM), xyz(up)
 
 
 def _nearest(

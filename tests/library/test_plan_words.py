@@ -8,6 +8,7 @@ import pytest
 from skills.library.plans import hands_over, plan_in_words
 from skills.library.playbacks import headline
 from skills.verification.errors import CALIBRATED, UNCALIBRATED
+from skills.verification.probabilities import JUDGE_VERSION
 
 NAN = float("nan")
 PSM_M = {"approach": [-1.0, 0.0, 0.0]}
@@ -26,7 +27,7 @@ def told(of: dict[str, Any], lower: float | None, count: int = 990, feasible: ob
     whole = {"count": count, "of": 1000, "probability": count / 1000, "lower": lower, "upper": upper}
     under = [{"errors": asdict(CALIBRATED), "plan": whole}]
     cost = {"error": "registration_deg", "without": {"count": count + 4, "probability": count / 1000 + 0.004}}
-    judged = {"version": 2, "under": under, "costs": [cost]}
+    judged = {"version": JUDGE_VERSION, "under": under, "costs": [cost]}
     report = {"feasible": feasible, "failure_in_words": "Pass 0, A1, sample 3: no.", "doubt": judged}
     return headline(of, report, errors=CALIBRATED, lower_bound=0.95)
 
@@ -99,10 +100,10 @@ def test_nothing_else_is_good(of, lower, count, feasible, level, word):
 def test_an_error_that_was_not_judged_is_said_and_not_good():
     whole = {"count": 999, "of": 1000, "probability": 0.999, "lower": 0.99, "upper": 1.0}
     first_judge = {"under": [{"tip_error_mm": 0.65, "plan": whole}]}
-    other = {"version": 2, "under": [{"errors": asdict(CALIBRATED), "plan": whole}], "costs": []}
+    other = {"version": JUDGE_VERSION, "under": [{"errors": asdict(CALIBRATED), "plan": whole}], "costs": []}
     for doubted, words in (
         (None, "older version"),
-        (first_judge, "judged by an older version, without errors of registration and wrist; play it again."),
+        (first_judge, "judged by an older version, which had other errors, jaws or tissue; play it again."),
         (other, "with the errors of a calibrated arm, which the installation stated then; now it states the errors"),
     ):
         line = headline(FULL, {"feasible": True, "doubt": doubted}, errors=UNCALIBRATED, lower_bound=0.95)

@@ -29,6 +29,7 @@ from skills.schemas.requests import PlanIn
 from skills.transparency import PublicKey, read_notes
 from skills.verification.errors import CALIBRATED, UNCALIBRATED, ArmErrors
 from skills.verification.playback import Playback, link_pairs
+from skills.verification.probabilities import JUDGE_VERSION
 from tests.independent_history import check_envelope
 from tests.library import cases
 from tests.library.attacks import tampering
@@ -79,7 +80,7 @@ def doubt(*lower: float | None, errors: ArmErrors = UNCALIBRATED, stated_by: str
     under = [{"errors": asdict(errors), "passes": passes, "plan": {"count": 700}}]
     without = {"count": 880, "probability": 0.88}
     costs = [{"error": "registration_mm", "without": without}]
-    return {"doubt": {"version": 2, "under": under, "costs": costs}, "stated_by": stated_by}
+    return {"doubt": {"version": JUDGE_VERSION, "under": under, "costs": costs}, "stated_by": stated_by}
 
 
 def of_the_first_judge(lower: float) -> dict[str, Any]:
@@ -87,6 +88,12 @@ def of_the_first_judge(lower: float) -> dict[str, Any]:
     succeeds = {"count": 990, "of": 1000, "probability": 0.99, "lower": lower, "upper": 1.0}
     under = [{"tip_error_mm": mm, "plan": succeeds, "passes": [{"succeeds": succeeds}]} for mm in (0.65, 3.0)]
     return {"doubt": {"seed": 0, "under": under, "settings": {"tip_errors_mm": [0.65, 3.0]}}}
+
+
+def of_the_second_judge(lower: float) -> dict[str, Any]:
+    """Return a stored verdict of the judge that had PSM_M's jaw open throughout."""
+    judged = doubt(lower)
+    return judged | {"doubt": judged["doubt"] | {"version": 2}}
 
 
 def gate(database: Database, plan: Plan, **asked: Any) -> str:
@@ -253,7 +260,8 @@ def test_consent_that_is_withdrawn_while_a_bag_is_composed_is_seen(
         (doubt(0.95, stated_by="request"), {"errors": CALIBRATED}, None),
         (doubt(0.85, stated_by="request", errors=CALIBRATED), {}, "With the errors of a calibrated arm a pass"),
         (doubt(), {}, "only nan"),
-        (of_the_first_judge(0.99), {}, "judged by an older version, without errors of registration and wrist; play"),
+        (of_the_first_judge(0.99), {}, "judged by an older version, which had other errors, jaws or tissue; play it"),
+        (of_the_second_judge(0.99), {}, "judged by an older version"),
         (of_the_first_judge(0.99), {"errors": CALIBRATED}, "older version"),
         ({"doubt": None}, {}, "older version"),
         ({}, {}, "older version"),

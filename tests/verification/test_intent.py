@@ -15,6 +15,8 @@ from skills.gridworld.reward import sparse_reward
 from skills.kinematics import forward, instrument_of, joint_margins, matrix_of, quaternion_of
 from skills.learning.policy import learn_tabular
 from skills.learning.q_learning import PhaseQLearning
+from skills.library.playbacks import CHECK_VERSION
+from skills.packing import canonical, sha256
 from skills.planning.handoff import PsmM
 from skills.planning.plan import SuturePoint, stack
 from skills.planning.trajectory import A1, A2, TRANSFER, PassPath, Trajectory
@@ -35,6 +37,30 @@ def test_a_sound_motion_deviates_nowhere(a2, orientation):
     asked, motion = sound(a2, orientation)
     assert broken(compare(asked, motion)) is None
     assert broken(compare(asked, poses(motion).built())) is None
+
+
+def test_limits_stay_the_same_while_the_version_of_the_check_does():
+    """A change of a limit changes verdicts: then `CHECK_VERSION` is raised, so that plans can be played again."""
+    stated = sha256(canonical([[kind, unit, repr(limit)] for kind, (unit, limit) in LIMITS.items()]))
+    assert (CHECK_VERSION, stated[:12]) == (5, "9793dd655632")
+
+
+def test_a_pass_without_its_a2_is_named_at_its_first_sample_alone():
+    asked, motion = sound()
+    changed = poses(motion)
+    changed.repeat(np.flatnonzero((changed.passes != 1) | (changed.phase != A2)))
+    values = compare(asked, changed.built()).values["number of passes off the suture points"]
+    assert np.flatnonzero(~(values == 0)).tolist() == [int(np.argmax(changed.passes == 1))]
+
+
+def test_a_pass_that_ends_with_a_place_beyond_the_hinge_at_its_point_deviates_nowhere():
+    demo, policy = turning()
+    point, psm_m = SuturePoint(tuple((demo.tip_mm[-1] - [0.0, 0.0, 10.2]).tolist())), PsmM(PSM_M, BASE_MM, BASE_XYZW)
+    plan = stack(policy, [point], demo=demo, psm_m=psm_m, rate_hz=RATE_HZ, speed_mm_s=20.0, tip_offset_mm=10.2)
+    asked, motion = asked_of(plan, policy, demo), timed(plan.pass_paths, psm_m)
+    assert broken(compare(asked, motion)) is None
+    nearer = replace(asked, tip_offset_mm=10.0)
+    assert broken(compare(nearer, motion)) is not None
 
 
 def base_off(motion: Trajectory) -> Trajectory:

@@ -225,6 +225,14 @@ def test_the_recorded_hand_off_missed_by_a_third_of_a_degree_is_named():
     assert broken(compare(asked, changed.built())) == ("A2 off the recorded hand-off", rows[-1])
 
 
+def test_a_stall_makes_the_clock_late_by_the_time_that_it_takes_of_the_recording():
+    asked, motion = sound()
+    changed = poses(motion)
+    stall(A1, 0, 0.2)(changed)
+    late_s = compare(asked, changed.built()).values["clock of A1 off the recording's"]
+    assert late_s[changed.rows(A1, 0)[-1]] == pytest.approx(0.5 * motion.tempo, abs=0.02)
+
+
 def test_a_held_jaw_that_turns_by_a_degree_is_named():
     asked, motion = sound(orientation="constant")
     changed = poses(motion)

@@ -12,8 +12,8 @@ import pytest
 
 import skills
 from skills.errors import BadInput, BadSettings
-from skills.kinematics import JAW_TIP_MM, POINTING_DOWN
-from skills.planning.handoff import JAW_OPEN_RAD, NEEDLE_RADIUS_MM, OtherArm, PsmM, realign
+from skills.kinematics import JAW_TIP_MM, POINTING_DOWN, matrix_of
+from skills.planning.handoff import HOLDING_RAD, JAW_CLOSED_RAD, JAW_OPEN_RAD, NEEDLE_RADIUS_MM, OtherArm, PsmM, realign
 from skills.planning.trajectory import PassPath, Trajectory, time_parametrise
 from skills.verification import monte_carlo, probabilities
 from skills.verification.clearance import (
@@ -110,7 +110,7 @@ def test_without_any_doubt_a_clear_plan_succeeds_for_certain(trajectory):
     assert (exact.plan.count, exact.plan.of, exact.plan.probability) == (40, 40, 1.0)
     assert exact.plan.lower == pytest.approx(1 / (1 + 1.959964**2 / 40))  # Wilson's bound of all of n, by hand
     assert all(one.caught.probability == 1.0 for one in exact.passes)
-    assert (found.with_psm_m, found.hand_offs, found.version) == (trajectory is BESIDE, 2, 2)
+    assert (found.with_psm_m, found.hand_offs, found.version) == (trajectory is BESIDE, 2, 3)
     assert exact.passes[0].faults.arms == (0 if trajectory is BESIDE else None)
 
 
@@ -171,12 +171,15 @@ def test_elsewhere_is_the_same_way_for_both_arms_whatever_their_bases():
         np.testing.assert_allclose(moved.end_mm[:, 1:] - planned.end_mm[:, 1:] - shift, 0, atol=1e-6)
 
 
-def test_the_pad_is_cleared_as_often_as_the_error_function_says():
-    settings = DoubtSettings(variations=2000, suture_point_mm=0.0)
-    whole = scene_of(ALONE, 0, -148.0, 0.06).arms[0]
-    spare = float(clearance_to_pad(whole.links(whole.joints), -148.0).min()) - 1.0
+@pytest.mark.parametrize("normal", [(0.0, 0.0, 1.0), (0.6, 0.0, 0.8)])
+def test_the_pad_is_cleared_as_often_as_the_error_function_says(normal):
+    settings = DoubtSettings(variations=2000, suture_point_mm=5.0 if normal[2] < 1 else 0.0)  # the pad moves along
+    arm = scene_of(ALONE, 0, 0.0, 0.06).arms[0]
+    links = arm.links(arm.joints)
+    ends = np.concatenate([links.begin_mm, links.end_mm], axis=1) @ normal - np.tile([4.0, 3.6, 1.1, 1.1], 2)
+    spare, top_mm = 2.0, float(ends.min()) - 3.0
     for mean_mm in (0.65, 3.0):
-        found = judged(pad_top_mm=-148.0, settings=settings, errors=of_tips(mean_mm))
+        found = judged(pad_top_mm=top_mm, pad_normal=normal, settings=settings, errors=of_tips(mean_mm))
         clear, sigma = under(found).passes[0].clear, mean_mm / MEAN_LENGTH
         expected = (1 + erf(spare / sigma / sqrt(2))) / 2
         assert clear.lower - 0.005 <= expected <= clear.upper + 0.005
@@ -197,6 +200,28 @@ def test_only_fingers_may_touch_and_only_at_the_hand_off():
     reached[:, 2:] = other.end_mm[:, 2:]
     over = replace(arm, end_mm=reached)
     assert monte_carlo._apart(over, other, np.array([False])) < 0 < monte_carlo._apart(over, other, np.array([True]))
+
+
+def test_psm_ms_fingers_are_as_open_as_its_jaw_is_planned_to_be():
+    """They come in open, hold the needle while PSM_A leaves, and let it go again; without a plan they stay open."""
+    first, second = (scene_of(BESIDE, k, PAD_TOP_MM, OPENING_RAD).arms[1].opening_rad for k in (0, 1))
+    assert (first[0], first[-1]) == (OPENING_RAD, HOLDING_RAD)
+    assert (second[0], second.max(), second[-1]) == (HOLDING_RAD, OPENING_RAD, HOLDING_RAD)
+    other = replace(BESIDE.psm_m, jaw_rad=None)
+    unplanned = scene_of(replace(BESIDE, psm_m=other), 1, PAD_TOP_MM, OPENING_RAD).arms[1].opening_rad
+    assert (unplanned == OPENING_RAD).all()
+
+
+@pytest.mark.parametrize(("jaw_rad", "touch"), [(JAW_OPEN_RAD, True), (JAW_CLOSED_RAD, False)])
+def test_arms_side_by_side_touch_unless_psm_ms_jaw_is_closed(jaw_rad, touch):
+    """An open finger ends 10.2 sin 30 = 5.1 mm beside its hinge, a closed one 0.6 mm."""
+    apart = 9.5 * matrix_of(ALONE.rotation_xyzw[:1])[0, :, 1]  # the side to which fingers open
+    mine, theirs = (np.full(len(ALONE), angle) for angle in (JAW_OPEN_RAD, jaw_rad))
+    same = OtherArm(apart, np.array([0.0, 0, 0, 1]), "400006", ALONE.joints, theirs)
+    scene = scene_of(replace(ALONE, psm_m=same, jaw_rad=mine), 0, PAD_TOP_MM, OPENING_RAD)
+    scene = replace(scene, arms=tuple(arm.at(np.array([0])) for arm in scene.arms))
+    scene = replace(scene, phase=scene.phase[:1], stamps_s=scene.stamps_s[:1])
+    assert wrong(scene)["arms"] == [touch] * 4
 
 
 def test_a_pass_far_enough_elsewhere_is_out_of_reach():
@@ -453,6 +478,9 @@ def test_doubts_that_cannot_be_meant_are_refused():
             DoubtSettings(**wrong)
     with pytest.raises(BadInput, match="height"):
         judged(pad_top_mm=nan)
+    for normal in ((0.0, 0.0, 2.0), (nan, 0.0, 1.0)):
+        with pytest.raises(BadInput, match="length 1"):
+            judged(pad_normal=normal)
     with pytest.raises(BadSettings, match="seed"):
         judged(seed=-1)
 

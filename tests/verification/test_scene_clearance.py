@@ -21,7 +21,7 @@ from skills.verification.clearance import (
 )
 from skills.verification.gates import SCENE
 from skills.verification.playback import PSM_A, PSM_M
-from skills.verification.scene_clearance import LOOK_BODIES_MM, LOOK_MM, clearance_of
+from skills.verification.scene_clearance import LOOK_BODIES_MM, LOOK_MM, clearance_of, flat_tissue
 from skills.verification.verdict import judge
 from tests.planning.motions import ideal_playback
 from tests.verification.test_playback import TRAJECTORY, beside, with_psm_m
@@ -199,3 +199,16 @@ def test_at_the_beginning_of_a_pass_the_needle_may_be_where_the_hand_left_it():
     found = clearance_of(TRAJECTORY, Scene("PSM2_base", tissue=Tissue.plane((0.0, 0.0, top), (0.0, 0.0, 1.0))))
     assert np.isinf(found.needle_mm[a1[0] : leaves]).all()
     assert (found.needle_mm[: leaves + 1] >= 0).all()
+
+
+@pytest.mark.parametrize("rows", [((0.5,),), ((0.5, 0.5), (0.5, 0.5))])
+def test_sloping_tissue_is_flat_tissue_of_that_slope_for_the_estimate(rows):
+    """As a plane it is itself; as a map of equal heights it is the same, as exactly as distances from a map are."""
+    normal, along = np.array([0.0, 0.6, 0.8]), (1.0, 0.0, 0.0)
+    lowest = float((np.minimum(ARM.begin_mm @ normal, ARM.end_mm @ normal) - RADII_MM).min())
+    x, y, z = ((lowest - 3.5) * normal).tolist()
+    tissue = Tissue((x, y, z), (0.0, 1.2, 1.6), along, 5.0, rows)
+    report = clearance_of(TRAJECTORY, Scene("PSM2_base", tissue=tissue)).report
+    height_mm, up = flat_tissue(TRAJECTORY, report, tissue)
+    assert up == pytest.approx(tuple(normal))
+    assert height_mm == pytest.approx(lowest - 3.0, abs=1e-9 if len(rows) == 1 else 0.5)

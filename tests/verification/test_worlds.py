@@ -1,6 +1,7 @@
 """The probability in closed form beside an independent Monte Carlo of the same event (`tests.verification.worlds`)."""
 
 from dataclasses import replace
+from math import cos, radians, sin
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from tests.by_day import some
 from tests.verification import worlds
 from tests.verification.test_monte_carlo import PAD_TOP_MM, PATH_MM, PSM_M, motion
 
+Pad = tuple[float, tuple[float, float, float]]  # height along the normal, mm, and the normal
 TIPS = ArmErrors("tips alone", 0, 0, 0, 0.65 / MEAN_LENGTH, 0, 0, dict.fromkeys(SIZES, "a test"))
 # An independent Monte Carlo of the first judge's plan, with these errors added to a tip error of 0.65 mm on average.
 FOUND_BEFORE = {
@@ -29,11 +31,13 @@ FOUND_BEFORE = {
 
 
 def probability(
-    trajectory: Trajectory, errors: ArmErrors, pad_top_mm: float = PAD_TOP_MM, variations: int = 1000
+    trajectory: Trajectory, errors: ArmErrors, pad: Pad = (PAD_TOP_MM, (0.0, 0.0, 1.0)), variations: int = 1000
 ) -> float:
     settings = DoubtSettings(variations=variations)
     tools = Limits(clearance_bodies_mm=-1e6)  # the other worlds have no outer bodies
-    found = doubt(trajectory, approach_m=None, pad_top_mm=pad_top_mm, errors=errors, settings=settings, limits=tools)
+    pad_top_mm, pad_normal = pad
+    asked = {"errors": errors, "settings": settings, "limits": tools}
+    found = doubt(trajectory, approach_m=None, pad_top_mm=pad_top_mm, pad_normal=pad_normal, **asked)
     return found.under[0].plan.probability
 
 
@@ -42,14 +46,16 @@ def test_errors_that_the_first_judge_left_out_cost_as_much_as_was_found(errors, 
     assert probability(motion(1, PSM_M), errors) == pytest.approx(found, abs=0.04)
 
 
-def some_plan(seed: int) -> tuple[Trajectory, ArmErrors, float]:
-    """Return a plan of one pass with an approach, a height of the pad and errors of its own."""
+def some_plan(seed: int) -> tuple[Trajectory, ArmErrors, Pad]:
+    """Return a plan of one pass with an approach, errors and a pad of its own; two of three pads slope."""
     rng = np.random.default_rng(seed)
     approach = np.array(PSM_M.approach) + rng.uniform(-0.15, 0.15, 3)
     path = PATH_MM + rng.uniform(-4, 4, 3) + np.append(np.zeros((1, 3)), rng.uniform(-2, 2, (3, 3)), axis=0)
     psm_m = replace(PSM_M, approach=tuple(approach.tolist()))
     one = PassPath(path, POINTING_DOWN, realign(POINTING_DOWN, approach).rotation)
-    pad_top_mm = float(path[:, 2].min()) - 10.2 - rng.uniform(2.0, 6.0)
+    below_mm, slope, towards = rng.uniform(2.0, 6.0), radians(12.0 * (seed % 3)), float(seed)
+    normal = (sin(slope) * cos(towards), sin(slope) * sin(towards), cos(slope))
+    pad_top_mm = float((path @ normal).min()) - 10.2 - below_mm
     most = rng.uniform(0.2, 1.0)  # so that some plans have small errors alone
     errors = replace(
         TIPS,
@@ -60,17 +66,17 @@ def some_plan(seed: int) -> tuple[Trajectory, ArmErrors, float]:
         tip_noise_mm=most * rng.uniform(0, 0.5),
         tip_correlation_s=rng.choice([0.0, 0.3, 2.0]),
     )
-    return time_parametrise([one], rate_hz=100.0, psm_m=psm_m), errors, pad_top_mm
+    return time_parametrise([one], rate_hz=100.0, psm_m=psm_m), errors, (pad_top_mm, normal)
 
 
 def compared(plans: int, variations: int, tried: int) -> tuple[list[float], int]:
     """Return the probabilities of plans from 0.2 to 0.99, and how many are within the other one's Wilson interval."""
     found, agree, seed = [], 0, 0
     while len(found) < plans:
-        trajectory, errors, pad_top_mm = some_plan(seed)
-        closed = probability(trajectory, errors, pad_top_mm, variations)
+        trajectory, errors, pad = some_plan(seed)
+        closed = probability(trajectory, errors, pad, variations)
         if 0.2 <= closed <= 0.99:
-            lower, upper = wilson(worlds.successes(trajectory, errors, pad_top_mm, tried, 2000 + seed), tried)
+            lower, upper = wilson(worlds.successes(trajectory, errors, *pad, tried, 2000 + seed), tried)
             found.append(closed)
             agree += lower <= closed <= upper
         seed += 1

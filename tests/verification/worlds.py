@@ -104,7 +104,7 @@ def caught(tip_a, jaw_a, free, needle_turn, tip_m, jaw_m) -> bool:
     return bool(spare.all() and swept and abs(along @ jaw_m[:, 0]) / np.linalg.norm(along) >= cos(STATED_RAD))
 
 
-def successes(trajectory, errors, pad_top_mm: float, worlds: int, seed: int, step: int = 8) -> int:
+def successes(trajectory, errors, pad_top_mm: float, pad_normal, worlds: int, seed: int, step: int = 8) -> int:
     """Count the worlds in which a trajectory of one pass with PSM_M stays clear and the needle is caught."""
     rng = np.random.default_rng(seed)
     at = np.unique(np.append(np.arange(0, len(trajectory), step), len(trajectory) - 1))
@@ -114,7 +114,7 @@ def successes(trajectory, errors, pad_top_mm: float, worlds: int, seed: int, ste
     base_mm = trajectory.psm_m.base_mm
     moving = np.concatenate([trajectory.joints, trajectory.psm_m.joints], axis=1)
     stands = np.array([np.ptp(moving[k:], axis=0).max() < 1e-6 for k in at])
-    opening = np.maximum(trajectory.jaw_rad[at] / 2, HOLDING_RAD)
+    openings = [np.maximum(jaw_rad[at] / 2, HOLDING_RAD) for jaw_rad in (trajectory.jaw_rad, trajectory.psm_m.jaw_rad)]
     planned = [chain(joints[at]) for joints in (trajectory.joints, trajectory.psm_m.joints)]
     seen = planned[0], (planned[1][0] @ base.T + base_mm, base @ planned[1][1])  # in PSM_A's base frame
     jaw_a, jaw_m = seen[0][1][-1], seen[1][1][-1]
@@ -128,15 +128,15 @@ def successes(trajectory, errors, pad_top_mm: float, worlds: int, seed: int, ste
         base_turn = rodrigues(radians(errors.registration_deg) * rng.standard_normal(3))
         turns = [rodrigues(radians(errors.wrist_deg) * rng.standard_normal(3)) for _ in range(2)]
         noise = [_noise(rng, stamps, errors) + errors.tip_bias_mm * rng.standard_normal(3) for _ in range(2)]
-        links = [segments(seen[0][0] + shift, seen[0][1], opening, turns[0])]
+        links = [segments(seen[0][0] + shift, seen[0][1], openings[0], turns[0])]
         own = (seen[1][0] + shift - base_mm) @ base, np.swapaxes(base, 0, 1) @ seen[1][1]
-        links.append(segments(*own, OPEN_RAD, base.T @ turns[1] @ base))
+        links.append(segments(*own, openings[1], base.T @ turns[1] @ base))
         placed = [tuple(ends + noise[0][:, None] for ends in links[0])]
         placed.append(tuple(ends @ (base_turn @ base).T + base_mm + base_off + noise[1][:, None] for ends in links[1]))
-        low = min((np.minimum(b, e)[:, :, 2] - THICK_MM).min() for b, e in placed)
+        low = min((np.minimum(b @ pad_normal, e @ pad_normal) - THICK_MM).min() for b, e in placed)
         near = apart(*placed)
         near[stands, 2:, 2:] = np.inf  # at the hand-off itself
-        if not (low - pad_top_mm - shift[2] >= PAD_MM and near.min() >= ARMS_MM):
+        if not (low - pad_top_mm - shift @ pad_normal >= PAD_MM and near.min() >= ARMS_MM):
             continue
         tip_a, tip_m = placed[0][1][-1, 1], placed[1][1][-1, 1]
         count += caught(tip_a, turns[0] @ jaw_a, free, _in_jaws(turns[0], needle), tip_m, base_turn @ turns[1] @ jaw_m)
