@@ -1,12 +1,20 @@
 """Faults of the jaws: the needle is dropped, or does not change hands."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from skills.kinematics import instrument_of
-from skills.planning.handoff import JAW_CLOSED_RAD, JAW_OPEN_RAD
+from skills.planning.handoff import JAW_CLOSED_RAD, JAW_OPEN_RAD, PsmM
+from skills.planning.plan import SuturePoint, stack
 from skills.planning.trajectory import A1, A2, TRANSFER
-from tests.verification.faults import Fault, Faults, Motion, check_named
+from skills.verification.asked import asked_of
+from skills.verification.intent import compare
+from tests.planning.motions import PSM_M
+from tests.planning.test_hand import turning
+from tests.verification.faults import RATE_HZ, Fault, Faults, Motion, broken, check_named, poses, timed
+from tests.verification.hands import BASE_MM, BASE_XYZW
 
 A_LETS_GO = "PSM_A's jaw opens before PSM_M's holds"
 
@@ -121,3 +129,15 @@ FAULTS: Faults = {
 @pytest.mark.parametrize("name", FAULTS)
 def test_a_fault_of_the_jaws_is_named_by_its_kind_and_its_first_sample(name):
     check_named(*FAULTS[name])
+
+
+def test_a_jaw_that_was_not_recorded_stays_closed_in_a1():
+    demo, policy = turning()
+    bare, psm_m = replace(demo, jaw_rad=None), PsmM(PSM_M, BASE_MM, BASE_XYZW)
+    point = SuturePoint(tuple(demo.tip_mm[-1].tolist()))
+    plan = stack(policy, [point], demo=bare, psm_m=psm_m, rate_hz=RATE_HZ, speed_mm_s=20.0)
+    asked, motion = asked_of(plan, policy, bare), poses(timed(plan.pass_paths, psm_m))
+    assert broken(compare(asked, motion.built())) is None
+    rows = motion.rows(A1, 0)[300:]
+    motion.jaw[rows] += 0.01
+    assert broken(compare(asked, motion.built())) == (A_LETS_GO, rows[0])

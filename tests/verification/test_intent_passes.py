@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from skills.kinematics import quaternion_of
-from skills.planning.trajectory import A1, A2
+from skills.planning.trajectory import A1, A2, TRANSFER
 from skills.verification.intent import compare
+from skills.verification.moments import REST_S
 from tests.planning.motions import PSM_M
 from tests.verification.faults import (
     Fault,
@@ -231,6 +232,32 @@ def test_a_stall_makes_the_clock_late_by_the_time_that_it_takes_of_the_recording
     stall(A1, 0, 0.2)(changed)
     late_s = compare(asked, changed.built()).values["clock of A1 off the recording's"]
     assert late_s[changed.rows(A1, 0)[-1]] == pytest.approx(0.5 * motion.tempo, abs=0.02)
+
+
+@pytest.mark.parametrize(("phase", "part"), [(A1, 0.2), (TRANSFER, 0.5)])
+@pytest.mark.parametrize(("share", "stands"), [(0.001, True), (0.004, False)])
+def test_an_arm_stands_below_a_five_hundredth_of_its_greatest_speed(phase, part, share, stands):
+    asked, motion = sound()
+    changed = poses(motion)
+    steps = np.diff(changed.tip[changed.rows(phase)], axis=0)
+    step = steps[int(part * len(steps))]
+    step = share * np.linalg.norm(steps, axis=1).max() * step / np.linalg.norm(step)
+    at = stall(phase, 1, part)(changed)
+    changed.tip[at : at + 51] += np.arange(-50, 1)[:, None] * step
+    stood = compare(asked, changed.built()).values["standing still"]
+    assert (stood[at : at + 51].max() > 1) == stands
+
+
+@pytest.mark.parametrize(("ticks", "named"), [(75, False), (90, True)])
+def test_at_the_beginning_an_arm_may_stand_while_the_hand_is_given_its_rest(ticks, named):
+    """It may for 0.8 s here; another rest would be a fifth of a second more."""
+    asked, motion = sound()
+    assert pytest.approx(0.2, abs=0.01) == REST_S / motion.tempo
+    changed = poses(motion)
+    at = changed.rows(A1, 0)[3]
+    changed.repeat(np.insert(np.arange(len(changed.tip)), at, np.full(ticks, at)))
+    stood = compare(asked, changed.built()).values["standing still"]
+    assert (stood[: at + ticks + 50].max() > 1) == named
 
 
 def test_a_held_jaw_that_turns_by_a_degree_is_named():
