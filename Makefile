@@ -13,7 +13,7 @@ export SKILLS_PAPER_DATA ?= $(abspath $(wildcard ../shared/paper/data))
 export SKILLS_TEST_JIGSAWS ?= $(abspath $(wildcard ../shared/jigsaws))
 export SKILLS_TEST_BENCHMARKS ?= $(abspath $(wildcard ../shared/benchmarks))
 
-.PHONY: demo test serve bench faults nightly mutants deep lint lock wheelhouse wheel-check fixture clean
+.PHONY: demo test serve docs bench faults nightly mutants deep lint lock wheelhouse wheel-check fixture clean
 
 # uv where it is present, venv and pip otherwise; either way the same versions, checked by their hashes. One package,
 # movement-primitives, comes as source: setuptools is there first, and it is built before Cython, a need of python-fcl, is
@@ -58,6 +58,17 @@ test: $(READY)
 serve: $(READY)
 	@$(BIN)/skills serve --samples
 
+# The documentation site into build/site: a dead link fails. The builder goes into the same `.venv`; the rest asks no network.
+docs: $(READY)
+	@if command -v uv >/dev/null 2>&1; then \
+	  VIRTUAL_ENV=$(CURDIR)/$(VENV) uv pip install -q --no-deps --require-hashes -r requirements-docs.lock ; \
+	else \
+	  $(BIN)/python -m pip install -q --no-deps --require-hashes -r requirements-docs.lock ; \
+	fi
+	@$(BIN)/python docs/make_site.py
+	@$(BIN)/zensical build --strict --clean
+	@echo "The site: build/site/index.html; its search needs a server: $(BIN)/python -m http.server -b 127.0.0.1 -d build/site"
+
 bench: $(READY)
 	@$(BIN)/python -m tests.bench $(PARTS)
 
@@ -92,14 +103,16 @@ deep: $(READY)
 	fi
 
 # The locks hold versions and hashes, no addresses; the second one adds the extra `deep`, but for torch and what a build of
-# it for graphics cards brings along. Needs uv.
-LOCK := uv pip compile pyproject.toml --python-version 3.11 --universal --generate-hashes --no-header --no-annotate -q
+# it for graphics cards brings along, and the third the builder of the documentation site. Needs uv.
+HOW := --python-version 3.11 --universal --generate-hashes --no-header --no-annotate -q
+LOCK := uv pip compile pyproject.toml $(HOW)
 OF_TORCH := /^(torch|triton|cuda-[a-z]+|nvidia-[a-z0-9-]+)==/,/[^\\]$$/d
 lock:
 	$(LOCK) --group dev -o requirements.lock
 	@mkdir -p build
 	$(LOCK) --extra deep -c requirements.lock -o build/deep.lock
 	sed -E '$(OF_TORCH)' build/deep.lock > requirements-deep.lock
+	uv pip compile --group docs $(HOW) -c requirements.lock -o requirements-docs.lock
 
 # What `requirements.lock` names, for this platform, into build/wheelhouse; what comes as source stays source, so that the
 # hashes of the lock hold there too. With pip, for uv downloads nothing.
@@ -107,7 +120,9 @@ wheelhouse:
 	@$(IS_PYTHON) || { $(NO_PYTHON); }
 	@$(PYTHON) -m venv build/pip
 	@$(SETUPTOOLS) | build/pip/bin/python -m pip install -q --require-hashes -r /dev/stdin
-	@build/pip/bin/python -m pip download -q --no-deps --no-build-isolation --require-hashes -d build/wheelhouse -r requirements.lock
+	@for lock in requirements.lock requirements-docs.lock; do \
+	  build/pip/bin/python -m pip download -q --no-deps --no-build-isolation --require-hashes -d build/wheelhouse -r $$lock || exit 1; \
+	done
 
 # The wheel in bare environments of each Python, without a compiler; the packages come from pip's index.
 PYTHONS ?= $(PYTHON)

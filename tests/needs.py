@@ -85,6 +85,7 @@ NEEDS = {
         "set TESTS_OPENH_VALIDATOR to scripts/validation/validate_formatting.py of open-h-embodiment/data-collection",
         lambda: os.environ.get("TESTS_OPENH_VALIDATOR"),
     ),
+    "site": Need("the builder of the documentation site is", "make docs", lambda: find_spec("zensical")),
     "npm": Need("npm is", "install Node.js 20 or later", lambda: shutil.which("npm")),
     "openssl": Need("openssl is", "apt-get install openssl", lambda: shutil.which("openssl")),
     "systemd": Need("systemd-analyze is", "apt-get install systemd", lambda: shutil.which("systemd-analyze")),

@@ -17,13 +17,16 @@ from typing import Any
 import pytest
 from typer.main import get_command
 
+import skills
 from skills.cli import app
 from tests.api.conformance import conformance
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / name for name in ("README.md", "ARCHITECTURE.md", "CONTRIBUTING.md", "urdf/README.md")]
 PAGES += sorted((ROOT / "docs").glob("*.md"))
-CODE = sorted(file for folder in ("skills", "seeds", "migrations", "tests") for file in (ROOT / folder).rglob("*.py"))
+CODE = sorted(
+    file for folder in ("skills", "seeds", "migrations", "tests", "docs") for file in (ROOT / folder).rglob("*.py")
+)
 PACKAGES = {file.parent.name for file in CODE}
 NAMES_FILE = re.compile(r"(?<![\w./*{}-])(?:[\w-]+/)*[\w-]+\.(?:py|md)\b")
 DOTTED = re.compile(r"`([A-Za-z]\w*(?:\.[A-Za-z_]\w*)+)(?:\(\))?`")
@@ -90,6 +93,7 @@ def code(file: Path) -> Code:
 def members() -> dict[str, set[str]]:
     """Return the names that are defined in all modules, packages and classes of one name."""
     found: dict[str, set[str]] = defaultdict(set)
+    found["skills"] |= set(skills.__all__)  # imported at first use
     bases: list[tuple[str, str]] = []
     for file in CODE:
         found[file.parent.name].add(file.stem)
