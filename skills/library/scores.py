@@ -84,7 +84,8 @@ def others_of(
 ) -> Iterator[Other]:
     """Measure the newest demonstrations of a suture type against a reference's shape, where consent covers it.
 
-    Of overlapping cuts of one motion one counts: the compared demonstration, or else the newest.
+    Of overlapping cuts of one motion one counts: the compared demonstration, or else the newest that is not marked recovery
+    or failure, or else the newest.
 
     Args:
         session: The caller's transaction.
@@ -102,7 +103,7 @@ def others_of(
     if surgeon is not None:
         query = query.where(Demonstration.surgeon_row == surgeon.row)
     first = {one.row for one in compared}
-    found = sorted(session.scalars(query), key=lambda one: (one.row in first, one.row))
+    found = sorted(session.scalars(query), key=lambda one: (one.row in first, not one.failed, one.row))
     members, _ = without_overlaps([member_of(row) for row in found if may(row.surgeon, "atlas")])
     counted = {one.row for one in members}
     agreed = {row.row: row for row in found if row.row in counted}

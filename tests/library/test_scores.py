@@ -11,7 +11,7 @@ from skills.errors import BadInput, Conflict, NotFound
 from skills.formats.reader_process import read_told
 from skills.library.calibrations import keep
 from skills.library.catalogue import put_surgeon
-from skills.library.demos import upload_demo, withdraw_demo
+from skills.library.demos import mark_demo, upload_demo, withdraw_demo
 from skills.library.recordings import store_recording
 from skills.library.scores import LEAST_DEMOS, progress, score
 from skills.packing import canonical, sha256
@@ -145,6 +145,22 @@ def test_overlapping_cuts_of_one_motion_count_once(database: Database) -> None:
     with database.writing() as session:
         withdraw_demo(session, mine.sha256, "test")
     novice = next(one for one in scored(database, another).percentiles if one.level == "novice")
+    assert novice.demos == LEAST_DEMOS
+
+
+def test_a_newer_cut_that_failed_does_not_hide_one_that_did_not(database: Database) -> None:
+    bent(0.0, "kestrel", database)
+    put(database, "wren", skill_level="novice")
+    for number in range(LEAST_DEMOS - 1):
+        bent(4.0 + number, "wren", database)
+    tip_mm = cases.points_mm(samples=40)
+    cases.add_demo(database, cases.table(tip_mm), "wren")
+    failed = cases.add_demo(database, cases.table(tip_mm), "wren", start_s=0.1)
+    with database.writing() as session:
+        mark_demo(session, failed.sha256, "failure", "The needle fell.", "test")
+    put(database, "plover")
+    told = scored(database, bent(20.0, "plover", database))
+    (novice,) = (one for one in told.percentiles if one.level == "novice")
     assert novice.demos == LEAST_DEMOS
 
 
