@@ -23,6 +23,7 @@ from skills.learning.policy import Learner, Policy, learn_tabular, next_step
 from skills.learning.q_learning import CellQLearning, PhaseQLearning
 from skills.library import policies
 from skills.library.training import joining_of
+from tests.by_day import some
 from tests.formats.bags import sample_folder
 from tests.gridworld.paths import WALKS, learnt
 
@@ -76,7 +77,7 @@ def agrees(runner: Any, policy: Policy, states: NDArray[np.int64]) -> None:
             assert runner.next(here, phase) == (step.phase, step.action, step.done), (state, phase)
 
 
-IN_JSON = [(name, "json") for name in WALKS]
+IN_JSON = some(((name, "json") for name in WALKS), 3)
 IN_OTHER_FORMS = [  # by day of one walk
     pytest.param(name, form, marks=[pytest.mark.nightly] * (number > 0))
     for number, name in enumerate(WALKS)

@@ -22,7 +22,7 @@ from skills.formats.cells import NS_PER
 from skills.formats.reader_process import tell
 from tests.formats import hostile, written
 
-QUICK, WHOLE = 60, 1500
+QUICK, WHOLE = 20, 1500
 MAPPED = {"column": ["x=PosX", "y=PosY", "z=PosZ"], "unit": ["mm"], "frame": "ECM"}
 TIMED = "Time;" + written.positions().splitlines()[0] + ";Note\n"
 TIMED += "".join(f"{10 * k};{row};n\n" for k, row in enumerate(written.positions().splitlines()[1:120]))

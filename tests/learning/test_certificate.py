@@ -12,7 +12,7 @@ from skills.learning.certificate import certify, coverage, mdp_of
 from skills.learning.dynamic_programming import ValueIteration, exact_values
 from skills.learning.policy import learn_tabular, rollout_from
 from skills.learning.q_learning import CellQLearning, PhaseQLearning
-from tests.by_day import examples
+from tests.by_day import examples, some
 from tests.gridworld.paths import WALKS, follow, joins_nearest, learnt, named_path
 
 STAY = 13
@@ -80,7 +80,7 @@ def test_what_was_learnt_is_worth_what_dynamic_programming_says(name, phased):
     assert policy.q[live].max(axis=1) == pytest.approx(expected, rel=1e-9, abs=0)
 
 
-@every_walk
+@pytest.mark.parametrize("name", some(WALKS, 3))
 def test_with_phases_every_q_value_is_exact_and_leaving_the_domain_pays_0(name):
     policy, path = learnt(name), named_path(name)
     q, _ = values_everywhere(path, policy.learner.gamma, phased=True)
