@@ -1,8 +1,8 @@
 """The sweep: rows that nobody can see any more, or that are older than their retention, deleted in short transactions.
 
-Each step deletes at most `JOBS_AT_ONCE` jobs or `AT_ONCE_BYTES` of chunks, because others wait for it. A step that is
-interrupted is repeated, so any process may sweep: whoever has erased something, before it answers; and the workers,
-once a minute.
+Each step deletes at most `JOBS_AT_ONCE` jobs or `AT_ONCE_BYTES` of chunks, because others wait for it; fewer jobs,
+where the step before took longer than `HELD_S`. A step that is interrupted is repeated, so any process may sweep:
+whoever has erased something, before it answers; and the workers, once a minute.
 
 A clock that is set ahead by mistake makes everything look old. So a worker deletes by age only while its clock has run
 steadily for `STEADY_S` (`SteadyClock`): that is the time in which a wrong clock can be corrected without loss.
@@ -39,6 +39,8 @@ from skills.library.recordings import AT_ONCE_BYTES, CHUNK_BYTES, UNFINISHED
 from skills.settings import Settings
 
 JOBS_AT_ONCE = 300
+FEWEST_JOBS = 20
+HELD_S = 0.05  # ours: half of the time for which nothing may hold SQLite's one lock
 PICTURES_AT_ONCE = 10
 UNDIVIDED_S = 600.0  # ours: the styles of a batch are added within seconds, or its request was interrupted
 STEADY_S = 3600.0  # ours: retentions are of a year, so an hour more changes nothing
@@ -166,13 +168,19 @@ def _sweep_jobs(database: Database) -> Iterator[None]:
     for surgeon_row in surgeons:
         with database.reading() as session:
             rows = session.scalars(_jobs_of(surgeon_row)).all()
-        for first in range(0, len(rows), JOBS_AT_ONCE):
+        done, at_once = 0, JOBS_AT_ONCE
+        while done < len(rows):
             with database.writing([locks.SWEEP]) as session:
-                session.execute(delete(_JOBS).where(_JOBS.c.row.in_(rows[first : first + JOBS_AT_ONCE])))
+                session.connection()
+                began_s = monotonic()
+                session.execute(delete(_JOBS).where(_JOBS.c.row.in_(rows[done : done + at_once])))
+            done += at_once
+            share = HELD_S / max(monotonic() - began_s, 1e-6)
+            at_once = min(max(int(at_once * min(share, 2.0)), FEWEST_JOBS), JOBS_AT_ONCE)
             yield
         with database.writing([locks.SWEEP]) as session:
-            done = delete(ErasedSurgeon).where(ErasedSurgeon.surgeon_row == surgeon_row)
-            session.execute(done, **UNSYNCHRONISED)
+            theirs = delete(ErasedSurgeon).where(ErasedSurgeon.surgeon_row == surgeon_row)
+            session.execute(theirs, **UNSYNCHRONISED)
         yield
 
 

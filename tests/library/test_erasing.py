@@ -5,7 +5,7 @@ import time
 from typing import Any
 
 import pytest
-from sqlalchemy import event, insert, select
+from sqlalchemy import event, insert, select, text
 
 from skills import db
 from skills.db import history
@@ -13,7 +13,7 @@ from skills.db.models import Demonstration, MeasuredShape, RecordingChunk, Store
 from skills.db.service_tables import Job
 from skills.db.session import Database
 from skills.errors import Conflict, NotAllowed, NotFound
-from skills.library import atlas
+from skills.library import atlas, sweep
 from skills.library.atlas import atlas_of
 from skills.library.backup import back_up, erasures_of, restore
 from skills.library.catalogue import put_surgeon
@@ -21,9 +21,11 @@ from skills.library.demos import add_demo, withdraw_demo
 from skills.library.erasure import delete_recording, erase_demo, erase_surgeon
 from skills.library.neighbours import nearest_to
 from skills.library.recordings import store_recording
+from skills.library.sweep import sweep_erased
 from skills.schemas.requests import DemoIn
 from tests import backends
 from tests.comparison.cohort import cohort
+from tests.db.test_query_plans import noted, plan_of
 from tests.library import cases, cohorts
 
 
@@ -225,6 +227,37 @@ def test_erasing_binds_no_more_parameters_for_more_rows(database: Database, monk
     assert 3 < max(most) <= 16
     with database.reading() as session:
         assert [session.scalars(select(kind)).all() for kind in (Job, Demonstration, StoredRecording)] == [[], [], []]
+
+
+def test_steps_take_fewer_jobs_while_they_take_longer_than_others_may_wait(database: Database, monkeypatch):
+    """A step seems to take 0.1 s, the next one 0.2 s, and then none any time."""
+    cases.add_surgeon(database)
+    many_jobs(database, 1000)
+    with database.writing() as session:
+        erase_surgeon(session, "kestrel", "test")
+    clock = iter([0.0, 0.1, 0.1, 0.3, *[0.3] * 20])
+    monkeypatch.setattr(sweep, "monotonic", lambda: next(clock))
+    steps = []
+
+    def note(_conn: object, _cursor: object, statement: str, values: Any, *_: object) -> None:
+        if statement.startswith("DELETE FROM jobs"):
+            steps.append(len(values))
+
+    event.listen(database.engine, "before_cursor_execute", note)
+    sweep_erased(database)
+    assert steps == [300, 150, 37, 74, 148, 290]
+
+
+def test_an_erasure_does_not_walk_along_the_jobs_that_have_ended(database: Database):
+    cases.add_surgeon(database)
+    many_jobs(database, 1000)
+    with database.engine.execution_options(isolation_level="AUTOCOMMIT").connect() as connection:
+        connection.execute(text("ANALYZE"))
+    with noted(database) as asked, database.writing() as session:
+        erase_surgeon(session, "kestrel", "test")
+    (found,) = [one for one in asked if "attempt" in one[0] and "surgeon_row" in one[0]]
+    with database.reading() as session:
+        assert "ix_jobs_state" in str(plan_of(session, *found))
 
 
 @pytest.mark.nightly
