@@ -32,6 +32,7 @@ from skills.demonstration.recording import (
 )
 from skills.demonstration.segments import Segment, propose_segments
 from skills.errors import BadSegment, JointsDisagree, NotMetres
+from skills.notebook import card
 
 __all__ = [
     "Demo",
@@ -108,6 +109,20 @@ class Demo:
         if self.stamps_s[0] != 0 or (np.diff(self.stamps_s) <= 0).any():
             raise BadSegment("The stamps of a demonstration start at 0 and increase strictly.")
         _check_extent(self.topic, self.tip_mm)
+
+    def _repr_html_(self) -> str:
+        also = {"orientation": self.rotation_xyzw is not None, "jaw": self.jaw_rad is not None}
+        extent = " x ".join(f"{side:.0f}" for side in np.ptp(self.tip_mm, axis=0))
+        facts = {
+            "arm": f"{self.arm}, in {self.frame}",
+            "in the recording": f"{self.start_s:.2f} to {self.end_s:.2f} s, {len(self.stamps_s)} samples",
+            "extent": f"{extent} mm",
+            "recorded": ", ".join(["position", *(name for name, there in also.items() if there)]),
+            "instrument": self.instrument,
+            "not driven": f"{sum(one.end_s - one.start_s for one in self.pauses):.2f} s, {len(self.pauses)} times",
+            "takes the needle": None if self.partner is None else self.partner.arm,
+        }
+        return card("Demonstration", facts, {"recorded": [self.tip_mm]})
 
 
 def cut_demo(

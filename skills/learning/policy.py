@@ -27,6 +27,7 @@ from skills.learning.max_ent_irl import MaxEntIRL, learn_from_recovered
 from skills.learning.networks import DDPG, DQN, TRPO, Network
 from skills.learning.q_learning import CellQLearning, PhaseQLearning, Training, learn_q
 from skills.learning.ties import REMOTE_CENTRE, ShortestWay, choose
+from skills.notebook import card
 
 Tabular = PhaseQLearning | CellQLearning | ValueIteration | MaxEntIRL
 Learner = Tabular | DQN | DDPG | TRPO
@@ -258,6 +259,21 @@ class Policy:
         """Return the row of a phase and state, or None outside the certified domain."""
         cell = self.path.grid.cells_of(state)
         return int(self.domain.rows_of(phase, cell)) if self.domain.holds(phase, cell) else None
+
+    def _repr_html_(self) -> str:
+        grid, states, replay = self.path.grid, self.path.states, self.replay
+        same = replay.finished and np.array_equal(replay.states, states)
+        facts = {
+            "learner": f"{self.learner.kind}, seed {self.seed}",
+            "grid world": f"{' x '.join(map(str, grid.shape))} cells of {grid.cell_mm:g} mm",
+            "demonstration": f"{len(states)} states",
+            "states with an action": f"{np.count_nonzero(self.greedy >= 0)} of {self.domain.n_rows}",
+            "from its start": "the demonstration, state by state"
+            if same
+            else f"{len(replay.states)} states, {'to the goal' if replay.finished else 'not to the goal'}",
+            "learnt in a scene": None if self.surroundings is None else f"in {self.surroundings.scene.frame}",
+        }
+        return card("Policy", facts, {"demonstrated": [self.path.tip_mm], "learnt": [replay.tip_mm]})
 
 
 def learn_tabular(

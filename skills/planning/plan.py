@@ -55,6 +55,7 @@ from skills.kinematics import (
     reachable,
 )
 from skills.learning.policy import Policy, rollout
+from skills.notebook import card
 from skills.planning.hand import Hand, hand_along, moved
 from skills.planning.handoff import PsmM, needle_tips_mm, realign
 from skills.planning.motion_laws import Pose, followed
@@ -195,6 +196,22 @@ class SuturePlan:
             PassPath(one.tip_mm, one.rotation, one.target_rotation, one.start_mm, one.hand, one.taking)
             for one in self.passes
         )
+
+    def _repr_html_(self) -> str:
+        points = "; ".join(", ".join(f"{x:g}" for x in one.point.position_mm) for one in self.passes)
+        facts = {
+            "arm": f"{self.arm}, in {self.frame}",
+            "instrument": self.instrument,
+            "passes": len(self.passes),
+            "suture points": f"{points} mm",
+            "path": self.path,
+            "orientation": self.orientation,
+            "greatest speed": f"{self.speed_mm_s:g} mm/s",
+            "hand-off": "none is planned" if self.psm_m is None else f"to PSM_M, {self.a2}",
+            "tissue and obstacles": "none are stated" if self.scene is None else "stated",
+            "checked": "not by itself: skills.judge decides",
+        }
+        return card("Plan", facts, {"passes": [one.tip_mm for one in self.passes]})
 
 
 def stack(

@@ -29,6 +29,7 @@ from skills.kinematics import (
     angle_between,
     matrix_of,
 )
+from skills.notebook import card
 from skills.planning.motion_laws import A2, PHASES
 from skills.planning.trajectory import Trajectory
 from skills.verification.bodies import BodiesReport, bodies_clearance
@@ -179,6 +180,23 @@ class PlaybackReport:
     bodies: BodiesReport | None = field(default=None, kw_only=True)
     intent: tuple[Mismatch, ...] | None = field(default=None, kw_only=True)
     means: Mapping[str, str] | None = field(default=None, kw_only=True)
+
+    def _repr_html_(self) -> str:
+        beyond = [one.kind for one in self.intent or () if one.value is None or not one.value <= one.limit]
+        asked = "not compared" if self.intent is None else ", ".join(beyond) or "within every limit"
+        facts = {
+            "first failure": self.failure,
+            "motion": f"{self.passes} passes, {self.duration_s:.1f} s, {self.samples} samples",
+            "least margin of a joint, as a part of its range": self.least_margin,
+            "greatest speed, as a part of its limit": self.peak_speed_ratio,
+            "greatest acceleration, as a part of its limit": self.peak_acceleration_ratio,
+            "greatest tracking error, mm": self.tracking_max_mm,
+            "error at the goal, mm": self.goal_error_mm,
+            "distance from the pad, mm": self.clearance_pad_mm,
+            "distance from PSM_M, mm": self.clearance_psm_m_mm if self.psm_m_in_scene else "PSM_M is not in the scene",
+            "deviation from what was asked": asked,
+        }
+        return card(f"Verdict: {'feasible' if self.feasible else 'not feasible'}", facts)
 
 
 def judge(
