@@ -21,9 +21,13 @@ from contextlib import closing
 from pathlib import Path
 from queue import SimpleQueue
 from threading import Thread
-from typing import TYPE_CHECKING
+from time import time
+from typing import TYPE_CHECKING, Any
 
-from sqlalchemy.engine import make_url
+from sqlalchemy import event
+from sqlalchemy.dialects import plugins
+from sqlalchemy.engine import URL, CreateEnginePlugin, make_url
+from sqlalchemy.engine import Engine as Connections
 
 from skills.db.session import make_private, write_ahead
 from skills.library.jobs import EXPORT, PART, PICTURES
@@ -45,6 +49,7 @@ STEPS = "1"  # the engine's "application version": change it if and only if the 
 # worker for a second.
 POLLING_S = {JOBS: 0.3, BATCHES: 0.3, ASIDE: 1.0}
 FAREWELL_S = 2.0  # timeout of `Engine.close`, within which it processes its pending calls
+CLOCK = "skills_clock"  # the name of `Clock` in the engine's URL
 
 log = logging.getLogger(__name__)
 Errand = Callable[["DBOSClient"], None]
@@ -61,7 +66,7 @@ def configuration(settings: Settings, executor: str) -> "DBOSConfig":
 
     return {
         "name": APPLICATION,
-        "system_database_url": settings.engine_url,
+        "system_database_url": _address(settings),
         "dbos_system_schema": "dbos",
         "serializer": DBOSPortableJSONSerializer(),  # the default is pickle, which can execute stored bytes
         "executor_id": executor,
@@ -77,7 +82,7 @@ def connect(settings: Settings) -> "DBOSClient":
 
     prepare(settings)
     return DBOSClient(
-        system_database_url=settings.engine_url,
+        system_database_url=_address(settings),
         dbos_system_schema="dbos",
         serializer=DBOSPortableJSONSerializer(),
         application_name=APPLICATION,
@@ -97,6 +102,45 @@ def prepare(settings: Settings) -> None:
     make_private(Path(url.database))
     with closing(sqlite3.connect(url.database)) as connection:
         write_ahead(connection)
+
+
+class Clock(CreateEnginePlugin):
+    """The clock `unixepoch('subsec')` on SQLite files, where SQLite is older than 3.42, as on Debian 12.
+
+    DBOS needs it from Python 3.12 on, whatever the version of SQLite: it is in its statements, and in the defaults of a
+    file's tables for as long as the file exists. An older SQLite returns NULL there, and every poll of a queue fails.
+    """
+
+    def update_url(self, url: URL) -> URL:
+        """Return the URL as it is: it has no more settings for this."""
+        return url
+
+    def engine_created(self, engine: Connections) -> None:
+        """Add the clock to each new connection that lacks it."""
+        event.listen(engine, "connect", _add_clock)
+
+
+plugins.register(CLOCK, __name__, Clock.__name__)
+
+
+def _add_clock(connection: sqlite3.Connection, _record: Any) -> None:
+    if connection.execute("SELECT unixepoch('subsec')").fetchone() == (None,):
+        connection.create_function("unixepoch", 1, _now_s)
+
+
+def _now_s(modifier: str) -> float:
+    """Return the seconds since 1970 in milliseconds, as SQLite does from 3.42 on."""
+    if modifier != "subsec":
+        raise ValueError(modifier)  # nothing else of the function that this one replaces is used
+    return round(time(), 3)
+
+
+def _address(settings: Settings) -> str:
+    """Return the URL of the engine's database, with `Clock` if it is a SQLite file."""
+    url = make_url(settings.engine_url)
+    if url.get_backend_name() == "sqlite":
+        url = url.update_query_pairs([("plugin", CLOCK)])
+    return url.render_as_string(hide_password=False)
 
 
 def queue_of(kind: str) -> str:

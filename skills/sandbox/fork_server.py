@@ -89,7 +89,8 @@ def main(folder: str, code: str, layers: str, *modules: str) -> NoReturn:
     children: dict[int, _Child] = {}
     try:
         with socket.socket(fileno=0) as control, selectors.DefaultSelector() as events:
-            control.send(json.dumps(inherited.layers).encode())
+            with suppress(BrokenPipeError):  # the caller has ended by now
+                control.send(json.dumps(inherited.layers).encode())
             _serve(control, events, children, inherited)
     finally:
         for child in children.values():

@@ -4,6 +4,7 @@ import base64
 import pickle
 import time
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import pytest
 from sqlalchemy import inspect, text
@@ -12,6 +13,7 @@ from skills.db.service_tables import Executor
 from skills.db.session import Database
 from skills.jobs import connect, drop, workflow_id
 from skills.jobs.workflows import ENGINE_ATTEMPTS, Leases, Watch
+from skills.settings import Settings
 from tests.jobs.house import House
 from tests.waiting import until
 
@@ -212,3 +214,16 @@ def test_a_job_longer_than_a_lease_is_begun_once(house: House):
     row = house.ask("slow", seconds=house.settings.lease_s + 2.0)
     assert house.ended(row).state == "succeeded"
     assert len(house.noted("begins", row)) == 1
+
+
+def test_the_engine_has_its_clock_on_a_sqlite_before_3_42_too(tmp_path: Path):
+    # From Python 3.12 on DBOS uses it in statements and in its tables, which another Python may have created.
+    client = connect(Settings(database_url=f"sqlite:///{tmp_path / 'skills.sqlite'}"))
+    with client._sys_db.engine.begin() as connection:
+        connection.execute(
+            text("CREATE TABLE polls (row INTEGER, at INTEGER NOT NULL DEFAULT (unixepoch('subsec') * 1000))")
+        )
+        connection.execute(text("INSERT INTO polls (row) VALUES (1)"))
+        told_ms = connection.execute(text("SELECT at FROM polls")).scalar_one()
+    client.destroy()
+    assert abs(told_ms / 1000 - time.time()) < 5

@@ -292,6 +292,22 @@ def test_an_asker_that_goes_without_reading_what_it_was_told_ends_it_without_a_w
         fork_server._serve(control, events, {}, fork_server._Inherited(Place("", ()), (), 0))
 
 
+def test_an_asker_that_has_ended_before_it_was_ready_ends_it_without_a_word(tmp_path: Path):
+    asker, control = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    asker.close()
+    folder = tempfile.mkdtemp(dir=tmp_path)
+    with control:
+        ended = subprocess.run(
+            [sys.executable, "-P", "-c", forked._ENTRY, folder, json.dumps(forked.code_folders()), "null"],
+            stdin=control.fileno(),
+            stderr=subprocess.PIPE,
+            env=forked.environment(),
+            timeout=60 * crowded(),
+            check=False,
+        )
+    assert (ended.returncode, ended.stderr) == (0, b"")
+
+
 def test_a_disk_that_fails_is_not_said_to_be_an_unreadable_answer():
     class Failing(io.BytesIO):
         def read(self, *_: Any) -> bytes:
