@@ -80,6 +80,16 @@ class Action(Enum):
         command="Name one: --segment N, or take the whole recording: --segment whole",
         python="Name one: segment=N, or take the whole recording: segment='whole'",
     )
+    LIST_PROPOSALS = Words(
+        http="GET /proposals lists them.",
+        command="List them: skills proposal list",
+        python="List them: client.proposals()",
+    )
+    WITHDRAW_DEMO = Words(
+        http="DELETE /demos/{demo} withdraws it.",
+        command="Withdraw it: skills demo withdraw {demo}",
+        python="Withdraw it: client.withdraw_demo({demo})",
+    )
     MARK_DEMO = Words(
         http="PUT /demos/{demo}/outcome marks it as {outcome}.",
         command="Mark it: skills demo mark {demo} {outcome} --reason WHY",

@@ -22,7 +22,7 @@ from skills.settings import settings
 from tests.arms import ARMS
 from tests.e2e.conftest import running
 from tests.formats import trials
-from tests.library import rated
+from tests.library import cases, rated
 from tests.library.test_arm_errors import bag as calibration_bag
 from tests.needs import need
 
@@ -39,6 +39,7 @@ def installation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[No
     need("simulator")
     sample = next(sample for sample in sample_recordings() if sample.surgeon == "wren")
     (tmp_path / "hand-off.mcap").write_bytes(sample.data)
+    (tmp_path / "both-arms.mcap").write_bytes(cases.bag("PSM1", "PSM2"))
     trials.folder(tmp_path / "jigsaws")
     rated.folder(tmp_path / "rated")
     (tmp_path / "arms.json").write_text(json.dumps(asdict(ARMS)))

@@ -18,7 +18,7 @@ from skills.api.openapi import complete
 from skills.api.policy_cache import AtHand, PolicyCache
 from skills.api.problems import TOO_LARGE, answer_refusals
 from skills.api.responses import DOWNLOADS_READ, Encoded, Watching
-from skills.api.routes import catalogue, datasets, demos, operating, pages, plans, policies, timelines
+from skills.api.routes import catalogue, datasets, demos, operating, pages, plans, policies, proposals, timelines
 from skills.api.sessions import Sessions
 from skills.db.session import Database
 from skills.jobs import Engine
@@ -86,6 +86,7 @@ def create_app(settings: Settings) -> FastAPI:
         catalogue.router,
         demos.uploads,
         demos.router,
+        proposals.router,
         policies.job_router,
         policies.router,
         plans.router,
@@ -102,6 +103,7 @@ def create_app(settings: Settings) -> FastAPI:
         operating.reference_router,
         pages.router,
         demos.page_router,
+        proposals.page_router,
         timelines.page_router,
         operating.sign_in_router,
         catalogue.key_router,

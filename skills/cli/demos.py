@@ -1,4 +1,4 @@
-"""Commands of demonstrations: cut from recordings or from the trials of JIGSAWS, and marked."""
+"""Commands of demonstrations: cut from recordings, proposals or the trials of JIGSAWS, and marked."""
 
 import sys
 from dataclasses import asdict
@@ -39,14 +39,16 @@ from skills.errors import BadInput, SkillsError
 from skills.remedies import Door, did_you_mean
 
 if TYPE_CHECKING:
-    from skills.schemas.given import Demonstration
+    from skills.schemas.given import Demonstration, Proposal
 
     Part = Literal["whole"] | int | None
 
 commands = typer.Typer()
 demos = typer.Typer(no_args_is_help=True, help="Demonstrations: one hand-off each.")
+proposals = typer.Typer(no_args_is_help=True, help="Proposed hand-offs: to be accepted, corrected or rejected.")
 jigsaws = typer.Typer(no_args_is_help=True, help="The JIGSAWS data set, which its authors provide on request.")
 commands.add_typer(demos, name="demo")
+commands.add_typer(proposals, name="proposal")
 commands.add_typer(jigsaws, name="jigsaws")
 
 Demo = Annotated[str, typer.Argument(help="The demonstration's digest.")]
@@ -282,6 +284,92 @@ def demo_withdraw(
         print_json({"demo": demo, "state": done})
     else:
         out.print(f"The demonstration is {done}, and no release depends on it.")
+
+
+PROPOSAL = ("recording", "number", "state", "arm", "start_s", "end_s", "found_by", "surgeon", "suture", "note")
+
+OfRecording = Annotated[str, typer.Argument(help="The recording's digest.")]
+Number = Annotated[int, typer.Argument(help="The number of the proposal, counted from 1.")]
+Note = Annotated[str | None, typer.Option(help="Why.")]
+
+
+@proposals.command("list")
+@refusing
+def proposal_list(
+    state: Annotated[
+        Literal["open", "accepted", "rejected"] | None, typer.Option(help="Only those in this state.")
+    ] = None,
+    recording: Annotated[str | None, typer.Option(help="Only those of this recording, by its digest.")] = None,
+    surgeon: OfSurgeon = None,
+    suture: OfSuture = None,
+    as_json: AsJson = False,
+) -> None:
+    """List the hand-offs proposed in recordings, those of the newest recording first."""
+    with service() as client:
+        _tell_proposals(client.proposals(state, recording=recording, surgeon=surgeon, suture=suture), as_json)
+
+
+@proposals.command("accept")
+@refusing
+def proposal_accept(
+    recording: OfRecording,
+    number: Number,
+    surgeon: Annotated[str, typer.Option(help="The surgeon's pseudonym.", autocompletion=complete_surgeons)],
+    suture: Annotated[
+        str, typer.Option(help="The suture type, such as simple-running.", autocompletion=complete_sutures)
+    ],
+    start_s: Annotated[float | None, typer.Option(help="Corrected start, s.")] = None,
+    end_s: Annotated[float | None, typer.Option(help="Corrected end, s.")] = None,
+    session: Annotated[str | None, typer.Option(help="Name of the session, such as 2026-11-23-a.")] = None,
+    outcome: Annotated[Outcome | None, typer.Option(help="What became of the hand-off, if it is known.")] = None,
+    reason: Annotated[str | None, typer.Option(help="Why; needed for a recovery or a failure.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Cut a demonstration where a hand-off is proposed, with its times or with corrected ones."""
+    with service() as client:
+        proposed = client.recording(recording).segments
+        if not 1 <= number <= len(proposed):
+            raise BadInput(
+                f"There is no proposal {number} in this recording; it has {len(proposed)}.",
+                f"List them: skills proposal list --recording {recording}",
+            )
+        one = proposed[number - 1]
+        cut = client.cut_demo(
+            recording,
+            surgeon=surgeon,
+            suture=suture,
+            arm=one.arm,
+            start_s=one.start_s if start_s is None else start_s,
+            end_s=one.end_s if end_s is None else end_s,
+            session=session,
+            outcome=outcome,
+            outcome_reason=reason,
+        )
+    _measured(cut, as_json)
+
+
+@proposals.command("reject")
+@refusing
+def proposal_reject(recording: OfRecording, number: Number, note: Note = None, as_json: AsJson = False) -> None:
+    """Reject a proposed hand-off; it stays rejected until it is opened again."""
+    with service() as client:
+        _tell_proposals([client.decide_proposal(recording, number, "rejected", note=note)], as_json)
+
+
+@proposals.command("open")
+@refusing
+def proposal_open(recording: OfRecording, number: Number, note: Note = None, as_json: AsJson = False) -> None:
+    """Open a rejected proposal again."""
+    with service() as client:
+        _tell_proposals([client.decide_proposal(recording, number, "open", note=note)], as_json)
+
+
+def _tell_proposals(found: "list[Proposal]", as_json: bool) -> None:
+    if as_json:
+        print_json(found)
+        return
+    rows = [one.model_dump() | {"recording": one.recording[:12]} for one in found]
+    show([row | {name: f"{row[name]:.2f}" for name in ("start_s", "end_s")} for row in rows], False, PROPOSAL)
 
 
 @jigsaws.command("add")

@@ -6,10 +6,11 @@ from typing import Any, Literal
 
 from skills.client.connection import Connection, at, call, given
 from skills.client.transport import Progress
-from skills.schemas import DemoOutcome, Handedness, OutcomeAsked, SkillLevel
+from skills.schemas import DemoOutcome, Handedness, OutcomeAsked, ProposalDecision, ProposalState, SkillLevel
 from skills.schemas.given import (
     Demonstration,
     DemoPath,
+    Proposal,
     Recording,
     RecordingPreview,
     RecordingSummary,
@@ -157,6 +158,41 @@ class Recordings(Connection):
     async def delete_recording(self, recording: str) -> None:
         """Delete a recording without demonstrations, by its digest."""
         await self._send("DELETE", at("recordings", recording))
+
+    @call
+    async def proposals(
+        self,
+        state: ProposalState | None = None,
+        *,
+        recording: str | None = None,
+        surgeon: str | None = None,
+        suture: str | None = None,
+    ) -> list[Proposal]:
+        """List the hand-offs proposed in recordings, those of the newest recording first.
+
+        Args:
+            state: Only those in this state.
+            recording: Only those of this recording, by its digest.
+            surgeon: Only those of this surgeon's demonstrations and recordings.
+            suture: Only accepted ones, whose demonstration is of this suture type.
+        """
+        asked = {"state": state, "recording": recording, "surgeon": surgeon, "suture": suture}
+        return await self._all(Proposal, at("proposals"), **asked)
+
+    @call
+    async def decide_proposal(
+        self, recording: str, number: int, state: ProposalDecision, *, note: str | None = None
+    ) -> Proposal:
+        """Reject a proposed hand-off, or open a rejected one again; `cut_demo` accepts it.
+
+        Args:
+            recording: Digest of the recording.
+            number: The number of the proposal, counted from 1.
+            state: "rejected" or "open".
+            note: Why.
+        """
+        body = {"state": state, "note": note}
+        return await self._ask(Proposal, "PUT", at("recordings", recording, "proposals", number), body)
 
     @call
     async def add_demo(

@@ -2,10 +2,10 @@
 
 A row labels a value: it has the value's owner, time and origin, and the value itself serialised in one column.
 
-Append-only (triggers of the migrations refuse changes): recordings and their chunks, demonstrations and their
-outcomes, reward maps, policy versions with their further demonstrations and pose styles, releases, plans, playbacks and
-their pictures, calibrations; a demonstration and a release can be withdrawn, once. Only erasure deletes. The tables of
-the service's own state are in `skills.db.service_tables`.
+Append-only (triggers of the migrations refuse changes): recordings with their chunks and the decisions on their
+proposals, demonstrations and their outcomes, reward maps, policy versions with their further demonstrations and pose
+styles, releases, plans, playbacks and their pictures, calibrations; a demonstration and a release can be withdrawn,
+once. Only erasure deletes. The tables of the service's own state are in `skills.db.service_tables`.
 """
 
 from datetime import datetime
@@ -202,6 +202,29 @@ class ParsedChunk(Base):
     )
     number: Mapped[int] = mapped_column(primary_key=True)
     data: Mapped[bytes] = mapped_column(LargeBinary)
+
+
+class ProposalMark(Base):
+    """A decision on a proposed hand-off of a recording, with a note: rejected, or open again. The newest one counts.
+
+    `number` is that of the proposal in `StoredRecording.about`, counted from 1. An accepted proposal has no mark: its
+    demonstration says so.
+    """
+
+    __tablename__ = "proposal_marks"
+
+    row: Mapped[RowId]
+    recording_row: Mapped[int] = mapped_column(ForeignKey("recordings.row", ondelete="CASCADE"))
+    number: Mapped[int]
+    state: Mapped[str]
+    note: Mapped[str | None]
+    actor: Mapped[str]
+    created_at: Mapped[datetime] = mapped_column(default=now)
+
+    __table_args__ = (
+        CheckConstraint("state IN ('open', 'rejected')", name="state"),
+        Index("ix_proposal_marks_newest", "recording_row", "number", "row"),
+    )
 
 
 SUCCESS = "success"

@@ -47,6 +47,8 @@ SkillLevel = Literal["novice", "intermediate", "expert"]
 Handedness = Literal["right", "left", "ambidextrous"]
 DemoOutcome = Literal["success", "recovery", "failure"]
 OutcomeAsked = Literal["success", "recovery", "failure", "unknown"]
+ProposalDecision = Literal["open", "rejected"]
+ProposalState = Literal[ProposalDecision, "accepted"]
 VersionNumber = Annotated[int, Field(ge=1)]
 
 

@@ -11,10 +11,10 @@ from skills.demonstration.partner import Partner
 from skills.demonstration.quality import MotionReport
 from skills.demonstration.recording import BaseFrame, Column, Format, Topic
 from skills.demonstration.segments import Segment, TakenSegment
-from skills.fields import Count, Point, Quaternion, Sha256, Slug, schema, stored_schema
+from skills.fields import Count, Fraction, Point, Quaternion, Sha256, Slug, schema, stored_schema
 from skills.gridworld.grid import PathReport
 from skills.gridworld.reward import RewardLevels
-from skills.schemas import ChosenGrid, DemoOutcome, Given
+from skills.schemas import ChosenGrid, DemoOutcome, Given, ProposalState
 
 
 @schema
@@ -189,6 +189,33 @@ class Recording(Described):
     duration_s: float
     quality: list[Quality]
     created_at: datetime
+
+
+class Proposal(Given):
+    """A proposed hand-off of a recording, and what was decided on it."""
+
+    recording: Sha256
+    number: int = Field(description="Its number in the recording, counted from 1.")
+    state: ProposalState = Field(
+        description="accepted: a demonstration was cut there, which shares at least half of the longer of the two."
+    )
+    arm: str
+    start_s: float = Field(description="Seconds since the recording's `origin_ns`.")
+    end_s: float
+    handover_s: float = Field(description="Transition from A1 to A2.")
+    found_by: str = Field(description="The source: stage, gesture, transfer, jaw or motion.")
+    reasons: list[str]
+    confidence: Fraction | None = Field(
+        description="Probability that the needle was given to another arm; null unless found by a transfer."
+    )
+    surgeon: Slug | None = Field(
+        description="Of its demonstration, else the only one that the recording was uploaded for."
+    )
+    suture: Slug | None = Field(description="Of its demonstration; null if there is none.")
+    demo: Sha256 | None = Field(description="The demonstration, active or withdrawn.")
+    outcome: DemoOutcome | None = Field(description="Of the demonstration.")
+    note: str | None = Field(description="Why it was rejected, or the reason of the outcome.")
+    created_at: datetime = Field(description="Of the recording.")
 
 
 class RecordingSummary(Given):

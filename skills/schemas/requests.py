@@ -27,7 +27,7 @@ from skills.planning.plan import (
     Turning,
 )
 from skills.planning.trajectory import MAX_SPEED_MM_S
-from skills.schemas import DemoOutcome, Handedness, SkillLevel
+from skills.schemas import DemoOutcome, Handedness, ProposalDecision, SkillLevel
 from skills.settings import Role
 from skills.verification.errors import NAMED, ArmErrors, checked_own
 
@@ -195,6 +195,15 @@ class OutcomeIn(Schema):
 def _require_reason(outcome: DemoOutcome | None, reason: str | None) -> None:
     if outcome in ("recovery", "failure") and reason is None:
         raise ValueError(f"a {outcome} needs a reason")
+
+
+class ProposalIn(Schema):
+    """The decision on a proposed hand-off. To accept it, cut a demonstration there."""
+
+    model_config = shown({"state": "rejected", "note": "The needle was only regrasped."}, {"state": "open"})
+
+    state: ProposalDecision
+    note: Name | None = None
 
 
 class Reading(Schema):

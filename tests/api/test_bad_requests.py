@@ -48,6 +48,7 @@ SOUND: dict[tuple[str, str], Any] = {
         "rotations_xyzw": [[0.0, 0.0, 0.0, 1.0]], "tip_offset_mm": 0.0, "handoff": "none",
     },
     ("PUT", "/demos/{demo}/outcome"): {"outcome": "failure", "reason": "It fell."},
+    ("PUT", "/recordings/{recording}/proposals/{number}"): {"state": "rejected", "note": "Idle."},
     ("POST", "/playbacks"): {"plan": "0" * 64},
     ("POST", "/datasets"): {
         "demos": ["0" * 64], "outcomes": "any", "whole": True, "version": "v3.0", "fps": 30, "split": "session",
@@ -119,7 +120,7 @@ def routes() -> Iterator[tuple[str, str, dict[str, Any]]]:
 
 
 def filled(path: str, **parts: str) -> str:
-    known = {**KESTREL, "version": "1", "job": "0" * 16, **parts}
+    known = {**KESTREL, "version": "1", "number": "1", "job": "0" * 16, **parts}
     for name in [part[1:-1] for part in path.split("/") if part.startswith("{")]:
         path = path.replace(f"{{{name}}}", known.get(name, "0" * 64))
     return path
@@ -247,7 +248,7 @@ def lists() -> list[str]:
 
 
 def test_no_limit_and_no_cursor_is_ours_to_blame(still: Service, untouched: None):
-    assert len(lists()) == 10
+    assert len(lists()) == 11
     for path in lists():
         for name, values in (("limit", LIMITS), ("cursor", CURSORS)):
             for value in values:

@@ -35,6 +35,7 @@ NEEDED = {
     "POST /demos": UPLOADER,
     "POST /recordings/{recording}/demos": UPLOADER,
     "DELETE /recordings/{recording}": UPLOADER,
+    "PUT /recordings/{recording}/proposals/{number}": UPLOADER,
     "POST /suture-points": UPLOADER,
     "PUT /demos/{demo}/outcome": RELEASER,
     "DELETE /demos/{demo}": RELEASER,
@@ -63,6 +64,7 @@ SHAPES = {
     "job": "0" * 16,
     "key": "0" * 8,
     "version": "1",
+    "number": "1",
     "name": "site.css",
 }
 

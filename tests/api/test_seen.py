@@ -39,6 +39,7 @@ def ids(admin: As, surgeon: str) -> dict[str, str]:
     """Find a surgeon's objects, by the parameter names that they have in paths."""
     demo = admin("GET", f"/demos?surgeon={surgeon}").json()["items"][0]
     found = {"surgeon": surgeon, "suture": cases.SUTURE, "demo": demo["id"], "recording": demo["recording"]}
+    found["number"] = "1"
     jobs = admin("GET", "/jobs").json()["items"]
     if surgeon == "kestrel":
         played = next(job["result"] for job in jobs if job["kind"] == "playback")
@@ -52,7 +53,7 @@ def ids(admin: As, surgeon: str) -> dict[str, str]:
 def filled(path: str, about: dict[str, str]) -> str | None:
     """Fill a path with ids; None if it names nothing that belongs to a surgeon."""
     names = [part[1:-1] for part in path.split("/") if part.startswith("{")]
-    if not set(names) & set(about) - {"suture", "version"}:
+    if not set(names) & set(about) - {"suture", "version", "number"}:
         return None
     for name in names:
         path = path.replace(f"{{{name}}}", about[name])

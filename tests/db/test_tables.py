@@ -13,6 +13,7 @@ from skills.db.models import (
     DemonstrationOutcome,
     Erasure,
     MeasuredShape,
+    ProposalMark,
     RecordingSurgeon,
     StoredCalibration,
     StoredPictures,
@@ -29,6 +30,7 @@ from tests.library.styles import retrain
 FROZEN = (
     "recordings",
     "recording_chunks",
+    "proposal_marks",
     "reward_maps",
     "policy_versions",
     "policy_demonstrations",
@@ -82,6 +84,7 @@ def fill(database: Database) -> None:
         session.add(StoredPictures(playback_row=played.row, drawn=Pictures(b"mp4", b"gif", b"png", b"png")))
         session.add(StoredCalibration(sha256="0" * 64, about={}))
         session.add(DemonstrationOutcome(demonstration_row=demo.row, outcome="failure", reason="fell", actor="ada"))
+        session.add(ProposalMark(recording_row=demo.recording_row, number=1, state="rejected", actor="ada"))
         job = service_tables.Job(id="0" * 16, kind="dataset", identity="0" * 64, request={})
         session.add(job)
         session.flush()

@@ -1,10 +1,14 @@
 """A real browser for the pages: Debian's Chromium, driven by Playwright, with a record of its complaints."""
 
+import io
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
+from axe_playwright_python.sync_playwright import Axe
 from hypothesis import settings
+from PIL import Image
 from playwright.sync_api import Browser, Page, sync_playwright
 
 from tests.needs import chromium, need
@@ -27,6 +31,18 @@ def browsing() -> Iterator[Browser]:
         browser = driver.chromium.launch(executable_path=chromium(), args=ARGUMENTS)
         yield browser
         browser.close()
+
+
+def colours(drawn: bytes) -> int:
+    """Count the colours of a picture: an empty canvas has one."""
+    pixels = np.asarray(Image.open(io.BytesIO(drawn)).convert("RGB"))
+    return len(np.unique(pixels.reshape(-1, 3), axis=0))
+
+
+def axe(page: Page, without: str | None = None) -> list[str]:
+    """Return what axe-core finds on a page, but in the elements of a selector: rule, and the elements that break it."""
+    found = Axe().run(page, context=None if without is None else {"exclude": [[without]]}).response["violations"]
+    return [f"{one['id']}: {[node['html'][:120] for node in one['nodes']]}" for one in found]
 
 
 class Watched:
@@ -81,3 +97,13 @@ class Watched:
         """Return by how many pixels the page is wider than the window."""
         wide: int = self.page.evaluate("document.documentElement.scrollWidth - document.documentElement.clientWidth")
         return wide
+
+
+@contextmanager
+def visiting(browser: Browser, url: str, **how: bool) -> Iterator[Watched]:
+    """Open a tab, and assert at the end that the browser has complained of nothing and requested no other server."""
+    tab = Watched(browser, url, **how)
+    yield tab
+    tab.context.close()
+    assert tab.complaints == []
+    assert tab.foreign() == []

@@ -1,24 +1,20 @@
 """The pages in a real browser: from a recording to a playback, without complaints or external addresses."""
 
-import io
 import json
 import re
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
-from playwright.sync_api import Browser, Locator, Route, expect
+from playwright.sync_api import Browser, Locator, expect
 
+from skills.api.app import create_app
 from skills.client import Client
-from skills.db.session import Database
-from skills.library.keys import create_key
 from skills.seeds.recordings import sample_recordings
 from skills.settings import Settings
 from tests.api.service import GOAL_MM
-from tests.e2e.browsers import Watched, browsing
+from tests.e2e.browsers import Watched, axe, browsing, colours, visiting
 from tests.e2e.conftest import Service, running
 from tests.formats import written
 from tests.library import cases
@@ -26,7 +22,6 @@ from tests.waiting import END_S
 
 SAMPLE = next(s for s in sample_recordings() if len(s.segments) > 1)
 STYLE = f"{SAMPLE.surgeon}/{SAMPLE.suture}"
-PREFIX = "/lab/skills"
 WORK_MS = 300_000  # for a training or a playback on a busy machine
 expect.set_options(timeout=1000 * END_S)
 
@@ -61,16 +56,6 @@ def url(service: Service, client: Client) -> str:
     return service.url
 
 
-@contextmanager
-def visiting(browser: Browser, url: str, **how: bool) -> Iterator[Watched]:
-    """Open a tab, and assert at the end that the browser has complained of nothing and requested no other server."""
-    tab = Watched(browser, url, **how)
-    yield tab
-    tab.context.close()
-    assert tab.complaints == []
-    assert tab.foreign() == []
-
-
 @pytest.fixture
 def tab(browser: Browser, url: str) -> Iterator[Watched]:
     with visiting(browser, url) as opened:
@@ -82,12 +67,6 @@ def flat(browser: Browser, url: str) -> Iterator[Watched]:
     """Yield a tab without 3-D views, for tests of what stands beside them."""
     with visiting(browser, url, view=False) as opened:
         yield opened
-
-
-def colours(drawn: bytes) -> int:
-    """Count the colours of a picture: an empty canvas has one."""
-    pixels = np.asarray(Image.open(io.BytesIO(drawn)).convert("RGB"))
-    return len(np.unique(pixels.reshape(-1, 3), axis=0))
 
 
 def camera(scene: Locator) -> list[float]:
@@ -413,6 +392,46 @@ def test_every_page_fits_its_window_and_says_what_it_is_for(
             tab.shoot(f"{name}-{which}")
 
 
+BORROWED = {"/docs": "#calls"}  # drawn by Swagger UI, in which axe finds contrast, landmarks and links within buttons
+# What a page that loads its content has when it is complete.
+LOADING = {
+    "/docs": ".opblock-tag >> nth=0",
+    "/pages/player/{source}/{digest}": "#player[data-ready]",
+    "/pages/proposals": "body[data-drawn]",
+    "/pages/recordings/{recording}": "#timeline svg[data-drawn]",
+    "/pages/styles/{surgeon}/{suture}": "#view[data-drawn]",
+}
+
+
+def test_axe_finds_nothing_on_any_page_of_any_route(browser: Browser, service: Service, pages: dict[str, str]) -> None:
+    """A page is whatever a route answers to a browser with HTML, so a new one is examined without being listed here."""
+    with Client(service.url) as client, visiting(browser, service.url, view=False) as tab:
+        (demo,), (job, *_) = client.demos(surgeon=SAMPLE.surgeon), client.jobs()
+        known = {"surgeon": SAMPLE.surgeon, "suture": SAMPLE.suture, "version": "1", "demo": demo.id, "job": job.id}
+        known |= {"recording": demo.recording, "plan": pages["plan"].rpartition("/")[2], "source": "demos"}
+        known |= {"digest": demo.id, "policy": client.versions(SAMPLE.surgeon, SAMPLE.suture)[0].sha256}
+        examined, found = set(), {}
+        for path in sorted({one.path for one in create_app(Settings()).routes if "GET" in getattr(one, "methods", ())}):
+            names = set(re.findall("{(\\w+)}", path))
+            if path.startswith("/pages/"):
+                assert names <= set(known), f"{path}: name an example of its parameters here"
+            if not names <= set(known):
+                continue
+            where = path.format(**known)
+            answer = client.http.get(where, headers={"Accept": "text/html"})
+            if not answer.headers.get("content-type", "").startswith("text/html"):
+                continue
+            assert answer.status_code == 200, (path, answer.status_code)
+            tab.open(where)
+            if path in LOADING:
+                expect(tab.page.locator(LOADING[path])).to_have_count(1)
+            examined.add(path)
+            found[path] = axe(tab.page, BORROWED.get(path))
+        assert [(path, one) for path, broken in found.items() for one in broken] == []
+        assert examined >= {"/", "/docs", "/sign-in", "/demos/{demo}/report", "/policy-versions/{policy}/card"}
+        assert len(examined) >= 20
+
+
 @pytest.mark.nightly  # by day each page is opened
 def test_light_or_dark_is_chosen_and_stays(tab: Watched) -> None:
     ground = "getComputedStyle(document.body).backgroundColor"
@@ -459,55 +478,6 @@ def test_a_demonstration_is_scored_from_the_page_of_its_style(browser: Browser, 
         expect(tab.page.get_by_text("not a credential")).to_be_visible()
         assert tab.too_wide() <= 0
         tab.shoot(f"score-{name}")
-
-
-def try_out(tab: Watched, call: str) -> Locator:
-    """Execute a call without parameters on the page of the calls; returns its response."""
-    block = tab.page.locator(f"[id$={call}]")
-    block.locator(".opblock-summary-control").click()
-    block.get_by_role("button", name="Try it out").click()
-    block.get_by_role("button", name="Execute").click()
-    return block.locator(".live-responses-table .response")
-
-
-@pytest.mark.nightly  # a page that takes 5 s of processor time; by day tests/api reads it
-@pytest.mark.parametrize(
-    "name", ["desk", *(pytest.param(one, marks=pytest.mark.nightly) for one in ("desk-dark", "phone"))]
-)
-def test_a_call_is_tried_out_on_the_page_of_the_calls(browser: Browser, url: str, name: str) -> None:
-    with visiting(browser, url, phone="phone" in name, dark="dark" in name) as tab:
-        tab.open("/docs")
-        answer = try_out(tab, "list_surgeons")
-        expect(tab.page.get_by_text("Loading the calls")).to_have_count(0)
-        expect(answer.locator(".response-col_status")).to_contain_text("200")
-        expect(answer).to_contain_text(f'"surgeon": "{SAMPLE.surgeon}"')
-        assert tab.too_wide() == 0
-        tab.shoot(f"docs-{name}")
-
-
-@pytest.mark.nightly  # as above, with a service of its own
-@pytest.mark.parametrize("scheme", ["bearer", pytest.param("header", marks=pytest.mark.nightly)])
-def test_a_call_with_a_key_is_tried_out_behind_a_prefix(browser: Browser, tmp_path: Path, scheme: str) -> None:
-    serving = running(tmp_path, root_path=PREFIX, workers=0)
-    with serving as service, closing(Database(f"sqlite:///{service.database}")) as database:
-        with database.writing() as session:
-            _, key = create_key(session, "anna", "reader", "local")
-        with visiting(browser, service.url) as tab:
-            tab.page.route(f"**{PREFIX}/**", without_prefix)
-            tab.open(f"{PREFIX}/docs")
-            tab.page.get_by_role("button", name="Authorize").first.click()
-            credentials = tab.page.locator(".auth-container").filter(has_text=f"{scheme} (")
-            credentials.locator("input").fill(key)
-            credentials.get_by_role("button", name="Apply credentials").click()
-            credentials.get_by_role("button", name="Close").click()
-            answer = try_out(tab, "list_surgeons")
-            expect(answer.locator(".response-col_status")).to_contain_text("200")
-            assert f"{service.url}{PREFIX}/surgeons?limit=50" in tab.asked
-
-
-def without_prefix(route: Route) -> None:
-    """Pass a request on as a reverse proxy does that takes its prefix off."""
-    route.continue_(url=route.request.url.replace(PREFIX, "", 1))
 
 
 @pytest.mark.parametrize("phone", [False, pytest.param(True, marks=pytest.mark.nightly)])

@@ -1,16 +1,15 @@
-"""The player in a real browser: a minute of two arms, scrubbed, played, compared; and pages examined by axe-core."""
+"""The player in a real browser: a minute of two arms, scrubbed, played, compared, and with marked parts."""
 
 import re
 from collections.abc import Iterator
 
 import pytest
-from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Browser, Page, expect
 
 from skills.client import Client
 from skills.formats.writer import write_mcap
 from skills.seeds.recordings import sample_recordings
-from tests.e2e.browsers import Watched, browsing
+from tests.e2e.browsers import Watched, axe, browsing, colours
 from tests.e2e.conftest import Service
 from tests.verification.timelines import two_arms
 from tests.waiting import END_S, crowded
@@ -143,6 +142,20 @@ def test_a_sign_of_loading_stands_until_the_motion_is_there(browser: Browser, se
     close(tab)
 
 
+def test_a_marked_part_is_shown_where_it_is_and_sought(browser: Browser, service: Service, beside: str) -> None:
+    tab = Watched(browser, service.url, view=False)
+    page = when_ready(tab, beside)
+    start = float(page.locator("#time").inner_text().split()[0])
+    unmarked = colours(page.locator(".chart").first.screenshot())
+    page = when_ready(tab, f"{beside}&mark={start + 0.5:.2f}-{start + 1:.2f}&mark={start + 2:.2f}-{start + 2.5:.2f}")
+    assert now(page) == pytest.approx(0.5, abs=0.01)
+    assert colours(page.locator(".chart").first.screenshot()) > unmarked
+    page.get_by_role("button", name=re.compile("^2 ")).click()
+    assert now(page) == pytest.approx(2.0, abs=0.01)
+    assert axe(page) == []
+    close(tab)
+
+
 SCREENS = [("desk", "light"), ("desk", "dark"), ("phone", "light"), ("phone", "dark")]
 
 
@@ -158,29 +171,3 @@ def test_the_player_fits_every_window(
         tab.shoot(f"player-{name}-{window}-{theme}")
         assert axe(page) == []
     close(tab)
-
-
-def axe(page: Page) -> list[str]:
-    """Return what axe-core finds on a page: rule, and the elements that break it."""
-    found = Axe().run(page).response["violations"]
-    return [f"{one['id']}: {[node['html'][:120] for node in one['nodes']]}" for one in found]
-
-
-def test_axe_finds_nothing_on_the_player_nor_on_any_page(
-    browser: Browser, service: Service, client: Client, beside: str
-) -> None:
-    (demo,) = client.demos(surgeon="kestrel")
-    style = f"/pages/styles/kestrel/{demo.suture}"
-    paths = ["/", style, "/pages/recordings", "/pages/recordings/new", f"/pages/recordings/{demo.recording}"]
-    paths += ["/pages/plans", "/pages/jobs", "/pages/catalogue", "/pages/atlas", f"/pages/atlas/{demo.suture}"]
-    paths += [f"/pages/demos/{demo.id}/score", f"/demos/{demo.id}/report"]
-    tab = Watched(browser, service.url, view=False)
-    found = {}
-    for path in [beside, *paths]:
-        if path == beside:
-            when_ready(tab, path)
-        else:
-            tab.open(path)
-        found[re.sub("[0-9a-f]{64}", "*", path)] = axe(tab.page)
-    close(tab)
-    assert [(path, one) for path, broken in found.items() for one in broken] == []

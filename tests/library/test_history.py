@@ -145,6 +145,7 @@ EDITS = [
     ("UPDATE playbacks SET feasible = NOT feasible WHERE row = 1", "playbacks 1", "feasible"),
     ("UPDATE playbacks SET measured = {blob} WHERE row = 1", "playbacks 1", "measured"),
     ("UPDATE playback_pictures SET drawn = {blob} WHERE row = 1", "playback_pictures 1", "drawn"),
+    ("UPDATE proposal_marks SET state = 'open' WHERE row = 1", "proposal_marks 1", "state"),
     ("DELETE FROM erasures WHERE row = 1", "erasures 1", "remove"),
     ("UPDATE datasets SET sha256 = 'f' WHERE row = 1", "datasets 1", "sha256"),
     ("UPDATE jobs SET result = '{{}}' WHERE row = 1", "jobs 1", "result"),

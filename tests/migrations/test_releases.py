@@ -40,7 +40,8 @@ ADDED_LATER = {
     "retraining_styles", "playback_pictures", "keys", "key_surgeons", "sign_ins", "recording_uploads",
     "measured_shapes", "calibrations", "policy_demonstrations", "recording_surgeons",
     "demonstration_outcomes", "dataset_demonstrations", "datasets", "dataset_chunks",
-    "parsed_recordings", "parsed_chunks", "pose_styles", "loose_chunks", "erased_surgeons", *HISTORY,
+    "parsed_recordings", "parsed_chunks", "pose_styles", "loose_chunks", "erased_surgeons", "proposal_marks",
+    *HISTORY,
 }  # fmt: skip
 FILLED_AGAIN = {"recording_uploads", *HISTORY}
 KEYS = {"keys", "key_surgeons", "sign_ins"}  # empty: with a key, the installation would answer its tests with 401

@@ -22,6 +22,8 @@ from skills.settings import MEBIBYTE
 router = router_of(tags=["timelines"], max_body_size=MEBIBYTE)
 page_router = router_of(route_class=PageRoute, include_in_schema=False, max_body_size=MEBIBYTE)
 
+SPAN, MOST_MARKS = r"^\d{1,6}(\.\d{1,6})?-\d{1,6}(\.\d{1,6})?$", 20
+
 
 @router.get(
     "/timelines/{source}/{digest}",
@@ -69,11 +71,16 @@ def show_player(
     caller: Asking,
     db: Db,
     beside: Annotated[str | None, Query(max_length=100)] = None,
+    mark: Annotated[list[Annotated[str, Query(pattern=SPAN)]] | None, Query(max_length=MOST_MARKS)] = None,
 ) -> Response:
-    """Show the player of a motion; `beside` is another one, such as `plans/DIGEST`, to be played in step with it."""
+    """Show the player of a motion; `beside` is another one, such as `plans/DIGEST`, to be played in step with it.
+
+    Each `mark` is a part to show, such as `1.5-2.25`: seconds on the clock of the first motion.
+    """
     with db.reading() as session:
         shown, choices = chosen(session, source, digest)
         other = None if not beside else next((one for one in choices if f"{one.source}/{one.sha256}" == beside), None)
         if beside and other is None:
             raise NotFound("There is no such motion to play beside this one; choose one of the list.")
-        return render(request, "player.html", caller, shown=shown, choices=choices, other=other)
+        marks = [[float(end) for end in one.split("-")] for one in mark or ()]
+        return render(request, "player.html", caller, shown=shown, choices=choices, other=other, marks=marks)

@@ -7,6 +7,7 @@ import { element, say } from "./site.js";
 const get = (id) => document.getElementById(id);
 const player = get("player");
 const names = JSON.parse(player.dataset.names);
+const marks = JSON.parse(player.dataset.marks); // parts to show, in seconds on the clock of the first motion
 const JOINTS = ["yaw", "pitch", "insertion", "roll", "wrist pitch", "wrist yaw"];
 // A colour for each arm, of the first motion and of the second; the second is also drawn dashed.
 const COLOURS = [["path", "learnt"], ["goal", "other"]];
@@ -268,7 +269,7 @@ function draws() {
 
 function plotAll() {
   const place = get("charts");
-  plots = draws().map(([title, mine, more]) => new Plot(place, title, mine, { ...more, motions, end, ends, rowOf, scrub: show }));
+  plots = draws().map(([title, mine, more]) => new Plot(place, title, mine, { ...more, motions, marks, end, ends, rowOf, scrub: show }));
 }
 
 // ---- the controls
@@ -284,6 +285,7 @@ function restage() {
 function listen() {
   get("play").addEventListener("click", () => play(!playing));
   get("at").addEventListener("input", () => show(Number(get("at").value)));
+  document.querySelectorAll("[data-mark]").forEach((one) => one.addEventListener("click", () => show(marks[one.dataset.mark][0] - motions[0].start_s)));
   get("step")?.addEventListener("change", () => {
     get("at").max = end();
     plots.forEach((plot) => plot.draw());
@@ -349,7 +351,7 @@ try {
   await new Promise((wake) => requestAnimationFrame(wake)); // the picture comes before the plots
   performance.mark("first picture");
   plotAll();
-  show(0);
+  show(marks.length ? marks[0][0] - motions[0].start_s : 0);
   listen();
   player.dataset.ready = "true";
 } catch (problem) {

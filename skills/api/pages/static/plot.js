@@ -79,6 +79,16 @@ export class Plot {
         if (ink.measureText(stage.name).width < to - from - 4) ink.fillText(stage.name, from + 3, EDGE.top + 10);
       });
     }
+    this.marks.forEach(([from, to], i) => {
+      const [left, right] = [from, to].map((at) => this.x(Math.max(0, Math.min(this.end(), at - first.start_s))));
+      ink.fillStyle = colour("reward");
+      ink.globalAlpha = 0.3;
+      ink.fillRect(left, EDGE.top, Math.max(2, right - left), bottom - EDGE.top);
+      ink.globalAlpha = 1;
+      ink.fillStyle = colour("ink");
+      ink.textAlign = "left";
+      ink.fillText(`${i + 1}`, left + 2, bottom - 3);
+    });
     ink.fillStyle = colour("strong");
     ink.globalAlpha = 0.35;
     for (const [down, up] of first.clutch_s) ink.fillRect(this.x(down - first.start_s), EDGE.top, Math.max(1, this.x(up - first.start_s) - this.x(down - first.start_s)), bottom - EDGE.top);
