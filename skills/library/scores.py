@@ -84,8 +84,8 @@ def others_of(
 ) -> Iterator[Other]:
     """Measure the newest demonstrations of a suture type against a reference's shape, where consent covers it.
 
-    Of overlapping cuts of one motion one counts: the compared demonstration, or else the newest that is not marked recovery
-    or failure, or else the newest.
+    Of overlapping cuts of one motion one counts: the compared demonstration, or else the newest that is not marked
+    recovery or failure, or else the newest.
 
     Args:
         session: The caller's transaction.
