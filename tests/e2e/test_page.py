@@ -14,6 +14,7 @@ from skills.api.app import create_app
 from skills.client import Client
 from skills.seeds.recordings import sample_recordings
 from skills.settings import Settings
+from skills.simulation import film
 from tests.api.service import GOAL_MM
 from tests.e2e.browsers import Watched, axe, browsing, colours, visiting
 from tests.e2e.conftest import Service, running
@@ -35,9 +36,12 @@ def browser() -> Iterator[Browser]:
 
 @contextmanager
 def by_a_thread(folder: Path) -> Iterator[Service]:
-    """Start a service whose jobs a thread carries out: a worker takes three seconds to start."""
-    with running(folder, workers=0) as started, cases.working(Settings(database_url=f"sqlite:///{started.database}")):
-        yield started
+    """Start a service whose jobs a thread carries out: a worker takes three seconds to start, and draws whole films."""
+    with running(folder, workers=0) as started, pytest.MonkeyPatch.context() as patched:
+        patched.setattr(film, "FRAMES", 4)
+        patched.setattr(film, "FRAMES_PER_PASS", 4)
+        with cases.working(Settings(database_url=f"sqlite:///{started.database}")):
+            yield started
 
 
 @pytest.fixture(scope="module")

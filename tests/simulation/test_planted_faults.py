@@ -201,6 +201,7 @@ def played(database: Database, plan: Plan) -> StoredPlayback:
         return find_playback(session, job.result["playback"])
 
 
+@pytest.mark.nightly  # by day tests/simulation/test_player.py, in another process
 def test_the_same_plan_has_the_same_playback_in_another_database(databases):
     one, other = (played(database, cases.add_plan(database)) for database in databases)
     assert one.sha256 == other.sha256

@@ -73,6 +73,7 @@ def test_jaws_hold_where_friction_exceeds_the_wedge_between_them():
     assert exactly(physics=Physics(friction=1.25 * wedges[1])).held.count == 1
 
 
+@pytest.mark.nightly  # of the referee, which is no gate
 def test_the_same_seed_gives_the_same_trials_and_a_half_step_the_same_outcomes():
     need("mujoco")
     trajectory, errors, _ = some_plan(4)
@@ -128,6 +129,7 @@ def test_fingers_that_come_never_near_are_watched_for_one_sample():
     assert refereeing._watched(away, 0).tolist() == refereeing._watched(ONE, 0)[-1:].tolist()
 
 
+@pytest.mark.nightly  # of the referee, which is no gate
 def test_each_quantity_of_the_physics_is_halved_and_doubled():
     need("mujoco")
     found = referee(ONE, errors=ARMS, trials=1, varied=1, settings=replace(NO_DOUBT, variations=2))
