@@ -228,11 +228,21 @@ _Row = tuple[int, str]  # a style: the surgeon's row and the suture type's slug
 
 
 @dataclass(frozen=True)
+class Shown:
+    """The part of a version's manifest that a tile shows; the share is None where an older version did not state it."""
+
+    grid_shape: tuple[int, int, int]
+    waypoints: Sequence[int]
+    mean_share: float | None
+    dtw_total_mm: float
+
+
+@dataclass(frozen=True)
 class Style:
     """The state of one style: the numbers of active demonstrations and versions, the served version and the shown one.
 
-    `shown` is the manifest of the served version or, if none is served, of the newest; `waiting` is true if the newest
-    demonstration is newer than those of the shown version.
+    `shown` is of the served version or, if none is served, of the newest; `waiting` is true if the newest demonstration
+    is newer than those of the shown version.
     """
 
     suture: str
@@ -240,7 +250,7 @@ class Style:
     demos: int = 0
     versions: int = 0
     released: int | None = None
-    shown: dict[str, Any] | None = None
+    shown: Shown | None = None
     waiting: bool = False
 
 
@@ -348,10 +358,12 @@ def _styles(session: Session, surgeons: Sequence[int], suture: str | None = None
     served = select(Release.surgeon_row, Release.suture, Release.policy_row).where(*mine(Release), is_served())
     released = {(who, what): policy for who, what, policy in session.execute(served)}
     wanted = {**newest_version, **released}
-    # Columns and not entities, of which a page has hundreds.
+    # Columns and not entities, of which a page has hundreds; and of manifests the part that is shown.
+    shown = [("grid", "shape"), ("waypoints",), ("coverage", "mean_share"), ("metrics", "dtw_total_mm")]
+    manifest = [by.manifest[names] for names in shown]
     others = select(func.max(PolicyDemonstration.demonstration_row)).where(PolicyDemonstration.policy_row == by.row)
-    about = select(by.row, by.version, by.manifest, by.demonstration_row, others.scalar_subquery().label("other"))
-    told = {one.row: one for one in session.execute(about.where(by.row.in_(wanted.values())))}
+    about = select(by.row, by.version, by.demonstration_row, others.scalar_subquery(), *manifest)
+    told = {row: rest for row, *rest in session.execute(about.where(by.row.in_(wanted.values())))}
     return {
         style: _sum_up(
             style,
@@ -365,17 +377,18 @@ def _styles(session: Session, surgeons: Sequence[int], suture: str | None = None
     }
 
 
-def _sum_up(style: _Row, demos: int, versions: int, shown: Any, newest_demo: int, released: bool) -> Style:
-    if shown is None:
+def _sum_up(style: _Row, demos: int, versions: int, told: list[Any] | None, newest_demo: int, released: bool) -> Style:
+    if told is None:
         return Style(style[1], "stored", demos)
+    version, demonstration_row, other, shape, *shown = told
     return Style(
         suture=style[1],
         state="released" if released else "trained",
         demos=demos,
         versions=versions,
-        released=shown.version if released else None,
-        shown=shown.manifest,
-        waiting=newest_demo > max(shown.demonstration_row, shown.other or 0),
+        released=version if released else None,
+        shown=Shown(tuple(shape), *shown),
+        waiting=newest_demo > max(demonstration_row, other or 0),
     )
 
 

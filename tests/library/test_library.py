@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from pydantic import ValidationError
-from sqlalchemy import delete, func, select, text
+from sqlalchemy import delete, func, select, text, update
 from sqlalchemy.orm import Session
 
 from skills import library
@@ -23,7 +23,7 @@ from skills.errors import Conflict, Corrupt, Erased
 from skills.gridworld.grid import PAPER_GRID, discretisation_rmse, discretize
 from skills.learning.dynamic_programming import ValueIteration
 from skills.learning.max_ent_irl import MaxEntIRL
-from skills.library import jobs, releases
+from skills.library import jobs, overview, releases
 from skills.library.catalogue import find_surgeon, put_surgeon, seed_catalogue
 from skills.library.demos import add_demo, find_demo, withdraw_demo
 from skills.library.erasure import erase_surgeon
@@ -33,6 +33,7 @@ from skills.schemas.requests import DemoIn
 from skills.settings import Settings
 from tests import backends
 from tests.library import cases
+from tests.library.attacks import tampering
 
 AT_ONCE = 8
 SHAKE = np.random.default_rng(5).normal(0, 0.4, (150, 3)).clip(-1, 1)  # mm, less than a quarter of a cell
@@ -253,6 +254,29 @@ def test_what_was_released_is_what_was_learnt(database: Database):
         served = policy_of(session, "kestrel", cases.SUTURE)
         assert served.policy.sha256 == version.sha256
         assert learnt(served.policy).path.states.tolist() == find_demo(session, demo.sha256).path.states.tolist()
+
+
+def test_the_first_page_shows_what_the_manifest_states(database: Database):
+    """Also that of an older version, which states no share."""
+    cases.add_demo(database)
+    cases.train(database)
+    with database.reading() as session:
+        manifest = session.scalars(select(PolicyVersion.manifest)).one()
+        assert tile(session) == (manifest["waypoints"], pytest.approx(manifest["coverage"]["mean_share"]))
+    older = manifest | {"coverage": {"n_states": 1}}
+    with tampering(database) as connection:
+        connection.execute(update(PolicyVersion).values(manifest=older))
+        with Session(connection) as session:
+            assert tile(session) == (manifest["waypoints"], None)
+
+
+def tile(session: Session) -> tuple[list[int], float | None]:
+    ((_, styles),) = overview.matrix(session).rows
+    shown = next(style.shown for style in styles if style.shown is not None)
+    manifest = session.scalars(select(PolicyVersion.manifest)).one()
+    assert shown.grid_shape == tuple(manifest["grid"]["shape"])
+    assert shown.dtw_total_mm == pytest.approx(manifest["metrics"]["dtw_total_mm"])
+    return shown.waypoints, shown.mean_share
 
 
 def test_what_value_iteration_finds_may_be_released(database: Database):

@@ -160,9 +160,9 @@ def outline(style: Style) -> dict[str, Any] | None:
     """
     if style.shown is None:
         return None
-    nx, ny, nz = style.shown["grid"]["shape"]
+    nx, ny, nz = style.shown.grid_shape
     seen, box = _box(nx, ny, nz)
-    path = [seen(at // (ny * nz), at // nz % ny, at % nz) for at in style.shown["waypoints"]]
+    path = [seen(at // (ny * nz), at // nz % ny, at % nz) for at in style.shown.waypoints]
     return {**box, "path": _line(path), "start": path[0], "goal": path[-1]}
 
 
