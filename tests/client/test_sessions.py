@@ -9,12 +9,15 @@ from socket import SHUT_RDWR
 from typing import Any
 
 import httpx2 as httpx
+import numpy as np
 import pytest
 import uvicorn
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 from websockets.sync.server import Server, ServerConnection, serve
 
+from examples import crtk_session
+from examples.crtk_session import Measured
 from skills.api.sessions import WITHDRAWN
 from skills.client import AsyncClient, Client, NotReached, NotUnderstood, Problem, Retrying, SessionClosed
 from skills.client.sessions import LOST
@@ -26,6 +29,7 @@ from skills.schemas.policies import SessionLimits
 from tests import backends
 from tests.api import service as services
 from tests.api.service import KESTREL, MCAP
+from tests.client.test_crtk import StandInBus
 from tests.library.test_pose_styles import turning
 from tests.waiting import END_S, until
 
@@ -160,6 +164,16 @@ def test_a_withdrawal_closes_the_session_with_its_cause(posed: tuple[services.Se
         with pytest.raises(SessionClosed, match="withdrawn"):  # and for ever
             session.next(*START)
         client.release(**KESTREL, version=1)
+
+
+def test_the_crtk_example_follows_a_session_to_its_end(posed: tuple[services.Service, str]) -> None:
+    with Client(posed[1]) as client:
+        style = client.pose_style(**KESTREL)
+        bus = StandInBus(Measured(style.position_mm[0], style.rotation_xyzw[0], style.frame, 0.0), tick_s=0.012)
+        with client.session(**KESTREL) as session:  # which allows 100 poses a second
+            assert crtk_session.follow(bus, session) == "finished"
+    assert np.linalg.norm(np.subtract(bus.here.position_mm, style.position_mm[-1])) < 1.0
+    assert len(bus.said) >= len(style.position_mm) - 1
 
 
 # ---- a peer that misbehaves ------------------------------------------------------------------------------------------
