@@ -7,6 +7,7 @@ test of their own run here, on a real service that stands for the one of the pag
 import ast
 import json
 import re
+import runpy
 import shlex
 import shutil
 import subprocess
@@ -146,6 +147,16 @@ def test_the_statements_of_the_pages_are_accepted() -> None:
     [stated] = [text for language, text in blocks("recordings.md") if language == "toml"]
     for statement in tomllib.loads(stated).values():
         StatedIn.model_validate(statement)
+
+
+def test_the_labels_of_the_surgeons_page_are_on_the_pages_of_the_service() -> None:
+    """The steps themselves are done in a browser by `tests/e2e/test_page.py`, in six clicks."""
+    pages = [*(ROOT / "skills/api/pages").rglob("*.*"), ROOT / "skills/library/tries.py"]
+    shown = "\n".join(page.read_text() for page in pages if page.suffix in (".html", ".js", ".py")).lower()
+    page = (ROOT / "docs/surgeon.md").read_text()
+    labels = [re.sub(r" (\d+|of 0.6 mm)$", "", label) for label in re.findall(r"(?<!\*)\*([A-Z][^*]+)\*", page)]
+    assert len(labels) > 8
+    assert [label for label in labels if label.lower() not in shown] == []
 
 
 def test_every_setting_is_on_a_page() -> None:
@@ -373,7 +384,7 @@ def paths(nav: object) -> Iterator[str]:
 
 
 def gather(to: Path) -> None:
-    subprocess.run([sys.executable, "docs/make_site.py", str(to)], cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
+    runpy.run_path(str(ROOT / "docs/make_site.py"))["main"](to)
 
 
 def test_every_page_is_on_the_site_and_lists_every_call_and_name(tmp_path: Path) -> None:
