@@ -184,7 +184,7 @@ def draw_probability() -> Figure:
     by_size.errorbar(
         SCALES, shares[:, 1], [shares[:, 1] - shares[:, 0], shares[:, 2] - shares[:, 1]], color=CELLS, marker="o"
     )
-    by_size.axhline(GATE, color=GOAL, ls="--", label="lower bound that an export needs")
+    by_size.axhline(GATE, color=GOAL, ls="--", label="lower bound that an export needs of each pass")
     by_size.set(
         xlabel="errors of both arms, 1: a calibrated arm", ylabel="probability that the plan succeeds", ylim=(0, 1.02)
     )
