@@ -134,4 +134,4 @@ fixture: $(READY)
 	@$(BIN)/python -m tests.migrations.make_fixture
 
 clean:
-	rm -rf $(VENV) build
+	rm -rf $(VENV) build .cache

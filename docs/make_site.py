@@ -34,7 +34,7 @@ def main(to: Path) -> None:
     for file in sorted((ROOT / "docs").iterdir()):
         if file.suffix == ".md":
             (to / file.name).write_text(linked(file, file.read_text()) + more.get(file.name, ""))
-        elif file.suffix in (".png", ".toml"):
+        elif file.suffix in (".png", ".toml", ".css"):
             shutil.copyfile(file, to / file.name)
     for name, as_page in OF_THE_TOP.items():
         (to / as_page).write_text(linked(ROOT / name, (ROOT / name).read_text()))
