@@ -67,7 +67,7 @@ function settle(item, state, words) {
   const badge = item.querySelector(".badge");
   badge.textContent = state;
   badge.className = `badge ${state === "accepted" ? "released" : "job-failed"}`;
-  const said = element("p", { className: `said ${state === "accepted" ? "well" : ""}`, tabIndex: -1 }, words);
+  const said = element("p", { className: "said well", tabIndex: -1 }, words);
   said.setAttribute("role", "status");
   item.querySelector("form").replaceWith(said);
   const next = items.slice(items.indexOf(item) + 1).find((one) => one.querySelector("form button"));

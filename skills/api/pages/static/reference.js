@@ -20,4 +20,5 @@ SwaggerUIBundle({
   displayOperationId: true,
   defaultModelsExpandDepth: 0,
   validatorUrl: null,  // no outside address
+  onComplete: () => document.querySelector("#calls main")?.setAttribute("role", "group"),  // the page has one already
 });
