@@ -392,6 +392,11 @@ def _sum_up(style: _Row, demos: int, versions: int, told: list[Any] | None, newe
     )
 
 
+def styles_of(session: Session, surgeon: Surgeon) -> list[Style]:
+    """List the styles of a surgeon that have anything, by suture type."""
+    return [style for _, style in sorted(_styles(session, [surgeon.row]).items())]
+
+
 @dataclass(frozen=True)
 class WholeStyle:
     """One style with its demonstrations, versions and releases, the newest first; `served` is the served release."""

@@ -71,6 +71,8 @@ def every_page(service: Service) -> list[str]:
         *("/pages/atlas", *(f"/pages/atlas/{one}?scaled=true&clusters=" for one in {suture for _, suture in styles})),
         *("/pages/catalogue", "/?q=kestrel&state=released&skill=expert"),
         *(f"/pages/styles/{surgeon}/{suture}" for surgeon, suture in sorted(styles)),
+        *(f"/pages/surgeons/{surgeon}" for surgeon, _ in sorted(styles)),
+        *("/pages/proposals", "/pages/proposals?state=", f"/pages/proposals?state=accepted&suture={cases.SUTURE}"),
         *(f"/pages/demos/{one}/score" for one in scored),
         *(f"/pages/recordings/{one}" for one in recordings),
         *(f"/pages/player/recordings/{one}" for one in recordings),

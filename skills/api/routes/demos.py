@@ -27,14 +27,14 @@ from skills.api.responses import (
     stored,
     stored_pieces,
 )
-from skills.api.routes.pages import PageRoute
+from skills.api.routes.pages import PageRoute, Picked
 from skills.api.routes.policies import Accept
 from skills.db.models import StoredRewardMap
 from skills.errors import BadInput, Conflict, NotFound
 from skills.formats import BYTES, MEDIA_TYPES
 from skills.library import demos, erasure, locks, overview, recordings, scores
 from skills.library.atlas import CONFOUNDED, DISTANCE, MOST, SESSIONS, atlas_of, atlases
-from skills.library.catalogue import find_suture_type
+from skills.library.catalogue import find_surgeon, find_suture_type
 from skills.library.demos import demo_json, path_json, reward_map_json
 from skills.library.neighbours import nearest_to
 from skills.library.recordings import recording_json
@@ -384,6 +384,37 @@ def show_atlas(
             sessions=SESSIONS,
             distance=DISTANCE,
         )
+
+
+@page_router.get("/pages/surgeons/{surgeon}", dependencies=[needs("reader")])
+def show_surgeon(
+    surgeon: Slug, request: Request, caller: Asking, db: Db, suture: Picked = None, against: Picked = None
+) -> Response:
+    """Show a surgeon over time: the demonstrations of a suture type, session by session, beside a style's reference."""
+    with db.reading() as session:
+        found = find_surgeon(session, surgeon)
+        styles = [style for style in overview.styles_of(session, found) if style.demos]
+        chosen = suture or next((style.suture for style in styles), None)
+        others = scores.references(session, chosen) if chosen else []
+    compared = against or next((one.slug for one in others if one.slug != surgeon), surgeon)
+    shown, refused = None, ""
+    if chosen:
+        try:
+            shown = scores.progress(db, surgeon, chosen, compared)
+        except (Conflict, BadInput, NotFound) as error:
+            refused = error.words()  # beside what else is known of the surgeon
+    return render(
+        request,
+        "surgeon.html",
+        caller,
+        surgeon=found,
+        styles=styles,
+        asked={"suture": chosen, "against": compared},
+        others=others,
+        shown=shown,
+        refused=refused,
+        curve=drawings.score_curve(shown.demos, "") if shown is not None and len(shown.demos) > 1 else None,
+    )
 
 
 score_router = router_of(route_class=Strict, tags=["scores"], max_body_size=MEBIBYTE)
