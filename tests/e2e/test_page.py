@@ -1,10 +1,12 @@
 """The pages in a real browser: from a recording to a playback, without complaints or external addresses."""
 
+import io
 import json
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from zipfile import ZipFile
 
 import numpy as np
 import pytest
@@ -555,6 +557,25 @@ def accept_as_a_failure(tab: Watched, surgeon: str) -> None:
     page.reload()
     expect(page.locator(".badge", has_text="failure")).to_be_visible()
     expect(page.get_by_text("Mark the outcome of a demonstration")).to_be_visible()
+
+
+def test_the_folder_of_a_bag_is_sent_as_one_file_without_its_pictures(flat: Watched, tmp_path: Path) -> None:
+    bag = tmp_path / "theatre"
+    (bag / "camera").mkdir(parents=True)
+    (bag / "part_0.mcap").write_bytes(cases.bag("PSM1"))
+    (bag / "camera" / "0.png").write_bytes(b"not sent")
+    flat.open("/pages/recordings/new")
+    flat.page.get_by_label("or a bag's folder").set_input_files(bag)
+    expect(flat.page.locator("#chosen")).to_contain_text("theatre.zip")
+    sent = flat.page.evaluate(
+        "document.getElementById('file').files[0].arrayBuffer().then(b => [...new Uint8Array(b)])"
+    )
+    with ZipFile(io.BytesIO(bytes(sent))) as packed:
+        assert packed.testzip() is None
+        assert packed.namelist() == ["theatre/part_0.mcap"]
+    flat.page.get_by_role("button", name="Preview").click()
+    expect(flat.page.locator("#seen")).to_contain_text("PSM1")
+    expect(flat.page.get_by_role("button", name="Store it")).to_be_enabled()
 
 
 @pytest.mark.nightly  # by day, of a table

@@ -1,5 +1,6 @@
 // From a recording to a verdict on one page: each step of the job as it is done, questions, and remedies as buttons.
 import { call, digestOf, root, send, watch } from "./api.js";
+import { takeFolders } from "./folder.js";
 import { element, say } from "./site.js";
 
 const get = (id) => document.getElementById(id);
@@ -12,15 +13,7 @@ function chosen() {
 }
 
 file.addEventListener("change", chosen);
-for (const name of ["dragover", "dragleave", "drop"]) {
-  get("try-drop").addEventListener(name, (event) => {
-    event.preventDefault();
-    get("try-drop").classList.toggle("over", name === "dragover");
-    if (name !== "drop" || !event.dataTransfer.files.length) return;
-    file.files = event.dataTransfer.files;
-    chosen();
-  });
-}
+takeFolders(get("try-drop"), file, get("try-folder"));
 
 async function addSurgeon(surgeon) {
   if (!("adds" in form.dataset)) return;

@@ -1,5 +1,6 @@
 // Upload of a recording as raw bytes with their digest: a preview of what is understood, and then, unchanged, its storage.
 import { digestOf, root, send } from "./api.js";
+import { takeFolders } from "./folder.js";
 import { understood } from "./preview.js";
 
 const get = (id) => document.getElementById(id);
@@ -35,17 +36,7 @@ get("file").addEventListener("change", chosen);
 form.addEventListener("input", changed);
 form.addEventListener("change", changed);
 
-const drop = get("drop");
-for (const name of ["dragover", "dragleave", "drop"]) {
-  drop.addEventListener(name, (event) => {
-    event.preventDefault();
-    drop.classList.toggle("over", name === "dragover");
-    if (name !== "drop" || !event.dataTransfer.files.length) return;
-    get("file").files = event.dataTransfer.files;
-    chosen();
-    changed();
-  });
-}
+takeFolders(get("drop"), get("file"), get("folder"));
 
 // The answers to what the file does not say, of the fields that its format has.
 function answers() {
