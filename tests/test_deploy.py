@@ -89,7 +89,7 @@ def test_every_command_and_option_exists():
 
 
 def test_no_secret_is_in_a_file_and_the_port_is_on_loopback():
-    assert set(re.findall(r"POSTGRES_PASSWORD:\s*(.*)", COMPOSE_TEXT)) == {"${POSTGRES_PASSWORD:?write it into .env}"}
+    assert set(re.findall(r"POSTGRES_PASSWORD: (.*)", COMPOSE_TEXT)) == {"${POSTGRES_PASSWORD:?write it into .env}"}
     assert COMPOSE["services"]["service"]["ports"] == ["127.0.0.1:8000:8000"]
     assert not any("ports" in one for name, one in COMPOSE["services"].items() if name != "service")
     assert not re.search(r":latest\b", COMPOSE_TEXT)

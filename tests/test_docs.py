@@ -50,7 +50,7 @@ SCENES = "tests/learning/test_in_scene.py::test_the_examples_of_the_page_run"
 RUN_BY: dict[str, list[str]] = {
     "README.md": [HERE + "test_the_two_commands_of_the_readme_exist"],
     "atlas.md": [RUN, MEASURED],
-    "cli.md": 17 * [CLI + "test_every_command_of_the_page_runs_and_prints_what_the_page_says"],
+    "cli.md": 18 * [CLI + "test_every_command_of_the_page_runs_and_prints_what_the_page_says"],
     "client.md": 13 * ["tests/test_client_page.py::test_every_block_of_the_page_runs_in_the_order_of_the_page"],
     "combining.md": 2 * [RUN],
     "contact.md": [RUN],
