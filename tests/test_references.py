@@ -25,7 +25,9 @@ ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / name for name in ("README.md", "ARCHITECTURE.md", "CONTRIBUTING.md", "urdf/README.md")]
 PAGES += sorted((ROOT / "docs").glob("*.md"))
 CODE = sorted(
-    file for folder in ("skills", "seeds", "migrations", "tests", "docs", "examples") for file in (ROOT / folder).rglob("*.py")
+    file
+    for folder in ("skills", "seeds", "migrations", "tests", "docs", "examples")
+    for file in (ROOT / folder).rglob("*.py")
 )
 PACKAGES = {file.parent.name for file in CODE}
 NAMES_FILE = re.compile(r"(?<![\w./*{}-])(?:[\w-]+/)*[\w-]+\.(?:py|md)\b")

@@ -13,7 +13,10 @@ import httpx2 as httpx
 import pytest
 
 from skills.client import Client
+from skills.settings import Settings
+from skills.simulation import film
 from tests import backends
+from tests.library import cases
 from tests.waiting import END_S, until
 
 WORKER, FORK_SERVER = "skills.jobs.worker", "skills.sandbox.fork_server"
@@ -98,9 +101,19 @@ def running(folder: Path, **settings: object) -> Iterator[Service]:
             service.stop()
 
 
+@contextmanager
+def by_a_thread(folder: Path) -> Iterator[Service]:
+    """Start a service whose jobs a thread carries out: a worker takes three seconds to start, and draws whole films."""
+    with running(folder, workers=0) as started, pytest.MonkeyPatch.context() as patched:
+        patched.setattr(film, "FRAMES", 4)
+        patched.setattr(film, "FRAMES_PER_PASS", 4)
+        with cases.working(Settings(database_url=f"sqlite:///{started.database}")):
+            yield started
+
+
 @pytest.fixture(scope="module")
 def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
-    with running(tmp_path_factory.mktemp("service")) as started:
+    with by_a_thread(tmp_path_factory.mktemp("service")) as started:
         yield started
 
 

@@ -4,7 +4,6 @@ import io
 import json
 import re
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from zipfile import ZipFile
 
@@ -16,10 +15,9 @@ from skills.api.app import create_app
 from skills.client import Client
 from skills.seeds.recordings import sample_recordings
 from skills.settings import Settings
-from skills.simulation import film
 from tests.api.service import GOAL_MM
 from tests.e2e.browsers import Watched, axe, browsing, colours, visiting
-from tests.e2e.conftest import Service, running
+from tests.e2e.conftest import Service, by_a_thread, running
 from tests.formats import written
 from tests.library import cases
 from tests.waiting import END_S
@@ -33,23 +31,6 @@ expect.set_options(timeout=1000 * END_S)
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
     with browsing() as started:
-        yield started
-
-
-@contextmanager
-def by_a_thread(folder: Path) -> Iterator[Service]:
-    """Start a service whose jobs a thread carries out: a worker takes three seconds to start, and draws whole films."""
-    with running(folder, workers=0) as started, pytest.MonkeyPatch.context() as patched:
-        patched.setattr(film, "FRAMES", 4)
-        patched.setattr(film, "FRAMES_PER_PASS", 4)
-        with cases.working(Settings(database_url=f"sqlite:///{started.database}")):
-            yield started
-
-
-@pytest.fixture(scope="module")
-def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
-    """Yield a service whose jobs a thread carries out."""
-    with by_a_thread(tmp_path_factory.mktemp("service")) as started:
         yield started
 
 

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 from sqlalchemy import inspect, text
 
-from skills.db.service_tables import Executor
+from skills.db.service_tables import Executor, Job
 from skills.db.session import Database
-from skills.jobs import connect, drop, workflow_id
+from skills.jobs import STEPS, WORKFLOW, connect, drop, workflow_id
 from skills.jobs.workflows import ENGINE_ATTEMPTS, Leases, Watch
 from skills.settings import Settings
 from tests.jobs.house import House
@@ -227,3 +227,25 @@ def test_the_engine_has_its_clock_on_a_sqlite_before_3_42_too(tmp_path: Path):
         told_ms = connection.execute(text("SELECT at FROM polls")).scalar_one()
     client.destroy()
     assert abs(told_ms / 1000 - time.time()) < 5
+
+
+def test_what_a_worker_took_without_hearing_so_is_done_all_the_same(house: House):
+    """The response to the worker's claim was lost with the connection: the worker owns the job without knowing it."""
+    (executor,) = house.executors()
+    row = house.ask(state="cancelled")  # so that the watch ignores it for now
+    client = connect(house.settings)
+    name = workflow_id(row, 1)
+    client.enqueue({"queue_name": "nowhere", "workflow_name": WORKFLOW, "workflow_id": name}, row, 1)
+    client.destroy()
+    in_engine(
+        house,
+        "UPDATE {} SET status = 'PENDING', executor_id = :executor, queue_name = 'jobs', recovery_attempts = 1,"
+        " application_version = :version, application_name = 'suture-skills' WHERE workflow_uuid = :id",
+        id=name,
+        executor=executor,
+        version=STEPS,
+    )
+    with house.database.writing() as session:
+        session.get_one(Job, row).state = "queued"
+    assert house.ended(row).state == "succeeded"
+    assert len(house.noted("begins", row)) == 1

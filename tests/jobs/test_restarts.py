@@ -22,13 +22,11 @@ from skills.db.models import Demonstration, PolicyVersion
 from skills.db.service_tables import Event, Executor, Job
 from skills.db.session import RESTART_S, Database
 from skills.errors import Busy
-from skills.jobs import STEPS, WORKFLOW, connect, workflow_id
 from skills.packing import sha256
 from tests.backends import new_server, start
 from tests.e2e.conftest import WORKER
 from tests.failing_disk import fail_syncs
-from tests.jobs.house import House, Site, add_demonstration, site_at
-from tests.jobs.test_one_worker import in_engine
+from tests.jobs.house import Site, add_demonstration, site_at
 from tests.library import cases
 from tests.waiting import END_S, crowded, until
 
@@ -306,25 +304,3 @@ def refused(database: Database) -> float:
     with pytest.raises(Busy):
         one(database)
     return time.monotonic() - began
-
-
-def test_what_a_worker_took_without_hearing_so_is_done_all_the_same(house: House):
-    """The response to the worker's claim was lost with the connection: the worker owns the job without knowing it."""
-    (executor,) = house.executors()
-    row = house.ask(state="cancelled")  # so that the watch ignores it for now
-    client = connect(house.settings)
-    name = workflow_id(row, 1)
-    client.enqueue({"queue_name": "nowhere", "workflow_name": WORKFLOW, "workflow_id": name}, row, 1)
-    client.destroy()
-    in_engine(
-        house,
-        "UPDATE {} SET status = 'PENDING', executor_id = :executor, queue_name = 'jobs', recovery_attempts = 1,"
-        " application_version = :version, application_name = 'suture-skills' WHERE workflow_uuid = :id",
-        id=name,
-        executor=executor,
-        version=STEPS,
-    )
-    with house.database.writing() as session:
-        session.get_one(Job, row).state = "queued"
-    assert house.ended(row).state == "succeeded"
-    assert len(house.noted("begins", row)) == 1

@@ -83,10 +83,10 @@ def compared(plans: int, variations: int, tried: int) -> tuple[list[float], int]
     return found, agree
 
 
-def test_a_few_plans_succeed_as_often_as_in_independent_worlds():
+def test_a_plan_succeeds_as_often_as_in_independent_worlds():
     # So many variations that the closed form's own error is a quarter of the worlds': Wilson's interval has that alone.
-    found, agree = compared(plans=2, variations=1500, tried=80)
-    assert agree == 2, found  # the intervals hold 95 %, and the seeds are always the same
+    found, agree = compared(plans=1, variations=1500, tried=80)
+    assert agree == 1, found  # the interval holds 95 %, and the seed is always the same
 
 
 @pytest.mark.nightly
