@@ -40,7 +40,7 @@ def installation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[No
     settings.cache_clear()
 
 
-@pytest.mark.parametrize(("name", "least"), [("tables", 10), ("lerobot", 5)])
+@pytest.mark.parametrize(("name", "least"), [("tables", 10), pytest.param("lerobot", 5, marks=pytest.mark.nightly)])
 def test_every_command_of_the_page_runs_and_prints_what_it_says(installation: None, name: str, least: int) -> None:
     now: dict[str, str] = {}
     page = (DOCS / f"{name}.md").read_text()

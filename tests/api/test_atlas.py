@@ -30,6 +30,7 @@ def compared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
         yield service
 
 
+@pytest.mark.nightly  # by day tests/api/test_conditions.py
 def test_it_is_the_same_bytes_until_something_changes(compared: Service):
     first = compared.http.get(ATLAS)
     assert first.status_code == 200
@@ -113,6 +114,7 @@ def test_a_key_sees_an_atlas_of_its_surgeons_and_nothing_of_others(tmp_path: Pat
 PAGE = f"/pages/atlas/{cases.SUTURE}"
 
 
+@pytest.mark.nightly  # a page; by day tests/api/test_pages.py opens it
 def test_the_page_draws_every_demonstration_and_every_distance(compared: Service):
     said = compared.http.get(PAGE).text
     assert said.count('class="mark c0" d="M') > 3 and said.count('class="mark c1" d="M') > 3

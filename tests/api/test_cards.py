@@ -161,6 +161,7 @@ def test_the_citation_names_the_digests_and_balances_its_braces(still: Service):
 # ---- the page ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.nightly  # a page; by day its numbers are tested in JSON
 def test_every_number_of_the_page_is_in_the_json(trained: Service):
     trained.train(learner={"kind": "cell-q-learning", "episodes": 20})
     for version in (1, 2):

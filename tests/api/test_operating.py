@@ -225,6 +225,7 @@ def test_a_worker_whose_clock_is_an_hour_off_is_known_by_its_beats(installation:
         worker.join()
 
 
+@pytest.mark.nightly  # by day tests/jobs/test_restarts.py stops a server
 def test_a_server_that_was_stopped_makes_it_unready_and_comes_back():
     server = backends.new_server()
     service = Service(server.get_uri(driver="psycopg"))

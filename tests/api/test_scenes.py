@@ -73,6 +73,7 @@ def test_in_a_forbidden_cell_nothing_is_commanded(trained: Service):
     assert [wrong for checked in inspect_installation(trained.database) for wrong in checked.wrong] == []
 
 
+@pytest.mark.nightly  # pages; by day the served policy states them
 def test_card_and_page_state_the_scene_and_its_odds(trained: Service):
     about = in_scene(trained)
     near = about["scene"]["near"]

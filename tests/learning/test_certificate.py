@@ -232,6 +232,7 @@ def test_on_a_long_grid_an_action_is_optimal_where_it_comes_nearer(learner):
         assert (further == 0) == certificate.every_action_optimal == optimal
 
 
+@pytest.mark.nightly  # by day shorter grids
 def test_on_a_long_grid_a_gamma_nearer_1_is_certified():
     path = long_path()
     for learner in (PhaseQLearning(gamma=0.22), ValueIteration(gamma=0.22), ValueIteration(gamma=0.4, slip=0.2)):

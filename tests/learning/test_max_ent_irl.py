@@ -126,6 +126,7 @@ def test_the_penalty_holds_the_rewards_down():
 # ---- the failure of the recovered reward ------------------------------------------------------------------------
 
 
+@pytest.mark.nightly  # it explains a result, and nothing else rests on it
 def test_the_cause_is_standing_still_on_the_best_cell_for_repeated_pay():
     path = named_path("an angle")
     policy = learn_tabular(sparse_reward(path), MaxEntIRL())
@@ -142,6 +143,7 @@ def test_the_cause_is_standing_still_on_the_best_cell_for_repeated_pay():
     assert coverage(policy).reaches.sum() == 1  # the goal itself
 
 
+@pytest.mark.nightly  # it explains a result, and nothing else rests on it
 def test_the_cause_the_same_reward_less_a_constant_arrives_from_everywhere():
     # Every trajectory of the model has T moves, so it cannot distinguish the two; but now standing still costs.
     path = named_path("an angle")

@@ -136,6 +136,7 @@ def test_the_dendrogram_and_the_clusters_are_one(database: Database):
         atlas_of(database, SUTURE, clusters=5)
 
 
+@pytest.mark.nightly  # slow if it fails, not wrong
 def test_a_new_demonstration_costs_one_row_of_distances(database: Database, measured: list[int]):
     small(database)
     first = atlas_of(database, SUTURE)
@@ -166,6 +167,7 @@ def test_the_shape_cache_may_be_dropped_and_other_versions_are_ignored(
         assert set(session.scalars(select(MeasuredShape.version))) == {0}
 
 
+@pytest.mark.nightly  # slow if it fails, not wrong
 def test_it_is_measured_in_blocks_and_kept_block_by_block(
     database: Database, measured: list[int], monkeypatch: pytest.MonkeyPatch
 ):

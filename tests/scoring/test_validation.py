@@ -38,6 +38,7 @@ def test_skill_that_shows_is_found_at_surgeons_left_out(judged: dict[str, Any]) 
     assert len(known_parts(judged)) == 6
 
 
+@pytest.mark.nightly  # by day models of nothing and of the duration are refused
 def test_rivals_are_the_trivial_predictions() -> None:
     drawn = cohort(seed=5)
     found = asdict(validate(drawn, permutations=39)[1])["tasks"]["Task_A"]["rivals"]
@@ -53,6 +54,7 @@ def test_rivals_are_the_trivial_predictions() -> None:
     assert found["mean"]["rho"] < -0.5  # the better the one who is left out, the lower the mean of the others
 
 
+@pytest.mark.nightly  # by day one task
 def test_several_tasks_are_judged_one_by_one_and_their_mean() -> None:
     drawn = cohort(tasks=2)
     found = asdict(validate(drawn, permutations=39)[1])
