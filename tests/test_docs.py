@@ -147,6 +147,11 @@ def test_the_statements_of_the_pages_are_accepted() -> None:
     [stated] = [text for language, text in blocks("recordings.md") if language == "toml"]
     for statement in tomllib.loads(stated).values():
         StatedIn.model_validate(statement)
+    [said] = [text for language, text in blocks("lerobot.md") if language == "json"]
+    from tests.formats.lerobots import episode, packed  # here, because pyarrow is slow to import
+
+    recording = skills.read_recording(packed(episode(said=json.loads(said))))
+    assert [motion.frame for motion in recording.motions if motion.arm == "PSM1"] == ["ECM"]
 
 
 def test_the_labels_of_the_surgeons_page_are_on_the_pages_of_the_service() -> None:
@@ -353,6 +358,7 @@ def tables(reader: Reader) -> None:
     from tests.formats import written
 
     Path("hand-off.csv").write_text(written.positions())
+    assert written.positions().startswith(blocks("tables.md")[0][1])
     reader.names["Path"] = Path
 
 
