@@ -76,8 +76,8 @@ bench: $(READY)
 faults: $(READY)
 	@$(BIN)/python -m tests.faults $(FAULTS)
 
-# The sweeps, and ten runs of the suite in a row: none red, nothing left behind.
-nightly: $(READY)
+# The documentation site, the sweeps, and ten runs of the suite in a row: none red, nothing left behind.
+nightly: docs
 	@$(BIN)/python -m pytest --hypothesis-profile=nightly -m nightly
 	@for run in 1 2 3 4 5 6 7 8 9 10; do $(BIN)/python -m pytest --hypothesis-profile=nightly || exit 1; done
 
