@@ -4,6 +4,7 @@ At night the installing lines of the Containerfile run in a new folder, in place
 """
 
 import json
+import os
 import re
 import subprocess
 import sys
@@ -28,6 +29,8 @@ STEPS = [line.split(" ", 1) for line in LINES if line and not line.startswith("#
 COMPOSE_TEXT = (ROOT / "deploy" / "compose.yaml").read_text()
 COMPOSE = yaml.safe_load(COMPOSE_TEXT)
 OURS = ("service", "worker")
+# Without the paths of this process: pip would take the project for installed already.
+BARE = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
 
 
 def of(step: str) -> list[str]:
@@ -132,6 +135,6 @@ def test_the_installing_lines_run_in_a_new_folder(tmp_path):
             for place, here in places.items():
                 said = said.replace(place, here)
             said = re.sub(r"^python ", f"{sys.executable} ", said)
-            ended = subprocess.run(said, shell=True, capture_output=True, text=True, check=False)
+            ended = subprocess.run(said, shell=True, env=BARE, capture_output=True, text=True, check=False)
             assert ended.returncode == 0, (said, ended.stderr[-2000:])
     assert ended.stdout.startswith(tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"])

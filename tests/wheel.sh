@@ -3,6 +3,7 @@
 # training, a playback (refused in words where PyBullet has no wheel), and `serve`.
 # `make wheel-check PYTHONS="python3.11 python3.12 python3.13"`; the packages come from pip's index.
 set -eu
+unset PYTHONPATH  # pip would take this project for installed already
 built=$(mktemp -d)
 trap 'rm -rf "$built"' EXIT
 "$1" -m venv "$built/builder"
@@ -17,7 +18,7 @@ for python in "$@"; do
     mkdir "$bare/data"
     cd "$bare/data"
     export CC=/bin/false XDG_STATE_HOME="$bare/state" SKILLS_DATABASE_URL="sqlite:///$bare/data/skills.sqlite"
-    unset PYTHONPATH SKILLS_SAMPLE_RECORDINGS
+    unset SKILLS_SAMPLE_RECORDINGS
     skills="timeout 600 $bare/bin/skills"
     echo "$version: skills $($skills --version)"
     $skills seed >/dev/null
