@@ -12,6 +12,7 @@ longer one. That is not stored, so it holds for demonstrations that were cut in 
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -44,7 +45,7 @@ class Proposal:
         recording: The row of its recording, or columns of it.
         number: Its number in the recording, from 1.
         segment: The segment as it was stored, which `demonstration.segments.Segment` describes.
-        surgeons: Pseudonyms of the surgeons that the recording was uploaded for.
+        surgeon: The surgeon of its demonstration, else the only one that the recording was uploaded for.
         demo: The demonstration that was cut there, as columns of its row; None if none was.
         mark: The newest decision on it; None if there is none.
     """
@@ -52,7 +53,7 @@ class Proposal:
     recording: Any
     number: int
     segment: dict[str, Any]
-    surgeons: tuple[str, ...]
+    surgeon: str | None
     demo: Any
     mark: ProposalMark | None
 
@@ -62,13 +63,6 @@ class Proposal:
         if self.demo is not None:
             return "accepted"
         return "open" if self.mark is None or self.mark.state == "open" else "rejected"
-
-    @property
-    def surgeon(self) -> str | None:
-        """The surgeon of its demonstration, else the only one that the recording was uploaded for."""
-        if self.demo is not None:
-            return str(self.demo.slug)
-        return self.surgeons[0] if len(self.surgeons) == 1 else None
 
     @property
     def cursor(self) -> int:
@@ -160,21 +154,26 @@ def find_proposal(session: Session, recording: str, number: int) -> Proposal:
 def _proposals_in(session: Session, recordings: Sequence[Any]) -> Iterator[Proposal]:
     rows = [one.row for one in recordings]
     of, named, marked = Demonstration, RecordingSurgeon, ProposalMark
-    columns = (of.recording_row, of.arm, of.start_s, of.end_s, of.sha256, of.suture, of.withdrawn_at, Surgeon.slug)
-    cut = select(*columns, of.outcome, of.outcome_reason).join(Surgeon, Surgeon.row == of.surgeon_row)
+    columns = (of.row, of.recording_row, of.surgeon_row, of.arm, of.start_s, of.end_s, of.sha256, of.suture)
+    cut = select(*columns, of.withdrawn_at, of.outcome, of.outcome_reason).where(of.recording_row.in_(rows))
     demos: defaultdict[int, list[Any]] = defaultdict(list)
-    for demo in session.execute(cut.where(of.recording_row.in_(rows)).order_by(of.row)):
+    for demo in sorted(session.execute(cut), key=lambda one: one.row):
         demos[demo.recording_row].append(demo)
-    surgeons = defaultdict(list)
-    names = select(named.recording_row, Surgeon.slug).join(Surgeon, Surgeon.row == named.surgeon_row)
-    for row, slug in session.execute(names.where(named.recording_row.in_(rows)).order_by(Surgeon.slug)):
-        surgeons[row].append(slug)
+    owners: defaultdict[int, list[int]] = defaultdict(list)
+    sent_as = select(named.recording_row, named.surgeon_row).where(named.recording_row.in_(rows))
+    for row, owner in session.execute(sent_as):
+        owners[row].append(owner)
+    known = {*chain.from_iterable(owners.values()), *(demo.surgeon_row for some in demos.values() for demo in some)}
+    called = select(Surgeon.row, Surgeon.slug).where(Surgeon.row.in_(known))
+    slugs = {one.row: one.slug for one in session.execute(called)}
     all_marks = session.scalars(select(marked).where(marked.recording_row.in_(rows)).order_by(marked.row))
     marks = {(one.recording_row, one.number): one for one in all_marks}  # the newest of each
     for one in recordings:
         for number, segment in enumerate(one.about["segments"], 1):
             demo = _cut_there(segment, demos[one.row])
-            yield Proposal(one, number, segment, tuple(surgeons[one.row]), demo, marks.get((one.row, number)))
+            theirs = owners[one.row] if demo is None else [demo.surgeon_row]
+            surgeon = slugs[theirs[0]] if len(theirs) == 1 else None
+            yield Proposal(one, number, segment, surgeon, demo, marks.get((one.row, number)))
 
 
 def _cut_there(segment: dict[str, Any], demos: Sequence[Any]) -> Any:

@@ -12,13 +12,21 @@ from sqlalchemy.orm import Session
 
 from skills.db.session import Database
 from skills.jobs.workflows import Leases, Watch
-from skills.library import batch_work, catalogue, demos, jobs, policies, retraining, training
+from skills.library import batch_work, catalogue, demos, jobs, policies, proposals, retraining, training
 from skills.library.overview import condition_of, matrix, newest_job, released_styles
 from skills.schemas.requests import RetrainingIn, TrainingIn
 from tests import backends
 from tests.library import hospital
 
-IN_ORDER = {"surgeons", "demonstrations", "demonstrations, further on", "what is served", "jobs"}  # no search
+IN_ORDER = {
+    "surgeons",
+    "proposals",
+    "proposals, further on",
+    "demonstrations",
+    "demonstrations, further on",
+    "what is served",
+    "jobs",
+}  # no search
 STYLE = ("surgeon-0003", "figure-of-eight")
 NEWEST_MARK = re.compile(r"ORDER BY demonstration_outcomes\.row DESC\s+LIMIT")  # of one row, not of a page
 Plan = list[str]
@@ -59,6 +67,8 @@ HOT: dict[str, Callable[[Session], object]] = {
     "demonstrations of a style": lambda s: demos.list_demos(s, 10, 30, *STYLE),
     "failures of a style": lambda s: demos.list_demos(s, 10, 30, *STYLE, outcome="failure"),
     "what failed of a style or not": lambda s: demos.newest_demos(s, 1, STYLE[1], 10, any_outcome=True),
+    "proposals": lambda s: proposals.list_proposals(s, 10, None),
+    "proposals, further on": lambda s: proposals.list_proposals(s, 10, 20_000, state="rejected"),
     "a demonstration": lambda s: demos.find_demo(s, newest(s).sha256),
     "what is served": lambda s: policies.list_served(s, 10, 20),
     "a released policy": served,

@@ -15,6 +15,7 @@ from skills.library import erasure, sweep
 from skills.library.demos import mark_demo
 from skills.library.erasure import erase_demo, erase_surgeon
 from skills.library.plans import planned, trajectory_of
+from skills.library.proposals import decide
 from skills.library.recordings import store_recording
 from skills.library.sweep import sweep_erased
 from skills.library.training import request_training
@@ -62,7 +63,10 @@ def learn(database: Database, surgeon: str, demo: str, other: str | None, seed: 
 def whole(database: Database, surgeon: str, shift: float, seed: int) -> list[str]:
     """Store all that there can be of a surgeon, and return the demonstrations."""
     demos = [exports.add(database, exports.session_of((shift + more, 0.0, 0.0)), surgeon) for more in (0.0, 0.5)]
-    store_recording(database, cases.upload(cases.hand_off((shift + 1, 0, 0))), "test", surgeon=surgeon)
+    sent = cases.upload(cases.hand_off((shift + 1, 0, 0)))
+    uncut, _ = store_recording(database, sent, "test", surgeon=surgeon)
+    with database.writing() as session:
+        decide(session, uncut.sha256, 1, "rejected", "idle", "test")
     learn(database, surgeon, *demos, seed, release=True)
     job = ask_retraining(database, surgeon=surgeon)
     for part in parts_of(database, job):
