@@ -150,6 +150,16 @@ def test_what_is_not_served_is_refused_with_its_problem(posed: tuple[services.Se
         client.session(**KESTREL).__enter__()
 
 
+def test_the_crtk_example_follows_a_session_to_its_end(posed: tuple[services.Service, str]) -> None:
+    with Client(posed[1]) as client:
+        style = client.pose_style(**KESTREL)
+        bus = StandInBus(Measured(style.position_mm[0], style.rotation_xyzw[0], style.frame, 0.0), tick_s=0.012)
+        with client.session(**KESTREL) as session:  # which allows 100 poses a second
+            assert crtk_session.follow(bus, session) == "finished"
+    assert np.linalg.norm(np.subtract(bus.here.position_mm, style.position_mm[-1])) < 1.0
+    assert len(bus.said) >= len(style.position_mm) - 1
+
+
 @both
 def test_a_withdrawal_closes_the_session_with_its_cause(posed: tuple[services.Service, str], follow: Follow) -> None:
     service, url = posed
@@ -164,16 +174,6 @@ def test_a_withdrawal_closes_the_session_with_its_cause(posed: tuple[services.Se
         with pytest.raises(SessionClosed, match="withdrawn"):  # and for ever
             session.next(*START)
         client.release(**KESTREL, version=1)
-
-
-def test_the_crtk_example_follows_a_session_to_its_end(posed: tuple[services.Service, str]) -> None:
-    with Client(posed[1]) as client:
-        style = client.pose_style(**KESTREL)
-        bus = StandInBus(Measured(style.position_mm[0], style.rotation_xyzw[0], style.frame, 0.0), tick_s=0.012)
-        with client.session(**KESTREL) as session:  # which allows 100 poses a second
-            assert crtk_session.follow(bus, session) == "finished"
-    assert np.linalg.norm(np.subtract(bus.here.position_mm, style.position_mm[-1])) < 1.0
-    assert len(bus.said) >= len(style.position_mm) - 1
 
 
 # ---- a peer that misbehaves ------------------------------------------------------------------------------------------
