@@ -253,7 +253,8 @@ class _Total:
     tasks: dict[str, int] = field(default_factory=dict)
     frames: dict[str, str] = field(default_factory=dict)
     splits: dict[Split, list[int]] = field(default_factory=dict)
-    stats: Stats = field(default_factory=dict)
+    widths: dict[str, int] = field(default_factory=dict)  # of the columns with statistics, in their order
+    numbers: dict[str, list[float]] = field(default_factory=dict)  # the statistics of all columns, one after another
 
     def take(self, episode: ExportedEpisode) -> _Taken:
         """Return an episode as columns, and add it."""
@@ -275,9 +276,11 @@ class _Total:
             "index": np.arange(self.rows, self.rows + rows),
             "task_index": np.full(rows, task),
         }
-        stats = _stats_of({name: column for name, column in columns.items() if not isinstance(column, list)})
-        self.stats = {name: joined_stats(self.stats[name], one) for name, one in stats.items()} if number else stats
-        taken = _Taken(number, (episode.task,), task, self.rows, columns, stats)
+        wide = {name: one.reshape(rows, -1) for name, one in columns.items() if not isinstance(one, list)}
+        numbers = _stats_of(np.concatenate([*wide.values()], axis=1, dtype=np.float64))
+        self.widths = {name: one.shape[1] for name, one in wide.items()}
+        self.numbers = joined_stats(self.numbers, numbers) if number else numbers
+        taken = _Taken(number, (episode.task,), task, self.rows, columns, _by_column(numbers, self.widths))
         self.episodes, self.rows = number + 1, self.rows + rows
         return taken
 
@@ -429,19 +432,25 @@ def _stages(recording: Recording, times_ns: Ints) -> list[str]:
 # ---- statistics ----------------------------------------------------------------------------------------------------
 
 
-def _stats_of(columns: Mapping[str, Numbers]) -> Stats:
-    """Return the statistics of some columns with equal numbers of rows, for each of their numbers."""
-    wide = {name: column.reshape(len(column), -1).astype(np.float64) for name, column in columns.items()}
-    # One call for all, because it takes longer than what it computes for an episode.
-    quantiles = np.quantile(np.concatenate([*wide.values()], axis=1), list(QUANTILES.values()), axis=0)
+def _stats_of(values: Floats) -> dict[str, list[float]]:
+    """Return the statistics of the numbers of all columns, shape (rows, numbers): together, because that is faster."""
+    stats = {
+        "min": values.min(axis=0),
+        "max": values.max(axis=0),
+        "mean": values.mean(axis=0),
+        "std": values.std(axis=0),
+    }
+    quantiles = dict(zip(QUANTILES, np.quantile(values, list(QUANTILES.values()), axis=0), strict=True))
+    return {name: one.tolist() for name, one in (stats | quantiles).items()} | {"count": [len(values)]}
+
+
+def _by_column(numbers: Mapping[str, list[float]], widths: Mapping[str, int]) -> Stats:
+    """Divide the statistics of all columns into those of each."""
     stats: Stats = {}
     at = 0
-    for name, values in wide.items():
-        of = {"min": values.min(axis=0), "max": values.max(axis=0)}
-        of |= {"mean": values.mean(axis=0), "std": values.std(axis=0)}
-        of |= dict(zip(QUANTILES, quantiles[:, at : at + values.shape[1]], strict=True))
-        stats[name] = {what: one.tolist() for what, one in of.items()} | {"count": [len(values)]}
-        at += values.shape[1]
+    for name, width in widths.items():
+        of = {key: some if key == "count" else some[at : at + width] for key, some in numbers.items()}
+        stats[name], at = of, at + width
     return stats
 
 
@@ -548,7 +557,7 @@ class _SharedFiles:
         with io.BytesIO() as file:
             parquet.write_table(tasks, file)
             yield TASK_TABLE, file
-        yield "meta/stats.json", _json(total.stats)
+        yield "meta/stats.json", _json(_by_column(total.numbers, total.widths))
 
     def _finished_file(self) -> Iterator[tuple[str, IO[bytes]]]:
         self._writer.close()
