@@ -166,7 +166,7 @@ def test_differences_and_progress_are_given_and_shown(scoring: Service, stored: 
     assert_problem(scoring.http.get(path.replace("plover", "nobody")), 404, "not-found")
     over_time = page(scoring, f"/pages/surgeons/plover?suture={cases.SUTURE}&against=kestrel")
     assert "2 demonstrations in the order" in over_time and "not a credential" in over_time
-    assert f"{found['sessions'][0]['distance_mm']:.1f} mm" in over_time
+    assert f"{found['sessions'][0]['distance_mm']:.2f}".rstrip("0").rstrip(".") + " mm" in over_time
     first, newest = found["demos"]
     assert f"/pages/player/demos/{first['demo']}?beside=demos/{newest['demo']}" in over_time
     assert "There is no surgeon" in page(scoring, "/pages/surgeons/plover?against=nobody")

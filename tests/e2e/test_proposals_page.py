@@ -51,7 +51,7 @@ def test_proposals_are_decided_one_after_the_other(tmp_path: Path) -> None:
             expect(items).to_have_count(1)
             expect(items).to_contain_text("Only regrasped.")
             items.get_by_role("button", name="Open it again").click()
-            expect(page.get_by_role("heading", name="No such proposal")).to_be_visible()
+            expect(page.get_by_role("heading", name="No proposal fits these choices")).to_be_visible()
         found = client.proposals(recording=recording)
         assert [one.state for one in found] == ["accepted", "accepted", "open", "open", "open"]
         assert {one.surgeon for one in found[:2]} == {"osprey"}

@@ -162,7 +162,7 @@ class Plot:
 
     def along_y(self, name: str) -> Markup:
         """Draw the axis of y: its name, its numbers and their rules."""
-        drawn = [text(2, self.top - 4, name, "start")]
+        drawn = [text(2, self.top - 6, name, "start")]
         for value in ticks(self.low[1], self.high[1]):
             y = float(self.place(np.array([[self.low[0], value]]))[0, 1])
             drawn.append(element("line", kind="axis", x1=self.left, y1=y, x2=self.right, y2=y))
