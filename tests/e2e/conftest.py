@@ -8,6 +8,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import httpx2 as httpx
 import pytest
@@ -18,6 +19,9 @@ from skills.simulation import film
 from tests import backends
 from tests.library import cases
 from tests.waiting import END_S, until
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser
 
 WORKER, FORK_SERVER = "skills.jobs.worker", "skills.sandbox.fork_server"
 REPLACED = 2  # workers that may die while a service starts, as where its database is not yet reachable
@@ -109,6 +113,14 @@ def by_a_thread(folder: Path) -> Iterator[Service]:
         patched.setattr(film, "FRAMES_PER_PASS", 4)
         with cases.working(Settings(database_url=f"sqlite:///{started.database}")):
             yield started
+
+
+@pytest.fixture(scope="module")
+def browser() -> "Iterator[Browser]":
+    from tests.e2e.browsers import browsing  # here, because most tests of this folder need none
+
+    with browsing() as started:
+        yield started
 
 
 @pytest.fixture(scope="module")

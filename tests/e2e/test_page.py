@@ -16,7 +16,7 @@ from skills.client import Client
 from skills.seeds.recordings import sample_recordings
 from skills.settings import Settings
 from tests.api.service import GOAL_MM
-from tests.e2e.browsers import Watched, axe, browsing, colours, visiting
+from tests.e2e.browsers import Watched, axe, colours, visiting
 from tests.e2e.conftest import Service, by_a_thread, running
 from tests.formats import written
 from tests.library import cases
@@ -26,12 +26,6 @@ SAMPLE = next(s for s in sample_recordings() if len(s.segments) > 1)
 STYLE = f"{SAMPLE.surgeon}/{SAMPLE.suture}"
 WORK_MS = 300_000  # for a training or a playback on a busy machine
 expect.set_options(timeout=1000 * END_S)
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with browsing() as started:
-        yield started
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,6 @@
 """The player in a real browser: a minute of two arms, scrubbed, played, compared, and with marked parts."""
 
 import re
-from collections.abc import Iterator
 
 import pytest
 from playwright.sync_api import Browser, Page, expect
@@ -9,7 +8,7 @@ from playwright.sync_api import Browser, Page, expect
 from skills.client import Client
 from skills.formats.writer import write_mcap
 from skills.seeds.recordings import sample_recordings
-from tests.e2e.browsers import Watched, axe, browsing, colours
+from tests.e2e.browsers import Watched, axe, colours
 from tests.e2e.conftest import Service
 from tests.verification.timelines import two_arms
 from tests.waiting import END_S, crowded
@@ -28,12 +27,6 @@ SCRUBBED_HZ = """async () => {
   }
   return (1000 * (Number(view.dataset.painted) - before)) / (performance.now() - began);
 }"""
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with browsing() as started:
-        yield started
 
 
 @pytest.fixture(scope="module")

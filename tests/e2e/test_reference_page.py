@@ -10,18 +10,12 @@ from playwright.sync_api import Browser, Locator, Route, expect
 from skills.client import Client
 from skills.db.session import Database
 from skills.library.keys import create_key
-from tests.e2e.browsers import Watched, browsing, visiting
+from tests.e2e.browsers import Watched, visiting
 from tests.e2e.conftest import Service, running
 from tests.waiting import END_S
 
 PREFIX = "/lab/skills"
 expect.set_options(timeout=1000 * END_S)
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with browsing() as started:
-        yield started
 
 
 @pytest.fixture(scope="module")
