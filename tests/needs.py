@@ -86,6 +86,7 @@ NEEDS = {
         lambda: os.environ.get("TESTS_OPENH_VALIDATOR"),
     ),
     "site": Need("the builder of the documentation site is", "make docs", lambda: find_spec("zensical")),
+    "curl": Need("curl is", "apt-get install curl", lambda: shutil.which("curl")),
     "npm": Need("npm is", "install Node.js 20 or later", lambda: shutil.which("npm")),
     "openssl": Need("openssl is", "apt-get install openssl", lambda: shutil.which("openssl")),
     "systemd": Need("systemd-analyze is", "apt-get install systemd", lambda: shutil.which("systemd-analyze")),

@@ -9,7 +9,6 @@ import json
 import re
 import runpy
 import shlex
-import shutil
 import subprocess
 import sys
 import tomllib
@@ -239,8 +238,7 @@ def sample(surgeon: str, passes: int = 1) -> Sample:
 def reader(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Reader]:
     """Start a service with the samples and a released policy, and stand in a folder with the files of the pages."""
     need("simulator")
-    if shutil.which("curl") is None:
-        pytest.skip("curl is not here: apt-get install curl")
+    need("curl")
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("SKILLS_API_KEY", raising=False)
     (tmp_path / "service").mkdir()
