@@ -227,6 +227,25 @@ def test_routes_send_lazy_responses_only_through_the_closing_stream():
     assert users == ["api/responses.py"]
 
 
+ASKS = {"Client", "AsyncClient", "get", "head", "options", "post", "put", "patch", "delete", "request", "stream"}
+
+
+def test_each_connection_of_a_test_says_how_long_it_waits_for_an_answer():
+    """By default it waits 5 s, and a disk of a busy machine may take longer to store what a request asks for."""
+    impatient = [
+        f"{file.relative_to(PROJECT)}:{node.lineno}"
+        for file in sorted((PROJECT / "tests").rglob("*.py"))
+        if "httpx" in source(file)
+        for node in nodes(file)
+        if isinstance(node, ast.Call)
+        and isinstance(node.func, ast.Attribute)
+        and ast.unparse(node.func.value) == "httpx"
+        and node.func.attr in ASKS
+        and not {"timeout", "transport"} & {word.arg for word in node.keywords}
+    ]
+    assert impatient == []
+
+
 def test_no_generator_of_the_api_takes_a_session():
     """Its caller could leave the session before the generator, or the generator before its end."""
     found = [

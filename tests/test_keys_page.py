@@ -17,6 +17,7 @@ from skills.settings import Settings, settings
 from tests.api.service import copy_of_trained
 from tests.e2e.conftest import Service
 from tests.e2e.test_keys_served import wait_until_alive
+from tests.waiting import END_S
 
 PAGE = (Path(__file__).parent.parent / "docs" / "keys.md").read_text()
 UNITS = {"GiB": 2**30, "": 1}
@@ -86,7 +87,7 @@ def test_local_commands_need_no_key_and_send_theirs_to_a_server(installation: Pa
     service.launch()
     assert service.process is not None
     try:
-        with httpx.Client(base_url=service.url) as http:
+        with httpx.Client(base_url=service.url, timeout=END_S) as http:
             wait_until_alive(http, service.process)
         monkeypatch.setenv("SKILLS_SERVER", service.url)
         for key, status in (("", "401"), (made["secret"], None)):

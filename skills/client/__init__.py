@@ -198,7 +198,7 @@ class Client(Calls, Now):
         sleep: Callable[[float], None] | None = None,
     ) -> None:
         named = isinstance(server, str)
-        self.http = httpx.Client(**_of(server)) if isinstance(server, str) else server
+        self.http = httpx.Client(**_of(server), timeout=timeout_s) if isinstance(server, str) else server
         key = _own_key() if named and api_key is None else api_key
         self._connect(Blocking(self.http, sleep), key, plain_http, timeout_s, retrying, clock, streams=named)
 
@@ -248,7 +248,7 @@ class AsyncClient(Calls, Later):
         sleep: Callable[[float], Awaitable[None]] | None = None,
     ) -> None:
         named = isinstance(server, str)
-        self.http = httpx.AsyncClient(**_of(server)) if isinstance(server, str) else server
+        self.http = httpx.AsyncClient(**_of(server), timeout=timeout_s) if isinstance(server, str) else server
         key = _own_key() if named and api_key is None else api_key
         self._connect(Awaited(self.http, sleep), key, plain_http, timeout_s, retrying, clock, streams=named)
 

@@ -53,7 +53,7 @@ def wait_until_it_answers(port: int, process: subprocess.Popen[bytes]) -> None:
         assert process.poll() is None, "the server ended"
         assert time.monotonic() < deadline, "the server does not answer"
         try:
-            httpx.get(f"http://127.0.0.1:{port}/healthz")
+            httpx.get(f"http://127.0.0.1:{port}/healthz", timeout=PATIENCE_S)
         except httpx.TransportError:
             time.sleep(0.05)
         else:

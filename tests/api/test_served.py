@@ -168,7 +168,7 @@ def test_under_load_nothing_is_served_after_its_end_is_acknowledged(pair: Pair, 
     over = threading.Event()
 
     def read() -> None:
-        with httpx.Client(base_url=pair.other.base_url) as client:
+        with httpx.Client(base_url=pair.other.base_url, timeout=END_S) as client:
             while not over.is_set():
                 asked = time.monotonic()
                 version = served(client)

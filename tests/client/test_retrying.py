@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skills.client import NotReached, Problem, Retrying
+from skills.client import AsyncClient, Client, NotReached, Problem, Retrying
 from tests.client.peers import BOTH, Script, Time, answer, asked, refusal
 from tests.waiting import crowded
 
@@ -134,3 +134,10 @@ def test_an_address_that_is_none_is_not_tried_again(made):
     with pytest.raises(NotReached):
         made(script, Time())("surgeons")
     assert len(script.asked) == 1
+
+
+@pytest.mark.parametrize("kind", [Client, AsyncClient])
+def test_requests_on_its_own_connection_wait_as_long_as_its_calls(kind):
+    """Before, `client.http` gave up after the 5 s of httpx, whatever `timeout_s` said."""
+    assert kind("http://127.0.0.1:8000").http.timeout == httpx.Timeout(60.0)
+    assert kind("http://127.0.0.1:8000", timeout_s=7.0).http.timeout == httpx.Timeout(7.0)

@@ -146,7 +146,10 @@ def test_what_is_not_served_is_refused_with_its_problem(posed: tuple[services.Se
     assert (refused.value.status, refused.value.kind) == (404, "not-found")
     with pytest.raises(NotReached), follow("http://127.0.0.1:9"):
         pass
-    with pytest.raises(BadSettings, match="own connection"), Client(httpx.Client(base_url=url)) as client:
+    with (
+        pytest.raises(BadSettings, match="own connection"),
+        Client(httpx.Client(base_url=url, timeout=END_S)) as client,
+    ):
         client.session(**KESTREL).__enter__()
 
 

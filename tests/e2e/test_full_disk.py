@@ -77,7 +77,7 @@ def upload(url: str, shift_mm: float) -> httpx.Response:
 
 
 def test_a_disk_fills_up_and_gets_space_again(small: Small):
-    assert httpx.put(f"{small.url}/surgeons/kestrel", json={}).status_code in (200, 201)
+    assert httpx.put(f"{small.url}/surgeons/kestrel", json={}, timeout=END_S).status_code in (200, 201)
     assert upload(small.url, 0.1).status_code == 201
     assert {oct(path.stat().st_mode & 0o777) for path in small.seen.glob("skills.*")} == {"0o600"}
     filler = small.seen / "filler"
@@ -90,7 +90,7 @@ def test_a_disk_fills_up_and_gets_space_again(small: Small):
     answers = [upload(small.url, 0.2 + 0.1 * k) for k in range(3)]
     for answer in answers:
         assert_problem(answer, 507, "storage-full")
-    assert httpx.get(f"{small.url}/surgeons").status_code == 200
+    assert httpx.get(f"{small.url}/surgeons", timeout=END_S).status_code == 200
     filler.unlink()
     assert upload(small.url, 0.2).status_code == 201
     assert small.process is not None and small.process.poll() is None
@@ -101,12 +101,12 @@ def test_a_write_that_fails_ends_the_service_and_its_workers(tmp_path: Path, cap
     with running(tmp_path) as service:
         assert service.process is not None
         worker = service.child("skills.jobs.worker")
-        assert httpx.put(f"{service.url}/surgeons/kestrel", json={}).status_code in (200, 201)
+        assert httpx.put(f"{service.url}/surgeons/kestrel", json={}, timeout=END_S).status_code in (200, 201)
         size = Path(f"{service.database}-wal").stat().st_size
         resource.prlimit(service.process.pid, resource.RLIMIT_FSIZE, (size // 2, size // 2))
         with pytest.raises(httpx.HTTPError):  # noqa: PT012
             for k in range(200):
-                httpx.put(f"{service.url}/surgeons/heron-{k}", json={"protocol": "." * 200})
+                httpx.put(f"{service.url}/surgeons/heron-{k}", json={"protocol": "." * 200}, timeout=END_S)
         assert service.process.wait(30) == EXIT_CODE
         assert "The database's disk failed" in capfd.readouterr().err
         until_gone(worker)
@@ -130,18 +130,18 @@ def test_a_sync_that_fails_ends_the_service_and_its_workers(tmp_path: Path, capf
         service.start()
         assert service.process is not None
         worker = service.child(WORKER)
-        assert httpx.put(f"{service.url}/surgeons/wren", json={}).status_code == 201
+        assert httpx.put(f"{service.url}/surgeons/wren", json={}, timeout=END_S).status_code == 201
         fail(service.process.pid)
-        assert httpx.get(f"{service.url}/surgeons/wren").status_code == 200  # reading syncs nothing
+        assert httpx.get(f"{service.url}/surgeons/wren", timeout=END_S).status_code == 200  # reading syncs nothing
         with pytest.raises(httpx.HTTPError):
-            httpx.put(f"{service.url}/surgeons/heron", json={})
+            httpx.put(f"{service.url}/surgeons/heron", json={}, timeout=END_S)
         assert service.process.wait(END_S) == EXIT_CODE
         printed = capfd.readouterr().err
         assert "The database's disk failed (SQLITE_IOERR_FSYNC" in printed and "skills verify" in printed
         until_gone(worker)
         service.start()
-        assert httpx.get(f"{service.url}/surgeons/wren").status_code == 200
-        assert httpx.put(f"{service.url}/surgeons/plover", json={}).status_code == 201
+        assert httpx.get(f"{service.url}/surgeons/wren", timeout=END_S).status_code == 200
+        assert httpx.put(f"{service.url}/surgeons/plover", json={}, timeout=END_S).status_code == 201
     finally:
         if service.process is not None and service.process.poll() is None:
             service.stop()

@@ -39,7 +39,7 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
 
 
 def gauge(service: Service) -> float:
-    text = httpx.get(f"{service.url}/metrics").text
+    text = httpx.get(f"{service.url}/metrics", timeout=END_S).text
     (line,) = [line for line in text.splitlines() if line.startswith("skills_sessions_open ")]
     return float(line.split()[1])
 

@@ -30,7 +30,11 @@ def installation(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tup
         return
     url = backends.fresh(request.param, tmp_path)
     apart = running(tmp_path, database_url=url, workers=0)
-    with apart as service, httpx.Client(base_url=service.url) as http, closing(Database(url)) as database:
+    with (
+        apart as service,
+        httpx.Client(base_url=service.url, timeout=END_S) as http,
+        closing(Database(url)) as database,
+    ):
         yield http, database
     backends.drop(url)
 
@@ -104,7 +108,7 @@ def test_it_speaks_tls_itself_and_its_cookie_then_goes_over_tls_alone(tmp_path: 
     assert service.process is not None
     address = f"https://localhost:{service.port}"
     try:
-        with httpx.Client(base_url=address, verify=ssl.create_default_context(cafile=str(cert))) as http:
+        with httpx.Client(base_url=address, verify=ssl.create_default_context(cafile=str(cert)), timeout=END_S) as http:
             wait_until_alive(http, service.process)
             assert Client(http, api_key=text).put_surgeon("heron").surgeon == "heron"
             signed_in = http.post("/sign-in", data={"key": text})
@@ -112,6 +116,6 @@ def test_it_speaks_tls_itself_and_its_cookie_then_goes_over_tls_alone(tmp_path: 
             assert "Secure" in signed_in.headers["set-cookie"].split("; ")
             assert http.get("/surgeons").json()["items"][0]["surgeon"] == "heron"
         with pytest.raises(httpx.TransportError):
-            httpx.get(f"http://localhost:{service.port}/healthz")
+            httpx.get(f"http://localhost:{service.port}/healthz", timeout=END_S)
     finally:
         service.stop()

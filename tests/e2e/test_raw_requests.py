@@ -164,7 +164,7 @@ def test_a_body_that_comes_slowly_but_fast_enough_is_taken(service):
 
 def test_100_senders_that_stall_do_not_keep_others_from_being_served(service, untouched):
     stalled = [connected(service) for _ in range(100)]
-    with httpx.Client(base_url=service.url) as http, others_are_served(http):
+    with httpx.Client(base_url=service.url, timeout=END_S) as http, others_are_served(http):
         for sent in stalled:
             sent.sendall(head(f"Content-Length: {len(TABLE)}") + TABLE[:100])
         with ThreadPoolExecutor(10) as threads:

@@ -159,7 +159,7 @@ def restart(postgres: Postgres, place: Site, people: People, rng: random.Random)
 def live_through(postgres: Postgres, folder: Path, restarts: int, seed: int) -> None:
     rng = random.Random(seed)
     with site_at(postgres.url, folder, log_level="error") as place:
-        with httpx.Client(base_url=place.service.url) as http:
+        with httpx.Client(base_url=place.service.url, timeout=PATIENCE_S) as http:
             http.put("/surgeons/kestrel", json={}).raise_for_status()
         people = People(place.service.url, rng)
         with people.at_work():
@@ -192,7 +192,7 @@ def nothing_acknowledged_is_lost(place: Site, people: People) -> None:
     assert [job.error for job in jobs.values() if job.state != "succeeded"] == []
     assert sorted(job.result["sha256"] for job in jobs.values()) == sorted(policies) == sorted(trained)
     assert place.wrong() == []
-    with httpx.Client(base_url=place.service.url) as http:
+    with httpx.Client(base_url=place.service.url, timeout=PATIENCE_S) as http:
         for demo, data in people.demos.items():
             assert sha256(http.get(f"/demos/{demo}/recording").content) == sha256(data)
 
@@ -211,7 +211,7 @@ def test_five_restarts_lose_nothing(postgres: Postgres, tmp_path: Path):
 def test_after_a_long_outage_the_worker_restarts_and_finishes_its_job(postgres: Postgres, tmp_path: Path):
     with site_at(postgres.url, tmp_path, workers=1, log_level="error") as place:
         add_demonstration(place.service.url)
-        with httpx.Client(base_url=place.service.url) as http:
+        with httpx.Client(base_url=place.service.url, timeout=PATIENCE_S) as http:
             learner = {"kind": "cell-q-learning", "episodes": 1_000_000}  # a second or two
             body = {"surgeon": "kestrel", "suture": cases.SUTURE, "learner": learner}
             job = http.post("/trainings", json=body).json()["id"]
