@@ -48,6 +48,9 @@ from skills.verification.scene_clearance import NEEDLE, SceneClearance, clearanc
 from skills.verification.verdict import judge
 
 Level = Literal["good", "caution", "bad"]
+Counts = Literal["hand-over", "clearance"]
+_LEFT_OUT = {"place": "a hand-off", "arms": "the other arm", "pad": "tissue"}  # by the fault that was not judged
+_NEVER_JUDGED = "how exactly the tip meets its points"
 MORE_OFTEN_NOT = 0.5  # a plan whose upper bound is below this fails more often than it succeeds
 
 
@@ -65,8 +68,10 @@ def headline(about: dict[str, Any], report: dict[str, Any], *, errors: ArmErrors
         under = judged_under(report, errors)
     except Conflict as unjudged:
         whole, name, most, odds = None, errors.name, None, f". {unjudged.words()}"
+        counts, left_out = None, []
     else:
         whole, name, most = under["plan"], under["errors"]["name"], costs_most(report)
+        counts, left_out = counted_as(under), not_judged(under)
         odds = f"; {_odds(under)}{'' if most is None else f' {most}'}"
     level = _level(about, feasible, whole, lower_bound)
     word = _word(about, feasible, level)
@@ -78,6 +83,8 @@ def headline(about: dict[str, Any], report: dict[str, Any], *, errors: ArmErrors
         "text": f"{word}: {verdict} {plan_in_words(about)}",
         "errors": name,
         "probability": whole,
+        "counts": counts,
+        "not_judged": left_out,
         "costs_most": most,
     }
 
@@ -115,7 +122,8 @@ def costs_most(report: dict[str, Any]) -> str | None:
     if first["without"]["count"] <= whole["count"]:
         return "No error by itself lowers this."
     share = _percent(first["without"]["probability"])
-    return f"Most is lost by {error_called(first['error'])}: without it {share} of the worlds succeed."
+    well = "succeed" if counted_as(doubted["under"][0]) == "hand-over" else "stay clear"
+    return f"Most is lost by {error_called(first['error'])}: without it {share} of the worlds {well}."
 
 
 def error_called(error: str) -> str:
@@ -143,13 +151,29 @@ def _word(about: dict[str, Any], feasible: bool, level: Level) -> str:
     return "Likely to succeed" if level == "good" else "Uncertain"
 
 
+def counted_as(under: dict[str, Any]) -> Counts:
+    """Return the event of a probability: the needle handed over in every pass, or only a motion that stays clear."""
+    return "hand-over" if _judged_in_all(under, "place") else "clearance"
+
+
+def not_judged(under: dict[str, Any]) -> list[str]:
+    """Return, in words, the parts of a plan's success that its probability leaves out."""
+    return [words for fault, words in _LEFT_OUT.items() if not _judged_in_all(under, fault)] + [_NEVER_JUDGED]
+
+
+def _judged_in_all(under: dict[str, Any], fault: str) -> bool:
+    passes = under["passes"]
+    return bool(passes) and all(one["faults"].get(fault) is not None for one in passes)
+
+
 def _odds(under: dict[str, Any]) -> str:
-    whole = under["plan"]
-    return (
-        f"with {errors_in_words(under['errors']['name'])} the complete plan succeeds in {whole['count']} of "
-        f"{whole['of']} worlds: {_percent(whole['probability'])} ({_percent(whole['lower'])} to "
-        f"{_percent(whole['upper'])}, 95 %)."
+    whole, left_out = under["plan"], not_judged(under)
+    of = "the complete plan succeeds" if counted_as(under) == "hand-over" else "the motion stays within reach and clear"
+    said = (
+        f"with {errors_in_words(under['errors']['name'])} {of} in {whole['count']} of {whole['of']} worlds: "
+        f"{_percent(whole['probability'])} ({_percent(whole['lower'])} to {_percent(whole['upper'])}, 95 %)."
     )
+    return said if left_out == [_NEVER_JUDGED] else f"{said} Not judged: {', '.join(left_out)}."
 
 
 def errors_in_words(name: str) -> str:

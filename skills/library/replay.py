@@ -35,7 +35,14 @@ from skills.library import consent, policies, releases, signatures
 from skills.library.demos import find_demo
 from skills.library.integrity import learnt, learnt_in, planned
 from skills.library.plans import describe_plan, find_plan, plan_in_words, trajectory_of
-from skills.library.playbacks import costs_most, errors_in_words, judged_under, trajectory_digest
+from skills.library.playbacks import (
+    costs_most,
+    counted_as,
+    errors_in_words,
+    judged_under,
+    not_judged,
+    trajectory_digest,
+)
 from skills.library.policies import learnt_from
 from skills.packing import canonical, sha256
 from skills.planning.handoff import JAW_CLOSED_RAD
@@ -354,14 +361,17 @@ def _written(paper: dict[str, Any]) -> bytes:
 
 def _readme(plan: dict[str, Any], report: dict[str, Any], arms: tuple[ArmMotion, ...], head: Note) -> str:
     """Return the text of the bag's README: its contents, and the figures of each arm to check before it moves."""
-    errors, stated_by = ArmErrors(**report["doubt"]["under"][0]["errors"]), report["stated_by"]
+    under, stated_by = report["doubt"]["under"][0], report["stated_by"]
+    errors = ArmErrors(**under["errors"])
+    well = "succeed" if counted_as(under) == "hand-over" else "stay within reach and clear"
     about = [
         f"A needle hand-off for replay: plan {plan['sha256']},",
         f"surgeon {plan['surgeon']}, {plan['suture']}, policy version {plan['policy']['version']}.",
         plan["in_words"],
         "",
-        f"Every pass is likely enough to succeed with {errors_in_words(errors.name)}, as the {stated_by} stated them:",
+        f"Every pass is likely enough to {well} with {errors_in_words(errors.name)}, as the {stated_by} stated them:",
         f"{errors.in_words}.",
+        f"Not judged: {', '.join(not_judged(under))}.",
         "With greater errors it was not judged: compare these with your arms.",
         "",
         USE,

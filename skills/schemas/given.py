@@ -307,6 +307,12 @@ class Headline(Given):
         description="Name of the errors of the arms: those of the playback's request, or else of the installation."
     )
     probability: Probability | None = Field(description="Of the whole plan; null where it was not judged.")
+    counts: Literal["hand-over", "clearance"] | None = Field(
+        default=None,
+        description="The event of the probability: the needle is handed over in every pass, or, without a hand-off, "
+        "the motion only stays within reach and clear; null where it was not judged.",
+    )
+    not_judged: list[str] = Field(default=[], description="What the probability leaves out, in words.")
     costs_most: str | None = Field(description="The error that costs the most, in words; null where none was judged.")
 
 

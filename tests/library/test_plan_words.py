@@ -1,5 +1,6 @@
 """Headlines of plans: they name omissions, and are green only if the hand-over is probable enough."""
 
+import json
 from dataclasses import asdict
 from typing import Any
 
@@ -8,7 +9,10 @@ import pytest
 from skills.library.plans import hands_over, plan_in_words
 from skills.library.playbacks import headline
 from skills.verification.errors import CALIBRATED, UNCALIBRATED
-from skills.verification.probabilities import JUDGE_VERSION
+from skills.verification.monte_carlo import doubt
+from skills.verification.probabilities import JUDGE_VERSION, DoubtSettings
+from tests.verification.test_monte_carlo import PAD_TOP_MM, motion
+from tests.verification.test_monte_carlo import PSM_M as OTHER_ARM
 
 NAN = float("nan")
 PSM_M = {"approach": [-1.0, 0.0, 0.0]}
@@ -25,7 +29,8 @@ FULL = about(psm_m=PSM_M, moves=True)
 def told(of: dict[str, Any], lower: float | None, count: int = 990, feasible: object = True) -> dict[str, Any]:
     upper = None if lower is None else min(1.0, count / 1000 + 0.03)
     whole = {"count": count, "of": 1000, "probability": count / 1000, "lower": lower, "upper": upper}
-    under = [{"errors": asdict(CALIBRATED), "plan": whole}]
+    passes = [{"faults": {"place": 0, "arms": 0, "pad": 0}}]
+    under = [{"errors": asdict(CALIBRATED), "plan": whole, "passes": passes}]
     cost = {"error": "registration_deg", "without": {"count": count + 4, "probability": count / 1000 + 0.004}}
     judged = {"version": JUDGE_VERSION, "under": under, "costs": [cost]}
     report = {"feasible": feasible, "failure_in_words": "Pass 0, A1, sample 3: no.", "doubt": judged}
@@ -97,10 +102,47 @@ def test_nothing_else_is_good(of, lower, count, feasible, level, word):
     assert plan_in_words(of) in line["text"]
 
 
+@pytest.mark.parametrize(
+    ("trajectory", "pad_top_mm", "counts", "left_out"),
+    [
+        (motion(1, OTHER_ARM), PAD_TOP_MM, "hand-over", []),
+        (motion(1, OTHER_ARM), None, "hand-over", ["tissue"]),
+        (motion(1), PAD_TOP_MM, "hand-over", ["the other arm"]),
+        (motion(1, with_a2=False), PAD_TOP_MM, "clearance", ["a hand-off", "the other arm"]),
+        (motion(1, with_a2=False), None, "clearance", ["a hand-off", "the other arm", "tissue"]),
+    ],
+)
+def test_odds_count_what_was_judged_and_name_what_was_not(trajectory, pad_top_mm, counts, left_out):
+    settings = DoubtSettings(variations=20)
+    found = doubt(
+        trajectory, approach_m=OTHER_ARM.approach, pad_top_mm=pad_top_mm, errors=UNCALIBRATED, settings=settings
+    )
+    report = {"feasible": True, "doubt": json.loads(json.dumps(asdict(found)))}
+    line = headline(FULL if counts == "hand-over" else about(1), report, errors=UNCALIBRATED, lower_bound=0.95)
+    always = "how exactly the tip meets its points"
+    assert (line["counts"], line["not_judged"]) == (counts, [*left_out, always])
+    assert ("the complete plan succeeds in" in line["text"]) == (counts == "hand-over")
+    assert ("the motion stays within reach and clear in" in line["text"]) == (counts == "clearance")
+    assert ("Not judged:" in line["text"]) == bool(left_out)
+    if left_out:
+        assert f"Not judged: {', '.join(left_out)}, {always}." in line["text"]
+
+
+def test_without_a_hand_off_no_error_is_said_to_cost_success():
+    whole = {"count": 20, "of": 20, "probability": 1.0, "lower": 0.9, "upper": 1.0}
+    passes = [{"faults": {"reach": 0, "limits": 0, "pad": 0, "arms": None, "place": None}}]
+    under = {"errors": asdict(CALIBRATED), "plan": whole | {"count": 15, "probability": 0.75}, "passes": passes}
+    cost = {"error": "tip_bias_mm", "without": whole}
+    report = {"feasible": True, "doubt": {"version": JUDGE_VERSION, "under": [under], "costs": [cost]}}
+    line = headline(about(1), report, errors=CALIBRATED, lower_bound=0.95)
+    assert line["costs_most"].endswith("without it 100.0 % of the worlds stay clear.")
+
+
 def test_an_error_that_was_not_judged_is_said_and_not_good():
     whole = {"count": 999, "of": 1000, "probability": 0.999, "lower": 0.99, "upper": 1.0}
     first_judge = {"under": [{"tip_error_mm": 0.65, "plan": whole}]}
-    other = {"version": JUDGE_VERSION, "under": [{"errors": asdict(CALIBRATED), "plan": whole}], "costs": []}
+    under = {"errors": asdict(CALIBRATED), "plan": whole, "passes": []}
+    other = {"version": JUDGE_VERSION, "under": [under], "costs": []}
     for doubted, words in (
         (None, "older version"),
         (first_judge, "judged by an older version, which had other errors, jaws or tissue; play it again."),
