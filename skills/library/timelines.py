@@ -6,15 +6,23 @@ form: the path of a demonstration, the trajectory of a plan. A file of it is an 
 """
 
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from skills.db.models import Demonstration, Plan, PolicyVersion, RecordingSurgeon, StoredPlayback, Surgeon
+from skills.db.models import (
+    Demonstration,
+    Plan,
+    PolicyVersion,
+    RecordingSurgeon,
+    StoredPlayback,
+    StoredRecording,
+    Surgeon,
+)
 from skills.db.row_visibility import EVERYBODYS
 from skills.db.session import Database
-from skills.errors import Conflict
+from skills.errors import Conflict, NotFound
 from skills.library import consent, policies
 from skills.library.demos import exported_recording, find_demo
 from skills.library.plans import find_plan, motion_of, trajectory_of
@@ -87,31 +95,53 @@ class Choice(NamedTuple):
     name: str
 
 
-def chosen(session: Session, source: Source, sha256: str) -> tuple[Choice, Sequence[Choice]]:
-    """Return a resource under its name, and those to play beside it: of the same suture type, its own surgeon's first.
+def motion_named(session: Session, name: str) -> Choice:
+    """Return the resource of a name such as `plans/DIGEST`.
 
     Raises:
         NotFound: There is no such resource.
     """
+    source, _, sha256 = name.partition("/")
+    for known in get_args(Source):
+        if source == known:
+            return _found(session, known, sha256)[0]
+    raise NotFound("There is no such motion to play beside this one; choose one of the list.")
+
+
+def chosen(session: Session, source: Source, sha256: str) -> tuple[Choice, Sequence[Choice]]:
+    """Return a resource under its name, and some to play beside it: of the same suture type, its own surgeon's first.
+
+    Raises:
+        NotFound: There is no such resource.
+    """
+    here, row = _found(session, source, sha256)
+    if isinstance(row, StoredRecording):
+        cut = select(Demonstration).where(Demonstration.recording_row == row.row)
+        demos = session.scalars(cut.order_by(Demonstration.start_s).limit(MOST_CHOICES)).all()
+        return here, [_demo(one) for one in demos]
+    of = row.policy if isinstance(row, Plan) else row
+    others = [_demo(one) for one in _newest(session, Demonstration, of.suture, of.surgeon_row)]
+    versions = _newest(session, PolicyVersion, of.suture, of.surgeon_row)
+    others += [_path(one) for one in versions if one.poses is not None]
+    plans = select(Plan).join(PolicyVersion).where(PolicyVersion.suture == of.suture).order_by(Plan.row.desc())
+    others += [_plan(one) for one in session.scalars(plans.limit(MOST_CHOICES))]
+    return here, [one for one in others if one != here]
+
+
+def _found(
+    session: Session, source: Source, sha256: str
+) -> tuple[Choice, StoredRecording | Demonstration | PolicyVersion | Plan]:
     if source == "recordings":
         recording = find_recording(session, sha256)
-        cut = select(Demonstration).where(Demonstration.recording_row == recording.row)
-        demos = session.scalars(cut.order_by(Demonstration.start_s).limit(MOST_CHOICES)).all()
-        return Choice(source, sha256, f"Recording {sha256[:12]}"), [_demo(one) for one in demos]
+        return Choice(source, recording.sha256, f"Recording {recording.sha256[:12]}"), recording
     if source == "demos":
-        found = find_demo(session, sha256)
-        here, surgeon_row, suture = _demo(found), found.surgeon_row, found.suture
-    elif source == "policy-versions":
+        demo = find_demo(session, sha256)
+        return _demo(demo), demo
+    if source == "policy-versions":
         version = policies.find_by_digest(session, sha256)
-        here, surgeon_row, suture = _path(version), version.surgeon_row, version.suture
-    else:
-        plan = find_plan(session, sha256)
-        here, surgeon_row, suture = _plan(plan), plan.policy.surgeon_row, plan.policy.suture
-    others = [_demo(one) for one in _newest(session, Demonstration, suture, surgeon_row)]
-    others += [_path(one) for one in _newest(session, PolicyVersion, suture, surgeon_row) if one.poses is not None]
-    of = select(Plan).join(PolicyVersion).where(PolicyVersion.suture == suture).order_by(Plan.row.desc())
-    others += [_plan(one) for one in session.scalars(of.limit(MOST_CHOICES))]
-    return here, [one for one in others if one != here]
+        return _path(version), version
+    plan = find_plan(session, sha256)
+    return _plan(plan), plan
 
 
 def _newest(

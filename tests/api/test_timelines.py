@@ -82,6 +82,21 @@ def test_an_unknown_motion_is_not_found_also_beside_another(told: Service):
     assert_problem(told.http.get(f"/timelines/recordings/{recording}", headers={"Accept": "text/csv"}), 415)
 
 
+def test_every_motion_can_be_played_beside_another_however_many_there_are(told: Service, monkeypatch):
+    monkeypatch.setattr("skills.library.timelines.MOST_CHOICES", 1)
+    every = digests(told)
+    demos = [one["id"] for one in told.client.demos()]
+    assert len(demos) == 2
+    others = [f"demos/{one}" for one in demos] + [f"{source}/{digest}" for source, digest in every.items()]
+    for source, digest in every.items():
+        for other in others:
+            page = told.http.get(f"/pages/player/{source}/{digest}?beside={other}", headers={"Accept": "text/html"})
+            assert page.status_code == 200, (source, other)
+            assert page.text.count(f'<option value="{other}" selected>') == 1
+    for other in ("surgeons/kestrel", "x"):
+        assert told.http.get(f"/pages/player/demos/{every['demos']}?beside={other}").status_code == 404
+
+
 def test_a_file_needs_consent_to_export_and_a_plan_consent_to_train(tmp_path):
     with serving(copy_of_told(tmp_path)) as service:
         every = digests(service)

@@ -11,11 +11,11 @@ from skills.api.pages import render
 from skills.api.responses import JSON, Giving
 from skills.api.routes.pages import PageRoute
 from skills.api.routes.policies import Accept
-from skills.errors import NotFound, UnknownFormat
+from skills.errors import UnknownFormat
 from skills.fields import as_json
 from skills.formats import MCAP
 from skills.formats.timeline_bag import timeline_mcap
-from skills.library.timelines import Source, check_export, chosen, timeline_of
+from skills.library.timelines import Source, check_export, chosen, motion_named, timeline_of
 from skills.schemas.given import MotionTimeline
 from skills.settings import MEBIBYTE
 
@@ -79,8 +79,8 @@ def show_player(
     """
     with db.reading() as session:
         shown, choices = chosen(session, source, digest)
-        other = None if not beside else next((one for one in choices if f"{one.source}/{one.sha256}" == beside), None)
-        if beside and other is None:
-            raise NotFound("There is no such motion to play beside this one; choose one of the list.")
+        other = motion_named(session, beside) if beside else None
+        if other is not None and other not in choices:
+            choices = [other, *choices]  # such as one of a link to an older demonstration than those of the list
         marks = [[float(end) for end in one.split("-")] for one in mark or ()]
         return render(request, "player.html", caller, shown=shown, choices=choices, other=other, marks=marks)
