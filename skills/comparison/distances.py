@@ -201,7 +201,7 @@ class Measured:
         others: Numbers that identify the others, shape (K,).
         apart_mm: Distance from each, with the size taken into account, shape (K,).
         apart_scaled: The same for scaled shapes, in units of the distance from start to goal, shape (K,).
-        signature: The result of `skills.comparison.traits.signature_of`, with its NaN; None: of an older version.
+        signature: The result of `skills.comparison.recognition.signature_of`, with its NaN; None: of an older version.
     """
 
     shape_mm: Floats | None

@@ -37,17 +37,16 @@ from skills.gridworld.grid import GridPath, GridWorld
 from skills.gridworld.reward import RewardLevels, RewardMap
 from skills.gridworld.scene import Box, Capsule, Scene, SceneCosts, Surroundings, Tissue
 from skills.learning.certificate import Coverage
-from skills.learning.dynamic_programming import ValueIteration
+from skills.learning.dynamic_programming import ShortestWay, ValueIteration
 from skills.learning.networks import Network
 from skills.learning.policy import LEARNERS, Policy
 from skills.learning.pose_style import PosePath
 from skills.learning.q_learning import PhaseQLearning, Training
-from skills.learning.ties import ShortestWay
 from skills.learning.tube import CertifiedPoses, TubeCertificate, TubeLimits
 from skills.packing import added_later, few_numbers
-from skills.planning.hand import Hand
 from skills.planning.handoff import PsmM
 from skills.planning.motion_laws import Pose
+from skills.planning.path_fit import Hand
 from skills.planning.plan import Departure, Pass, SuturePlan, SuturePoint
 from skills.verification.playback import Pictures, Playback
 

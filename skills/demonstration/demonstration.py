@@ -17,8 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from skills.arrays import Floats, frozen
+from skills.demonstration.movement import Pause, clutched, is_driven, undriven
 from skills.demonstration.partner import Partner, PartnerMotion, in_base, partner_along, partner_at
-from skills.demonstration.pauses import Pause, clutched, is_driven, undriven
 from skills.demonstration.recording import (
     BaseFrame,
     Format,

@@ -48,11 +48,10 @@ from skills.demonstration.movement import (
     offset,
     onset,
     spans_of,
+    undriven,
 )
-from skills.demonstration.partner import partner_at
-from skills.demonstration.pauses import undriven
+from skills.demonstration.partner import REGRIP_S, Transfer, closed_jaw, find_transfers, partner_at
 from skills.demonstration.recording import BaseFrame, Label, Motion, Recording, base_frames
-from skills.demonstration.transfers import REGRIP_S, Transfer, closed_jaw, find_transfers
 from skills.fields import Fraction, computed_field, schema
 
 FOLLOWS_NS = 5_000_000_000  # an A2 that begins later than 5 s after the end of A1 belongs to another hand-off

@@ -29,8 +29,8 @@ from typing import BinaryIO
 import numpy as np
 
 from skills.arrays import Floats, Ints
-from skills.demonstration.bases import WIDE_MM
 from skills.demonstration.recording import (
+    WIDE_MM,
     Column,
     Joints,
     Motion,

@@ -27,7 +27,7 @@ import numpy as np
 from skills import errors, packing
 from skills.compiled import check_kept, kept_in, make_ready
 from skills.demonstration.identification import ArmIdentification, Identification
-from skills.demonstration.pauses import press_times
+from skills.demonstration.movement import press_times
 from skills.demonstration.recording import (
     BaseFrame,
     Column,

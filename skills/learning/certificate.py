@@ -22,9 +22,17 @@ from skills.fields import Count, schema
 from skills.gridworld.domain import FINISHED
 from skills.gridworld.reward import sparse_reward
 from skills.learning import _kernels
-from skills.learning.dynamic_programming import FAINT, Mdp, action_values, exact_q, exact_values, log_losses
+from skills.learning.dynamic_programming import (
+    FAINT,
+    TIE,
+    Mdp,
+    action_values,
+    exact_q,
+    exact_values,
+    log_losses,
+    off_rule,
+)
 from skills.learning.policy import Policy
-from skills.learning.ties import TIE, off_rule
 
 NOISE = 1e-12  # of the cost of touching: values that nearly cancel are exact to less
 FAINTEST = 100  # times that noise: a smaller value is not compared

@@ -4,7 +4,8 @@
 
 `skills.deep.learn_policy` learns with all learners, `learn_tabular` with those that need no network. The *greedy*
 action of a row has the largest Q value. Of equally good ones the tabular learners of the phase state take the one of
-the shortest way (`skills.learning.ties`); the others, whose values have not settled, the one with the lowest index.
+the shortest way (`skills.learning.dynamic_programming`); the others, whose values have not settled, the one with the
+lowest index.
 """
 
 from dataclasses import asdict, dataclass
@@ -22,11 +23,10 @@ from skills.gridworld.domain import FINISHED, OUTSIDE, Domain, Moves
 from skills.gridworld.grid import GridPath, refuse_metres
 from skills.gridworld.reward import RewardLevels, RewardMap
 from skills.gridworld.scene import Hazards, Surroundings, hazards_of, touching
-from skills.learning.dynamic_programming import ValueIteration, iterate_values
+from skills.learning.dynamic_programming import REMOTE_CENTRE, ShortestWay, ValueIteration, choose, iterate_values
 from skills.learning.max_ent_irl import MaxEntIRL, learn_from_recovered
 from skills.learning.networks import DDPG, DQN, TRPO, Network
 from skills.learning.q_learning import CellQLearning, PhaseQLearning, Training, learn_q
-from skills.learning.ties import REMOTE_CENTRE, ShortestWay, choose
 from skills.notebook import card
 
 Tabular = PhaseQLearning | CellQLearning | ValueIteration | MaxEntIRL

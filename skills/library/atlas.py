@@ -43,7 +43,7 @@ from skills.comparison.distances import (
     silhouette,
     spread,
 )
-from skills.comparison.traits import NUMBERS, signature_of
+from skills.comparison.recognition import NUMBERS, signature_of
 from skills.db import in_parts
 from skills.db.models import Demonstration, MeasuredShape, SutureType
 from skills.db.packed import pack

@@ -38,8 +38,7 @@ from skills.db.models import (
 from skills.db.service_tables import Event, Executor, Job
 from skills.db.session import Database
 from skills.demonstration.demonstration import Demo, Recording
-from skills.demonstration.movement import smoothed_speed
-from skills.demonstration.pauses import press_times
+from skills.demonstration.movement import press_times, smoothed_speed
 from skills.gridworld.grid import GridPath
 from skills.gridworld.reward import RewardMap, sparse_reward
 from skills.learning.policy import Policy

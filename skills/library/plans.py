@@ -27,8 +27,8 @@ from skills.library import locks, policies
 from skills.library.integrity import find_by_digest, learnt, plan_identity, planned, scene_digest
 from skills.library.policies import combined_of, learnt_from
 from skills.library.recordings import Reader, Upload, read_upload
-from skills.planning.hand import jaw_recorded, styled
 from skills.planning.handoff import PsmM
+from skills.planning.path_fit import jaw_recorded, styled
 from skills.planning.plan import SuturePlan, pose_xyzw, stack, turn_deg
 from skills.planning.trajectory import Trajectory, seams, seconds_by_phase, time_parametrise, transfers
 from skills.remedies import Action, Remedy

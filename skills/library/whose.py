@@ -20,8 +20,7 @@ from sqlalchemy import func, select
 
 from skills.arrays import Floats, Ints
 from skills.comparison.distances import shape_of
-from skills.comparison.recognition import Validated, recognise, usable, validate, vote
-from skills.comparison.traits import NUMBERS, signature_of
+from skills.comparison.recognition import NUMBERS, Validated, recognise, signature_of, usable, validate, vote
 from skills.db.models import Demonstration, StoredRecording
 from skills.db.row_visibility import EVERYBODYS
 from skills.db.session import Database

@@ -7,7 +7,7 @@
 A pass has three phases:
 
     transfer   from the end of the previous pass to where A1 begins; ours, so that a plan is one motion
-    A1         PSM_A's tip moves along its polyline, the jaw held or turning as the surgeon's (`skills.planning.hand`)
+    A1         PSM_A's tip moves along its polyline, the jaw held or turning as the surgeon's (`path_fit`)
     A2         PSM_A's jaw turns with the tip held, and PSM_M comes in
 
 A transfer goes through *stations*, at rest in each. Between passes PSM_M goes back, then PSM_A moves to its start while
@@ -37,9 +37,9 @@ import numpy as np
 from skills.arrays import Bytes, Floats, Ints, frozen
 from skills.errors import BadPlan, NoMotion, Unreachable
 from skills.kinematics import JOINTS, ROLL, check_rotation, instrument_of, inverse, matrix_of
-from skills.planning.hand import Hand
 from skills.planning.handoff import OtherArm, PsmM, hand_off
 from skills.planning.motion_laws import PHASES, SAME_POINT_MM, Arms, Pose, Poses
+from skills.planning.path_fit import Hand
 
 STAND_OFF_MM = 30.0  # ours: the needle's circle, 16.6 mm across, plus a finger of 10.2 mm, plus a little more
 _HINGE_REVERSED = np.diag([-1.0, -1.0, 1.0])

@@ -8,9 +8,9 @@ A pass moves the complete grid world so that the policy's *goal* lies at the sut
 has a rotation. In the moved grid the policy is rolled out from the pass's start. The result is a path in the arm's
 frame: through the centres of its cells, as in the paper, or, if the demonstration is given, fitted to the recording
 within the same cells (`skills.planning.path_fit`), with the surgeon's orientation, jaw and tempo along it
-(`skills.planning.hand`). What was demonstrated at the policy's goal is then done at the suture point: the hand's last
-sample lies there, somewhere in the cell of the goal. Between passes the surgeon inserts and grasps the needle by hand
-(M1, M2).
+(`skills.planning.path_fit`). What was demonstrated at the policy's goal is then done at the suture point: the hand's
+last sample lies there, somewhere in the cell of the goal. Between passes the surgeon inserts and grasps the needle by
+hand (M1, M2).
 
 The orientation turns with the pass. It is held as at the first sample where that is requested, and the plan then states
 its *departure* from the recorded one. A2 ends in the recorded hand-off, the poses of both arms moved with the pass, if
@@ -56,11 +56,10 @@ from skills.kinematics import (
 )
 from skills.learning.policy import Policy, rollout
 from skills.notebook import card
-from skills.planning.hand import Hand, hand_along, moved
 from skills.planning.handoff import PsmM, needle_tips_mm, realign
 from skills.planning.motion_laws import Pose, followed
 from skills.planning.passes import PassPath, Way, ways
-from skills.planning.path_fit import Trace, ends_of, fit_to_demo, trace
+from skills.planning.path_fit import Hand, Trace, ends_of, fit_to_demo, hand_along, moved, trace
 
 MAX_PASSES = 200
 RATE_HZ = (100.0, 200.0)  # of the plans that a robot's controller follows

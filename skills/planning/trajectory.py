@@ -9,8 +9,8 @@ passes.
 
 The law of motion is ours; the paper only asks for no jerky movements:
 
-* A1 along a recorded hand has the hand's own profile of speeds and turns (`skills.planning.hand`), all of it slowed by
-  one factor, the *tempo*: a part of the surgeon's, so that the tip is nowhere faster than asked. Slower in one place
+* A1 along a recorded hand has the hand's own profile of speeds and turns (`skills.planning.path_fit`), all of it slowed
+  by one factor, the *tempo*: a part of the surgeon's, so that the tip is nowhere faster than asked. Slower in one place
   only would be another profile. The tip is near the polyline, as the hand states it.
 * A1 without a hand is a cubic spline through the polyline's points, at rest at both ends and slower in bends. Each
   point is passed exactly, on a tick. Between points it leaves the straight move by at most 1.25 mm, because moves are

@@ -18,9 +18,8 @@ from numpy.typing import ArrayLike
 
 from skills.arrays import Floats
 from skills.demonstration.demonstration import Demo, partner_motion
-from skills.demonstration.movement import same_signs, smoothed_speed
+from skills.demonstration.movement import press_times, same_signs, smoothed_speed
 from skills.demonstration.partner import STEADY_MM
-from skills.demonstration.pauses import press_times
 from skills.demonstration.recording import Motion, Recording
 from skills.kinematics import INSTRUMENTS, forward, matrix_of, quaternion_of
 from skills.learning.pose_style import PosePath

@@ -9,7 +9,7 @@ import pytest
 
 from skills.api.pages import drawings
 from skills.comparison.distances import STATES
-from skills.comparison.traits import NUMBERS
+from skills.comparison.recognition import NUMBERS
 from skills.library.atlas import _compare, _told
 from skills.library.members import Member
 from skills.schemas.comparison import Atlas, LeftOutOfAtlas

@@ -30,10 +30,9 @@ from skills.gridworld.grid import choose_grid, discretize
 from skills.kinematics import matrix_of
 from skills.learning.evaluation import dtw
 from skills.learning.slip import replay
-from skills.planning.hand import hand_along
 from skills.planning.handoff import needle_tips_mm
 from skills.planning.motion_laws import followed
-from skills.planning.path_fit import TREMOR_S, fit_to_demo, trace
+from skills.planning.path_fit import TREMOR_S, fit_to_demo, hand_along, trace
 from skills.planning.plan import departure_of
 from skills.seeds.recordings import sample_recordings
 from tests.planning.test_path_fit import walked, without_rests

@@ -15,7 +15,7 @@ from sqlalchemy import insert, select
 
 from skills.comparison.distances import STATES, VERSION, Measured, distances, in_lengths, shape_of
 from skills.comparison.nearest import ShapeIndex
-from skills.comparison.traits import NUMBERS
+from skills.comparison.recognition import NUMBERS
 from skills.db import now
 from skills.db.models import Demonstration, MeasuredShape, StoredRecording, Surgeon
 from skills.db.packed import pack

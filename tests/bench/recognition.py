@@ -19,8 +19,7 @@ import numpy as np
 from rich.table import Table
 
 from skills.comparison.distances import STATES, distances, resampled, shape_of
-from skills.comparison.recognition import Validated, usable, validate, vote
-from skills.comparison.traits import FAMILIES, NUMBERS, signature_of
+from skills.comparison.recognition import FAMILIES, NUMBERS, Validated, signature_of, usable, validate, vote
 from skills.demonstration.demonstration import Demo, cut_demo
 from skills.demonstration.recording import Recording
 from skills.demonstration.segments import Segment, movements_by_arm, propose_by_arm

@@ -5,6 +5,8 @@ import pytest
 
 from skills.comparison.distances import STATES
 from skills.comparison.recognition import (
+    FAMILIES,
+    NUMBERS,
     Settings,
     Validated,
     calibrate,
@@ -12,11 +14,11 @@ from skills.comparison.recognition import (
     folds_of,
     probabilities,
     recognise,
+    signature_of,
     usable,
     validate,
     vote,
 )
-from skills.comparison.traits import FAMILIES, NUMBERS, signature_of
 from skills.errors import BadInput
 from tests.comparison.cohort import Cohort, cohort
 

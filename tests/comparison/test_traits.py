@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from skills.comparison.traits import FAMILIES, NUMBERS, signature_of
+from skills.comparison.recognition import FAMILIES, NUMBERS, signature_of
 from skills.demonstration.demonstration import Demo
 from skills.kinematics import matrix_of, quaternion_of
 from tests.comparison.cohort import cohort

@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from skills.demonstration.bases import PAIR_NS
-from skills.demonstration.recording import Motion, Recording, base_frames
+from skills.demonstration.recording import PAIR_NS, Motion, Recording, base_frames
 from skills.formats import read_recording
 from skills.kinematics import angle_between, matrix_of, quaternion_of
 from tests.formats.bags import sample_folder

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from skills.demonstration.partner import Transfer, closed_jaw, find_transfers
 from skills.demonstration.recording import Label, Recording, Signal, base_frames
 from skills.demonstration.segments import propose_by_arm
-from skills.demonstration.transfers import Transfer, closed_jaw, find_transfers
 from skills.formats.jigsaws import read_jigsaws
 from skills.samples import agreement
 from tests.demonstration.exchanges import Given, exchanges

@@ -11,7 +11,7 @@ from typing import IO, Any, BinaryIO
 import numpy as np
 import pytest
 
-from skills.demonstration import bases, motion
+from skills.demonstration import motion, recording
 from skills.demonstration import recording as values
 from skills.demonstration.identification import ArmIdentification, Identification
 from skills.demonstration.segments import Segment
@@ -69,7 +69,7 @@ def test_the_recording_is_the_same_to_the_last_bit(reader, data, how):
 
 
 def test_every_value_of_a_recording_may_come_back():
-    rooms = {one.__name__: vars(one) for one in (values, motion, bases)}
+    rooms = {one.__name__: vars(one) for one in (values, motion, recording)}
     assert {v for name, here in rooms.items() for v in here.values() if is_dataclass(v) and v.__module__ == name} == {
         *KNOWN.values()
     } - {Refusal, Told, Segment, ArmIdentification, Identification}

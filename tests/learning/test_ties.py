@@ -14,10 +14,9 @@ from skills.gridworld.grid import MOVES, GridPath, GridWorld
 from skills.gridworld.reward import sparse_reward
 from skills.learning import policy as policy_module
 from skills.learning.certificate import certify, mdp_of
-from skills.learning.dynamic_programming import ValueIteration, exact_q
+from skills.learning.dynamic_programming import REMOTE_CENTRE, ShortestWay, ValueIteration, exact_q, rule_in
 from skills.learning.policy import Policy, learn_tabular, rollout_from
 from skills.learning.q_learning import PhaseQLearning
-from skills.learning.ties import REMOTE_CENTRE, ShortestWay, rule_in
 from tests.by_day import examples, some
 from tests.gridworld.paths import WALKS, learnt, named_path, random_path
 

@@ -20,9 +20,8 @@ from skills.learning.policy import Policy, Rollout, learn_tabular
 from skills.learning.pose_style import learn_pose_style
 from skills.learning.q_learning import PhaseQLearning
 from skills.learning.slip import replay
-from skills.planning.hand import Hand, hand_along, styled
 from skills.planning.handoff import HELD_MM, NEEDLE_RADIUS_MM, PsmM, needle_tips_mm, turn
-from skills.planning.path_fit import TREMOR_S, fit_to_demo, trace
+from skills.planning.path_fit import TREMOR_S, Hand, fit_to_demo, hand_along, styled, trace
 from skills.planning.plan import SuturePoint, departure_of, driven_pass, stack
 from skills.planning.trajectory import A1, A2, Trajectory, time_parametrise
 from skills.verification.clearance import openings
