@@ -1,6 +1,6 @@
 """Errors of arms for tests: a laboratory's well calibrated arms, and arms that are exactly where they should be."""
 
-from skills.verification.errors import SIZES, ArmErrors
+from skills.verification.arm_errors import SIZES, ArmErrors
 
 ARMS = ArmErrors(
     name="bench",

@@ -32,7 +32,7 @@ def calibrate(
     from skills.fields import as_json as plain
     from skills.library.arm_errors import read_measured
     from skills.packing import canonical
-    from skills.verification.measured_errors import calibrate_arm
+    from skills.verification.arm_errors import calibrate_arm
 
     try:
         found = calibrate_arm(read_measured(bag, arm=arm, instrument=instrument, rate_hz=rate_hz), name=name)

@@ -381,7 +381,7 @@ def _tell_model(about: dict[str, Any]) -> None:
 
     from skills.library.calibrations import accepted
     from skills.scoring.calibration import from_numbers
-    from skills.scoring.trials import KIND_OF
+    from skills.scoring.features import TRIAL_KIND_OF
     from skills.scoring.validation import level_refusals, refusals
 
     model, used = from_numbers(about["model"]), accepted(about)
@@ -394,7 +394,7 @@ def _tell_model(about: dict[str, Any]) -> None:
         for column in ("figure", "typical", "unit", "points per deviation"):
             weights.add_column(column)
         for figure, centre, weight in zip(model.figures, model.centre[task], model.weights[task, 0], strict=True):
-            kind = KIND_OF[figure]
+            kind = TRIAL_KIND_OF[figure]
             weights.add_row(kind.label, f"{kind.readable(float(centre)):.3g}", cell(kind.unit), f"{weight:+.2f}")
         out.print(f"{name} is rated by")
         out.print(weights)

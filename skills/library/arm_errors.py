@@ -20,8 +20,7 @@ from skills.arrays import Floats
 from skills.errors import BadInput, BadRecording, BadSettings
 from skills.formats import read_recording
 from skills.kinematics import DEFAULT_INSTRUMENT, INSERTION, forward, matrix_of
-from skills.verification.errors import NAMED, SIZES, ArmErrors, checked_own
-from skills.verification.measured_errors import Measured
+from skills.verification.arm_errors import NAMED, SIZES, ArmErrors, Measured, checked_own
 
 MOST_ROWS = 1_000_000
 _JOINTS = tuple(f"q{number}" for number in range(1, 7))

@@ -38,8 +38,8 @@ from skills.scoring.calibration import (
     calibrate,
     from_numbers,
 )
-from skills.scoring.trials import NAMES as FIGURES
-from skills.scoring.trials import TrialFigures, measure_trial
+from skills.scoring.features import TRIAL_NAMES as FIGURES
+from skills.scoring.features import TrialFigures, measure_trial
 from skills.scoring.validation import BOOTSTRAPS, NOTHING, PERMUTATIONS, refusals, validate
 
 NAMED = 5  # the most trials that an error names

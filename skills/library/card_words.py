@@ -9,7 +9,7 @@ from skills.db.models import PolicyVersion
 from skills.demonstration.quality import times_in_words
 from skills.gridworld.domain import REACH
 from skills.schemas.policies import Citation, StartCounts
-from skills.verification.errors import CALIBRATED_MM, UNCALIBRATED_MM
+from skills.verification.arm_errors import CALIBRATED_MM, UNCALIBRATED_MM
 
 USE = "Research use only; not a medical device. Never move an arm by it on or near a person."
 IS = [

@@ -67,7 +67,7 @@ from skills.schemas.policies import (
     TipErrors,
 )
 from skills.transparency import Note
-from skills.verification.errors import CALIBRATED_MM, UNCALIBRATED_MM
+from skills.verification.arm_errors import CALIBRATED_MM, UNCALIBRATED_MM
 
 FORMAT = 1  # of the JSON: raise it when a field is removed or changes its meaning
 

@@ -36,8 +36,8 @@ from skills.packing import canonical, sha256
 from skills.planning.trajectory import Trajectory
 from skills.remedies import Action, Remedy
 from skills.settings import Settings
+from skills.verification.arm_errors import CALLED, NAMED, ArmErrors
 from skills.verification.asked import asked_of
-from skills.verification.errors import CALLED, NAMED, ArmErrors
 from skills.verification.gates import SCENE, Failure
 from skills.verification.intent import compare
 from skills.verification.monte_carlo import doubt

@@ -45,11 +45,9 @@ from skills.schemas.comparison import (
 )
 from skills.schemas.requests import ScoreIn
 from skills.scoring.calibration import LEVELS, Level
-from skills.scoring.deviation import as_recorded, laid, laid_on
-from skills.scoring.differences import differences
-from skills.scoring.features import KINDS, Numbers, compare, measure
+from skills.scoring.deviation import as_recorded, differences, laid, laid_on
+from skills.scoring.features import KINDS, Numbers, compare, measure, measure_trial
 from skills.scoring.rating import Skill, rate, unrated
-from skills.scoring.trials import measure_trial
 from skills.scoring.validation import refusals
 
 LEAST_DEMOS, LEAST_SURGEONS = 5, 2  # of a level: with fewer, a percentile is meaningless, or describes one person

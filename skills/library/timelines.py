@@ -28,8 +28,8 @@ from skills.library.demos import exported_recording, find_demo
 from skills.library.plans import find_plan, motion_of, trajectory_of
 from skills.library.pose_styles import poses_of
 from skills.library.recordings import Teller, find_recording, stored_recording
-from skills.verification.timeline import Timeline
-from skills.verification.timelines import (
+from skills.verification.timeline import (
+    Timeline,
     timeline_of_demo,
     timeline_of_path,
     timeline_of_plan,

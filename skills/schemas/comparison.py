@@ -12,8 +12,7 @@ from pydantic import ConfigDict, Field
 from skills.fields import Count, Fraction, Sha256, Slug
 from skills.schemas import Given
 from skills.scoring.calibration import Level
-from skills.scoring.deviation import Deviation
-from skills.scoring.differences import Differences
+from skills.scoring.deviation import Deviation, Differences
 from skills.scoring.features import ScoreFigure
 from skills.scoring.rating import Skill
 

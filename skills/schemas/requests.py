@@ -29,7 +29,7 @@ from skills.planning.plan import (
 from skills.planning.trajectory import MAX_SPEED_MM_S
 from skills.schemas import DemoOutcome, Handedness, ProposalDecision, SkillLevel
 from skills.settings import Role
-from skills.verification.errors import NAMED, ArmErrors, checked_own
+from skills.verification.arm_errors import NAMED, ArmErrors, checked_own
 
 SLUG = r"^[a-z0-9][a-z0-9_-]{0,63}$"
 DIGEST = r"^[0-9a-f]{8,64}$"  # in full, or a prefix that no other digest has

@@ -3,7 +3,7 @@
     Cohort --held_out--> HeldOut   the rating of every trial by a model that has not seen its surgeon
     Cohort, HeldOut --calibrate--> SkillModel
 
-The figures of a trial (`skills.scoring.trials`) and its ratings are standardised within each task. Ridge regression
+The figures of a trial (`skills.scoring.features`) and its ratings are standardised within each task. Ridge regression
 without an intercept, on all tasks together or on each, gives the weights of a score:
 
     score  = sum of weight * (figure - the task's mean) / the task's standard deviation
@@ -32,7 +32,7 @@ import numpy as np
 
 from skills.arrays import Flags, Floats, Ints, frozen
 from skills.errors import BadInput
-from skills.scoring.trials import NAMES, THIRDS
+from skills.scoring.features import THIRDS, TRIAL_NAMES
 
 Level = Literal["novice", "intermediate", "expert"]
 LEVELS: tuple[Level, ...] = get_args(Level)
@@ -419,7 +419,7 @@ def calibrate(cohort: Cohort, found: HeldOut) -> SkillModel:
     levels = [_level_means(cohort.ratings[rows, :1], cohort.levels[rows, None])[:, 0] for rows in cohort.by_task]
     return SkillModel(
         tasks=cohort.names,
-        figures=NAMES,
+        figures=TRIAL_NAMES,
         masters=fit.design.masters,
         together=fit.design.together,
         strength=fit.design.strength,

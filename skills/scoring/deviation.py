@@ -1,4 +1,4 @@
-"""Deviation of a motion from a reference: dynamic time warping as in Sec. IV of the paper, with a description in words.
+"""Deviation of a motion from a reference by dynamic time warping (Sec. IV), and differences from an expert in words.
 
     Demo, Demo --laid_on or as_recorded--> Deviation
 
@@ -7,18 +7,31 @@
 reference. `as_recorded` leaves both where they were; that is the paper's comparison, and it is meaningful only if the
 set-up was the same. The total is exact; its division over the axes depends on the tie-break
 (`skills.learning.evaluation.TIE_BREAK`). The thresholds of the words are ours.
+
+    Demo, the expert's Demos --differences--> Differences: at most three, or none beyond the expert's own spread
+
+A difference says where along the way, how much, and what the expert does. All motions are laid on a reference of the
+expert and aligned with its states by dynamic time warping, with the share of the path's length as one coordinate, so
+that a deeper place is not aligned with another deep one. At each state five numbers are compared: how far the tip is to
+the left and how high, the angle of the wrist in the frame of the hand-off, the time in motion, and the time at rest. An
+expert's motions differ too. So a difference counts in standard deviations of the expert's own motions there, and is
+named only if it exceeds `LEAST` of them, and the largest number of them by which one of the expert's motions differs
+from the others in anything. With few motions the spread is mostly an assumed one (`Kind.usual`).
+
+All of this is ours, and so are the numbers. It says that motions differ, not which is better.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from skills.arrays import Floats, xyz
-from skills.comparison.distances import PARTS, TREMOR_S, Difference, difference, resampled, shape_of
+from skills.arrays import Flags, Floats, xyz
+from skills.comparison.distances import PARTS, STATES, TREMOR_S, Difference, difference, own_axes, resampled, shape_of
 from skills.demonstration.demonstration import Demo
-from skills.demonstration.movement import smoothed_tip
+from skills.demonstration.movement import same_signs, smoothed_tip, spans_of
 from skills.fields import Point, schema
+from skills.kinematics import matrix_of
 from skills.learning.evaluation import dtw
 
 NEAR_MM = 1.0  # mean distance; a fifth of the paper's cell, and the drift of a held hand in a second
@@ -166,3 +179,341 @@ def _places(found: Difference, sides: Sides) -> Iterator[str]:
 def _thirds(values: Floats) -> Thirds:
     first, middle, last = map(xyz, values)
     return first, middle, last
+
+
+NAMED = 3
+LEAST = 3.2  # standard deviations of the expert's own motions
+ASSUMED = 1.5  # motions that the assumed spread counts for
+AROUND = 5  # states before and after one whose times belong to it
+PHASE = 2.0  # of the reference's length: weight of the share of the path
+WIDE = 8  # states over which a spread is averaged
+REGION = 0.5  # of the largest difference: as far as it stays above, it is one difference
+REST_MM_S, REST_S = 2.0, 0.35  # a slower tip rests, if it does so for this long
+LEAST_S = 0.25  # of a difference in time: a shorter one cannot be noticed
+LEAST_TIME_S = 0.02  # added before a logarithm
+
+
+@dataclass(frozen=True)
+class Kind:
+    """One of the compared numbers: its name, its unit, and its usual spread in one expert's motions."""
+
+    name: str
+    unit: str
+    usual: float
+
+
+KINDS = (
+    Kind("to the side", "mm", 1.5),
+    Kind("height", "mm", 1.5),
+    Kind("wrist", "degrees", 4.0),
+    Kind("time in motion", "s", 0.15),  # of its logarithm
+    Kind("pause", "s", 0.25),
+)
+
+
+@schema
+@dataclass(frozen=True)
+class NamedDifference:
+    """One difference of a motion from the expert's.
+
+    Attributes:
+        kind: `to the side`, `height`, `wrist`, `time in motion` or `pause`.
+        unit: mm, degrees or s.
+        start: Where it begins, as a share of the reference's path, 0 to 1.
+        end: Where it ends.
+        start_s: When the motion reaches its beginning, in seconds since the motion's first sample.
+        end_s: When it reaches its end.
+        amount: The largest difference there, positive to the left, higher or turned; of a time that of the whole part,
+            positive if longer.
+        expert: The expert's mean there: mm to the left of the straight line to the goal or above it, degrees since the
+            start, or seconds.
+        spreads: The difference, in standard deviations of the expert's own motions.
+        words: All of it in a sentence.
+    """
+
+    kind: str
+    unit: str
+    start: float
+    end: float
+    start_s: float
+    end_s: float
+    amount: float
+    expert: float
+    spreads: float
+    words: str
+
+
+@schema
+@dataclass(frozen=True)
+class Differences:
+    """The largest differences of a motion from an expert's motions.
+
+    Attributes:
+        expert_demos: Number of the expert's motions that the spread is of.
+        named: At most three, the largest first.
+        words: A sentence for each; or that there is none beyond the expert's own spread.
+    """
+
+    expert_demos: int
+    named: tuple[NamedDifference, ...]
+    words: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Traced:
+    """A motion at the states of a reference: places in mm, clocks in s, rotations in the hand-off's frame."""
+
+    shape_mm: Floats  # (STATES, 3)
+    moving_s: Floats  # (STATES,), cumulated
+    resting_s: Floats  # (STATES,), cumulated
+    rotations: Floats | None  # (STATES, 3, 3)
+
+    def numbers(self) -> Floats:
+        """Return the compared numbers that need no mean, shape (4, STATES): to the side, height, time, pause."""
+        moving, resting = (_around(clock) for clock in (self.moving_s, self.resting_s))
+        return np.stack([self.shape_mm[:, 1], self.shape_mm[:, 2], np.log(moving + LEAST_TIME_S), resting])
+
+
+def differences(demo: Demo, expert: Sequence[Demo], reference: Demo) -> Differences:
+    """Name the largest differences of a motion from an expert's motions.
+
+    Args:
+        demo: The motion.
+        expert: Motions of one expert, at least one, without the compared one.
+        reference: The motion that all are laid on, of the same expert.
+
+    Raises:
+        BadPath: One of them ends where it began.
+    """
+    onto_mm = shape_of(reference)
+    mine, theirs = traced(demo, onto_mm), [traced(one, onto_mm) for one in expert]
+    deviations = _deviations(mine, theirs)
+    least = max(LEAST, *_own_spread(theirs))
+    found = []
+    for kind, (signed, spread) in enumerate(deviations):
+        if signed is not None:
+            found += [(kind, *one) for one in _regions(np.abs(signed) / spread, least)]
+    said = (_named(mine, theirs, deviations[kind][0], kind, where, spreads) for kind, where, spreads in _ranked(found))
+    named = [one for one in said if one is not None][:NAMED]
+    return Differences(len(theirs), tuple(named), tuple(one.words for one in named) or (_none(len(theirs)),))
+
+
+def _none(demos: int) -> str:
+    if demos == 1:
+        return (
+            "There is no difference beyond what surgeons usually differ from themselves; the expert's own spread is "
+            "not known from one demonstration."
+        )
+    return f"There is no difference beyond the expert's own spread, in {demos} demonstrations."
+
+
+def traced(demo: Demo, onto_mm: Floats) -> Traced:
+    """Lay a motion on a reference and return it at the reference's states.
+
+    Args:
+        demo: The motion.
+        onto_mm: The shape of the reference, (STATES, 3).
+    """
+    seconds, tip_mm = smoothed_tip(demo.stamps_s, demo.tip_mm, TREMOR_S)
+    steps_mm = np.linalg.norm(np.diff(tip_mm, axis=0), axis=1)
+    along_mm = np.append(0.0, np.cumsum(steps_mm))
+    speed = np.append(steps_mm, steps_mm[-1]) / (seconds[1] - seconds[0])
+    resting = _at_rest(seconds, speed)
+    step_s = np.append(0.0, np.diff(seconds))
+    at_mm = np.linspace(0.0, along_mm[-1], STATES)
+    clocks = [np.interp(at_mm, along_mm, np.cumsum(step_s * on)) for on in (~resting, resting)]
+    shape_mm = laid(shape_of(demo), onto_mm)
+    pairs = dtw(_by_phase(shape_mm, onto_mm), _by_phase(onto_mm, onto_mm)).pairs
+    count = np.bincount(pairs[:, 1], minlength=STATES)
+
+    def mean(values: Floats) -> Floats:
+        return np.bincount(pairs[:, 1], values[pairs[:, 0]], STATES) / count
+
+    rotations = None
+    if demo.rotation_xyzw is not None:
+        turned = smoothed_tip(demo.stamps_s, same_signs(demo.rotation_xyzw), TREMOR_S)[1]
+        there = np.stack([mean(np.interp(at_mm, along_mm, axis)) for axis in turned.T], axis=1)
+        there /= np.linalg.norm(there, axis=1, keepdims=True).clip(1e-12)
+        rotations = own_axes(resampled(tip_mm)) @ matrix_of(there)
+    return Traced(np.stack([mean(axis) for axis in shape_mm.T], axis=1), mean(clocks[0]), mean(clocks[1]), rotations)
+
+
+def _by_phase(shape_mm: Floats, onto_mm: Floats) -> Floats:
+    """Return a path with the share of its length in place of x, so that the same places are aligned, not any alike."""
+    length_mm = np.linalg.norm(np.diff(onto_mm, axis=0), axis=1).sum()
+    return np.column_stack([np.linspace(0.0, PHASE * length_mm, len(shape_mm)), shape_mm[:, 1:]])
+
+
+def _at_rest(seconds: Floats, speed_mm_s: Floats) -> Flags:
+    resting = np.zeros(len(seconds), bool)
+    for start, end in spans_of(seconds, speed_mm_s < REST_MM_S):
+        if end - start >= REST_S:
+            resting |= (seconds >= start) & (seconds <= end)
+    return resting
+
+
+def _around(clock_s: Floats) -> Floats:
+    """Return the time from `AROUND` states before each state to as many after it, in proportion at the ends."""
+    first, last = (np.arange(STATES) + by for by in (-AROUND, AROUND))
+    first, last = first.clip(0), last.clip(max=STATES - 1)
+    return np.asarray((clock_s[last] - clock_s[first]) * (2 * AROUND / (last - first)))
+
+
+# ---- the expert's spread --------------------------------------------------------------------------------------------
+
+_Apart = tuple[Floats | None, Floats]  # of one kind, at each state: signed, and the spread
+
+
+def _deviations(mine: Traced, theirs: Sequence[Traced]) -> list[_Apart]:
+    """Return the difference of a motion from the mean of others, and their spread, for each of `KINDS`."""
+    numbers = np.array([one.numbers() for one in theirs])
+    mean = numbers.mean(axis=0)
+    found: list[_Apart] = [
+        (signed, _spread(apart, kind.usual))
+        for signed, apart, kind in zip(
+            mine.numbers() - mean, (numbers - mean).transpose(1, 0, 2), (KINDS[0], KINDS[1], *KINDS[3:]), strict=True
+        )
+    ]
+    rotations = [one.rotations for one in theirs if one.rotations is not None]
+    if mine.rotations is None or len(rotations) < len(theirs):
+        found.insert(2, (None, np.ones(STATES)))
+    else:
+        middle = _mean_rotation(rotations)
+        apart = np.array([_angles_deg(middle, one) for one in rotations])
+        found.insert(2, (_angles_deg(middle, mine.rotations), _spread(apart, KINDS[2].usual)))
+    return found
+
+
+def _spread(apart: Floats, usual: float) -> Floats:
+    """Return the standard deviation at each state from deviations, (N, STATES), and the usual one; for a new motion."""
+    squared = np.pad((apart**2).sum(axis=0), WIDE, mode="edge")
+    smooth = np.convolve(squared, np.full(2 * WIDE + 1, 1.0 / (2 * WIDE + 1)), mode="valid")
+    smooth = np.maximum(smooth, np.median(smooth) / 2.0)
+    variance = (smooth + ASSUMED * usual**2) / (len(apart) - 1 + ASSUMED)
+    return np.asarray(np.sqrt(variance * (1.0 + 1.0 / len(apart))))
+
+
+def _own_spread(theirs: Sequence[Traced]) -> list[float]:
+    """Return, for each kind, the largest difference of one of the expert's motions from the others, in spreads."""
+    largest = [0.0] * len(KINDS)
+    for one in range(len(theirs) if len(theirs) > 2 else 0):
+        others = [*theirs[:one], *theirs[one + 1 :]]
+        for kind, (signed, spread) in enumerate(_deviations(theirs[one], others)):
+            if signed is not None:
+                largest[kind] = max(largest[kind], float((np.abs(signed) / spread).max()))
+    return largest
+
+
+def _mean_rotation(rotations: Sequence[Floats]) -> Floats:
+    """Return the rotation nearest to several at each state, shape (STATES, 3, 3): the projection of their mean."""
+    left, _, right = np.linalg.svd(np.mean(rotations, axis=0))
+    flip = np.sign(np.linalg.det(left @ right))
+    left[:, :, 2] *= flip[:, None]
+    return np.asarray(left @ right)
+
+
+def _angles_deg(rotations: Floats, others: Floats) -> Floats:
+    """Return the angle between two rotations at each state, in degrees."""
+    trace = np.einsum("nij,nij->n", rotations, others)
+    return np.asarray(np.degrees(np.arccos(((trace - 1.0) / 2.0).clip(-1.0, 1.0))))
+
+
+# ---- places and words -----------------------------------------------------------------------------------------------
+
+Region = tuple[int, int]  # first and last state
+
+
+def _regions(spreads: Floats, least: float) -> Iterator[tuple[Region, float]]:
+    """Yield the regions of the largest differences above a least one, and the largest in each."""
+    left = spreads.copy()
+    for _ in range(NAMED):
+        most = int(left.argmax())
+        if not left[most] > least:
+            return
+        yield _around_it(left > REGION * left[most], most), float(left[most])
+        first, last = _around_it(left > REGION * least, most)  # its slopes are of the same difference
+        left[first : last + 1] = 0.0
+
+
+def _around_it(above: Flags, at: int) -> Region:
+    """Return the first and the last of the states around one that are set without a gap."""
+    first = last = at
+    while first > 0 and above[first - 1]:
+        first -= 1
+    while last < STATES - 1 and above[last + 1]:
+        last += 1
+    return first, last
+
+
+def _ranked(found: list[tuple[int, Region, float]]) -> list[tuple[int, Region, float]]:
+    return sorted(found, key=lambda one: -one[2])
+
+
+def _named(
+    mine: Traced, theirs: Sequence[Traced], signed: Floats | None, kind: int, where: Region, spreads: float
+) -> NamedDifference | None:
+    """Return a difference with its words; None if its time is too short to notice."""
+    assert signed is not None
+    first, last = where
+    clock_s = mine.moving_s + mine.resting_s
+    if KINDS[kind].unit == "s":
+        clocks = [one.moving_s if KINDS[kind].name == "time in motion" else one.resting_s for one in (mine, *theirs)]
+        before, after = max(first - AROUND, 0), min(last + AROUND, STATES - 1)
+        if KINDS[kind].name == "time in motion":
+            before, after = first, last
+        mine_s, *their_s = (float(clock[after] - clock[before]) for clock in clocks)
+        expert, amount = float(np.mean(their_s)), mine_s - float(np.mean(their_s))
+        if abs(amount) < LEAST_S:
+            return None
+    else:
+        at = first + int(np.abs(signed[first : last + 1]).argmax())
+        amount = float(signed[at])
+        expert = _expert_at(theirs, kind, at)
+    start, end = first / (STATES - 1), last / (STATES - 1)
+    there = f"From {100 * start:.0f} to {100 * end:.0f} % of the way"
+    words = f"{there} {_words(kind, amount, expert, _speed(theirs, where))}"
+    start_s, end_s = float(clock_s[first]), float(clock_s[last])
+    return NamedDifference(
+        KINDS[kind].name, KINDS[kind].unit, start, end, start_s, end_s, amount, expert, spreads, words
+    )
+
+
+def _expert_at(theirs: Sequence[Traced], kind: int, at: int) -> float:
+    """Return the expert's mean at a state: mm beside or above the straight line, or degrees since the start."""
+    if KINDS[kind].name == "wrist":
+        rotations = [one.rotations for one in theirs if one.rotations is not None]
+        return float(np.mean([_angles_deg(one[[0]], one[[at]])[0] for one in rotations]))
+    return float(np.mean([one.shape_mm[at, 1 + kind] for one in theirs]))
+
+
+def _speed(theirs: Sequence[Traced], where: Region) -> float:
+    """Return the expert's mean speed in a region, in mm/s of the reference."""
+    first, last = max(where[0] - 1, 0), min(where[1] + 1, STATES - 1)
+    ways = [np.linalg.norm(np.diff(one.shape_mm[first : last + 1], axis=0), axis=1).sum() for one in theirs]
+    times = [one.moving_s[last] - one.moving_s[first] for one in theirs]
+    return float(np.sum(ways) / max(np.sum(times), 1e-3))
+
+
+def _words(kind: int, amount: float, expert: float, speed_mm_s: float) -> str:
+    name = KINDS[kind].name
+    if name == "wrist":
+        return (
+            f"the wrist is turned by up to {amount:.0f} degrees from the expert's; the expert has turned it there by "
+            f"{expert:.0f} degrees since the start."
+        )
+    if name == "pause":
+        more = "longer" if amount > 0 else "shorter"
+        rests = f"rests {expert:.1f} s" if expert >= REST_S else f"moves on at {speed_mm_s:.0f} mm/s"
+        return f"the motion pauses {abs(amount):.1f} s {more} than the expert's, who {rests} there."
+    if name == "time in motion":
+        slower = "slower" if amount > 0 else "faster"
+        return (
+            f"the motion is {slower}: it takes {expert + amount:.1f} s, where the expert takes {expert:.1f} s at "
+            f"{speed_mm_s:.0f} mm/s."
+        )
+    sides = (("to the right of", "to the left of"), ("lower than", "higher than"))[kind]
+    line = (("right of", "left of"), ("below", "above"))[kind]
+    return (
+        f"the tip is up to {abs(amount):.1f} mm {sides[int(amount > 0)]} the expert's, which is there "
+        f"{abs(expert):.1f} mm {line[int(expert > 0)]} the straight line to the goal."
+    )

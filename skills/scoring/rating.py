@@ -18,8 +18,7 @@ from skills.arrays import Floats
 from skills.errors import BadInput
 from skills.fields import Fraction, Sha256, schema
 from skills.scoring.calibration import LEAST_RATING, LEVELS, MOST_RATING, PARTS, SkillModel
-from skills.scoring.features import FigureKind
-from skills.scoring.trials import KIND_OF, SIDES, TrialFigures, TrialKind
+from skills.scoring.features import SIDES, TRIAL_KIND_OF, FigureKind, TrialFigures, TrialKind
 from skills.scoring.validation import known_parts, level_refusals
 
 TOLD = 3  # terms in words
@@ -150,7 +149,7 @@ def _terms(model: SkillModel, task: int, values: Floats, thirds: Floats) -> Iter
     points = model.standard(task, values) * weights
     by_third = (thirds - model.thirds_centre[task]) / model.thirds_scale[task] * weights
     for number in np.argsort(-np.abs(points), kind="stable").tolist():
-        kind = KIND_OF[model.figures[number]]
+        kind = TRIAL_KIND_OF[model.figures[number]]
         first, middle, last = by_third[:, number].tolist()
         yield Term(
             name=kind.name,
@@ -194,7 +193,7 @@ def _thirds_in_words(terms: Sequence[Term]) -> str:
 def _outside(model: SkillModel, task: int, values: Floats) -> Iterator[str]:
     for name, value, low, high in zip(model.figures, values, model.lowest[task], model.highest[task], strict=True):
         if not low <= value <= high:
-            kind = KIND_OF[name]
+            kind = TRIAL_KIND_OF[name]
             unit = f" {kind.unit}" if kind.unit else ""
             found, least, most = (_rounded(kind, one) for one in (value, low, high))
             yield f"{kind.label} is {found}{unit}; the calibration data has {least} to {most}{unit}."

@@ -3,8 +3,8 @@
     Trajectory, ArmErrors --referee--> Refereed: hand-offs held, and the closed form in the same worlds
     Physics: friction, grip and stiffness, each of which is also halved and doubled
 
-One trial is one world of `skills.verification.errors`: PSM_M's base, both wrists, both tips and the needle are off by
-the same draws as in the closed form. What happens then is decided by forces alone:
+One trial is one world of `skills.verification.arm_errors`: PSM_M's base, both wrists, both tips and the needle are off
+by the same draws as in the closed form. What happens then is decided by forces alone:
 
 1. PSM_A closes on the needle, and gravity begins.
 2. Both arms follow the planned motion from where PSM_M's fingers cannot have touched anything yet, until both stand.
@@ -46,6 +46,7 @@ from skills.planning.handoff import HELD_MM, NEEDLE_RADIUS_MM, OPEN_RAD
 from skills.planning.trajectory import A2, Trajectory
 from skills.sandbox import ProcessLimits
 from skills.simulation.player import array_from, simulated
+from skills.verification.arm_errors import ArmErrors, Displaced, Drawn, draw
 from skills.verification.clearance import (
     ASIDE_MM,
     FINGER_RADIUS_MM,
@@ -57,7 +58,6 @@ from skills.verification.clearance import (
     psm_m_poses,
     stands_from,
 )
-from skills.verification.errors import ArmErrors, Displaced, Drawn, draw
 from skills.verification.monte_carlo import at_hand_off, caught_by, scene_of
 from skills.verification.probabilities import DoubtSettings, Probability, share
 

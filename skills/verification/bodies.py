@@ -43,8 +43,8 @@ from skills.fields import Count, Figure, schema
 from skills.kinematics import CLASSIC, INSERTION, SI, WRIST_MM, axes_of, instrument_of, matrix_of
 from skills.planning.motion_laws import PHASES
 from skills.planning.trajectory import Trajectory
+from skills.verification.arm_errors import Displaced
 from skills.verification.clearance import FINGER_REACH_MM, SHAFT_RADIUS_MM
-from skills.verification.errors import Displaced
 from skills.verification.playback import CLEARANCE_SEEN_MM, PSM_A, PSM_M
 
 MARGIN_MM = 10.0  # ours: what each radius below is larger than the outline that it stands for, where one is known

@@ -39,9 +39,8 @@ from skills.planning.handoff import HELD_MM, JAW_CLOSED_RAD, JAW_OPEN_RAD, JAW_S
 from skills.planning.motion_laws import A1, A2, TRANSFER
 from skills.planning.passes import STAND_OFF_MM
 from skills.planning.trajectory import Trajectory
-from skills.verification.asked import Asked
+from skills.verification.asked import REST_S, Asked, Moments
 from skills.verification.clearance import stands_from
-from skills.verification.moments import REST_S, Moments
 
 STILL = 0.002  # of the greatest speed of a pass: an arm below it stands
 STAND_S = 0.25  # ours: so long it may, where the hand did not: more than a stroke needs to turn round

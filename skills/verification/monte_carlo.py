@@ -57,6 +57,7 @@ from skills.kinematics import (
 from skills.planning.handoff import HELD_MM, hand_off
 from skills.planning.motion_laws import Pose
 from skills.planning.trajectory import A2, Trajectory
+from skills.verification.arm_errors import CALIBRATED, CALLED, UNCALIBRATED, ArmErrors, Displaced, Drawn, draw
 from skills.verification.bodies import too_near
 from skills.verification.clearance import (
     FINGER_REACH_MM,
@@ -71,7 +72,6 @@ from skills.verification.clearance import (
     openings,
     travel_mm,
 )
-from skills.verification.errors import CALIBRATED, CALLED, UNCALIBRATED, ArmErrors, Displaced, Drawn, draw
 from skills.verification.gates import Limits
 from skills.verification.probabilities import (
     AT_THE_END,

@@ -16,7 +16,7 @@ from skills.errors import BadSettings
 from skills.fields import Count, Figure, Fraction, Point, schema, stored_schema
 from skills.learning.slip import wilson
 from skills.planning.handoff import OPEN_RAD
-from skills.verification.errors import ArmErrors
+from skills.verification.arm_errors import ArmErrors
 from skills.verification.gates import Limits
 
 # 1: tip errors alone, stated as a mean length. 2: PSM_M's jaw open throughout, fingers touch in the last sample alone,

@@ -1,4 +1,4 @@
-"""Timelines as values: motions as columns on one clock, to be played and compared.
+"""Timelines: motions as columns on one clock, to be played and compared.
 
     Timeline
     ├── ArmTrack   the motion of one arm: tip, jaws, joints, speed, outer bodies
@@ -6,17 +6,39 @@
     └── Stage      a named interval
 
 The clock is even: row i of a column is at `start_s` + i / `rate_hz`. Values between two samples are interpolated, turns
-on the shorter way; where an arm was not recorded they are NaN. `skills.verification.timelines` makes them. Nothing is
-learnt or judged from a timeline.
+on the shorter way; where an arm was not recorded they are NaN. Nothing is learnt or
+judged from a timeline. They are made from the samples of recordings, demonstrations, learnt paths and plans:
+
+    Recording                   --timeline_of_recording--> Timeline
+    Recording, Demo             --timeline_of_demo-->      Timeline
+    PosePath                    --timeline_of_path-->      Timeline
+    Trajectory, Playback, odds  --timeline_of_plan-->      Timeline
+
+The arms' outer bodies are sent at fewer times, because they are large and slow (`Timeline.every`).
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from itertools import pairwise
+from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from skills.arrays import Floats
+from skills.demonstration.demonstration import Demo, partner_motion
+from skills.demonstration.movement import press_times, same_signs, smoothed_speed
+from skills.demonstration.partner import STEADY_MM
+from skills.demonstration.recording import Motion, Recording
 from skills.fields import Column, Count, schema
+from skills.kinematics import INSTRUMENTS, forward, matrix_of, quaternion_of
+from skills.learning.pose_style import PosePath
+from skills.planning.motion_laws import PHASES
+from skills.planning.trajectory import Trajectory
+from skills.verification.bodies import Parts, between, names_of, parts_of, radii_of
+from skills.verification.clearance import FINGER_MM
+from skills.verification.gates import Limits
+from skills.verification.playback import PSM_A, PSM_M, Playback
 
 Kind = Literal["recording", "demonstration", "learnt path", "plan"]
 
@@ -128,3 +150,311 @@ class Timeline:
     def seconds(self) -> Floats:
         """Return the times of the rows, in s."""
         return self.start_s + np.arange(self.rows) / self.rate_hz
+
+
+RATE_HZ = 200.0  # ours: faster samples of a hand are not visible
+MOST_ROWS = 24_000  # ours: two minutes at that rate, 4 MB for two arms with joints; longer motions get a lower rate
+BODIES_HZ = 20.0  # ours: interpolated over a twentieth of a second a body is 1 mm off at 200 mm/s
+
+_Samples = tuple[Floats, Floats]  # stamps in s, (N,), and values, (N,) or (N, K)
+_Base = tuple[Floats, Floats]  # of an arm in the frame of its poses: rotation (3, 3), position (3,)
+
+
+@dataclass(frozen=True, eq=False)
+class _Clock:
+    """The times of the rows in s, shape (T,), and how many rows lie between two rows of bodies."""
+
+    at_s: Floats
+    rate_hz: float
+
+    @classmethod
+    def of(cls, start_s: float, end_s: float, rate_hz: float) -> "_Clock":
+        rate_hz = min(rate_hz, RATE_HZ, (MOST_ROWS - 1) / max(end_s - start_s, 1e-9))
+        rows = 1 + int((end_s - start_s) * rate_hz + 1e-6)
+        return cls(start_s + np.arange(rows) / rate_hz, rate_hz)
+
+    @property
+    def every(self) -> int:
+        return max(1, int(self.rate_hz / BODIES_HZ))
+
+    def column(self, stamps_s: Floats, values: ArrayLike) -> Floats:
+        """Return values at the rows, (T,) or (T, K); NaN more than two samples outside of their stamps."""
+        numbers = np.asarray(values, np.float64)
+        table = numbers.reshape(len(stamps_s), -1)
+        found = np.stack([np.interp(self.at_s, stamps_s, one) for one in table.T], axis=1)
+        slack = 2 / self.rate_hz
+        found[(self.at_s < stamps_s[0] - slack) | (self.at_s > stamps_s[-1] + slack)] = np.nan
+        return found.reshape(len(self.at_s), *numbers.shape[1:])
+
+    def turns(self, stamps_s: Floats, rotation_xyzw: Floats) -> Floats:
+        """Return orientations at the rows, unit quaternions, (T, 4)."""
+        found = self.column(stamps_s, same_signs(rotation_xyzw))
+        return np.asarray(found / np.linalg.norm(found, axis=1, keepdims=True))
+
+    def track(
+        self,
+        arm: str,
+        frame: str,
+        pose: tuple[Floats, Floats, Floats | None],
+        jaw: _Samples | None = None,
+        joints: _Samples | None = None,
+        instrument: str | None = None,
+        base: _Base | None = None,
+    ) -> tuple[ArmTrack, Parts | None]:
+        """Return an arm's columns, and its parts at the rows of bodies.
+
+        Args:
+            arm: Its name.
+            frame: The frame of its poses.
+            pose: Stamps in s, positions, and orientations if they are known.
+            jaw: Stamps and angles of the jaw.
+            joints: Stamps and joints.
+            instrument: Number of its instrument.
+            base: The rotation of its base in the frame, (3, 3), and its position, (3,); None if they are not known.
+        """
+        stamps_s, tip_mm, rotation = pose
+        known = instrument in INSTRUMENTS
+        found = None if joints is None else self.column(*joints)
+        parts, bodies, radii, ends = None, [], [], None
+        if found is not None and known and base is not None:
+            assert instrument is not None
+            parts = parts_of(found[:: self.every], instrument).seen_from(*base)
+            bodies, radii = list(names_of(instrument)[:-1]), radii_of(instrument)[:-1].tolist()
+            ends = np.concatenate([parts.begin_mm, parts.end_mm], axis=2)[:, :-1]
+        where = self.column(stamps_s, tip_mm)
+        speed = np.interp(self.at_s, *smoothed_speed(stamps_s, tip_mm))
+        speed[np.isnan(where[:, 0])] = np.nan
+        track = ArmTrack(
+            arm=arm,
+            frame=frame,
+            instrument=instrument,
+            tip_mm=_column(where),
+            rotation_xyzw=None if rotation is None else _column(self.turns(stamps_s, rotation)),
+            jaw_rad=None if jaw is None else _column(self.column(*jaw)),
+            joints=None if found is None else _column(found),
+            speed_mm_s=_column(speed),
+            bodies=tuple(bodies),
+            radii_mm=tuple(radii),
+            bodies_mm=None if ends is None else _column(ends),
+        )
+        return track, parts
+
+    def timeline(self, kind: Kind, arms: Sequence[tuple[ArmTrack, Parts | None]], **more: Any) -> Timeline:
+        """Return a timeline of arms, with the distance between the bodies of the first two if both are known."""
+        steps = [np.linalg.norm(np.diff(one.tip_mm, axis=0), axis=1) for one, _ in arms]
+        way = np.append(0.0, np.cumsum(np.nan_to_num(np.sum(steps, axis=0))))
+        traces = list(more.pop("traces", ()))
+        posed = [(track, parts) for track, parts in arms[:2] if parts is not None and more["in_one_frame"]]
+        if len(posed) == 2:
+            (a, parts), (b, others) = posed
+            apart = between(parts, radii_of(str(a.instrument)), others, radii_of(str(b.instrument))).min(axis=(1, 2))
+            values = np.interp(self.at_s, self.at_s[:: self.every], apart)
+            traces.insert(0, Trace("Outer bodies apart", "mm", Limits().clearance_bodies_mm, _column(values)))
+        return Timeline(
+            kind=kind,
+            rate_hz=self.rate_hz,
+            rows=len(self.at_s),
+            start_s=float(self.at_s[0]),
+            arms=tuple(track for track, _ in arms),
+            way=_column(way / way[-1] if way[-1] > 0 else way),
+            traces=tuple(traces),
+            every=self.every,
+            finger_mm=FINGER_MM,
+            **more,
+        )
+
+
+def _column(values: Floats) -> Any:
+    column = np.array(values, np.float32)
+    column.setflags(write=False)
+    return column
+
+
+# ---- recordings ----------------------------------------------------------------------------------------------------
+
+
+def timeline_of_recording(recording: Recording) -> Timeline:
+    """Return a recording as a timeline.
+
+    Arms are shown in one frame if each was recorded in it. Outer bodies are shown where joints were recorded and the
+    place of the base in that frame is known and stood still.
+    """
+    motions, together = _motions(recording)
+    clock = _Clock.of(0.0, recording.duration_s, _rate_hz(motions))
+    arms = []
+    for one in motions:
+        pose = recording.seconds(one.stamps_ns), one.tip_mm, one.rotation_xyzw
+        known = _signals(recording, one.arm)
+        arms.append(
+            clock.track(one.arm, one.frame, pose, *known, recording.instrument_on(one.arm), _base(recording, one))
+        )
+    return clock.timeline("recording", arms, in_one_frame=together, **_session(recording, 0.0, recording.duration_s))
+
+
+def timeline_of_demo(recording: Recording, demo: Demo) -> Timeline:
+    """Return a demonstration in its frame, with the other arm if that was recorded all along it.
+
+    Args:
+        recording: The recording from which it was cut.
+        demo: The demonstration, as `cut_demo` returned it.
+    """
+    seconds, m = demo.start_s + demo.stamps_s, demo.partner
+    motion = recording.motion_of(arm=demo.arm, topic=demo.topic)
+    clock = _Clock.of(demo.start_s, demo.end_s, _rate_hz([motion]))
+    still = (np.eye(3), np.zeros(3)) if motion.states_base or recording.base_under(motion) is not None else None
+    known = _signals(recording, demo.arm)
+    pose = seconds, demo.tip_mm, demo.rotation_xyzw
+    arms = [clock.track(demo.arm, demo.frame, pose, *known, demo.instrument, still)]
+    other = partner_motion(recording, demo)
+    if m is not None and other is not None:
+        base = None
+        if m.base_mm is not None and m.base_xyzw is not None:
+            base = matrix_of(np.array([m.base_xyzw]))[0], np.asarray(m.base_mm)
+        pose = seconds, other.tip_mm, other.rotation_xyzw
+        arms.append(clock.track(m.arm, demo.frame, pose, *_signals(recording, m.arm), m.instrument, base))
+    return clock.timeline("demonstration", arms, in_one_frame=True, **_session(recording, demo.start_s, demo.end_s))
+
+
+def _rate_hz(motions: Sequence[Motion]) -> float:
+    return max((1e9 / float(np.median(np.diff(m.stamps_ns))) for m in motions if len(m.stamps_ns) > 1), default=1.0)
+
+
+def _motions(recording: Recording) -> tuple[list[Motion], bool]:
+    """Return a motion for each arm, and whether they are in one frame, as they are if there is one for all."""
+    arms = recording.arms
+    if len(arms) > 1:
+        for frame in sorted({one.frame for one in recording.motions if not one.states_base}):
+            there = [one for one in recording.motions if one.frame == frame and not one.states_base]
+            found = [next(one for one in there if one.arm == arm) for arm in arms if arm in {one.arm for one in there}]
+            if len(found) == len(arms):
+                return found, True
+    return [recording.motion_of(arm=arm) for arm in arms], len(arms) == 1
+
+
+def _signals(recording: Recording, arm: str) -> tuple[_Samples | None, _Samples | None]:
+    """Return the jaw and the joints of an arm, each with its stamps in s."""
+    jaw = recording.jaw_of(arm)
+    joints = next((one for one in recording.joints if one.arm == arm and one.positions.shape[1] >= 6), None)
+    return (
+        None if jaw is None or not len(jaw.values) else (recording.seconds(jaw.stamps_ns), jaw.values),
+        None if joints is None else (recording.seconds(joints.stamps_ns), joints.positions[:, :6]),
+    )
+
+
+def _base(recording: Recording, motion: Motion) -> _Base | None:
+    if motion.states_base:
+        return np.eye(3), np.zeros(3)
+    for base in recording.bases:
+        if base.is_of(motion) and base.spread_mm <= STEADY_MM:
+            return matrix_of(np.array([base.rotation_xyzw]))[0], np.asarray(base.position_mm)
+    return None
+
+
+def _session(recording: Recording, start_s: float, end_s: float) -> dict[str, Any]:
+    """Return the clutch and the stages in a part of a recording."""
+    last_ns = recording.origin_ns + round(recording.duration_s * 1e9)
+    presses = [] if recording.clutch is None else press_times(recording.clutch)
+    down = [(first, last_ns if last is None else last) for first, last in presses]
+
+    def within(spans_ns: Sequence[tuple[int, int]]) -> list[tuple[float, float] | None]:
+        spans = recording.seconds(np.array(spans_ns, np.int64).reshape(-1, 2)).tolist()
+        return [(first, last) if last > start_s and first < end_s else None for first, last in spans]
+
+    stages = within([(one.start_ns, one.end_ns) for one in recording.labels])
+    return {
+        "clutch_s": tuple(span for span in within(down) if span),
+        "stages": tuple(Stage(one.name, *at) for one, at in zip(recording.labels, stages, strict=True) if at),
+    }
+
+
+# ---- learnt paths and plans ----------------------------------------------------------------------------------------
+
+
+def timeline_of_path(path: PosePath, *, arm: str, frame: str) -> Timeline:
+    """Return the motion that a pose style gives at its own place, in the tempo of its demonstrations."""
+    clock = _Clock.of(0.0, float(path.elapsed_s[-1]), RATE_HZ)
+    jaw = None if path.jaw_rad is None else (path.elapsed_s, path.jaw_rad)
+    arms = [clock.track(arm, frame, (path.elapsed_s, path.tip_mm, path.rotation_xyzw), jaw)]
+    if path.partner is not None:
+        other = path.partner
+        arms.append(clock.track(other.arm, frame, (path.elapsed_s, other.tip_mm, other.rotation_xyzw)))
+    return clock.timeline("learnt path", arms, in_one_frame=True, clutch_s=(), stages=())
+
+
+def timeline_of_plan(
+    trajectory: Trajectory,
+    *,
+    arm: str,
+    frame: str,
+    played: Playback | None = None,
+    odds: Mapping[int, float] | None = None,
+) -> Timeline:
+    """Return a plan's motion in the base frame of PSM_A.
+
+    Args:
+        trajectory: The motion.
+        arm: Name of PSM_A.
+        frame: Name of its base frame.
+        played: The newest playback, of which the distances are shown; None if there is none.
+        odds: For each pass the probability that it succeeds.
+    """
+    t, m, at_s = trajectory, trajectory.psm_m, trajectory.stamps_s
+    clock = _Clock.of(float(at_s[0]), float(at_s[-1]), t.rate_hz)
+    jaw = None if t.jaw_rad is None else (at_s, t.jaw_rad)
+    still = np.eye(3), np.zeros(3)
+    poses = at_s, t.tip_mm, t.rotation_xyzw
+    arms = [clock.track(f"{PSM_A} ({arm})", frame, poses, jaw, (at_s, t.joints), t.instrument, still)]
+    if m is not None:
+        base = matrix_of(m.base_xyzw[None])[0], m.base_mm
+        tip_mm, rotation = forward(m.joints, m.instrument)
+        seen = at_s, tip_mm @ base[0].T + base[1], quaternion_of(base[0] @ rotation)
+        arms.append(clock.track(PSM_M, frame, seen, None, (at_s, m.joints), m.instrument, base))
+    return clock.timeline(
+        "plan",
+        arms,
+        in_one_frame=True,
+        clutch_s=(),
+        stages=_stages(t),
+        traces=(*_distances(clock, t, played), *_odds(clock, t, odds or {})),
+    )
+
+
+def _stages(t: Trajectory) -> tuple[Stage, ...]:
+    """Return the phases of all passes; between two passes is the pause."""
+    key = t.pass_index * len(PHASES) + t.phase
+    edges = np.concatenate([[0], np.flatnonzero(np.diff(key)) + 1, [len(t)]])
+    stages = []
+    for first, after in pairwise(edges.tolist()):
+        last = after if after < len(t) and t.pass_index[after] == t.pass_index[first] else after - 1
+        name = f"pass {t.pass_index[first]}: {PHASES[t.phase[first]]}"
+        stages.append(Stage(name, float(t.stamps_s[first]), float(t.stamps_s[last])))
+    return tuple(stages)
+
+
+def _distances(clock: _Clock, t: Trajectory, played: Playback | None) -> list[Trace]:
+    """Return the least distances that the simulator measured, from the pad and between the tools."""
+    if played is None or len(played) != len(t):
+        return []
+    limits, pairs, stamps_s = Limits(), played.link_pairs, t.stamps_s[played.looked_at]
+    found = []
+    for name, other, limit in (
+        ("Tools above the pad", "pad", limits.clearance_pad_mm),
+        ("Tools apart", PSM_M, limits.clearance_psm_m_mm),
+    ):
+        columns = [k for k, pair in enumerate(pairs) if pair.other == other and not pair.may_touch]
+        if columns:
+            least = played.clearances_mm[:, columns].min(axis=1)
+            found.append(Trace(name, "mm", limit, _column(clock.column(stamps_s, least))))
+    return found
+
+
+def _odds(clock: _Clock, t: Trajectory, odds: Mapping[int, float]) -> list[Trace]:
+    """Return the probability of each pass while it lasts."""
+    if not odds:
+        return []
+    begins = np.searchsorted(t.stamps_s, clock.at_s + 1e-9, side="right").clip(1) - 1
+    ends = t.stamps_s[t.last_samples]
+    number = t.pass_index[begins]
+    values = np.array([odds.get(one, np.nan) for one in range(t.passes)])[number]
+    values[clock.at_s > ends[number] + 1e-6] = np.nan
+    return [Trace("The pass succeeds", "", None, _column(values))]

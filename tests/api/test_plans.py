@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from skills.verification.errors import UNCALIBRATED, ArmErrors
+from skills.verification.arm_errors import UNCALIBRATED, ArmErrors
 from tests.api.service import GOAL_MM, KESTREL, Service, assert_problem, copy_of_trained, serving
 from tests.arms import ARMS
 from tests.db.test_packed import forged

@@ -14,8 +14,7 @@ from skills.formats import writer as messages
 from skills.formats.writer import Message, write_messages
 from skills.kinematics import forward, quaternion_of
 from skills.library.arm_errors import read_measured, stated_errors
-from skills.verification.errors import SIZES, UNCALIBRATED
-from skills.verification.measured_errors import calibrate_arm
+from skills.verification.arm_errors import SIZES, UNCALIBRATED, calibrate_arm
 from tests.formats.bags import sample_folder
 from tests.verification.test_measured_errors import recorded
 

@@ -8,7 +8,7 @@ import pytest
 
 from skills.library.plans import hands_over, plan_in_words
 from skills.library.playbacks import headline
-from skills.verification.errors import CALIBRATED, UNCALIBRATED
+from skills.verification.arm_errors import CALIBRATED, UNCALIBRATED
 from skills.verification.monte_carlo import doubt
 from skills.verification.probabilities import JUDGE_VERSION, DoubtSettings
 from tests.verification.test_monte_carlo import PAD_TOP_MM, motion

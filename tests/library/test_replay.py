@@ -27,7 +27,7 @@ from skills.library.replay import check_doubt, cleared, replay_bag
 from skills.packing import canonical, sha256
 from skills.schemas.requests import PlanIn
 from skills.transparency import PublicKey, read_notes
-from skills.verification.errors import CALIBRATED, UNCALIBRATED, ArmErrors
+from skills.verification.arm_errors import CALIBRATED, UNCALIBRATED, ArmErrors
 from skills.verification.playback import Playback, link_pairs
 from skills.verification.probabilities import JUDGE_VERSION
 from tests.independent_history import check_envelope

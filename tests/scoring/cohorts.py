@@ -5,7 +5,7 @@ from typing import Literal
 import numpy as np
 
 from skills.scoring.calibration import LEVELS, OUTCOMES, Cohort
-from skills.scoring.trials import NAMES
+from skills.scoring.features import TRIAL_NAMES
 
 Rule = Literal["skill", "plain", "nothing", "surgeon", "duration", "shared"]
 
@@ -33,10 +33,12 @@ def cohort(
         """Return a number for each trial: half of its variance is the surgeon's, in all tasks."""
         return size * (rng.normal(size=surgeons)[whose] + rng.normal(size=count)) / np.sqrt(2.0)
 
-    skill, figures = effects(1.0), np.stack([effects(1.0) for _ in NAMES], axis=1)
+    skill, figures = effects(1.0), np.stack([effects(1.0) for _ in TRIAL_NAMES], axis=1)
     if rule == "shared":
         figures[:, 1:] = figures[:, :1] + 0.5 * figures[:, 1:]
-    better = np.where(np.arange(len(NAMES)) % 2, 1.0, -1.0)  # more of one figure is better, more of the other worse
+    better = np.where(
+        np.arange(len(TRIAL_NAMES)) % 2, 1.0, -1.0
+    )  # more of one figure is better, more of the other worse
     if rule == "skill":
         figures += skill[:, None] * np.append(-0.5, better[1:])
     if rule == "plain":
@@ -53,7 +55,7 @@ def cohort(
     parts = np.rint(np.clip(ratings[:, None] / 6 + rng.normal(0.0, 0.4, (count, OUTCOMES - 1)), 1, 5))
     means = np.array([ratings[whose == surgeon].mean() for surgeon in range(surgeons)])
     levels = means.argsort().argsort() * len(LEVELS) // surgeons
-    noise = rng.normal(0.0, 0.3, (count, sides, len(NAMES)))
+    noise = rng.normal(0.0, 0.3, (count, sides, len(TRIAL_NAMES)))
     values = figures[:, None] + noise * (np.arange(sides) > 0)[:, None]
     return Cohort(
         names=tuple(f"Task_{letter}" for letter in "ABC"[:tasks]),

@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from skills.demonstration.demonstration import Demo
 from skills.errors import BadPath
-from skills.scoring import differences as module
-from skills.scoring.differences import Differences, differences
+from skills.scoring import deviation as module
+from skills.scoring.deviation import Differences, differences
 
 RATE_HZ = 100.0
 PLANTED = {"deeper": "height", "slower": "time in motion", "turned": "wrist", "stopped": "pause"}

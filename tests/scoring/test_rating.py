@@ -8,11 +8,11 @@ import pytest
 
 from skills.errors import BadInput
 from skills.scoring.calibration import PARTS, SkillModel
+from skills.scoring.features import TRIAL_KIND_OF, TRIAL_KINDS, TRIAL_NAMES, TrialFigures
 from skills.scoring.rating import Skill, rate
-from skills.scoring.trials import KIND_OF, KINDS, NAMES, TrialFigures
 
-F = len(NAMES)
-PATH, IDLE = NAMES.index("path_length_mm"), NAMES.index("idle_share")
+F = len(TRIAL_NAMES)
+PATH, IDLE = TRIAL_NAMES.index("path_length_mm"), TRIAL_NAMES.index("idle_share")
 JUDGED: dict[str, Any] = {
     "trials": 40,
     "surgeons": 8,
@@ -37,7 +37,7 @@ def model(**changed: object) -> SkillModel:
     scale[0, PATH], scale[0, IDLE] = np.log(2.0), 0.1
     numbers: dict[str, object] = {
         "tasks": ("Knot_Tying",),
-        "figures": NAMES,
+        "figures": TRIAL_NAMES,
         "masters": False,
         "together": True,
         "strength": 10.0,
@@ -132,6 +132,6 @@ def test_a_trial_with_nan_is_no_trial() -> None:
 
 
 def test_every_figure_can_be_read_in_its_unit() -> None:
-    for kind in KINDS:
+    for kind in TRIAL_KINDS:
         assert kind.readable(kind.modelled(3.5)) == pytest.approx(3.5), kind.name
-    assert len({kind.name for kind in KINDS}) == len(KINDS) == len(KIND_OF)
+    assert len({kind.name for kind in TRIAL_KINDS}) == len(TRIAL_KINDS) == len(TRIAL_KIND_OF)

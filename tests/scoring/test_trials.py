@@ -10,7 +10,7 @@ from skills.demonstration.motion import Motion, Signal
 from skills.demonstration.recording import Recording
 from skills.errors import BadInput
 from skills.formats.jigsaws import read_jigsaws
-from skills.scoring.trials import KINDS, NAMES, TrialFigures, measure_trial
+from skills.scoring.features import TRIAL_KINDS, TRIAL_NAMES, TrialFigures, measure_trial
 from tests.library import rated
 
 PERIOD_S, RADIUS_MM = 4.0, 20.0
@@ -47,7 +47,7 @@ def circle(
 
 
 def readable(found: TrialFigures, side: int = 0) -> dict[str, float]:
-    return {kind.name: kind.readable(float(one)) for kind, one in zip(KINDS, found.values[side], strict=True)}
+    return {kind.name: kind.readable(float(one)) for kind, one in zip(TRIAL_KINDS, found.values[side], strict=True)}
 
 
 def test_the_figures_of_a_circle_are_those_by_hand() -> None:
@@ -96,7 +96,7 @@ def trial_at(rate_hz: float, seed: int = 3) -> Recording:
 def test_the_rate_of_the_recording_does_not_matter() -> None:
     """A trial recorded at 30 Hz and at 200 Hz has figures within 2 %, or 0.02 without a logarithm."""
     slow, fast = (measure_trial(trial_at(rate)) for rate in (30.0, 200.0))
-    off = dict(zip(NAMES, np.abs(slow.values - fast.values)[0].tolist(), strict=True))
+    off = dict(zip(TRIAL_NAMES, np.abs(slow.values - fast.values)[0].tolist(), strict=True))
     assert max(off.values()) < 0.02, off
 
 
@@ -111,16 +111,16 @@ def test_thirds_are_the_figures_of_the_parts_cut_out() -> None:
     """The middle third of a trial has the figures of a recording of it, but for the window at its ends."""
     found = measure_trial(trial_at(100.0))
     third = found.thirds[0, 1]
-    assert KINDS[0].readable(float(third[0])) == pytest.approx(29.9 / 3, rel=0.01)
-    paths = [KINDS[1].readable(float(one[1])) for one in found.thirds[0]]
-    assert KINDS[1].readable(float(found.values[0, 1])) == pytest.approx(sum(paths), rel=0.02)
+    assert TRIAL_KINDS[0].readable(float(third[0])) == pytest.approx(29.9 / 3, rel=0.01)
+    paths = [TRIAL_KINDS[1].readable(float(one[1])) for one in found.thirds[0]]
+    assert TRIAL_KINDS[1].readable(float(found.values[0, 1])) == pytest.approx(sum(paths), rel=0.02)
 
 
 def test_masters_are_a_side_of_their_own() -> None:
     instruments = (circle("PSM1"), circle("PSM2"))
     masters = (circle("MTML", radius_mm=50.0), circle("MTMR", radius_mm=50.0))
     found = measure_trial(recording(*instruments, masters=masters))
-    assert found.values.shape == (2, len(KINDS)) and found.thirds.shape == (2, 3, len(KINDS))
+    assert found.values.shape == (2, len(TRIAL_KINDS)) and found.thirds.shape == (2, 3, len(TRIAL_KINDS))
     ratio = readable(found, 1)["path_length_mm"] / readable(found, 0)["path_length_mm"]
     assert ratio == pytest.approx(2.5, rel=1e-6)
     one = measure_trial(recording(*instruments, masters=masters[:1]))

@@ -10,7 +10,7 @@ from skills.errors import BadSettings
 from skills.library.arm_errors import stated_errors
 from skills.schemas.requests import PlaybackIn
 from skills.settings import Settings
-from skills.verification.errors import CALIBRATED, CALLED, NAMED, SIZES, UNCALIBRATED, ArmErrors
+from skills.verification.arm_errors import CALIBRATED, CALLED, NAMED, SIZES, UNCALIBRATED, ArmErrors
 from tests.arms import ARMS
 
 PLAN = "0" * 64

@@ -7,12 +7,14 @@ import pytest
 
 from skills.errors import BadInput
 from skills.kinematics import forward
-from skills.verification.errors import SIZES, UNCALIBRATED, rotation_of
-from skills.verification.measured_errors import (
+from skills.verification.arm_errors import (
     LEAST_EFFECTIVE,
+    SIZES,
+    UNCALIBRATED,
     Measured,
     calibrate_arm,
     effective_number,
+    rotation_of,
 )
 
 

@@ -16,9 +16,9 @@ from skills.learning.pose_style import PosePath
 from skills.planning.passes import PassPath
 from skills.planning.trajectory import Trajectory, time_parametrise
 from skills.verification.bodies import names_of, parts_of, radii_of
-from skills.verification.timeline import Timeline
-from skills.verification.timelines import (
+from skills.verification.timeline import (
     MOST_ROWS,
+    Timeline,
     timeline_of_demo,
     timeline_of_path,
     timeline_of_plan,

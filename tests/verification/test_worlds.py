@@ -10,7 +10,7 @@ from skills.kinematics import POINTING_DOWN
 from skills.learning.slip import wilson
 from skills.planning.handoff import realign
 from skills.planning.trajectory import PassPath, Trajectory, time_parametrise
-from skills.verification.errors import MEAN_LENGTH, SIZES, ArmErrors
+from skills.verification.arm_errors import MEAN_LENGTH, SIZES, ArmErrors
 from skills.verification.gates import Limits
 from skills.verification.monte_carlo import doubt
 from skills.verification.probabilities import DoubtSettings

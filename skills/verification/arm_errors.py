@@ -1,4 +1,26 @@
-"""A laboratory's own errors: measured poses of an arm compared with its setpoints.
+"""Errors of real arms: their sizes, each with its source, seeded draws of them, and the measured ones of a laboratory.
+
+    ArmErrors: CALIBRATED, UNCALIBRATED, or a laboratory's own
+    seed --draw--> Drawn: random numbers of size 1 --Drawn.under(ArmErrors)--> Displaced: in mm and rad
+
+Five errors place the arms elsewhere than a plan says. All are normally distributed about zero, and their sizes are
+standard deviations along or about each axis:
+
+* Registration: PSM_M's base is offset, and turned about its remote centre. It is drawn once for a plan, because a base
+  stays where it is from pass to pass.
+* Wrist: each arm's jaws are turned about their hinge, the same over a pass. By how far the wrist's error displaces that
+  hinge is a part of the tip's error, which is measured there.
+* Tip bias: each arm as a whole is offset, the same over a pass.
+* Tip noise: each arm as a whole is offset by a stationary noise (Ornstein-Uhlenbeck) that changes during a pass. Two
+  moments correlate by exp(-seconds between them / correlation time).
+
+Two more errors belong to the pass and not to the arms, and are drawn uniformly: the shift of the suture point along
+each axis, and the needle's rotation in PSM_A's jaws, about any axis.
+
+Each error has its own stream of random numbers, decided by the seed, the error and the pass. So if one error is set to
+zero, all others are drawn as before, and the difference is the effect of that error.
+
+A laboratory measures its own errors by comparing measured poses of an arm with its setpoints:
 
     setpoints, measured poses --Measured--> errors per sample --calibrate_arm--> ArmCalibration, with ArmErrors
 
@@ -19,18 +41,280 @@ frame, and the rest is the error. An error that a registration can explain is re
 that the error can be.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from math import exp, inf, log, sqrt
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from math import exp, inf, isfinite, log, pi, radians, sqrt
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
 from skills.arrays import Floats, frozen
-from skills.errors import BadInput
+from skills.errors import BadInput, BadSettings
 from skills.fields import Count, Fraction, schema
-from skills.kinematics import check_rotation, quaternion_of
-from skills.verification.errors import CALIBRATED, MEAN_LENGTH, UNCALIBRATED, ArmErrors
+from skills.kinematics import check_rotation, matrix_of, quaternion_of
+
+MEAN_LENGTH = sqrt(8 / pi)  # of a vector of three standard normal numbers
+CALIBRATED_MM, UNCALIBRATED_MM = 0.65, 2.96  # mean tracking errors of a dVRK (Hwang et al., arXiv:2003.08520)
+_MOST = 1000.0  # mm, degrees or s; a greater one has a mistaken unit
+_NAME_LENGTH, _SOURCE_LENGTH = 60, 600
+
+
+@schema
+@dataclass(frozen=True)
+class ArmErrors:
+    """The errors of two arms, as standard deviations along or about each axis.
+
+    Attributes:
+        name: "calibrated", "uncalibrated", or a laboratory's name for its own arms.
+        registration_mm: Offset of PSM_M's base from its stated place in PSM_A's base frame, mm.
+        registration_deg: Rotation of that base about its remote centre, degrees.
+        wrist_deg: Rotation of either arm's jaws about their hinge, degrees.
+        tip_bias_mm: Offset of either arm that stays over a pass, mm; its mean length is 1.6 times as much.
+        tip_noise_mm: Offset of either arm that varies during a pass, mm.
+        tip_correlation_s: Correlation time of that noise, s; 0: every checked sample has its own.
+        sources: For each of these six sizes its source, and the reason for its value.
+    """
+
+    name: str
+    registration_mm: float
+    registration_deg: float
+    wrist_deg: float
+    tip_bias_mm: float
+    tip_noise_mm: float
+    tip_correlation_s: float
+    sources: Mapping[str, str]
+
+    def __post_init__(self) -> None:
+        if not (self.name.strip() and len(self.name) <= _NAME_LENGTH and self.name.isprintable()):
+            raise BadSettings(f"Errors of an arm need a name of 1 to {_NAME_LENGTH} characters on one line.")
+        for size in SIZES:
+            value = getattr(self, size)
+            if not (isfinite(value) and 0 <= value <= _MOST):
+                raise BadSettings(f"{size} must be a number from 0 to {_MOST:g}.", given=value)
+            if not 0 < len(self.sources.get(size, "").strip()) <= _SOURCE_LENGTH:
+                raise BadSettings(f"{size} needs its source: give sources.{size} in 1 to {_SOURCE_LENGTH} characters.")
+        if unknown := set(self.sources) - set(SIZES):
+            raise BadSettings(f"sources has {sorted(unknown)[0]}, which is none of {', '.join(SIZES)}.")
+        object.__setattr__(self, "sources", dict(self.sources))
+
+    def without(self, size: str) -> "ArmErrors":
+        """Return the same errors with one of `SIZES` set to zero."""
+        changed: dict[str, Any] = {size: 0.0}
+        return replace(self, **changed)
+
+    @property
+    def in_words(self) -> str:
+        """Return the sizes as a phrase."""
+        return (
+            f"registration {self.registration_mm:g} mm and {self.registration_deg:g} degrees, wrist {self.wrist_deg:g} "
+            f"degrees, tip {self.tip_bias_mm:g} mm constant and {self.tip_noise_mm:g} mm varying in "
+            f"{self.tip_correlation_s:g} s"
+        )
+
+
+SIZES = tuple(field.name for field in fields(ArmErrors) if field.name not in ("name", "sources"))
+# What a size is called in sentences. The correlation time is not an error by itself.
+CALLED = MappingProxyType(
+    {
+        "registration_mm": "the offset of PSM_M's base",
+        "registration_deg": "the rotation of PSM_M's base",
+        "wrist_deg": "the wrists' error",
+        "tip_bias_mm": "the tips' constant error",
+        "tip_noise_mm": "the tips' varying error",
+    }
+)
+
+_ENCODERS = (
+    "Setpoints and encoders of a Classic PSM in a published recording (KinematicCalibDVRK, raw_sensor_rosbag_09_traj3) "
+    "differ by 0.12 to 0.21 mm along an axis; that is the servo's part, without the cables'."
+)
+_STROKE = "Ours: the servo's error follows speed and friction, which change within a stroke of about half a second."
+_TRACKING = (
+    "Hwang et al., arXiv:2003.08520, measured a mean tracking error of {} mm of a dVRK {} calibration; a normal offset "
+    "of this mean length deviates by 0.63 times as much along each axis."
+)
+CALIBRATED = ArmErrors(
+    name="calibrated",
+    registration_mm=0.7,
+    registration_deg=0.25,
+    wrist_deg=1.0,
+    tip_bias_mm=round(CALIBRATED_MM / MEAN_LENGTH, 2),
+    tip_noise_mm=0.2,
+    tip_correlation_s=0.5,
+    sources={
+        "registration_mm": "The dVRK's documentation of the setup joints: once registered with an external sensor, "
+        "arms are within a couple of millimetres. 2 mm is taken as the length that 95 % of the offsets keep.",
+        "registration_deg": "Ours, no published value is known: 150 mm from the remote centre it moves the tip by 0.65 "
+        "mm, about as much as the offset.",
+        "wrist_deg": "Ours, no published value is known: a third of the uncalibrated one. The calibration cited for "
+        "the tip reduces its error to less than a quarter.",
+        "tip_bias_mm": _TRACKING.format(CALIBRATED_MM, "after"),
+        "tip_noise_mm": _ENCODERS,
+        "tip_correlation_s": _STROKE,
+    },
+)
+UNCALIBRATED = ArmErrors(
+    name="uncalibrated",
+    registration_mm=14.4,
+    registration_deg=3.0,
+    wrist_deg=3.0,
+    tip_bias_mm=round(UNCALIBRATED_MM / MEAN_LENGTH, 2),
+    tip_noise_mm=0.2,
+    tip_correlation_s=0.5,
+    sources={
+        "registration_mm": "The dVRK's documentation of the setup joints: their potentiometers place an instrument "
+        "within a cube of 50 mm. Evenly distributed over it, it deviates by 14.4 mm along each axis.",
+        "registration_deg": "Ours, no published value is known: the same potentiometers measure the base's rotation, "
+        "through six joints.",
+        "wrist_deg": "Ours, no published value is known: the wrist's cables stretch, and its encoders sit at the "
+        "motors. 3 degrees move the finger tips by half a millimetre.",
+        "tip_bias_mm": _TRACKING.format(UNCALIBRATED_MM, "before"),
+        "tip_noise_mm": _ENCODERS,
+        "tip_correlation_s": _STROKE,
+    },
+)
+NAMED = MappingProxyType({one.name: one for one in (CALIBRATED, UNCALIBRATED)})
+
+
+def checked_own(own: ArmErrors) -> ArmErrors:
+    """Return a laboratory's own errors.
+
+    Raises:
+        BadSettings: They have the name of a default, and differ from it.
+    """
+    if own.name in NAMED and own != NAMED[own.name]:
+        raise BadSettings(f"Errors named {own.name} are those of this version; give your own another name.")
+    return own
+
+
+# ---- draws -------------------------------------------------------------------------------------------------------
+
+_STREAMS = ("registration", "registration_turn", "wrist", "tip_bias", "tip_noise", "suture_point", "needle")
+
+
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """Random errors for N variations of a pass that is checked in S samples; arms are PSM_A and PSM_M.
+
+    Attributes:
+        registration: Offset of PSM_M's base, of size 1, shape (N, 3).
+        registration_turn: Rotation vector of that base, of size 1, shape (N, 3).
+        wrist: Rotation vector of each arm's jaws, of size 1, shape (2, N, 3).
+        tip_bias: Constant offset of each arm, of size 1, shape (2, N, 3).
+        tip_noise: Independent numbers of size 1 of which each arm's noise is made, shape (2, N, S, 3).
+        shift_mm: Shift of the pass from its planned place, shape (N, 3).
+        turned: Rotation of the needle about PSM_A's grip, shape (N, 3, 3).
+    """
+
+    registration: Floats
+    registration_turn: Floats
+    wrist: Floats
+    tip_bias: Floats
+    tip_noise: Floats
+    shift_mm: Floats
+    turned: Floats
+
+    def under(self, errors: ArmErrors, stamps_s: Floats) -> "Displaced":
+        """Return the displacements of both arms.
+
+        Args:
+            errors: The sizes of the errors.
+            stamps_s: Times of the checked samples, ascending, shape (S,).
+        """
+        base = radians(errors.registration_deg) * self.registration_turn
+        jaws = radians(errors.wrist_deg) * self.wrist
+        noise = errors.tip_noise_mm * _correlated(self.tip_noise, stamps_s, errors.tip_correlation_s)
+        return Displaced(
+            base_mm=errors.registration_mm * self.registration,
+            base_turn=rotation_of(base),
+            base_rad=np.linalg.norm(base, axis=1),
+            jaw_turn=rotation_of(jaws.reshape(-1, 3)).reshape(2, -1, 3, 3),
+            jaw_rad=np.linalg.norm(jaws, axis=2),
+            tip_mm=errors.tip_bias_mm * self.tip_bias[:, :, None] + noise,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Displaced:
+    """The displacements of both arms in N variations of a pass, in S samples.
+
+    Attributes:
+        base_mm: Offset of PSM_M's base in PSM_A's base frame, shape (N, 3).
+        base_turn: Rotation of that base about its remote centre, in the same frame, shape (N, 3, 3).
+        base_rad: The angle of this rotation, shape (N,).
+        jaw_turn: Rotation of each arm's jaws about their hinge, in the same frame, shape (2, N, 3, 3).
+        jaw_rad: The angles of these rotations, shape (2, N).
+        tip_mm: Offset of each arm as a whole in PSM_A's base frame, shape (2, N, S, 3).
+    """
+
+    base_mm: Floats
+    base_turn: Floats
+    base_rad: Floats
+    jaw_turn: Floats
+    jaw_rad: Floats
+    tip_mm: Floats
+
+    def at(self, chunk: slice) -> "Displaced":
+        """Return a slice of the variations."""
+        return Displaced(
+            self.base_mm[chunk],
+            self.base_turn[chunk],
+            self.base_rad[chunk],
+            self.jaw_turn[:, chunk],
+            self.jaw_rad[:, chunk],
+            self.tip_mm[:, chunk],
+        )
+
+
+def draw(seed: int, number: int, variations: int, samples: int, *, suture_point_mm: float, needle_rad: float) -> Drawn:
+    """Draw the variations of a pass; the same arguments give the same bytes.
+
+    Args:
+        seed: Seed of the random numbers, 0 or more.
+        number: Number of the pass, which gives each pass its own random numbers; all passes have the same registration.
+        variations: Number of variations, N.
+        samples: Number of checked samples of the pass, S.
+        suture_point_mm: Greatest shift of the pass along each axis.
+        needle_rad: Greatest rotation of the needle.
+    """
+    one_base = _stream(seed, "registration", 0), _stream(seed, "registration_turn", 0)
+    needle = _stream(seed, "needle", number)
+    axis = needle.standard_normal((variations, 3))
+    angle = needle.uniform(-needle_rad, needle_rad, (variations, 1))
+    return Drawn(
+        registration=one_base[0].standard_normal((variations, 3)),
+        registration_turn=one_base[1].standard_normal((variations, 3)),
+        wrist=_stream(seed, "wrist", number).standard_normal((2, variations, 3)),
+        tip_bias=_stream(seed, "tip_bias", number).standard_normal((2, variations, 3)),
+        tip_noise=_stream(seed, "tip_noise", number).standard_normal((2, variations, samples, 3)),
+        shift_mm=_stream(seed, "suture_point", number).uniform(-suture_point_mm, suture_point_mm, (variations, 3)),
+        turned=rotation_of(angle * axis / np.linalg.norm(axis, axis=1, keepdims=True)),
+    )
+
+
+def _stream(seed: int, error: str, number: int) -> np.random.Generator:
+    key = (_STREAMS.index(error), number)
+    return np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed, spawn_key=key)))
+
+
+def rotation_of(vectors: Floats) -> Floats:
+    """Return the rotations about axes, by their lengths in rad: vectors of shape (N, 3) to (N, 3, 3)."""
+    half = np.linalg.norm(vectors, axis=1, keepdims=True) / 2
+    # sin(x) / x, which numpy has for pi x, is 1 where nothing turns
+    return matrix_of(np.concatenate([np.sinc(half / pi) * vectors / 2, np.cos(half)], axis=1))
+
+
+def _correlated(normal: Floats, stamps_s: Floats, correlation_s: float) -> Floats:
+    """Return noise of size 1 with this correlation time, made of independent numbers, both of shape (2, N, S, 3)."""
+    if correlation_s == 0:
+        return normal
+    made = normal.copy()
+    keeps = np.exp(-np.diff(stamps_s) / correlation_s)
+    for k, kept in enumerate(keeps.tolist(), start=1):
+        made[:, :, k] = kept * made[:, :, k - 1] + sqrt(max(0.0, 1 - kept * kept)) * normal[:, :, k]
+    return made
+
 
 BAND, _HALF_BAND = 0.9, 1.6449  # of a normal error, in deviations
 BLOCKS = 6  # ours: with fewer the others are too few, with more a block is no longer than the errors last
