@@ -387,7 +387,9 @@ GUARDS = (
          "tests/library/test_parsed.py", "tests/library/test_what_remains.py", TOLD),
     ),
     Guard("skills/library/sweep.py", 14, ("tests/library/test_sweep.py", "tests/library/test_what_remains.py")),
-    Guard("skills/library/signatures.py", 12, ("tests/api/test_signatures.py",)),
+    Guard(
+        "skills/library/proofs.py", 12, ("tests/api/test_signatures.py",), ("head_over", "first_head", "sign_files"),
+    ),
     Guard("skills/library/relearning.py", 16, ("tests/library/test_relearning.py",)),
     Guard(
         "skills/library/backup.py", 20, ("tests/library/test_restoring.py", "tests/library/test_backup.py"),

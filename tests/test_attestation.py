@@ -9,9 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as some
 
-from skills.attestation import LONGEST, Statement, attest, pae, read_envelope
 from skills.errors import BadSignature, Corrupt
-from skills.transparency import Checkpoint, PublicKey, SigningKey, Tree
+from skills.transparency import LONGEST, Checkpoint, PublicKey, SigningKey, Statement, Tree, attest, pae, read_envelope
 from tests.independent_history import check_envelope
 
 KEY, ORIGIN = SigningKey(bytes(range(32))), "suture-skills/0123456789abcdef"

@@ -18,7 +18,7 @@ from skills.api.openapi import complete
 from skills.api.policy_cache import AtHand, PolicyCache
 from skills.api.problems import TOO_LARGE, answer_refusals
 from skills.api.responses import DOWNLOADS_READ, Encoded, Watching
-from skills.api.routes import catalogue, datasets, demos, operating, pages, plans, policies, proposals, timelines
+from skills.api.routes import catalogue, demos, operating, pages, plans, policies, timelines
 from skills.api.sessions import Sessions
 from skills.db.session import Database
 from skills.jobs import Engine
@@ -86,7 +86,6 @@ def create_app(settings: Settings) -> FastAPI:
         catalogue.router,
         demos.uploads,
         demos.router,
-        proposals.router,
         policies.job_router,
         policies.router,
         plans.router,
@@ -96,14 +95,13 @@ def create_app(settings: Settings) -> FastAPI:
         timelines.router,
         policies.retraining_router,
         policies.card_router,
-        datasets.router,
+        demos.dataset_router,
         demos.atlas_router,
         demos.score_router,
         operating.router,
         operating.reference_router,
         pages.router,
         demos.page_router,
-        proposals.page_router,
         timelines.page_router,
         operating.sign_in_router,
         catalogue.key_router,

@@ -17,8 +17,8 @@ from fastapi import Depends, Header, Path, Query, Request, Response
 from fastapi.routing import APIRoute
 from starlette.requests import ClientDisconnect
 
+from skills.api.authentication import RateLimits
 from skills.api.authorisation import Asking
-from skills.api.rate_limits import RateLimits
 from skills.db.session import Database
 from skills.errors import TooLarge, TooSlow, UnknownFormat, UnreadableRecording
 from skills.formats import BYTES, MEDIA_TYPES, media_type_of

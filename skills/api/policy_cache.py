@@ -24,8 +24,8 @@ from skills.db.session import Database
 from skills.errors import Busy, SkillsError, UnknownFormat
 from skills.library import consent, integrity, neighbours, policies
 from skills.library.history import sign_history
+from skills.library.proofs import first_head
 from skills.library.releases import STANDS
-from skills.library.signatures import first_head
 
 Style = tuple[str, str, str]  # surgeon, suture type, and media type of the response, or `POSES`, or `SIGNATURE`
 

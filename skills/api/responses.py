@@ -41,11 +41,10 @@ from skills.formats import BYTES
 from skills.library import policies
 from skills.library.integrity import covered, learnt
 from skills.library.jobs import ACTIVE, find_job, find_jobs, job_json
-from skills.library.policies import Served
-from skills.library.pose_styles import pose_style_json, poses_of
+from skills.library.policies import Served, pose_style_json, poses_of
+from skills.library.proofs import sign_files
 from skills.library.recordings import damaged
 from skills.library.releases import outcomes_of
-from skills.library.signatures import sign_files
 from skills.settings import MEBIBYTE, Settings
 from skills.transparency import Note
 

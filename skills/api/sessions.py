@@ -31,9 +31,9 @@ from sqlalchemy.exc import SQLAlchemyError
 from starlette.types import Scope
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
+from skills.api.authentication import Bucket
 from skills.api.authorisation import Caller
 from skills.api.dependencies import strictly_read
-from skills.api.rate_limits import Bucket
 from skills.api.responses import json_of
 from skills.db.changes import Changes
 from skills.db.models import Release
@@ -42,8 +42,7 @@ from skills.errors import Busy, SkillsError, TooMany
 from skills.fields import as_json
 from skills.learning.tube import CertifiedPoses, next_pose
 from skills.library import consent, releases
-from skills.library.policies import policy_of
-from skills.library.pose_styles import next_json, poses_of
+from skills.library.policies import next_json, policy_of, poses_of
 from skills.schemas.requests import PoseIn
 from skills.settings import Settings
 

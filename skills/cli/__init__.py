@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from skills.cli import arms, comparison, datasets, demos, installation, plans, policies, recordings, tries
+from skills.cli import comparison, demos, installation, plans, policies, recordings, tries
 from skills.cli.shell import err, out, tell
 from skills.remedies import did_you_mean
 
@@ -78,11 +78,9 @@ for commands in (  # the order of the commands in `skills --help`
     tries.commands,
     recordings.commands,
     demos.commands,
-    datasets.commands,
     policies.learning_commands,
     policies.commands,
     plans.commands,
-    arms.commands,
     comparison.commands,
     comparison.scoring_commands,
     comparison.report_commands,

@@ -33,10 +33,9 @@ from skills.client.connection import (
     call,
     given,
 )
-from skills.client.datasets import Datasets
 from skills.client.plans import Plans
 from skills.client.policies import Atlases, Jobs, Policies, Scores, steps_of
-from skills.client.recordings import Catalogue, Recordings
+from skills.client.recordings import Catalogue, Datasets, Recordings
 from skills.client.transport import Awaited, Blocking, Progress, Retrying, Transport
 from skills.errors import BadSettings
 from skills.remedies import Action, Remedy

@@ -23,7 +23,6 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from skills.arrays import Floats, Ints
-from skills.attestation import Statement, read_envelope
 from skills.errors import BadBag, Corrupt, UnknownInstrument
 from skills.formats.archive import Archive, shown
 from skills.formats.bag_folder import METADATA
@@ -35,7 +34,7 @@ from skills.formats.writer import DEFINITIONS, Written, metadata_of
 from skills.kinematics import INSERTION, JOINTS, angle_between, forward, instrument_of, joint_margins, matrix_of
 from skills.packing import canonical, sha256
 from skills.planning.trajectory import joint_ratios
-from skills.transparency import PublicKey, read_notes
+from skills.transparency import PublicKey, Statement, read_envelope, read_notes
 
 PLAN, VERDICT, POLICY, README = "plan.json", "verdict.json", "policy.json", "README.txt"
 EXECUTOR = "executor.json"  # the timetable

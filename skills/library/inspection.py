@@ -47,8 +47,7 @@ from skills.library.calibrations import read_calibration
 from skills.library.history import Verified, verify_history
 from skills.library.integrity import covered, demo_identity, planned, policy_identity, posed
 from skills.library.jobs import identity_of
-from skills.library.policies import path_of
-from skills.library.pose_styles import poses_of_demonstrations
+from skills.library.policies import path_of, poses_of_demonstrations
 from skills.library.recordings import Teller, alike, cached_content, read_entry, recording_bytes
 from skills.library.relearning import Again, Recordings, compute_again, decoded, learn_again
 from skills.packing import canonical, sha256

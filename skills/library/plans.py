@@ -2,15 +2,20 @@
 
 PlanIn --plan_sutures--> Plan, stored
 recording of a simulated scene --find_suture_points--> SuturePoints, not stored
+ReachIn --map_style--> Reach: at which suture points a style can be planned, not stored
 """
 
+from collections import Counter
 from dataclasses import asdict, dataclass, replace
 from functools import partial
+from math import ceil, floor, prod
 from typing import Any
 
+import numpy as np
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
+from skills.arrays import xyz
 from skills.db import rfc3339
 from skills.db.models import Plan, PolicyVersion, StoredPlayback
 from skills.db.service_tables import record_event
@@ -28,11 +33,15 @@ from skills.library.integrity import find_by_digest, learnt, plan_identity, plan
 from skills.library.policies import combined_of, learnt_from
 from skills.library.recordings import Reader, Upload, read_upload
 from skills.planning.handoff import PsmM
-from skills.planning.path_fit import jaw_recorded, styled
+from skills.planning.path_fit import ends_of, jaw_recorded, styled
 from skills.planning.plan import SuturePlan, pose_xyzw, stack, turn_deg
 from skills.planning.trajectory import Trajectory, seams, seconds_by_phase, time_parametrise, transfers
 from skills.remedies import Action, Remedy
+from skills.schemas import PolicyName
+from skills.schemas.given import Reach
+from skills.schemas.reach import ReachIn
 from skills.schemas.requests import PlanIn, PsmMIn
+from skills.verification.reach import MAX_PLACES, ReachPlace, map_reach
 
 
 def find_suture_points(upload: Upload, arm: str | None, frame: str | None, read: Reader) -> SuturePoints:
@@ -457,3 +466,82 @@ def plan_json(row: Plan) -> dict[str, Any]:
         "in_words": plan_in_words(row.about),
         "created_at": rfc3339(row.created_at),
     }
+
+
+def map_style(database: Database, request: ReachIn) -> Reach:
+    """Return where a plan of one pass is possible, without storing a plan.
+
+    Raises:
+        BadPlan: There are too many places, the frame is not an arm's base, or a plan with these settings is refused
+            wherever it is.
+        NoApproach, NoHandOff: As of a plan.
+        Conflict: The surgeon's consent does not cover training.
+    """
+    counts, rotations = _counts(request.size_mm, request.step_mm), len(request.rotations_xyzw)
+    if (places := prod(counts) * rotations) > MAX_PLACES:
+        wider = (step for step in range(ceil(request.step_mm), 402))
+        least = next(step for step in wider if prod(_counts(request.size_mm, step)) * rotations <= MAX_PLACES)
+        raise BadPlan(
+            f"A map of {places} places is too large; {MAX_PLACES} are the most.",
+            f"Give a step of {least} mm, a smaller box, or fewer rotations.",
+            places=places,
+        )
+    style = style_of(database, request.surgeon, request.suture, request.version)
+    centre_mm = request.centre_mm or xyz(ends_of(style.demo, style.policy.path)[1])
+    plan = stacked(request.plan_at(centre_mm), style)
+    check_frame(plan.frame)
+    axes = [(np.arange(one) - (one - 1) / 2) * request.step_mm for one in counts]
+    box = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    found = map_reach(plan, (np.array(centre_mm) + box).round(6))
+    x, y, z = counts
+    return Reach(
+        surgeon=request.surgeon,
+        suture=request.suture,
+        policy=PolicyName(version=style.version, sha256=style.sha256),
+        arm=plan.arm,
+        frame=plan.frame,
+        step_mm=request.step_mm,
+        counts=(x, y, z),
+        rotations=rotations,
+        places=found,
+        in_words=in_words(found),
+    )
+
+
+def _counts(size_mm: tuple[float, float, float], step_mm: float) -> list[int]:
+    """Return the number of places along each axis."""
+    return [floor(size / step_mm + 1e-9) + 1 for size in size_mm]
+
+
+def in_words(places: list[ReachPlace]) -> str:
+    """Return the result as sentences: how many places are possible, and what limits most of the others."""
+    yes = sum(one.reach == "yes" for one in places)
+    words = f"{yes} of {len(places)} places can be planned, each in a plan of its own."
+    limits = Counter(one.limited_by for one in places if one.reach == "no" and one.limited_by is not None)
+    if limits:
+        name, count = limits.most_common(1)[0]
+        words += f" Most others are refused for {CALLED.get(name, f'the limits of {name}')} ({count})."
+    doubt = sum(one.reach == "in doubt" for one in places)
+    return words + (f" {doubt} are so near to a limit that only a plan decides." if doubt else "")
+
+
+CALLED = {
+    "bodies": "the distance of the arms' outer bodies",
+    "tools": "the distance of the two tools",
+    "scene": "the distance from tissue and obstacles",
+    "needle": "the needle in the tissue",
+}
+
+
+def check_frame(frame: str) -> None:
+    """Refuse a frame that is not an arm's base.
+
+    Raises:
+        BadPlan: Joints can be solved in the frame of the arm's base only.
+    """
+    if not frame.endswith("_base"):
+        raise BadPlan(
+            f"The plan is in the frame '{frame}', which is not the frame of the arm's base, so the joints cannot "
+            "be computed; demonstrate with local/measured_cp.",
+            frame=frame,
+        )

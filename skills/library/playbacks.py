@@ -26,12 +26,12 @@ from skills.db import rfc3339
 from skills.db.models import StoredPictures, StoredPlayback
 from skills.db.service_tables import Job, record_event
 from skills.db.session import Database
-from skills.errors import BadPlan, Conflict, NotDrawnYet
+from skills.errors import Conflict, NotDrawnYet
 from skills.library import jobs, releases
 from skills.library.arm_errors import stated_errors
 from skills.library.integrity import find_by_digest, learnt, planned
 from skills.library.jobs import PICTURES, PicturesRequest, PlaybackRequest
-from skills.library.plans import find_plan, hand_of, hands_over, plan_in_words, psm_m_moves, trajectory_of
+from skills.library.plans import check_frame, find_plan, hand_of, hands_over, plan_in_words, psm_m_moves, trajectory_of
 from skills.packing import canonical, sha256
 from skills.planning.trajectory import Trajectory
 from skills.remedies import Action, Remedy
@@ -321,20 +321,6 @@ def trajectory_digest(trajectory: Trajectory) -> str:
     if trajectory.jaw_rad is not None:
         parts.append(trajectory.jaw_rad)
     return sha256(b"".join(part.tobytes() for part in parts))
-
-
-def check_frame(frame: str) -> None:
-    """Refuse a frame that is not an arm's base.
-
-    Raises:
-        BadPlan: Joints can be solved in the frame of the arm's base only.
-    """
-    if not frame.endswith("_base"):
-        raise BadPlan(
-            f"The plan is in the frame '{frame}', which is not the frame of the arm's base, so the joints cannot "
-            "be computed; demonstrate with local/measured_cp.",
-            frame=frame,
-        )
 
 
 def _finite(data: Any) -> Any:

@@ -1,8 +1,13 @@
-"""Policies of a style: the served version, the history, rollouts, the arrays for a client, and the demonstrations.
+"""Policies of a style: the served version, history, rollouts, arrays for a client, demonstrations and pose style.
 
 A policy may be learnt from several demonstrations. A combined path that is none of the demonstrations is stored only as
 the policy's path. To get more of it, combine the demonstrations again, which gives the same result; `skills verify`
 compares the resulting path with the policy's.
+
+A pose style belongs to its policy version: it is released, withdrawn, covered by consent and erased with it.
+
+    PolicyVersion --poses_of--> CertifiedPoses, verified, if its tube's certificate holds
+    PolicyVersion --poses_of_demonstrations--> the same, computed again from what is stored
 """
 
 import io
@@ -25,15 +30,16 @@ from skills.gridworld.domain import FINISHED, OUTSIDE
 from skills.gridworld.grid import GridPath
 from skills.learning.evaluation import dtw
 from skills.learning.policy import Policy, rollout
+from skills.learning.tube import CertifiedPoses, PoseStep, certified_poses, next_pose
 from skills.library import consent, integrity, releases
 from skills.library.catalogue import find_surgeon, find_suture_type
 from skills.library.demos import find_demo, newest_demos
-from skills.library.integrity import covered, learnt
+from skills.library.integrity import covered, learnt, posed
 from skills.library.jobs import KEPT, RetrainingRequest, with_rule
 from skills.library.releases import is_served
 from skills.remedies import Action, Remedy
 from skills.schemas import policies as described
-from skills.schemas.policies import Rollout
+from skills.schemas.policies import NextPose, Rollout
 
 MAX_JSON_ACTIONS = 10**6  # ours: above it, JSON has the certified domain alone, in `live_actions`
 MOST_DEMOS = 50  # ours: all pairs are compared, and the combined path with each some ten times, in a third of a second
@@ -520,3 +526,97 @@ def combined_of(version: PolicyVersion) -> Combined | None:
 def _followed(version: PolicyVersion) -> Followed:
     rows = version.demonstrations
     return followed([one.demo for one in rows], [one.path for one in rows], combining_of(version.manifest["combined"]))
+
+
+FORMAT = "suture-skills pose style 1"
+
+
+def poses_of(version: PolicyVersion) -> CertifiedPoses:
+    """Return the pose style of a policy version, verified.
+
+    Raises:
+        NotFound: It has none, with the reason: it is older than pose styles, its demonstrations have no orientation, or
+            the certificate of the tube does not hold.
+        Corrupt: The stored one does not match its digest.
+    """
+    if version.poses is None:
+        raise _absent(version)
+    poses = posed(version.poses)
+    if not poses.tube.holds:
+        raise NotFound(
+            f"The pose style of version {version.version} is not served, because the certificate of its tube does not "
+            f"hold: {'; '.join(poses.tube.faults)}.",
+            "Use the policy of the grid, or record the hand-off more slowly.",
+        )
+    return poses
+
+
+def _absent(version: PolicyVersion) -> NotFound:
+    """Return the error that a version has no pose style, with the reason."""
+    surgeon, suture = version.surgeon.slug, version.suture
+    without = [one.sha256[:12] for one in version.demonstrations if one.demo.rotation_xyzw is None]
+    if without:
+        return NotFound(
+            f"Version {version.version} has no pose style, because its demonstration {', '.join(without)} has no "
+            "orientation; record poses, and train from them."
+        )
+    return NotFound(
+        f"Version {version.version} has no pose style: it was trained before there were any.",
+        Remedy(Action.TRAIN, surgeon=surgeon, suture=suture),
+    )
+
+
+def poses_of_demonstrations(version: PolicyVersion, turn_share: float | None = None) -> CertifiedPoses | None:
+    """Compute the pose style of a policy version from its demonstrations; None if one has no orientation.
+
+    Args:
+        version: The version.
+        turn_share: The share of the demonstrations' mean turn; default: the one that `learn_pose_style` chooses.
+    """
+    demos, combined = version.demonstrations, version.manifest.get("combined")
+    at = 0 if combined is None else [one.sha256 for one in demos].index(combined["at"])
+    return certified_poses([one.demo for one in demos], at, turn_share)
+
+
+def pose_style_json(version: PolicyVersion, poses: CertifiedPoses) -> dict[str, Any]:
+    """Return the JSON of a pose style (`schemas.policies.PoseStyle`)."""
+    path = poses.path
+    return {
+        "format": FORMAT,
+        "version": version.version,
+        "sha256": version.sha256,
+        "surgeon": version.surgeon.slug,
+        "suture": version.suture,
+        "arm": poses.arm,
+        "frame": poses.frame,
+        "demos": version.manifest["demos"],
+        "position_mm": path.tip_mm.tolist(),
+        "rotation_xyzw": path.rotation_xyzw.tolist(),
+        "jaw_rad": None if path.jaw_rad is None else path.jaw_rad.tolist(),
+        "elapsed_s": path.elapsed_s.tolist(),
+        "spread_mm": path.spread_mm.tolist(),
+        "spread_rad": path.spread_rad.tolist(),
+        "turn_share": path.turn_share,
+        "tick_s": poses.tick_s,
+        "tube": as_json(poses.tube),
+        "partner": None if poses.partner is None else as_json(poses.partner),
+        "created_at": rfc3339(version.created_at),
+    }
+
+
+def next_json(poses: CertifiedPoses, step: PoseStep) -> dict[str, Any]:
+    """Return the JSON of a step (`schemas.policies.PoseAnswer`)."""
+    return {**vars(step), "inside": poses.tube.contains(step.off_mm, step.off_rad)}
+
+
+def about_next(
+    version: PolicyVersion,
+    poses: CertifiedPoses,
+    position_mm: Sequence[float],
+    rotation_xyzw: Sequence[float],
+    phase: int | None,
+) -> NextPose:
+    """Return the next pose of a version for a pose and its phase; see `skills.learning.tube.next_pose`."""
+    step = next_pose(poses.path, position_mm, rotation_xyzw, phase, poses.tube.limits)
+    named = {"version": version.version, "sha256": version.sha256, "frame": poses.frame, "tick_s": poses.tick_s}
+    return NextPose.model_validate(named | next_json(poses, step))

@@ -1,9 +1,18 @@
-"""Proofs of the history for a third party: which version of a style was served at a time, and the newest checkpoint.
+"""Proofs of the history for a third party, and signatures of files under its checkpoints.
 
-A proof is checked without the service and the database, given the verifier's key: the disclosed columns give some of
-the digests, the digests the commitment in the entry, and the entry with the hashes beside its path the signed root.
+A proof says which version of a style was served at a time. It is checked without the service and the database, given
+the verifier's key: the disclosed columns give some of the digests, the digests the commitment in the entry, and the
+entry with the hashes beside its path the signed root.
+
+Policies, cards and replay bags are signed under a checkpoint of the history that covers their rows:
+
+    rows --head_over--> the first checkpoint that covers them --sign_files--> a signed envelope about files
+
+Nothing is signed that the history does not have: the rows must be as their newest leaves say, and the leaves under the
+signed root. So somebody who can only write to the database gets no signature of what he wrote.
 """
 
+from collections.abc import Mapping, Sequence
 from datetime import datetime
 from typing import Any
 
@@ -11,15 +20,16 @@ from sqlalchemy import Connection, or_, select
 from sqlalchemy.orm import Session
 
 from skills.db import rfc3339
-from skills.db.history import LEAVES, History, Latest, latest_leaves
+from skills.db.history import CHECKPOINTS, LEAVES, History, Latest, latest_leaves
 from skills.db.logged_rows import as_bytes, logged
 from skills.db.models import PolicyVersion, Release
+from skills.db.session import Database
 from skills.db.tiles import stored_tiles
 from skills.errors import Busy, Corrupt, NotFound
 from skills.library.catalogue import find_surgeon
-from skills.library.history import newest_checkpoint
+from skills.library.history import newest_checkpoint, sign_history
 from skills.remedies import Action, Remedy
-from skills.transparency import Checkpoint, inclusion_proof, leaf_hash, node_from, proven_root, read_notes
+from skills.transparency import Checkpoint, Note, attest, inclusion_proof, leaf_hash, node_from, proven_root, read_notes
 
 DISCLOSED = {  # of the rows that a proof is about; the digests of their other columns reveal nothing without a guess
     "releases": ("row", "policy_row", "surgeon_row", "suture", "released_at", "released_by", "withdrawn_at"),
@@ -135,3 +145,56 @@ def _proofs(connection: Connection, keys: dict[str, str], note: str) -> list[dic
             }
         )
     return proofs
+
+
+Rows = Sequence[tuple[str, int]]  # a table, and the key of a row in it
+
+
+def head_over(database: Database, rows: Rows) -> Note:
+    """Return the first signed checkpoint that covers some rows; the history is signed if there is none yet.
+
+    Raises:
+        Corrupt: A row is not as the history has it, or the history is not as it was signed.
+        Busy: The history cannot be signed now.
+        BadSettings: The signing key cannot be read.
+    """
+    for _ in range(2):
+        with database.reading() as session:
+            head = first_head(session.connection(), database.history, rows)
+        if head is not None:
+            return head
+        sign_history(database, None)
+    raise Busy("The history is not signed up to these rows yet; try again in a second.")
+
+
+def first_head(connection: Connection, history: History, rows: Rows) -> Note | None:
+    """Return the first signed checkpoint that covers some rows; None if there is none yet.
+
+    Raises:
+        Corrupt: A row is not as the history has it, or the history is not as it was signed.
+        BadSettings: The signing key cannot be read.
+    """
+    leaves = [logged_leaf(connection, table, str(row)) for table, row in rows]
+    numbers = [number for _, number in leaves if number is not None]
+    if len(numbers) < len(leaves):
+        return None
+    query = select(CHECKPOINTS.c.note).where(CHECKPOINTS.c.size > max(numbers)).order_by(CHECKPOINTS.c.size)
+    for note in connection.scalars(query):
+        (head,) = read_notes(note)
+        if head.signed_by(history.key.public):  # those of an installation that a backup came from are not
+            for leaf, number in zip(leaves, numbers, strict=True):
+                covered_leaf(connection, leaf[0], number, head.checkpoint)
+            return head
+    return None
+
+
+def sign_files(history: History, head: Note, digests: Mapping[str, str], **facts: Any) -> bytes:
+    """Return a signed envelope about files.
+
+    Args:
+        history: The history, with its key.
+        head: The checkpoint that covers what the files are made of.
+        digests: The SHA-256 of each file in hex, by name.
+        facts: What is said about the files, as plain JSON.
+    """
+    return attest(digests, {**facts, "checkpoint": head.text}, history.key, head.checkpoint.origin)

@@ -31,7 +31,7 @@ from skills.formats.replay_bag import (
 )
 from skills.formats.verify import EXECUTOR, PLAN, POLICY, README, SIGNATURE, VERDICT
 from skills.learning.evaluation import TIE_BREAK, dtw
-from skills.library import consent, policies, releases, signatures
+from skills.library import consent, policies, proofs, releases
 from skills.library.demos import find_demo
 from skills.library.integrity import learnt, learnt_in, planned
 from skills.library.plans import describe_plan, find_plan, plan_in_words, trajectory_of
@@ -172,11 +172,11 @@ def replay_bag(
     members[EXECUTOR] = _written(
         {"use": USE, "plan": row.sha256, "before_each_pass": BY_HAND, "passes": timetable(trajectory, arms)}
     )
-    head = signatures.head_over(database, rows)
+    head = proofs.head_over(database, rows)
     members[README] = _readme(papers[PLAN], papers[VERDICT]["report"], arms, head).encode()
     for arm in arms:
         members |= folder_of(arm, row.sha256)
-    members[SIGNATURE] = signatures.sign_files(
+    members[SIGNATURE] = proofs.sign_files(
         database.history,
         head,
         {name: hashlib.sha256(data).hexdigest() for name, data in members.items()},

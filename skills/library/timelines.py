@@ -26,7 +26,7 @@ from skills.errors import Conflict, NotFound
 from skills.library import consent, policies
 from skills.library.demos import exported_recording, find_demo
 from skills.library.plans import find_plan, motion_of, trajectory_of
-from skills.library.pose_styles import poses_of
+from skills.library.policies import poses_of
 from skills.library.recordings import Teller, find_recording, stored_recording
 from skills.verification.timeline import (
     Timeline,

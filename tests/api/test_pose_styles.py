@@ -8,7 +8,7 @@ import pytest
 
 from skills.client import Problem
 from skills.library.keys import create_key
-from skills.library.pose_styles import FORMAT
+from skills.library.policies import FORMAT
 from tests import backends
 from tests.api.posed import of_pose_style
 from tests.api.service import KESTREL, POLICY, Service, assert_problem, serving

@@ -78,8 +78,8 @@ def path_of(path: str) -> str:
 
 @pytest.fixture
 def service(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Service]:
-    monkeypatch.setattr("skills.api.rate_limits.BAD_AT_ONCE", 10**6)
-    monkeypatch.setattr("skills.api.rate_limits.BAD_OF_ALL_AT_ONCE", 10**6)
+    monkeypatch.setattr("skills.api.authentication.BAD_AT_ONCE", 10**6)
+    monkeypatch.setattr("skills.api.authentication.BAD_OF_ALL_AT_ONCE", 10**6)
     with serving(backends.fresh("sqlite", tmp_path), key_requests_per_s=1e6) as service:
         yield service
 

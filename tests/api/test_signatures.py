@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from skills.errors import Busy
-from skills.library import signatures
+from skills.library import proofs
 from skills.library.catalogue import find_surgeon, put_surgeon
 from skills.transparency import SigningKey
 from tests.api.service import KESTREL, POLICY, Service, assert_problem
@@ -73,15 +73,15 @@ def test_new_rows_are_signed_first_and_keep_the_first_head_that_covers_them(
 
     first = added("heron")
     with monkeypatch.context() as busy:
-        busy.setattr(signatures, "sign_history", lambda *_: None)
+        busy.setattr(proofs, "sign_history", lambda *_: None)
         with pytest.raises(Busy, match="not signed up to these rows yet"):
-            signatures.head_over(trained.database, [first])
-    head = signatures.head_over(trained.database, [first])
+            proofs.head_over(trained.database, [first])
+    head = proofs.head_over(trained.database, [first])
     second = added("wren")
-    later = signatures.head_over(trained.database, [first, second])
+    later = proofs.head_over(trained.database, [first, second])
     assert later.checkpoint.size > head.checkpoint.size
-    assert signatures.head_over(trained.database, [first]) == head
-    assert signatures.head_over(trained.database, [second, first]) == later
+    assert proofs.head_over(trained.database, [first]) == head
+    assert proofs.head_over(trained.database, [second, first]) == later
 
 
 def test_the_card_has_the_history_on_it_and_is_signed(trained: Service):

@@ -21,8 +21,7 @@ from rich.table import Table
 from skills.db.session import Database
 from skills.learning.tube import next_pose
 from skills.library import releases
-from skills.library.policies import policy_of
-from skills.library.pose_styles import poses_of
+from skills.library.policies import policy_of, poses_of
 from skills.serving import environment
 from skills.settings import Settings
 from tests import backends

@@ -17,14 +17,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from skills.attestation import attest, read_envelope
 from skills.errors import BadBag, BadSignature, SkillsError
 from skills.formats.replay_bag import arms_of, folder_of, seal, timetable
 from skills.formats.verify import JUDGED, SIGNATURE, check_bag
 from skills.kinematics import forward, quaternion_of
 from skills.packing import canonical, sha256
 from skills.planning.trajectory import A1, A2, Trajectory, joint_ratios
-from skills.transparency import Checkpoint, PublicKey, SigningKey, Tree
+from skills.transparency import Checkpoint, PublicKey, SigningKey, Tree, attest, read_envelope
 from tests.formats.replays import FRAME, members, papers
 from tests.formats.replays import trajectory as short
 from tests.independent_history import check_envelope

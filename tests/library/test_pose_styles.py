@@ -21,7 +21,7 @@ from skills.library.backup import back_up, restore
 from skills.library.demos import withdraw_demo
 from skills.library.erasure import erase_demo
 from skills.library.inspection import HISTORY, inspect_installation
-from skills.library.pose_styles import poses_of
+from skills.library.policies import poses_of
 from skills.remedies import Action, Remedy
 from tests import backends
 from tests.library import cases

@@ -1,25 +1,39 @@
-"""Routes of recordings and demonstrations, and of what compares demonstrations: atlases with their pages, and scores.
+"""Routes of recordings, proposals, demonstrations and datasets, and of atlases and scores, which compare them.
 
 Storing a recording or a demonstration never starts a training. An atlas compares the demonstrations of a suture type. A
-score compares a demonstration, or a part of a recording, with a style; nothing of it is stored.
+score compares a demonstration, or a part of a recording, with a style; nothing of it is stored. A dataset has
+demonstrations in the format of LeRobot, as a zip file.
 """
 
 from functools import partial
-from typing import Annotated
+from typing import Annotated, Literal
 
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import APIRouter, Path, Query, Request, Response
 from pydantic import Field
 from sqlalchemy import select
 
 from skills.api.authorisation import Asking, erasing_is_for_admins, needs
-from skills.api.dependencies import Actor, Db, Digest, Incoming, Jobs, Limit, RowCursor, Slug, Strict, Tell
-from skills.api.openapi import ends, gives, gives_file, gives_page, makes, router_of, says
+from skills.api.dependencies import (
+    Actor,
+    Db,
+    Digest,
+    Incoming,
+    Jobs,
+    Limit,
+    RowCursor,
+    Slug,
+    Strict,
+    Tell,
+    room_for_a_job,
+)
+from skills.api.openapi import ends, gives, gives_file, gives_page, makes, router_of, says, starts_job
 from skills.api.pages import HTML, drawings, render, standalone_headers, wants_page
 from skills.api.pages.drawings import report_page
 from skills.api.responses import (
     Condition,
     Giving,
     Stream,
+    accepted,
     as_asked,
     names,
     refuse_changed,
@@ -32,22 +46,26 @@ from skills.api.routes.policies import Accept
 from skills.db.models import StoredRewardMap
 from skills.errors import BadInput, Conflict, NotFound
 from skills.formats import BYTES, MEDIA_TYPES
-from skills.library import demos, erasure, locks, overview, recordings, scores
+from skills.library import datasets, demos, erasure, locks, overview, proposals, recordings, scores
 from skills.library.atlas import CONFOUNDED, DISTANCE, MOST, SESSIONS, atlas_of, atlases
 from skills.library.catalogue import find_surgeon, find_suture_type
 from skills.library.demos import demo_json, path_json, reward_map_json
+from skills.library.jobs import QUEUED, did_nothing
 from skills.library.neighbours import nearest_to
-from skills.library.recordings import recording_json
+from skills.library.proposals import proposal_json
+from skills.library.recordings import find_recording, recording_json
 from skills.library.sweep import drop_contents, sweep_erased
 from skills.library.whose import recognise_recording
-from skills.schemas import OutcomeAsked
+from skills.schemas import OutcomeAsked, ProposalState
 from skills.schemas.given import (
     Atlas,
+    DatasetEpisodes,
     Demonstration,
     DemoPath,
     Nearest,
     Page,
     Progress,
+    Proposal,
     RecognisedRecording,
     Recording,
     RecordingPreview,
@@ -55,7 +73,18 @@ from skills.schemas.given import (
     RewardMap,
     Score,
 )
-from skills.schemas.requests import COUNT, DIGEST, SLUG, DemoIn, OutcomeIn, ScoreIn, SlugField, TableIn
+from skills.schemas.requests import (
+    COUNT,
+    DIGEST,
+    SLUG,
+    DatasetIn,
+    DemoIn,
+    OutcomeIn,
+    ProposalIn,
+    ScoreIn,
+    SlugField,
+    TableIn,
+)
 from skills.settings import MEBIBYTE
 
 uploads = router_of(tags=["demonstrations"])
@@ -442,3 +471,130 @@ def surgeon_progress(
     Research use only; not a credential.
     """
     return give(scores.progress(db, surgeon, suture, against))
+
+
+Number = Annotated[int, Path(ge=1, le=1_000_000, description="The number of the proposal, counted from 1.")]
+
+
+@router.get("/proposals", dependencies=[needs("reader")], **gives_page(Page[Proposal], 404, 410))
+def list_proposals(
+    db: Db,
+    give: Giving,
+    state: Annotated[ProposalState | None, Query(description="Only those in this state.")] = None,
+    recording: Annotated[str | None, Query(pattern=DIGEST)] = None,
+    surgeon: Annotated[str | None, Query(pattern=SLUG)] = None,
+    suture: Annotated[
+        str | None, Query(pattern=SLUG, description="Only accepted ones, whose demonstration is of this suture type.")
+    ] = None,
+    limit: Limit = 50,
+    cursor: RowCursor = None,
+) -> Response:
+    """List the hand-offs proposed in recordings, those of the newest recording first.
+
+    A page may be shorter than `limit`, or empty, though `next` names another one.
+    """
+    asked = {"recording": recording, "surgeon": surgeon, "suture": suture}
+    with db.reading() as session:
+        found, following = proposals.list_proposals(session, limit, cursor, state=state, **asked)
+        return give.page([proposal_json(one) for one in found], len(found), following)
+
+
+@router.put("/recordings/{recording}/proposals/{number}", dependencies=[needs("uploader")], **says(Proposal, 404, 409))
+def decide_proposal(recording: Digest, number: Number, body: ProposalIn, db: Db, actor: Actor) -> Response:
+    """Reject a proposed hand-off, or open a rejected one again; `POST /recordings/{recording}/demos` accepts it."""
+    with db.reading() as session:
+        recording = find_recording(session, recording).sha256  # in full: the argument may be a prefix
+    with db.writing([locks.recording(recording)]) as session:
+        return say(proposal_json(proposals.decide(session, recording, number, body.state, body.note, actor)))
+
+
+@page_router.get("/pages/proposals", dependencies=[needs("reader")])
+def show_proposals(
+    request: Request,
+    caller: Asking,
+    db: Db,
+    state: Literal["", "open", "accepted", "rejected"] = "open",
+    recording: Picked = None,
+    surgeon: Picked = None,
+    suture: Picked = None,
+    cursor: RowCursor = None,
+) -> Response:
+    """Show proposed hand-offs, to be accepted, corrected or rejected; a form sends an empty text for any of them."""
+    asked = {"recording": recording or None, "surgeon": surgeon or None, "suture": suture or None}
+    with db.reading() as session:
+        found, following = proposals.list_proposals(session, overview.MOST, cursor, state=state or None, **asked)
+        return render(
+            request,
+            "proposals.html",
+            caller,
+            found=found,
+            following=following,
+            asked=asked | {"state": state},
+            surgeons=overview.all_surgeons(session),
+            sutures=overview.all_suture_types(session),
+        )
+
+
+@page_router.get("/pages/recordings/{recording}/proposals", dependencies=[needs("reader")])
+def draw_proposals(recording: Digest, caller: Asking, db: Db, tell: Tell) -> Response:
+    """Return the paths of the tip in all proposals of a recording, for their small pictures."""
+    return say({"paths_mm": proposals.paths_of(db, recording, tell)}, headers={"Cache-Control": "no-store"})
+
+
+dataset_router = router_of(route_class=Strict, tags=["datasets"], max_body_size=MEBIBYTE)
+
+ZIP = "application/zip"
+
+
+@dataset_router.post("/datasets", dependencies=[needs("trainer"), room_for_a_job], **starts_job(404, 409, 410))
+def export_dataset(body: DatasetIn, db: Db, jobs: Jobs, actor: Actor) -> Response:
+    """Request the export of demonstrations as a LeRobot dataset; `result.dataset` of the job is its digest.
+
+    409 if the consent of a surgeon in it does not cover an export.
+    """
+    with db.writing() as session:
+        job, new = datasets.request_dataset(session, body, actor)
+        answer = accepted(session, job, QUEUED if new else did_nothing(job))
+    # after the commit; if the engine cannot be notified now, a worker finds the job's row later
+    if new:
+        jobs.tell(job.row, job.attempt, job.kind)
+    return answer
+
+
+@dataset_router.get("/datasets/{dataset}", dependencies=[needs("reader")], **gives_file((BYTES, ZIP), 404, 409))
+def get_dataset(
+    dataset: Digest, db: Db, request: Request, if_none_match: Condition = None, accept: Accept = "*/*"
+) -> Response:
+    """Return a dataset as a zip; all of it is verified before the first byte is sent.
+
+    409 if a consent in it does not cover an export any more; consents are checked again for each chunk.
+    """
+    with db.reading() as session:
+        kept = datasets.served_dataset(session, dataset)
+        sha256, tag = kept.sha256, {"ETag": f'"{kept.sha256}"'}
+        attached = {"Content-Disposition": f'attachment; filename="dataset-{sha256[:12]}.zip"'}
+        headers = {"Content-Length": str(kept.size_bytes), **attached, **tag}
+    if if_none_match is not None and names(if_none_match, tag["ETag"]):
+        return Response(status_code=304, headers=tag)
+
+    def refuse() -> None:
+        with db.reading() as session:
+            datasets.served_dataset(session, sha256)
+
+    read = partial(datasets.dataset_chunk, db, sha256)
+    # outside the session, because a slow client may keep the stream open for long
+    return Stream(stored_pieces(read, refuse, sha256, request.app.state.downloads), as_asked(accept, ZIP), headers)
+
+
+@dataset_router.get("/datasets/{dataset}/episodes", dependencies=[needs("reader")], **gives(DatasetEpisodes, 404))
+def get_dataset_episodes(dataset: Digest, db: Db, give: Giving) -> Response:
+    """Return the recording and the demonstrations of each episode of a dataset, which does not name them itself."""
+    with db.reading() as session:
+        return give(datasets.episodes_json(session, dataset))
+
+
+@dataset_router.delete("/datasets/{dataset}", dependencies=[needs("trainer")], **ends(404))
+def delete_dataset(dataset: Digest, db: Db, actor: Actor) -> None:
+    """Delete a dataset and the job that made it; its demonstrations stay."""
+    with db.writing() as session:
+        datasets.delete_dataset(session, dataset, actor)

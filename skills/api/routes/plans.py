@@ -40,9 +40,8 @@ from skills.formats.replay_bag import rows_of_pass
 from skills.library import locks, overview, plans, playbacks
 from skills.library.arm_errors import stated_errors
 from skills.library.jobs import QUEUED, did_nothing
-from skills.library.plans import find_suture_points, motion_of, plan_json, plan_summary_json, trajectory_of
+from skills.library.plans import find_suture_points, map_style, motion_of, plan_json, plan_summary_json, trajectory_of
 from skills.library.playbacks import find_playback, playback_json
-from skills.library.reach import map_style
 from skills.library.replay import compare_with_plan, replay_bag
 from skills.planning.plan import MAX_PASSES
 from skills.planning.trajectory import Trajectory

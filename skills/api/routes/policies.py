@@ -56,11 +56,10 @@ from skills.library.cards import Card, card_of
 from skills.library.catalogue import find_surgeon, find_suture_type
 from skills.library.integrity import learnt
 from skills.library.jobs import PART, count, job_json, to_tell
-from skills.library.policies import summary_json, version_json
-from skills.library.pose_styles import about_next, poses_of
+from skills.library.policies import about_next, poses_of, summary_json, version_json
+from skills.library.proofs import head_over, sign_files
 from skills.library.releases import outcomes_of, outcomes_of_styles
 from skills.library.retraining import find_retraining, list_styles, request_retraining, retrained_json
-from skills.library.signatures import head_over, sign_files
 from skills.library.training import near_limits, odds_limits, request_training
 from skills.library.tries import request_try
 from skills.schemas.given import (
