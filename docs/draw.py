@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 import skills
 from skills.learning.tube import Hands, advance, certified_poses
 from skills.planning.handoff import PsmM
-from skills.report.drawings import CELLS, GOAL, RECORDED, ROLLOUT
+from skills.report.figures import CELLS, GOAL, RECORDED, ROLLOUT
 from skills.seeds.recordings import sample_recordings
 from skills.verification.arm_errors import CALIBRATED, CALLED
 from skills.verification.monte_carlo import doubt

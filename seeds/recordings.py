@@ -19,8 +19,8 @@ from numpy.typing import ArrayLike
 
 from skills.arrays import Floats, Ints
 from skills.demonstration.recording import Motion, Recording, Signal
+from skills.formats.bag_writer import write_mcap
 from skills.formats.topics import CLUTCH_TOPICS, PRESSED, RELEASED
-from skills.formats.writer import write_mcap
 
 ARM = "PSM2"
 FRAME = "PSM2_base"

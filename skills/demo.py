@@ -179,7 +179,7 @@ def suture_points(policy: Policy) -> list[dict[str, list[float]]]:
 
 def draw_samples(client: Client, styles: list[tuple[str, str]]) -> None:
     """Draw every style with rollouts from four corners of its grid."""
-    from skills.report.drawings import draw_styles  # here, because the report is slow to import
+    from skills.report.figures import draw_styles  # here, because the report is slow to import
 
     drawn = []
     for surgeon, suture in styles:

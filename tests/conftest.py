@@ -126,7 +126,9 @@ def shared_simulator() -> Iterator[None]:
     from skills.sandbox.forked import ForkServer
     from skills.simulation import player
 
-    with closing(ForkServer("skills.simulation.scene", *(("pybullet",) if find_spec("pybullet") else ()))) as server:
+    with closing(
+        ForkServer("skills.simulation.simulator", *(("pybullet",) if find_spec("pybullet") else ()))
+    ) as server:
 
         def call(target: str, request: object, *, classes: Any, **how: Any) -> Any:
             with tempfile.TemporaryFile() as given:
@@ -169,11 +171,11 @@ def shared_tables() -> Iterator[None]:
 
     That takes half of a restore; `tests/migrations` migrates.
     """
-    from skills.db import archive
+    from skills.db import dump
     from skills.db.session import revision_of, revisions
     from tests import backends
 
-    migrate = archive.upgrade
+    migrate = dump.upgrade
 
     def upgrade(connection: Any, to: str = "head") -> None:
         if connection.dialect.name == "sqlite" and to == revisions()[0] and revision_of(connection) is None:
@@ -183,7 +185,7 @@ def shared_tables() -> Iterator[None]:
             migrate(connection, to)
 
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(archive, "upgrade", upgrade)
+        patched.setattr(dump, "upgrade", upgrade)
         yield
 
 

@@ -36,7 +36,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from skills.api.authorisation import LOCAL, Caller
 from skills.api.problems import answer_to
 from skills.db import now
-from skills.db.changes import Kept
+from skills.db.changes import WeightedCache
 from skills.db.session import Database
 from skills.errors import Busy, NotAllowed, NotSignedIn, SkillsError, TooMany, WrongHost
 from skills.library.keys import (
@@ -106,9 +106,9 @@ class Access:
         # a separate pool, which slow requests cannot exhaust
         self._asked = Database(database.url, patience_ms=PATIENCE_MS)
         self._settings = settings
-        self._known: Kept[str, _Remembered] = Kept(KEPT)
+        self._known: WeightedCache[str, _Remembered] = WeightedCache(KEPT)
         # wrong keys, with the time until which each is refused without a query
-        self._wrong: Kept[str, float] = Kept(KEPT)
+        self._wrong: WeightedCache[str, float] = WeightedCache(KEPT)
         self._changed = 0.0  # cache entries older than this are invalid
         self._keys = _Together(lambda keys: self._ask(holders_of, keys))
         self._cookies = _Together(lambda cookies: self._ask(signed_in, cookies, self.lasts))
@@ -540,7 +540,7 @@ class _Buckets:
 
     def __init__(self, new: Callable[[], Bucket]) -> None:
         self._new = new
-        self._kept: Kept[str, Bucket] = Kept(MOST)
+        self._kept: WeightedCache[str, Bucket] = WeightedCache(MOST)
 
     def of(self, name: str) -> Bucket:
         bucket = self._kept.get(name)

@@ -19,7 +19,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from skills.api.authorisation import Needs
 from skills.api.responses import KEPT_BYTES, Body, Encoded, answer, negotiate
-from skills.db.changes import Kept, Unasked, changes_of
+from skills.db.changes import Unasked, WeightedCache, changes_of
 from skills.db.session import Database
 from skills.errors import Busy, SkillsError, UnknownFormat
 from skills.library import consent, integrity, neighbours, policies
@@ -59,7 +59,7 @@ class PolicyCache:
         self._database = database
         self._encoded = encoded
         self.changes = changes_of(database)
-        self._known: Kept[Style, Known] = Kept(KEPT_BYTES, lambda known: len(known.body.content))
+        self._known: WeightedCache[Style, Known] = WeightedCache(KEPT_BYTES, lambda known: len(known.body.content))
 
     @asynccontextmanager
     async def watching(self) -> AsyncIterator[None]:

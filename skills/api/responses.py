@@ -31,7 +31,7 @@ from pydantic import BaseModel
 from sqlalchemy.orm import Session
 from starlette.types import Send
 
-from skills.db.changes import Changes, Kept
+from skills.db.changes import Changes, WeightedCache
 from skills.db.history import History
 from skills.db.models import PolicyVersion, Release
 from skills.db.service_tables import Job
@@ -173,7 +173,7 @@ class Encoded:
     """LRU cache of encoded policy responses, keyed by everything that their content depends on."""
 
     def __init__(self) -> None:
-        self._kept: Kept[tuple[object, ...], Body] = Kept(KEPT_BYTES, lambda body: len(body.content))
+        self._kept: WeightedCache[tuple[object, ...], Body] = WeightedCache(KEPT_BYTES, lambda body: len(body.content))
 
     def policy(self, policy: PolicyVersion, release: Release | None, accept: str) -> Body:
         """Return the encoded response of a policy version and its release, from the cache if it is there."""

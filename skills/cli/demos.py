@@ -54,7 +54,7 @@ from skills.cli.shell import (
 
 if TYPE_CHECKING:
     from skills.client import Client
-    from skills.formats.lerobot.videos import Source
+    from skills.formats.lerobot.videos import EpisodeSource
 
 
 commands = typer.Typer()
@@ -508,7 +508,7 @@ def export_dataset(
     from skills.formats.lerobot.manifest import refuse_existing
 
     refuse_existing(to)
-    sources: dict[str, Source] = {}
+    sources: dict[str, EpisodeSource] = {}
     if videos:
         _refuse_videos(to, whole=whole, consented=pictures_consented)
         from skills.formats.lerobot.videos import find_recorded
@@ -564,7 +564,7 @@ def _refuse_videos(to: Path, *, whole: bool, consented: bool) -> None:
 
 
 def _save_with_videos(
-    client: "Client", dataset: str, to: Path, sources: Mapping[str, "Source"], version: Literal["v2.1", "v3.0"]
+    client: "Client", dataset: str, to: Path, sources: Mapping[str, "EpisodeSource"], version: Literal["v2.1", "v3.0"]
 ) -> None:
     """Download a dataset and add its videos, in a folder beside `to` that is renamed when all is there."""
     from skills.formats.lerobot.manifest import refuse_existing

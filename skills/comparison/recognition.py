@@ -195,7 +195,7 @@ LEAST = float(np.finfo(float).tiny)
 
 
 @dataclass(frozen=True)
-class Settings:
+class MetricSettings:
     """Chosen settings: the families of the signature that are compared, and the share of shrinkage."""
 
     families: tuple[str, ...]
@@ -220,7 +220,7 @@ class Metric:
         learnt: The demonstrations that it was learnt from, in these coordinates, shape (N, F).
     """
 
-    settings: Settings
+    settings: MetricSettings
     centre: Floats
     into: Floats
     means: Floats
@@ -243,7 +243,7 @@ class Metric:
         return np.asarray(squared.clip(0.0))
 
 
-def fit(signatures: Floats, truth: Ints, surgeons: int, settings: Settings) -> Metric:
+def fit(signatures: Floats, truth: Ints, surgeons: int, settings: MetricSettings) -> Metric:
     """Learn a metric.
 
     Args:
@@ -294,7 +294,7 @@ class Validated:
     stranger: Floats
     unknown: Floats
     right: int
-    settings: Settings
+    settings: MetricSettings
     temperature: float
     telling: Floats
     log_loss: float
@@ -450,7 +450,7 @@ def vote(probability: Floats) -> Floats:
 
 
 def _tell_strangers(
-    signatures: Floats, truth: Ints, sessions: Ints, recordings: Ints, tested: Ints, settings: Settings
+    signatures: Floats, truth: Ints, sessions: Ints, recordings: Ints, tested: Ints, settings: MetricSettings
 ) -> tuple[Floats, Floats, Floats]:
     """Return the probability of being a stranger of the tested demonstrations, of all as strangers, and the function.
 
@@ -540,12 +540,12 @@ def folds_of(sessions: Ints, truth: Ints, folds: int) -> Ints:
 
 def _choose(
     signatures: Floats, truth: Ints, sessions: Ints, surgeons: int, sets: Sequence[tuple[str, ...]]
-) -> tuple[Settings, float | None]:
+) -> tuple[MetricSettings, float | None]:
     """Choose settings and temperature by the log loss of sessions left out; None if that cannot be measured."""
     fold = folds_of(sessions, truth, INNER_FOLDS)
     best = np.inf
-    chosen: tuple[Settings, float | None] = (Settings(sets[-1], SHRINKAGES[-1]), None)
-    for settings in [Settings(names, shrinkage) for names in sets for shrinkage in SHRINKAGES]:
+    chosen: tuple[MetricSettings, float | None] = (MetricSettings(sets[-1], SHRINKAGES[-1]), None)
+    for settings in [MetricSettings(names, shrinkage) for names in sets for shrinkage in SHRINKAGES]:
         away = np.full((len(truth), surgeons), np.inf)
         for out in _left_out(fold):
             away[out] = fit(signatures[~out], truth[~out], surgeons, settings).away(signatures[out])

@@ -249,7 +249,7 @@ class Notified(Changes):
 # ---- cache ---------------------------------------------------------------------------------------------------------
 
 
-class Kept(Generic[K, V]):
+class WeightedCache(Generic[K, V]):
     """A least-recently-used cache, bounded by the total weight of its values, under a lock: cachetools has none."""
 
     def __init__(self, most: int, weight: Callable[[V], int] | None = None) -> None:

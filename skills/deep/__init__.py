@@ -5,7 +5,7 @@
 The libraries that train networks (the extra `deep`) seed the random numbers and set the threads of the whole process,
 so they are imported only in a separate process. Two trainings do not disturb each other, a cancelled training ends at
 once, and its memory is returned to the system. A service starts without them, and serves policies that were learnt
-elsewhere. `skills.deep.training` is that process; `skills.deep.environments` has its Gymnasium
+elsewhere. `skills.deep.trainer` is that process; `skills.deep.environments` has its Gymnasium
 environments.
 """
 
@@ -27,7 +27,7 @@ from skills.sandbox import ProcessLimits
 from skills.sandbox.forked import call_alone
 
 NEEDED = ("torch", "stable_baselines3", "sb3_contrib", "gymnasium")
-TARGET = "skills.deep.training:train"
+TARGET = "skills.deep.trainer:train"
 TIMEOUT_S = 3600.0  # ours: the default budgets take ten minutes on one core
 MEMORY_BYTES = 6 << 30  # ours, of address space: torch alone reserves 3 GiB, and uses a tenth of it
 PROGRESS = re.compile(rb"progress (\d\.\d+)\n")

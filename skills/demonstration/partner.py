@@ -268,7 +268,7 @@ ODDS = 30.0  # beyond these the exponential is of no use
 
 
 @dataclass(frozen=True)
-class Transfer:
+class NeedleTransfer:
     """One transfer of a needle; times are in seconds since the recording's `origin_ns`.
 
     Attributes:
@@ -323,7 +323,7 @@ def _closed(jaw: Signal, least: float, most: float) -> Flags:
 
 def find_transfers(
     recording: Recording, closed: Mapping[str, Sequence[Span] | None], bases: Sequence[BaseFrame]
-) -> tuple[Transfer, ...]:
+) -> tuple[NeedleTransfer, ...]:
     """Find the transfers between any two arms of a recording.
 
     Args:
@@ -342,7 +342,7 @@ def find_transfers(
                 found += _overlaps(giver, taker, holds, grips)
     seen = [_observed(recording, one, bases) for one in found]
     usual_mm = {pair: _usual_mm([one for one in seen if one.pair == pair]) for pair in {one.pair for one in seen}}
-    likely: dict[tuple[str, float], Transfer] = {}
+    likely: dict[tuple[str, float], NeedleTransfer] = {}
     for one in seen:
         transfer = one.judged(usual_mm[one.pair])
         key = transfer.giver, transfer.released_s
@@ -372,13 +372,13 @@ class _Observed:
     def pair(self) -> tuple[str, ...]:
         return tuple(sorted((self.overlap.giver, self.overlap.taker)))
 
-    def judged(self, usual_mm: float | None) -> Transfer:
+    def judged(self, usual_mm: float | None) -> NeedleTransfer:
         one = self.overlap
         deviation_mm = 0.0 if self.apart_mm is None or usual_mm is None else abs(self.apart_mm - usual_mm)
         seen = (1.0, self.slip_mm, min(self.parted_mm, PARTED_MM), deviation_mm)
         odds = float(np.dot(WITHOUT_FRAME if self.apart_mm is None else WEIGHTS, seen))
         confidence = 1.0 / (1.0 + exp(-max(odds, -ODDS)))
-        return Transfer(one.giver, one.taker, one.held_s, one.taken_s, one.released_s, self.slip_mm, confidence)
+        return NeedleTransfer(one.giver, one.taker, one.held_s, one.taken_s, one.released_s, self.slip_mm, confidence)
 
 
 def _overlaps(giver: str, taker: str, holds: Sequence[Span], grips: Sequence[Span]) -> list[_Overlap]:

@@ -50,7 +50,7 @@ from skills.demonstration.movement import (
     spans_of,
     undriven,
 )
-from skills.demonstration.partner import REGRIP_S, Transfer, closed_jaw, find_transfers, partner_at
+from skills.demonstration.partner import REGRIP_S, NeedleTransfer, closed_jaw, find_transfers, partner_at
 from skills.demonstration.recording import BaseFrame, Label, Motion, Recording, base_frames
 from skills.fields import Fraction, computed_field, schema
 
@@ -298,7 +298,7 @@ class _Heard:
     recording: Recording
     named: dict[str, list[Named]]  # by arm
     holding: dict[str, Spans | None]
-    transfers: tuple[Transfer, ...]
+    transfers: tuple[NeedleTransfer, ...]
 
 
 def _heard(recording: Recording) -> _Heard:
@@ -358,7 +358,7 @@ def _held(seen: _Seen, holding: Spans) -> list[Span]:
     return [span for span in spans if _is_a_pass(seen, span)]
 
 
-def _last_held(seen: _Seen, given: Mapping[float, Transfer]) -> list[tuple[Span, Transfer]]:
+def _last_held(seen: _Seen, given: Mapping[float, NeedleTransfer]) -> list[tuple[Span, NeedleTransfer]]:
     """Find the last movement before each transfer that the arm makes with the needle, by the time of its release."""
     assert seen.holding is not None
     found = []
@@ -465,7 +465,7 @@ def _told(seen: _Seen, span: Span, found_by: FoundBy) -> Segment:
     return _segment(seen, span, handover, found_by, reasons)
 
 
-def _given(seen: _Seen, span: Span, transfer: Transfer) -> Segment:
+def _given(seen: _Seen, span: Span, transfer: NeedleTransfer) -> Segment:
     """Return the movement before a transfer as a proposal, with its reasons."""
     told = _told(seen, span, "jaw")
     both_s = max(0.0, transfer.released_s - transfer.taken_s)

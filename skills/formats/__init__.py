@@ -14,11 +14,11 @@ from skills.demonstration.recording import Recording
 from skills.errors import BadSettings, MixedFrames, UnknownFormat, UnreadableRecording
 from skills.formats import archive, ee_csv, jigsaws, rosbag, tables
 from skills.formats.bag_folder import read_one, read_zip
+from skills.formats.bag_writer import write_bag, write_mcap
 from skills.formats.cells import SEPARATORS, Decimals, header_of, open_text
 from skills.formats.columns import BASE
 from skills.formats.mcap import MAGIC
 from skills.formats.tables import TableReading, read_table
-from skills.formats.writer import write_bag, write_mcap
 from skills.remedies import Action, Remedy
 
 __all__ = ["BYTES", "MEDIA_TYPES", "READABLE", "SUFFIXES", "media_type_of", "read_recording", "write_bag", "write_mcap"]

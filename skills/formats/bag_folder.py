@@ -53,7 +53,7 @@ from skills.errors import MixedFrames, NoUsableTopic, SkillsError, UnknownFormat
 from skills.formats import jigsaws
 from skills.formats.archive import Archive, refusing, shown
 from skills.formats.lerobot import is_shadow, root_of
-from skills.formats.lerobot.recording import read_episode
+from skills.formats.lerobot.episode import read_episode
 from skills.formats.mcap import NeedsRosbags, read_mcap
 from skills.formats.rosbag import Suffix, read_rosbag
 from skills.remedies import Action, Remedy

@@ -25,9 +25,9 @@ import numpy as np
 
 from skills.arrays import Floats, Ints
 from skills.errors import BadPlan
-from skills.formats import writer
+from skills.formats import bag_writer
 from skills.formats.archive import pack
-from skills.formats.writer import Message, bag_folder
+from skills.formats.bag_writer import Message, bag_folder
 from skills.kinematics import INSERTION, JOINTS, forward, instrument_of, quaternion_of
 from skills.planning.handoff import JAW_CLOSED_RAD, JAW_OPEN_RAD
 from skills.planning.motion_laws import A2, PHASES, TRANSFER
@@ -209,9 +209,9 @@ def messages_of(motion: ArmMotion) -> Iterator[Message]:
     turning = velocities_of(motion.stamps_ns, jaws, motion.rate_hz)
     columns = (motion.stamps_ns, motion.joints, velocities, motion.tip_m, motion.rotation_xyzw, jaws, turning)
     for stamp_ns, joints, speeds, tip_m, turn, jaw, rate in zip(*(one.tolist() for one in columns), strict=True):
-        yield writer.joint_state(on_joints, stamp_ns, joints, JOINTS, velocities=speeds)
-        yield writer.pose(on_tip, stamp_ns, motion.frame, tip_m, turn)
-        yield writer.joint_state(on_jaw, stamp_ns, jaw, ["jaw"], velocities=rate)
+        yield bag_writer.joint_state(on_joints, stamp_ns, joints, JOINTS, velocities=speeds)
+        yield bag_writer.pose(on_tip, stamp_ns, motion.frame, tip_m, turn)
+        yield bag_writer.joint_state(on_jaw, stamp_ns, jaw, ["jaw"], velocities=rate)
 
 
 def folder_of(motion: ArmMotion, plan_sha256: str) -> dict[str, bytes]:

@@ -29,10 +29,10 @@ from rosbags.typesys import Stores, get_typestore
 
 from skills.demonstration.recording import Format, Integrity, Recording, Topic
 from skills.errors import NoUsableTopic, UnreadableRecording
-from skills.formats import topics, writer
+from skills.formats import bag_writer, topics
 from skills.formats.archive import refusing
+from skills.formats.bag_writer import Message, write_messages
 from skills.formats.mcap import read_mcap
-from skills.formats.writer import Message, write_messages
 
 TABLES = frozenset({"schema", "metadata", "topics", "message_definitions", "messages"})
 STATISTICS = frozenset({"sqlite_stat1", "sqlite_stat4", "sqlite_sequence", "sqlite_schema", "sqlite_temp_schema"})
@@ -263,16 +263,18 @@ def _transform(topic: str, log_ns: int, said: Any) -> Message:
 
 def _tip(topic: str, log_ns: int, header: Any, place: Any, turn: Any) -> Message:
     place_m, turn_xyzw = (place.x, place.y, place.z), (turn.x, turn.y, turn.z, turn.w)
-    return writer.pose(topic, _stamp_ns(header), header.frame_id, place_m, turn_xyzw, log_ns=log_ns)
+    return bag_writer.pose(topic, _stamp_ns(header), header.frame_id, place_m, turn_xyzw, log_ns=log_ns)
 
 
 def _joint_state(topic: str, log_ns: int, said: Any) -> Message:
     stamp_ns, frame = _stamp_ns(said.header), said.header.frame_id
-    return writer.joint_state(topic, stamp_ns, said.position.tolist(), said.name, frame=frame, log_ns=log_ns)
+    return bag_writer.joint_state(topic, stamp_ns, said.position.tolist(), said.name, frame=frame, log_ns=log_ns)
 
 
 def _joy(topic: str, log_ns: int, said: Any) -> Message:
-    return writer.joy(topic, _stamp_ns(said.header), said.buttons.tolist(), frame=said.header.frame_id, log_ns=log_ns)
+    return bag_writer.joy(
+        topic, _stamp_ns(said.header), said.buttons.tolist(), frame=said.header.frame_id, log_ns=log_ns
+    )
 
 
 _WRITERS: dict[str, Callable[[str, int, Any], Message]] = {
@@ -280,9 +282,9 @@ _WRITERS: dict[str, Callable[[str, int, Any], Message]] = {
     topics.TRANSFORM: _transform,
     topics.JOINT_STATE: _joint_state,
     topics.JOY: _joy,
-    topics.BOOL: lambda topic, log_ns, said: writer.boolean(topic, log_ns, said.data),
-    topics.FLOAT64: lambda topic, log_ns, said: writer.number(topic, log_ns, said.data),
-    topics.STRING: lambda topic, log_ns, said: writer.text(topic, log_ns, said.data),
+    topics.BOOL: lambda topic, log_ns, said: bag_writer.boolean(topic, log_ns, said.data),
+    topics.FLOAT64: lambda topic, log_ns, said: bag_writer.number(topic, log_ns, said.data),
+    topics.STRING: lambda topic, log_ns, said: bag_writer.text(topic, log_ns, said.data),
 }
 
 

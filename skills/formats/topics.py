@@ -33,7 +33,7 @@ _SETPOINTS = ("setpoint_cp", "position_cartesian_desired", "position_cartesian_l
 _CONSOLE = ("clutch", "camera", "operator_present")
 
 
-class Kind(Enum):
+class TopicKind(Enum):
     """The quantity that a topic carries."""
 
     MOTION = auto()  # pose of a PSM's tip
@@ -56,7 +56,7 @@ class Meaning:
     `whose` is an arm such as "PSM2", a teleoperation such as "MTMR_PSM1", or the topic of a pedal.
     """
 
-    kind: Kind
+    kind: TopicKind
     whose: str
 
 
@@ -67,15 +67,15 @@ def meaning(topic: str, message_type: str) -> Meaning | None:
     if message_type == JOINT_STATE and topic.endswith("/measured_js"):
         return _of_joints(topic)
     if message_type == JOINT_STATE and topic.endswith("/jaw/setpoint_js"):
-        return _about(Kind.JAW_SETPOINT, _named(_PSM, topic))
+        return _about(TopicKind.JAW_SETPOINT, _named(_PSM, topic))
     if message_type in (JOY, BOOL) and _is_pedal(topic):
-        return Meaning(Kind.PEDAL, topic)
+        return Meaning(TopicKind.PEDAL, topic)
     if message_type == BOOL and topic.endswith("/following"):
-        return _about(Kind.FOLLOWING, _named(_PAIR, topic))
+        return _about(TopicKind.FOLLOWING, _named(_PAIR, topic))
     if message_type == FLOAT64 and topic.endswith("/scale"):
-        return _about(Kind.SCALE, _named(_PAIR, topic))
+        return _about(TopicKind.SCALE, _named(_PAIR, topic))
     if message_type == STRING and topic.endswith("/tool_type"):
-        return _about(Kind.TOOL, _named(_PSM, topic))
+        return _about(TopicKind.TOOL, _named(_PSM, topic))
     return None
 
 
@@ -86,32 +86,32 @@ def arm_of_pose(topic: str, message_type: str) -> str | None:
     carries it.
     """
     said = meaning(topic, message_type)
-    return said.whose if said is not None and said.kind is Kind.MOTION else None
+    return said.whose if said is not None and said.kind is TopicKind.MOTION else None
 
 
 def is_setpoint(topic: str, message_type: str) -> bool:
     """Return whether a topic carries setpoints of a PSM's tip or jaw; no recording is refused for them."""
     said = meaning(topic, message_type)
-    return said is not None and said.kind in (Kind.SETPOINT, Kind.JAW_SETPOINT)
+    return said is not None and said.kind in (TopicKind.SETPOINT, TopicKind.JAW_SETPOINT)
 
 
 def _of_pose(topic: str) -> Meaning | None:
     name = topic.rsplit("/", 1)[-1]
     if name in _SETPOINTS:
-        return _about(Kind.SETPOINT, _named(_PSM, topic))
+        return _about(TopicKind.SETPOINT, _named(_PSM, topic))
     if _COMMANDS.search(name):
         return None
-    return _about(Kind.MOTION, _named(_PSM, topic)) or _about(Kind.MASTER, _named(_MTM, topic))
+    return _about(TopicKind.MOTION, _named(_PSM, topic)) or _about(TopicKind.MASTER, _named(_MTM, topic))
 
 
 def _of_joints(topic: str) -> Meaning | None:
     psm, mtm = _named(_PSM, topic), _named(_MTM, topic)
     part = topic.split("/")[-2]
     if part == "jaw":
-        return _about(Kind.JAW, psm)
+        return _about(TopicKind.JAW, psm)
     if part == "gripper":
-        return _about(Kind.GRIPPER, mtm)
-    return Meaning(Kind.JOINTS, part) if part in (psm, mtm) else None
+        return _about(TopicKind.GRIPPER, mtm)
+    return Meaning(TopicKind.JOINTS, part) if part in (psm, mtm) else None
 
 
 def _is_pedal(topic: str) -> bool:
@@ -119,7 +119,7 @@ def _is_pedal(topic: str) -> bool:
     return group == "footpedals" or (group == "console" and name in _CONSOLE)
 
 
-def _about(kind: Kind, whose: str | None) -> Meaning | None:
+def _about(kind: TopicKind, whose: str | None) -> Meaning | None:
     return None if whose is None else Meaning(kind, whose)
 
 

@@ -26,11 +26,11 @@ from skills.arrays import Floats, Ints
 from skills.errors import BadBag, Corrupt, UnknownInstrument
 from skills.formats.archive import Archive, shown
 from skills.formats.bag_folder import METADATA
+from skills.formats.bag_writer import DEFINITIONS, Written, metadata_of
 from skills.formats.mcap.cdr import WANTED_POSE, Columns, Decoder, Wanted, fields_of
 from skills.formats.mcap.reader import MessageSchema, Walker
 from skills.formats.replay_bag import CRTK_ARMS, SUMS, ArmMotion, Role, arm_names, messages_of, notes_of, velocities_of
 from skills.formats.topics import JOINT_STATE, POSE
-from skills.formats.writer import DEFINITIONS, Written, metadata_of
 from skills.kinematics import INSERTION, JOINTS, angle_between, forward, instrument_of, joint_margins, matrix_of
 from skills.packing import canonical, sha256
 from skills.planning.trajectory import joint_ratios

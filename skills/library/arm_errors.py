@@ -20,7 +20,7 @@ from skills.arrays import Floats
 from skills.errors import BadInput, BadRecording, BadSettings
 from skills.formats import read_recording
 from skills.kinematics import DEFAULT_INSTRUMENT, INSERTION, forward, matrix_of
-from skills.verification.arm_errors import NAMED, SIZES, ArmErrors, Measured, checked_own
+from skills.verification.arm_errors import NAMED, SIZES, ArmErrors, MeasuredArm, checked_own
 
 MOST_ROWS = 1_000_000
 _JOINTS = tuple(f"q{number}" for number in range(1, 7))
@@ -50,7 +50,7 @@ def stated_errors(stated: str) -> ArmErrors:
 
 def read_measured(
     file: Path, *, arm: str | None = None, instrument: str = DEFAULT_INSTRUMENT, rate_hz: float | None = None
-) -> Measured:
+) -> MeasuredArm:
     """Read setpoints and measured poses of an arm.
 
     Args:
@@ -87,7 +87,7 @@ def read_measured(
     beside = np.abs(setpoints.stamps_ns[nearest] - motion.stamps_ns) <= period_ns
     if not beside.any():
         raise BadRecording("No setpoint was recorded within one period of a measured pose; record both at once.")
-    return Measured(
+    return MeasuredArm(
         setpoint_mm=setpoints.tip_mm[nearest][beside],
         setpoint=matrix_of(setpoints.rotation_xyzw[nearest][beside]),
         measured_mm=motion.tip_mm[beside],
@@ -96,7 +96,7 @@ def read_measured(
     )
 
 
-def _of_table(file: Path, instrument: str, rate_hz: float | None) -> Measured:
+def _of_table(file: Path, instrument: str, rate_hz: float | None) -> MeasuredArm:
     with file.open(newline="", encoding="utf-8") as opened:
         rows = csv.reader(opened)
         names = [name.strip().lower() for name in next(rows)]
@@ -123,7 +123,7 @@ def _of_table(file: Path, instrument: str, rate_hz: float | None) -> Measured:
         forward(_joints(columns, kind), instrument) for kind in ("setpoint", "measured")
     )
     marker_mm = np.stack([columns[name] for name in _MARKER], axis=1) * _M_TO_MM if marked else None
-    return Measured(setpoint_mm, setpoint, measured_mm, measured, stamps_s, marker_mm)
+    return MeasuredArm(setpoint_mm, setpoint, measured_mm, measured, stamps_s, marker_mm)
 
 
 def _joints(columns: dict[str, Floats], kind: str) -> Floats:

@@ -23,8 +23,8 @@ from sqlalchemy import Select, exists, func, inspect, select, tuple_, update
 from sqlalchemy.orm import Session
 
 from skills import __version__
-from skills.db import Base, archive, rfc3339
-from skills.db.archive import Manifest
+from skills.db import Base, dump, rfc3339
+from skills.db.dump import Manifest
 from skills.db.models import SUCCESS, Demonstration, Erasure, PolicyVersion, Release, StoredRecording, Surgeon
 from skills.db.service_tables import Event, Job, Key, record_event
 from skills.db.session import Database
@@ -159,7 +159,7 @@ def back_up(database: Database, target: Path, told: Told = lambda _: None) -> Ma
     if target.exists():
         raise Conflict(f"{target} exists; a backup never overwrites a file, so choose another name.")
     with _appearing(target) as file, database.reading() as session:
-        return archive.write(file, session.connection(), __version__, told)
+        return dump.write(file, session.connection(), __version__, told)
 
 
 def check_backup(source: Path) -> Manifest:
@@ -171,7 +171,7 @@ def check_backup(source: Path) -> Manifest:
         Conflict: It is of a newer version.
     """
     with source.open("rb") as file:
-        return archive.check(file)
+        return dump.check(file)
 
 
 def restore(database: Database, source: Path, erasures: Erasures = NOTHING, told: Told = lambda _: None) -> Restored:
@@ -191,11 +191,11 @@ def restore(database: Database, source: Path, erasures: Erasures = NOTHING, told
         Corrupt: The backup is damaged.
     """
     with source.open("rb") as file:
-        manifest = archive.check(file)
+        manifest = dump.check(file)
         with database.writing() as session:
             if set(inspect(session.connection()).get_table_names()) & set(Base.metadata.tables):
                 raise Conflict("There is a database already; restore a backup only into an empty one.")
-            archive.load(file, manifest, session.connection(), told)
+            dump.load(file, manifest, session.connection(), told)
             told("history")
             database.history.go_on_after_restore(session.connection())
             fill_tiles(session.connection())

@@ -49,7 +49,7 @@ from skills.library.integrity import covered, demo_identity, planned, policy_ide
 from skills.library.jobs import identity_of
 from skills.library.policies import path_of, poses_of_demonstrations
 from skills.library.recordings import Teller, alike, cached_content, read_entry, recording_bytes
-from skills.library.relearning import Again, Recordings, compute_again, decoded, learn_again
+from skills.library.relearning import Again, StoredRecordings, compute_again, decoded, learn_again
 from skills.packing import canonical, sha256
 from skills.settings import Settings
 from skills.transparency import Note
@@ -319,7 +319,7 @@ def inspect_policies(
     """Learn policies again if wanted, and compute the certificates of the others again; see `inspect_installation`."""
     done: set[int] = set()
     if relearn is not None:
-        learn = partial(learn_again, database, recordings=Recordings(database, tell), settings=relearn)
+        learn = partial(learn_again, database, recordings=StoredRecordings(database, tell), settings=relearn)
         yield from _again(database, Checked("policies learnt again"), limit, learn, done)
     yield from _again(database, Checked("certificates"), None, partial(compute_again, database), done)
 

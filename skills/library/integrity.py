@@ -16,7 +16,7 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from skills.arrays import Floats
-from skills.db.changes import Kept
+from skills.db.changes import WeightedCache
 from skills.db.models import Demonstration, Plan, PolicyVersion, StoredPlayback, StoredPoses, StoredRecording
 from skills.db.packed import digest
 from skills.db.service_tables import StoredDataset
@@ -70,7 +70,9 @@ def find_by_digest(session: Session, table: type[Row], digest: str, what: str, *
     return found[0]
 
 
-_policies: Kept[str, tuple[dict[str, Any], Policy]] = Kept(32)  # by digest, with its manifest; a few MB each
+_policies: WeightedCache[str, tuple[dict[str, Any], Policy]] = WeightedCache(
+    32
+)  # by digest, with its manifest; a few MB each
 
 
 def learnt(version: PolicyVersion) -> Policy:
@@ -88,7 +90,7 @@ def learnt(version: PolicyVersion) -> Policy:
     return policy
 
 
-_poses: Kept[str, tuple[str, CertifiedPoses]] = Kept(256)  # by the policy's digest; some 10 kB each
+_poses: WeightedCache[str, tuple[str, CertifiedPoses]] = WeightedCache(256)  # by the policy's digest; some 10 kB each
 
 
 def posed(stored: StoredPoses) -> CertifiedPoses:

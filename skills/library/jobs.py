@@ -142,7 +142,7 @@ def _why(counted: dict[str, int]) -> str | None:
 
 
 LIVE = ("queued", "running", "succeeded")
-QUEUED = "A new job is queued."  # `Asked.did` of a new job
+QUEUED = "A new job is queued."  # `RequestedJob.did` of a new job
 JOBS_WAIT_S = 10.0  # the `Retry-After` of `TooMany`: some trainings later
 
 
@@ -237,7 +237,7 @@ class DatasetRequest(TypedDict):
     demos_sha256: str
 
 
-class Asked(NamedTuple):
+class RequestedJob(NamedTuple):
     """A requested job, whether it is new, and the effect of the request, in words."""
 
     job: Job

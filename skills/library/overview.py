@@ -237,7 +237,7 @@ class Shown:
 
 
 @dataclass(frozen=True)
-class Style:
+class StyleState:
     """The state of one style: the numbers of active demonstrations and versions, the served version and the shown one.
 
     `shown` is of the served version or, if none is served, of the newest; `waiting` is true if the newest demonstration
@@ -258,7 +258,7 @@ class Matrix:
     """A page of surgeons with their styles in the order of the suture types; `next` is the cursor of the next page."""
 
     sutures: Sequence[SutureType]
-    rows: Sequence[tuple[Surgeon, Sequence[Style]]]
+    rows: Sequence[tuple[Surgeon, Sequence[StyleState]]]
     next: str | None
     counts: dict[str, int]  # surgeons, suture types, demonstrations, releases: independent of the search
     unused: Sequence[SutureType] = ()  # suture types that are left out because no shown style has them
@@ -302,7 +302,7 @@ def matrix(
     shown = [one for one in chosen if one.slug in used or state == "empty"]
     rows = []
     for surgeon in surgeons:
-        styles = [found.get((surgeon.row, one.slug), Style(one.slug, "empty")) for one in shown]
+        styles = [found.get((surgeon.row, one.slug), StyleState(one.slug, "empty")) for one in shown]
         if state is None or any(style.state == state for style in styles):
             rows.append((surgeon, styles))
     more = surgeons[-1].slug if len(surgeons) == limit else None
@@ -337,7 +337,7 @@ def _counts(session: Session) -> dict[str, int]:
     return {name: session.scalar(select(func.count()).select_from(rows)) or 0 for name, rows in few.items()}
 
 
-def _styles(session: Session, surgeons: Sequence[int], suture: str | None = None) -> dict[_Row, Style]:
+def _styles(session: Session, surgeons: Sequence[int], suture: str | None = None) -> dict[_Row, StyleState]:
     """Return the styles of some surgeons, by style; empty ones are left out."""
 
     def mine(of: Any) -> list[ColumnElement[bool]]:
@@ -376,11 +376,13 @@ def _styles(session: Session, surgeons: Sequence[int], suture: str | None = None
     }
 
 
-def _sum_up(style: _Row, demos: int, versions: int, told: list[Any] | None, newest_demo: int, released: bool) -> Style:
+def _sum_up(
+    style: _Row, demos: int, versions: int, told: list[Any] | None, newest_demo: int, released: bool
+) -> StyleState:
     if told is None:
-        return Style(style[1], "stored", demos)
+        return StyleState(style[1], "stored", demos)
     version, demonstration_row, other, shape, *shown = told
-    return Style(
+    return StyleState(
         suture=style[1],
         state="released" if released else "trained",
         demos=demos,
@@ -391,7 +393,7 @@ def _sum_up(style: _Row, demos: int, versions: int, told: list[Any] | None, newe
     )
 
 
-def styles_of(session: Session, surgeon: Surgeon) -> list[Style]:
+def styles_of(session: Session, surgeon: Surgeon) -> list[StyleState]:
     """List the styles of a surgeon that have anything, by suture type."""
     return [style for _, style in sorted(_styles(session, [surgeon.row]).items())]
 
@@ -402,7 +404,7 @@ class WholeStyle:
 
     surgeon: Surgeon
     suture: SutureType
-    style: Style
+    style: StyleState
     demos: Sequence[Demonstration]
     versions: Sequence[PolicyVersion]
     releases: Sequence[Release]
@@ -423,7 +425,7 @@ def whole_style(session: Session, surgeon: str, suture: str) -> WholeStyle:
         return session.scalars(mine.order_by(of.row.desc()).limit(MOST_VERSIONS)).all()
 
     releases: Sequence[Release] = newest(Release)
-    style = _styles(session, [who.row], what.slug).get((who.row, what.slug), Style(what.slug, "empty"))
+    style = _styles(session, [who.row], what.slug).get((who.row, what.slug), StyleState(what.slug, "empty"))
     return WholeStyle(
         surgeon=who,
         suture=what,

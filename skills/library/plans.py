@@ -93,7 +93,7 @@ def plan_sutures(database: Database, request: PlanIn, actor: str) -> tuple[Plan,
 
 
 @dataclass(frozen=True, eq=False)
-class Style:
+class FollowedStyle:
     """The policy version that a plan follows, and the demonstration whose hand it has."""
 
     version: int
@@ -107,7 +107,7 @@ class Style:
         return None if self.policy.surroundings is None else self.policy.surroundings.scene
 
 
-def style_of(database: Database, surgeon: str, suture: str, version: int | None) -> Style:
+def style_of(database: Database, surgeon: str, suture: str, version: int | None) -> FollowedStyle:
     """Return the requested version of a style, or the served one.
 
     Raises:
@@ -116,10 +116,10 @@ def style_of(database: Database, surgeon: str, suture: str, version: int | None)
     """
     with database.reading() as session:
         policy = policies.choose(session, surgeon, suture, version)
-        return Style(policy.version, policy.sha256, learnt(policy), hand_of(policy))
+        return FollowedStyle(policy.version, policy.sha256, learnt(policy), hand_of(policy))
 
 
-def stacked(request: PlanIn, style: Style) -> SuturePlan:
+def stacked(request: PlanIn, style: FollowedStyle) -> SuturePlan:
     """Return the plan that a request asks for, with its scene; nothing is stored.
 
     Raises:

@@ -75,7 +75,7 @@ def compute_again(database: Database, row: int) -> Again:
     return Again(stored.differing(certified(lesson, stored.request, unpack_as(Demo, lesson.demo), stored.policy)))
 
 
-def learn_again(database: Database, row: int, recordings: "Recordings", settings: Settings) -> Again:
+def learn_again(database: Database, row: int, recordings: "StoredRecordings", settings: Settings) -> Again:
     """Cut the demonstrations of a version out of their recordings again, learn from them, and compare the result.
 
     Args:
@@ -117,7 +117,7 @@ def _found(session: Session, row: int) -> PolicyVersion:
     return version
 
 
-class Recordings:
+class StoredRecordings:
     """Reads recordings from their stored bytes; the last one is kept, because versions in turn are often of one."""
 
     def __init__(self, database: Database, tell: Teller) -> None:
@@ -171,7 +171,7 @@ class _Cut:
         named = {name: getattr(demo, name) for name in ("arm", "topic", "start_s", "end_s")}
         return cls(row.recording_row, row.sha256, named, (path.grid, path.hysteresis), digest(demo), digest(path))
 
-    def again(self, told: Recordings) -> tuple[Demo, GridPath]:
+    def again(self, told: StoredRecordings) -> tuple[Demo, GridPath]:
         demo = cut_demo(told.read(self.recording).recording, **self.named)
         return demo, discretize(demo.tip_mm, *self.of_grid)
 

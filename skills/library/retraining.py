@@ -22,7 +22,7 @@ from skills.learning.policy import LEARNER_VERSION, describe_learner
 from skills.library import jobs, locks
 from skills.library.catalogue import find_surgeon, find_suture_type
 from skills.library.demos import newest_demos
-from skills.library.jobs import BATCH, KEPT, PART, Asked, PartRequest, RetrainingRequest, did_nothing
+from skills.library.jobs import BATCH, KEPT, PART, PartRequest, RequestedJob, RetrainingRequest, did_nothing
 from skills.library.policies import Kept, Recipe, in_pieces, kept_of, learner_kept, recipes_of
 from skills.library.releases import Outcome
 from skills.library.training import GATE_VERSION, POSES_VERSION, learner_to_train
@@ -41,7 +41,7 @@ def request_retraining(
     actor: str,
     near: NearLimits | None = None,
     odds: OddsLimits | None = None,
-) -> Asked:
+) -> RequestedJob:
     """Queue a batch that trains styles again, each from its newest demonstration that may be learnt from.
 
     One that is marked recovery or failure is left out, even if the style serves a version trained from any outcome. A
@@ -83,7 +83,7 @@ def request_retraining(
         who = None if batch.surgeon is None else find_surgeon(session, batch.surgeon)
         job, new = jobs.ask(session, BATCH, request, who, actor)
         if not new:
-            return Asked(job, False, _did_nothing(session, job))
+            return RequestedJob(job, False, _did_nothing(session, job))
     # Rows are inserted only for a new job; an equal one has its own.
     size = max(1, min(MOST_IN_A_PART, -(-len(styles) // FEWEST_PARTS)))
     at_once = STYLES_AT_ONCE // size * size
@@ -99,10 +99,10 @@ def request_retraining(
     if told is None:
         raise Conflict("The surgeon was erased while the batch was requested.")
     if not styles:
-        return Asked(told, True, "Nothing: no style needs training.")
+        return RequestedJob(told, True, "Nothing: no style needs training.")
     counted = f"{len(styles)} {'style' if len(styles) == 1 else 'styles'}"
     why = " that serve another version than when an equal batch ended" if "after" in request else ""
-    return Asked(told, True, f"A new job is queued, of {counted}{why}.")
+    return RequestedJob(told, True, f"A new job is queued, of {counted}{why}.")
 
 
 def choose_styles(

@@ -87,7 +87,7 @@ def check_export(session: Session, source: Source, sha256: str) -> None:
             raise Conflict("The recording contains a surgeon whose consent does not cover an export.")
 
 
-class Choice(NamedTuple):
+class TimelineLink(NamedTuple):
     """A resource with a timeline, and its name on a page."""
 
     source: Source
@@ -95,7 +95,7 @@ class Choice(NamedTuple):
     name: str
 
 
-def motion_named(session: Session, name: str) -> Choice:
+def motion_named(session: Session, name: str) -> TimelineLink:
     """Return the resource of a name such as `plans/DIGEST`.
 
     Raises:
@@ -108,7 +108,7 @@ def motion_named(session: Session, name: str) -> Choice:
     raise NotFound("There is no such motion to play beside this one; choose one of the list.")
 
 
-def chosen(session: Session, source: Source, sha256: str) -> tuple[Choice, Sequence[Choice]]:
+def chosen(session: Session, source: Source, sha256: str) -> tuple[TimelineLink, Sequence[TimelineLink]]:
     """Return a resource under its name, and some to play beside it: of the same suture type, its own surgeon's first.
 
     Raises:
@@ -130,10 +130,10 @@ def chosen(session: Session, source: Source, sha256: str) -> tuple[Choice, Seque
 
 def _found(
     session: Session, source: Source, sha256: str
-) -> tuple[Choice, StoredRecording | Demonstration | PolicyVersion | Plan]:
+) -> tuple[TimelineLink, StoredRecording | Demonstration | PolicyVersion | Plan]:
     if source == "recordings":
         recording = find_recording(session, sha256)
-        return Choice(source, recording.sha256, f"Recording {recording.sha256[:12]}"), recording
+        return TimelineLink(source, recording.sha256, f"Recording {recording.sha256[:12]}"), recording
     if source == "demos":
         demo = find_demo(session, sha256)
         return _demo(demo), demo
@@ -153,13 +153,13 @@ def _newest(
     return session.scalars(query.limit(MOST_CHOICES)).all()
 
 
-def _demo(row: Demonstration) -> Choice:
-    return Choice("demos", row.sha256, f"{row.surgeon.slug}, demonstration {row.sha256[:8]}")
+def _demo(row: Demonstration) -> TimelineLink:
+    return TimelineLink("demos", row.sha256, f"{row.surgeon.slug}, demonstration {row.sha256[:8]}")
 
 
-def _path(row: PolicyVersion) -> Choice:
-    return Choice("policy-versions", row.sha256, f"{row.surgeon.slug}, learnt path of version {row.version}")
+def _path(row: PolicyVersion) -> TimelineLink:
+    return TimelineLink("policy-versions", row.sha256, f"{row.surgeon.slug}, learnt path of version {row.version}")
 
 
-def _plan(row: Plan) -> Choice:
-    return Choice("plans", row.sha256, f"{row.policy.surgeon.slug}, plan {row.sha256[:8]}")
+def _plan(row: Plan) -> TimelineLink:
+    return TimelineLink("plans", row.sha256, f"{row.policy.surgeon.slug}, plan {row.sha256[:8]}")

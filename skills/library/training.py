@@ -68,7 +68,7 @@ from skills.library.catalogue import find_surgeon, find_suture_type
 from skills.library.consent import refusal, require
 from skills.library.demos import find_demo
 from skills.library.integrity import policy_identity_of, poses_identity_of, scene_digest
-from skills.library.jobs import QUEUED, Asked, Store, TrainingRequest, did_nothing
+from skills.library.jobs import QUEUED, RequestedJob, Store, TrainingRequest, did_nothing
 from skills.library.policies import BEST, choose_demos, combining_of, describe_combined, find_by_digest
 from skills.packing import canonical, sha256
 from skills.planning.plan import DrivenPass, driven_pass
@@ -116,7 +116,7 @@ def request_training(
     actor: str,
     near: NearLimits | None = None,
     odds: OddsLimits | None = None,
-) -> Asked:
+) -> RequestedJob:
     """Queue the training of a style, with all defaults resolved.
 
     Several demonstrations are combined, independently of the order in which they are named. If an equal training with
@@ -144,9 +144,9 @@ def request_training(
     request, who = training_request(session, training, near, odds)
     job, new = jobs.ask(session, "training", request, who, actor)
     if new:
-        return Asked(job, True, QUEUED)
+        return RequestedJob(job, True, QUEUED)
     again = training.release and job.state == "succeeded"
-    return Asked(job, False, _release_again(session, job, actor) if again else did_nothing(job))
+    return RequestedJob(job, False, _release_again(session, job, actor) if again else did_nothing(job))
 
 
 def training_request(

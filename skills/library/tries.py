@@ -35,7 +35,7 @@ from skills.library import jobs, locks, releases
 from skills.library.catalogue import find_surgeon, find_suture_type
 from skills.library.consent import require
 from skills.library.demos import add_demo, choose_part, find_demo
-from skills.library.jobs import Asked, Store, identity_of
+from skills.library.jobs import RequestedJob, Store, identity_of
 from skills.library.plans import find_plan, hand_of, plan_sutures
 from skills.library.playbacks import (
     check_playback,
@@ -58,7 +58,7 @@ MOST_CHOICES = 20
 STEPS = 10  # of a try that is not stopped, for its progress
 
 
-def request_try(session: Session, asked: TryIn, actor: str) -> Asked:
+def request_try(session: Session, asked: TryIn, actor: str) -> RequestedJob:
     """Queue a try; an equal one that has not ended is returned as it is.
 
     Raises:
@@ -75,7 +75,7 @@ def request_try(session: Session, asked: TryIn, actor: str) -> Asked:
         # What it reported may have been withdrawn or erased since, so it is tried again, not looked up.
         request["again"] = secrets.token_hex(8)
     job, new = jobs.ask(session, TRY, request, surgeon, actor)
-    return Asked(job, new, jobs.QUEUED if new else jobs.did_nothing(job))
+    return RequestedJob(job, new, jobs.QUEUED if new else jobs.did_nothing(job))
 
 
 def perform_try(database: Database, request: dict[str, Any], settings: Settings) -> Store:

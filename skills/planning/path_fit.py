@@ -72,7 +72,7 @@ _ROUNDS = 120
 
 
 @dataclass(frozen=True, eq=False)
-class Trace:
+class SmoothedDemo:
     """A demonstration without tremor and rests.
 
     Attributes:
@@ -121,7 +121,7 @@ class FittedPath:
         object.__setattr__(self, "places", frozen(self.places, np.float64, (len(self.clock_s),), "places"))
 
 
-def trace(demo: Demo, path: GridPath) -> Trace:
+def trace(demo: Demo, path: GridPath) -> SmoothedDemo:
     """Return a demonstration without tremor (8 to 12 Hz) and rests, with the waypoint of each point.
 
     Waypoints that contain no sample get a point on the straight line between the samples around them.
@@ -146,7 +146,7 @@ def trace(demo: Demo, path: GridPath) -> Trace:
     order = np.argsort(waypoints, kind="stable")
     moving = order[_moving(calm[order], MOVED * path.grid.cell_mm)]
     ends = ends_of(demo, path)
-    return Trace(path, calm[moving], waypoints[moving], times[moving], ends, float(demo.stamps_s[-1]))
+    return SmoothedDemo(path, calm[moving], waypoints[moving], times[moving], ends, float(demo.stamps_s[-1]))
 
 
 def ends_of(demo: Demo, path: GridPath) -> Floats:
@@ -162,7 +162,7 @@ def ends_of(demo: Demo, path: GridPath) -> Floats:
     return demo.tip_mm[[0, -1]].clip(centres - half, centres + half).round(6)
 
 
-def fit_to_demo(followed: Rollout, demonstrated: Trace, start_mm: Floats | None = None) -> FittedPath:
+def fit_to_demo(followed: Rollout, demonstrated: SmoothedDemo, start_mm: Floats | None = None) -> FittedPath:
     """Fit a smooth path to the demonstration that a rollout follows, within the rollout's cells in their order.
 
     With hysteresis a point may be outside of its cell by as much, but not outside of the grid.
@@ -215,7 +215,7 @@ def _moving(tip_mm: Floats, least_mm: float) -> Ints:
     return np.array(found)
 
 
-def _guide(followed: Rollout, demonstrated: Trace, start_mm: Floats | None) -> tuple[Floats, Ints, Floats]:
+def _guide(followed: Rollout, demonstrated: SmoothedDemo, start_mm: Floats | None) -> tuple[Floats, Ints, Floats]:
     """Return the points of the guide, (M, 3), the visit of each, (M,), and its time in the demonstration, (M,)."""
     last = len(followed.states) - 1
     joined = last + 1 - _tail(followed)

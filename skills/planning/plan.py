@@ -59,7 +59,7 @@ from skills.notebook import card
 from skills.planning.handoff import PsmM, needle_tips_mm, realign
 from skills.planning.motion_laws import Pose, followed
 from skills.planning.passes import PassPath, Way, ways
-from skills.planning.path_fit import Hand, Trace, ends_of, fit_to_demo, hand_along, moved, trace
+from skills.planning.path_fit import Hand, SmoothedDemo, ends_of, fit_to_demo, hand_along, moved, trace
 
 MAX_PASSES = 200
 RATE_HZ = (100.0, 200.0)  # of the plans that a robot's controller follows
@@ -310,7 +310,7 @@ class _Recorded:
     """The demonstration of a plan, its trace in the grid, and whether the jaw turns as it did there."""
 
     demo: Demo
-    trace: Trace
+    trace: SmoothedDemo
     turning: bool
 
     @property

@@ -49,7 +49,7 @@ def write_report(
     """
     if to.exists() and not to.is_dir():
         raise BadInput(f"{to} is a file; name a folder to write the report to.")
-    from skills.report.drawings import draw_all  # here, because it imports matplotlib
+    from skills.report.figures import draw_all  # here, because it imports matplotlib
 
     theirs = paper_source(paper_data)
     to.mkdir(parents=True, exist_ok=True)

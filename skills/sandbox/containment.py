@@ -59,7 +59,7 @@ _libc = ctypes.CDLL(None, use_errno=True)
 
 
 @dataclass(frozen=True)
-class Place:
+class Allowance:
     """What a contained process may reach.
 
     Attributes:
@@ -117,18 +117,18 @@ def _outermost(folders: Iterable[str]) -> list[str]:
 # ---- layers of the server ----------------------------------------------------------------------------------------
 
 
-def _own_network(place: Place) -> None:
+def _own_network(place: Allowance) -> None:
     _unshare(_NEW_NET | _NEW_IPC)
 
 
-def _no_network(place: Place) -> bool:
+def _no_network(place: Allowance) -> bool:
     """Return whether even this machine cannot be reached."""
     with socket.socket() as tried:
         tried.settimeout(1.0)
         return tried.connect_ex(("127.0.0.1", 9)) == errno.ENETUNREACH
 
 
-def _own_files(place: Place) -> None:
+def _own_files(place: Allowance) -> None:
     """Build a root in memory, show it the folders, and leave the old one."""
     _unshare(_NEW_NS)
     _mount(None, "/", None, _RECURSIVE | _PRIVATE)  # nothing that is mounted here is seen outside
@@ -170,13 +170,13 @@ def _show(source: str, at: str, attributes: int) -> None:
     _set_attributes(at, attributes, _WHOLE_TREE)
 
 
-def _only_own_files(place: Place) -> bool:
+def _only_own_files(place: Allowance) -> bool:
     """Return whether the root has nothing else, and cannot be changed."""
     wanted = {Path(one).parts[1] for one in (*place.code, *OF_PROC, *FILES, *DEVICES, place.folder)}
     return set(os.listdir("/")) <= wanted and not Path("/proc/self").exists() and not _writes("/")
 
 
-def _own_user(place: Place) -> None:
+def _own_user(place: Allowance) -> None:
     if os.geteuid() == 0:
         os.chown(place.folder, NOBODY, NOBODY)
         os.setgroups([])
@@ -184,42 +184,42 @@ def _own_user(place: Place) -> None:
         os.setresuid(NOBODY, NOBODY, NOBODY)
 
 
-def _useful_user(place: Place) -> bool:
+def _useful_user(place: Allowance) -> bool:
     """Return whether this is not root, and can read the code and write its temporary files."""
     readable = all(os.access(folder, os.R_OK | os.X_OK) for folder in place.code)
     return readable and os.geteuid() != 0 and os.getegid() != 0 and _writes(place.folder)
 
 
-def _no_capabilities(place: Place) -> None:
+def _no_capabilities(place: Allowance) -> None:
     for one in range(_CAPABILITIES):
         _libc.prctl(_DROP_BOUND, one, 0, 0, 0)  # refused where there is none to drop
     _checked(_libc.capset(ctypes.byref((ctypes.c_uint32 * 2)(_CAPABILITIES_3, 0)), (ctypes.c_uint32 * 6)()))
 
 
-def _none_left(place: Place) -> bool:
+def _none_left(place: Allowance) -> bool:
     return not any(_capabilities()) and _is_refused(lambda: os.setgroups([]))
 
 
-def _no_new_privileges(place: Place) -> None:
+def _no_new_privileges(place: Allowance) -> None:
     _checked(_libc.prctl(_SET_NO_NEW, 1, 0, 0, 0))
 
 
-def _has_no_new_privileges(place: Place) -> bool:
+def _has_no_new_privileges(place: Allowance) -> bool:
     return bool(_libc.prctl(_GET_NO_NEW, 0, 0, 0, 0) == 1)
 
 
 # ---- layers of each fork -----------------------------------------------------------------------------------------
 
 
-def _not_dumpable(place: Place) -> None:
+def _not_dumpable(place: Allowance) -> None:
     _checked(_libc.prctl(_SET_DUMPABLE, 0, 0, 0, 0))
 
 
-def _is_not_dumpable(place: Place) -> bool:
+def _is_not_dumpable(place: Allowance) -> bool:
     return bool(_libc.prctl(_GET_DUMPABLE, 0, 0, 0, 0) == 0)
 
 
-def _file_rights(place: Place) -> None:
+def _file_rights(place: Allowance) -> None:
     """Withhold every right on files, but for those that are listed here."""
     rights = _RIGHTS[min(_landlock_version(), max(_RIGHTS))]
     rules = [(folder, _READ | _LIST) for folder in place.code]
@@ -238,7 +238,7 @@ def _file_rights(place: Place) -> None:
         os.close(ruleset)
 
 
-def _has_file_rights(place: Place) -> bool:
+def _has_file_rights(place: Allowance) -> bool:
     """Return whether a folder that every process may list is closed, and the temporary files can be written."""
     try:
         os.listdir("/")
@@ -247,7 +247,7 @@ def _has_file_rights(place: Place) -> bool:
     return False
 
 
-def _signals(place: Place) -> None:
+def _signals(place: Allowance) -> None:
     if _landlock_version() < _SCOPES_SINCE:
         raise OSError(errno.ENOSYS, "Landlock of this kernel has no scopes")
     ruleset = _ruleset(0, _TCP, _SOCKETS_AND_SIGNALS)
@@ -257,12 +257,12 @@ def _signals(place: Place) -> None:
         os.close(ruleset)
 
 
-def _sends_no_signals(place: Place) -> bool:
+def _sends_no_signals(place: Allowance) -> bool:
     """Return whether the parent, a process of the same user, is out of reach."""
     return _is_refused(lambda: os.kill(os.getppid(), 0))
 
 
-def _system_calls(place: Place) -> None:
+def _system_calls(place: Allowance) -> None:
     steps = system_calls.filter_of(threads=place.threads, programs=bool(place.program), pid=os.getpid())
     buffer = ctypes.create_string_buffer(steps, len(steps))
 
@@ -273,12 +273,12 @@ def _system_calls(place: Place) -> None:
     _checked(_libc.prctl(_SET_SECCOMP, 2, ctypes.byref(program), 0, 0))
 
 
-def _has_few_system_calls(place: Place) -> bool:
+def _has_few_system_calls(place: Allowance) -> bool:
     attempts: tuple[Callable[[], object], ...] = (socket.socket, os.fork, lambda: os.getpgid(1))
     return all(_is_refused(one) for one in attempts)
 
 
-Layer = tuple[Callable[[Place], None], Callable[[Place], bool]]  # enters it; attempts what it prevents
+Layer = tuple[Callable[[Allowance], None], Callable[[Allowance], bool]]  # enters it; attempts what it prevents
 _OF_SERVER: dict[str, Layer] = {
     "own network": (_own_network, _no_network),
     "own files": (_own_files, _only_own_files),
@@ -315,7 +315,7 @@ def prepare(layers: Iterable[str]) -> None:
         _own_rights()
 
 
-def enter(place: Place, layers: Iterable[str]) -> None:
+def enter(place: Allowance, layers: Iterable[str]) -> None:
     """Enter those of the layers that a fork server enters, after `prepare`; its other threads do not enter all.
 
     Raises:
@@ -326,7 +326,7 @@ def enter(place: Place, layers: Iterable[str]) -> None:
             _OF_SERVER[name][0](place)
 
 
-def shut(place: Place, layers: Iterable[str]) -> None:
+def shut(place: Allowance, layers: Iterable[str]) -> None:
     """Enter those of the layers that a fork enters.
 
     Raises:
@@ -337,7 +337,7 @@ def shut(place: Place, layers: Iterable[str]) -> None:
             _OF_FORK[name][0](place)
 
 
-def offered(place: Place) -> list[str]:
+def offered(place: Allowance) -> list[str]:
     """Return the layers that hold on this system, all together.
 
     They are tried in forks. If one fails, the others are tried again without it, because it may have failed half-way.
@@ -348,7 +348,7 @@ def offered(place: Place) -> list[str]:
     return wanted
 
 
-def _held_in_a_fork(place: Place, wanted: list[str]) -> list[str]:
+def _held_in_a_fork(place: Allowance, wanted: list[str]) -> list[str]:
     """Enter layers in a fork, and return those that held, up to the first that did not."""
     receive, send = os.pipe()
     pid = os.fork()
@@ -372,7 +372,7 @@ def _held_in_a_fork(place: Place, wanted: list[str]) -> list[str]:
     return held
 
 
-def _tried(place: Place, wanted: list[str], layers: dict[str, Layer], told: int) -> bool:
+def _tried(place: Allowance, wanted: list[str], layers: dict[str, Layer], told: int) -> bool:
     """Enter layers, write the names of those that hold to a pipe, and return whether all hold."""
     for name, (apply, holds) in layers.items():
         if name in wanted:

@@ -34,7 +34,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from skills.sandbox import ProcessLimits, confine, perform
-from skills.sandbox.containment import Place, enter, offered, prepare, shut
+from skills.sandbox.containment import Allowance, enter, offered, prepare, shut
 
 MAX_REQUEST_BYTES = 16384
 BEGUN, NO_FORK = b"begun", b"no fork"
@@ -56,7 +56,7 @@ class _Child:
 class _Inherited:
     """What every fork has of the server: its containment, and the address space of the server's imports in bytes."""
 
-    place: Place
+    place: Allowance
     layers: tuple[str, ...]
     held_bytes: int
 
@@ -73,7 +73,7 @@ def main(folder: str, code: str, layers: str, *modules: str) -> NoReturn:
     """
     tempfile.tempdir = folder
     in_use, remover = _removed_afterwards(folder)
-    place, wanted = Place(folder, tuple(json.loads(code))), json.loads(layers)
+    place, wanted = Allowance(folder, tuple(json.loads(code))), json.loads(layers)
     held = tuple(offered(place) if wanted is None else wanted)
     prepare(held)
     gc.disable()  # imports create no garbage, and looking for it takes a fifth of the start
@@ -222,7 +222,7 @@ def _be_child(
         module, _, name = request["target"].partition(":")
         # The outermost package before, because the folder that contains it can no longer be listed then.
         importlib.import_module(module.partition(".")[0])
-        place = Place(tempfile.tempdir, inherited.place.code, threads=limits.threads, program=limits.program)
+        place = Allowance(tempfile.tempdir, inherited.place.code, threads=limits.threads, program=limits.program)
         shut(place, inherited.layers)
         function = getattr(importlib.import_module(module), name)
         with os.fdopen(0, "rb", closefd=False) as file, os.fdopen(answer, "wb") as out:

@@ -195,7 +195,7 @@ def _standard(values: Floats) -> tuple[Floats, Floats, Floats]:
 
 
 @dataclass(frozen=True, eq=False)
-class LeftOut:
+class LeftOutScores:
     """Scores of every trial by models that have not seen its group, in K variants of the ratings.
 
     Attributes:
@@ -210,7 +210,7 @@ class LeftOut:
     inner: Floats
 
 
-def left_out_scores(cohort: Cohort, groups: Ints, outcomes: Floats) -> LeftOut:
+def left_out_scores(cohort: Cohort, groups: Ints, outcomes: Floats) -> LeftOutScores:
     """Score every trial by a model that has not seen its group, of a design that was chosen without that group.
 
     Args:
@@ -228,7 +228,7 @@ def left_out_scores(cohort: Cohort, groups: Ints, outcomes: Floats) -> LeftOut:
         scores[~seen] = np.moveaxis(found[best, :, :, variants], 0, -1)
         chosen.append(best)
         inner.append(without)
-    return LeftOut(scores, np.stack(chosen), np.stack(inner))
+    return LeftOutScores(scores, np.stack(chosen), np.stack(inner))
 
 
 def _best(

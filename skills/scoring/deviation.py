@@ -16,7 +16,7 @@ that a deeper place is not aligned with another deep one. At each state five num
 the left and how high, the angle of the wrist in the frame of the hand-off, the time in motion, and the time at rest. An
 expert's motions differ too. So a difference counts in standard deviations of the expert's own motions there, and is
 named only if it exceeds `LEAST` of them, and the largest number of them by which one of the expert's motions differs
-from the others in anything. With few motions the spread is mostly an assumed one (`Kind.usual`).
+from the others in anything. With few motions the spread is mostly an assumed one (`DifferenceKind.usual`).
 
 All of this is ours, and so are the numbers. It says that motions differ, not which is better.
 """
@@ -194,7 +194,7 @@ LEAST_TIME_S = 0.02  # added before a logarithm
 
 
 @dataclass(frozen=True)
-class Kind:
+class DifferenceKind:
     """One of the compared numbers: its name, its unit, and its usual spread in one expert's motions."""
 
     name: str
@@ -203,11 +203,11 @@ class Kind:
 
 
 KINDS = (
-    Kind("to the side", "mm", 1.5),
-    Kind("height", "mm", 1.5),
-    Kind("wrist", "degrees", 4.0),
-    Kind("time in motion", "s", 0.15),  # of its logarithm
-    Kind("pause", "s", 0.25),
+    DifferenceKind("to the side", "mm", 1.5),
+    DifferenceKind("height", "mm", 1.5),
+    DifferenceKind("wrist", "degrees", 4.0),
+    DifferenceKind("time in motion", "s", 0.15),  # of its logarithm
+    DifferenceKind("pause", "s", 0.25),
 )
 
 

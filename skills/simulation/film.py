@@ -26,7 +26,7 @@ from skills.errors import SimulationFailed
 from skills.kinematics import JAW_TIP_MM, quaternion_of
 from skills.planning.trajectory import A1, A2, TRANSFER, Trajectory
 from skills.sandbox import ProcessLimits
-from skills.simulation import pictures, scene
+from skills.simulation import pictures, simulator
 from skills.simulation.player import simulated
 from skills.verification.clearance import needle_poses
 
@@ -89,7 +89,7 @@ def shoot(
         SimulationFailed: PyBullet is missing, or it crashed, hung, ran out of memory or returned no film.
     """
     if target == CREW:
-        scene.require_pybullet()
+        simulator.require_pybullet()
     at = frames_of(trajectory) if samples is None else np.asarray(samples, np.int64)
     limits = ProcessLimits(memory_bytes, timeout_s, program=_encoder())
     answer = simulated(target, _request(trajectory, at, pad_top_mm), limits)
@@ -160,7 +160,7 @@ def film(given: BinaryIO, answer: BinaryIO) -> None:
     """Make the film that `shoot` requests."""
     os.nice(_NICENESS)
     asked: Asked = packing.read(given, {})
-    with scene.opened(asked["instrument"], asked["rate_hz"]) as set_up:
+    with simulator.opened(asked["instrument"], asked["rate_hz"]) as set_up:
         mp4, gif = encode(_frames(set_up, asked))
     packing.write(answer, {"mp4": mp4, "gif": gif}, {})
 
@@ -186,7 +186,7 @@ def encode(frames: Iterable[bytes]) -> tuple[bytes, bytes]:
         return mp4.read(), gif.read()
 
 
-def _frames(set_up: scene.Scene, asked: Asked) -> Iterator[bytes]:
+def _frames(set_up: simulator.Simulator, asked: Asked) -> Iterator[bytes]:
     """Pose the scene for one frame after the other; the last one is repeated."""
     set_up.place_pad(asked["extent_mm"], asked["pad_top_mm"])
     if "m_joints" in asked:
@@ -208,7 +208,7 @@ def _frames(set_up: scene.Scene, asked: Asked) -> Iterator[bytes]:
 def _camera(asked: Asked) -> pictures.Camera:
     """Return a camera on the side opposite to PSM_M that also shows the finger tips, which are below the path."""
     way = asked["way_mm"]
-    facing = pictures.facing(np.concatenate([way, way - [0.0, 0.0, JAW_TIP_MM]]) * scene.MM)
+    facing = pictures.facing(np.concatenate([way, way - [0.0, 0.0, JAW_TIP_MM]]) * simulator.MM)
     if "m_joints" in asked and asked["m_base_mm"][0] > way[:, 0].mean():
         facing = replace(facing, yaw_deg=-facing.yaw_deg)
     height = HEIGHT - _HEAD - _FOOT
@@ -220,7 +220,7 @@ def _draw_way(sheet: pictures.Sheet, asked: Asked, k: int) -> None:
     group = asked["way_pass"] * 3 + asked["way_phase"]
     for one in np.unique(group[np.abs(asked["way_pass"] - present) <= _NEAR]):
         mine = group == one
-        way, place, number = asked["way"][mine], asked["way_mm"][mine] * scene.MM, int(one) // 3
+        way, place, number = asked["way"][mine], asked["way_mm"][mine] * simulator.MM, int(one) // 3
         along = int(one) % 3 == A1
         colour = pictures.colour_of(number) if along else _TRANSFER_COLOUR
         done = int(np.searchsorted(way, now, side="right"))

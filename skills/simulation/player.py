@@ -15,11 +15,11 @@ from skills.planning.handoff import HOLDING_RAD
 from skills.planning.trajectory import Trajectory
 from skills.sandbox import ProcessLimits
 from skills.sandbox.forked import call_alone
-from skills.simulation import scene
+from skills.simulation import simulator
 from skills.verification.clearance import FINGER_REACH_MM, openings, psm_m_poses
 from skills.verification.playback import Playback, link_pairs
 
-SIMULATOR = "skills.simulation.scene:simulate"
+SIMULATOR = "skills.simulation.simulator:simulate"
 PAD_BELOW_MM = 5.0  # ours: height of the finger tips above a pad whose height is not given
 CLEARANCE_EVERY = 4  # samples: 0.33 mm of the tip's path at 20 mm/s and 240 Hz, for which the bounds on distances allow
 Plain = TypeVar("Plain", bytes, str, float, dict[Any, Any])
@@ -72,7 +72,7 @@ def play(
     if clearance_every < 1:
         raise BadInput("The step between samples with distances must be 1 or more.", given=clearance_every)
     if target == SIMULATOR:
-        scene.require_pybullet()
+        simulator.require_pybullet()
     asked = request(trajectory, pad, clearance_every)
     answer = simulated(target, asked, ProcessLimits(memory_bytes, timeout_s))
     return _playback(answer, trajectory, pad)

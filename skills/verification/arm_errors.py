@@ -324,7 +324,7 @@ _FITS, _FITTED_MM = 10_000, 1e-9
 
 
 @dataclass(frozen=True, eq=False)
-class Measured:
+class MeasuredArm:
     """Setpoints of an arm and its measured poses at N moments, in the frame of its base.
 
     Attributes:
@@ -430,7 +430,7 @@ class ArmCalibration:
         )
 
 
-def calibrate_arm(measured: Measured, *, name: str, blocks: int = BLOCKS) -> ArmCalibration:
+def calibrate_arm(measured: MeasuredArm, *, name: str, blocks: int = BLOCKS) -> ArmCalibration:
     """Estimate a laboratory's own errors from setpoints and measured poses of an arm.
 
     Args:
@@ -607,7 +607,7 @@ def _vectors(rotation: Floats) -> Floats:
     return np.asarray(axis * (2 * np.arctan2(length, w) / np.maximum(length, 1e-300))[:, None])
 
 
-def _tracked_mm(measured: Measured, marker_mm: Floats) -> Floats:
+def _tracked_mm(measured: MeasuredArm, marker_mm: Floats) -> Floats:
     """Return the tip's error in the base frame, shape (N, 3): where the tracker shows it, minus its setpoint.
 
     Registration and the marker's place in the tool frame are fitted in turn until they no longer change.

@@ -55,7 +55,7 @@ STILL: Row = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
-class Body:
+class ArmCapsule:
     """One capsule of an arm, at zero joints: x to the side, y away from the base, z up, from the remote centre, in mm.
 
     Attributes:
@@ -79,39 +79,39 @@ class Body:
     slides: bool = False
 
 
-def _tool_side(adaptor_mm: float, behind_mm: float) -> tuple[Body, ...]:
+def _tool_side(adaptor_mm: float, behind_mm: float) -> tuple[ArmCapsule, ...]:
     """Return what is alike on both arms; the column is `behind_mm` behind the tool."""
     return (
-        Body(
+        ArmCapsule(
             "carriage",
             55.0,
             turning_mm=(0, behind_mm / 4, adaptor_mm + 50),
             end_turning_mm=(0, behind_mm / 4, adaptor_mm - 110),
             slides=True,
         ),
-        Body("cannula mount", 30.0, turning_mm=(0, behind_mm, 70), end_turning_mm=(0, 0, 70)),
-        Body("cannula", 12.0, turning_mm=(0, 0, 90), end_turning_mm=(0, 0, -10)),
+        ArmCapsule("cannula mount", 30.0, turning_mm=(0, behind_mm, 70), end_turning_mm=(0, 0, 70)),
+        ArmCapsule("cannula", 12.0, turning_mm=(0, 0, 90), end_turning_mm=(0, 0, -10)),
     )
 
 
-BODIES: Mapping[str, tuple[Body, ...]] = {
+BODIES: Mapping[str, tuple[ArmCapsule, ...]] = {
     CLASSIC.name: (
-        Body("setup joint end", 90.0, (0, -910, -49.8), (0, -800, -49.8), yaws=False),
-        Body("base", 85.0, (0, -780, -43), (0, -400, -43), yaws=False),
-        Body("yaw link", 112.0, (0, -750, -60.7), (0, -400, -60.7)),
-        Body("back lever", 50.0, (-29.5, -518.5, 0), (-29.5, -518.5, 0), end_turning_mm=(24.1, -42.1, 187)),
-        Body("front lever", 50.0, (-29.5, -428.5, 0), (-29.5, -428.5, 0), end_turning_mm=(24.1, -42.1, 187)),
-        Body("bars", 60.0, (-10, -518.5, 0), (-10, 1.5, 0), (0, -41.9, 168.5), (0, -41.9, 168.5)),
-        Body("insertion axis", 60.0, turning_mm=(0, -40, 10), end_turning_mm=(0, -40, 500)),
+        ArmCapsule("setup joint end", 90.0, (0, -910, -49.8), (0, -800, -49.8), yaws=False),
+        ArmCapsule("base", 85.0, (0, -780, -43), (0, -400, -43), yaws=False),
+        ArmCapsule("yaw link", 112.0, (0, -750, -60.7), (0, -400, -60.7)),
+        ArmCapsule("back lever", 50.0, (-29.5, -518.5, 0), (-29.5, -518.5, 0), end_turning_mm=(24.1, -42.1, 187)),
+        ArmCapsule("front lever", 50.0, (-29.5, -428.5, 0), (-29.5, -428.5, 0), end_turning_mm=(24.1, -42.1, 187)),
+        ArmCapsule("bars", 60.0, (-10, -518.5, 0), (-10, 1.5, 0), (0, -41.9, 168.5), (0, -41.9, 168.5)),
+        ArmCapsule("insertion axis", 60.0, turning_mm=(0, -40, 10), end_turning_mm=(0, -40, 500)),
         *_tool_side(CLASSIC.remote_centre_mm, -40),
     ),
     SI.name: (
-        Body("setup joint end", 90.0, (0, -1090, 0), (0, -1000, 0), yaws=False),
-        Body("base", 79.0, (0, -1001, 0), (0, -760, 0), yaws=False),
-        Body("yaw link", 81.0, (-51.7, -712.8, 21.2), (-129.1, -365.3, -71.1)),
-        Body("lever", 107.0, (0, -386.5, -71.2), (0, -386.5, -71.2), (0, -3.4, -47), (0, -138.4, 154)),
-        Body("bars", 93.0, (0, -438.1, 7), (0, -46.2, 49.3), (0, -115.2, 171.6), (0, -115.2, 171.6)),
-        Body("insertion axis", 49.0, turning_mm=(0, -66.7, 37.3), end_turning_mm=(0, -81.3, 578.9)),
+        ArmCapsule("setup joint end", 90.0, (0, -1090, 0), (0, -1000, 0), yaws=False),
+        ArmCapsule("base", 79.0, (0, -1001, 0), (0, -760, 0), yaws=False),
+        ArmCapsule("yaw link", 81.0, (-51.7, -712.8, 21.2), (-129.1, -365.3, -71.1)),
+        ArmCapsule("lever", 107.0, (0, -386.5, -71.2), (0, -386.5, -71.2), (0, -3.4, -47), (0, -138.4, 154)),
+        ArmCapsule("bars", 93.0, (0, -438.1, 7), (0, -46.2, 49.3), (0, -115.2, 171.6), (0, -115.2, 171.6)),
+        ArmCapsule("insertion axis", 49.0, turning_mm=(0, -66.7, 37.3), end_turning_mm=(0, -81.3, 578.9)),
         *_tool_side(SI.remote_centre_mm, -74),
     ),
 }
@@ -130,7 +130,7 @@ def radii_of(instrument: str) -> Floats:
     return np.array([body.radius_mm for body in _of(instrument)] + [SHAFT_RADIUS_MM, FINGER_REACH_MM])
 
 
-def _of(instrument: str) -> tuple[Body, ...]:
+def _of(instrument: str) -> tuple[ArmCapsule, ...]:
     return BODIES[instrument_of(instrument).arm.name]
 
 
@@ -195,7 +195,7 @@ def moved_mm(joints: Floats, to: Floats, instrument: str) -> Floats:
     return np.concatenate([outer, shaft[..., None], hand[..., None]], axis=-1)
 
 
-def _reach(body: Body, insertion_mm: float) -> Row:
+def _reach(body: ArmCapsule, insertion_mm: float) -> Row:
     """Return the greatest movement of a body's points for one radian of yaw and of pitch, and for 1 mm of insertion."""
     if not body.yaws:
         return STILL

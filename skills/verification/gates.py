@@ -36,7 +36,7 @@ from skills.verification.clearance import (
     psm_m_poses,
     stands_from,
 )
-from skills.verification.intent import LIMITS, Comparison
+from skills.verification.intent import LIMITS, IntentComparison
 from skills.verification.playback import PAD, PSM_A, PSM_M, Playback
 from skills.verification.scene_clearance import SceneClearance
 
@@ -223,7 +223,7 @@ def first_failure(
     limits: Limits,
     beside: SceneClearance | None = None,
     outer: BodiesClearance | None = None,
-    intent: Comparison | None = None,
+    intent: IntentComparison | None = None,
 ) -> Failure | None:
     """Return the earliest sample at which a gate is broken; of several gates broken there, the first listed.
 

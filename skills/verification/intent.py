@@ -105,7 +105,7 @@ class Mismatch:
 
 
 @dataclass(frozen=True, eq=False)
-class Comparison:
+class IntentComparison:
     """The deviations of a motion from what was asked: for each kind in `LIMITS` one number per sample, shape (T,)."""
 
     values: Mapping[str, Floats]
@@ -121,7 +121,7 @@ class Comparison:
         return tuple(found)
 
 
-def compare(asked: Asked, trajectory: Trajectory, joints: Floats | None = None) -> Comparison:
+def compare(asked: Asked, trajectory: Trajectory, joints: Floats | None = None) -> IntentComparison:
     """Compare a motion with what was asked.
 
     Args:
@@ -153,7 +153,7 @@ class _Compared:
         self.other: _Arm | None = None
         self.rate_hz = trajectory.rate_hz
 
-    def compared(self) -> Comparison:
+    def compared(self) -> IntentComparison:
         counted = np.abs(np.maximum(self.motion.pass_index + 1 - len(self.asked.points), 0)).astype(np.float64)
         counted[-1] = abs(self.motion.passes - len(self.asked.points))
         self.put("number of passes off the suture points", np.arange(len(self.motion)), counted)
@@ -162,7 +162,7 @@ class _Compared:
         for number in range(min(self.motion.passes, len(self.asked.points))):
             before = _Pass(self, number, before)
             before.compare()
-        return Comparison(MappingProxyType(self.values))
+        return IntentComparison(MappingProxyType(self.values))
 
     def put(self, kind: str, rows: Ints, values: ArrayLike) -> None:
         """Add the deviations of one kind at some samples; the greater of two remains, and NaN does."""

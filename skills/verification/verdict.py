@@ -37,7 +37,7 @@ from skills.verification.clearance import (
     psm_m_poses,
 )
 from skills.verification.gates import ArmSamples, Failure, Figures, Limits, figures_of, first_failure
-from skills.verification.intent import Comparison, Mismatch
+from skills.verification.intent import IntentComparison, Mismatch
 from skills.verification.playback import CLEARANCE_SEEN_MM, MEANS, PAD, PSM_M, Playback
 from skills.verification.scene_clearance import SceneClearance
 
@@ -207,7 +207,7 @@ def judge(
     approach_m: ArrayLike | None = None,
     beside: SceneClearance | None = None,
     pad_is_tissue: bool = True,
-    intent: Comparison | None = None,
+    intent: IntentComparison | None = None,
 ) -> PlaybackReport:
     """Compare the measurements with the intended motion, with what was asked, and with the limits.
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from skills.db.changes import Kept
+from skills.db.changes import WeightedCache
 from skills.library import integrity
 from tests.api.service import CSV, KESTREL, POLICY, Service, assert_problem
 from tests.library import cases
@@ -23,7 +23,7 @@ ASKS = (
 @pytest.fixture(autouse=True)
 def cold(monkeypatch: pytest.MonkeyPatch) -> None:
     """Clear the caches that other tests filled, as in a process that has just started."""
-    monkeypatch.setattr(integrity, "_policies", Kept(32))
+    monkeypatch.setattr(integrity, "_policies", WeightedCache(32))
 
 
 def test_a_manifest_changed_after_it_was_served_is_not_served_again(trained: Service):

@@ -15,7 +15,7 @@ import pytest
 from sqlalchemy import text
 
 from skills.api.responses import JSON, NPZ, Body, negotiate
-from skills.db.changes import APPLICATION, BOUND_S, Kept
+from skills.db.changes import APPLICATION, BOUND_S, WeightedCache
 from skills.db.session import Database
 from skills.errors import UnknownFormat
 from skills.library import integrity
@@ -270,7 +270,7 @@ def test_a_verified_policy_is_served_by_digest_and_a_damaged_one_refused(trained
 
 
 def test_what_is_kept_is_bounded_by_its_bytes():
-    kept: Kept[int, bytes] = Kept(100, len)
+    kept: WeightedCache[int, bytes] = WeightedCache(100, len)
     for number in range(10):
         kept.put(number, bytes(30))
     assert [key for key, _ in kept.items()] == [7, 8, 9]
@@ -287,7 +287,7 @@ def test_what_is_kept_is_bounded_by_its_bytes():
 
 
 def test_a_list_of_what_is_kept_marks_nothing_as_used():
-    kept: Kept[str, int] = Kept(2)
+    kept: WeightedCache[str, int] = WeightedCache(2)
     kept.put("first", 1)
     kept.put("second", 2)
     kept.get("first")
@@ -297,7 +297,7 @@ def test_a_list_of_what_is_kept_marks_nothing_as_used():
 
 
 def test_threads_may_share_what_is_kept():
-    kept: Kept[int, bytes] = Kept(100, len)
+    kept: WeightedCache[int, bytes] = WeightedCache(100, len)
 
     def use(seed: int) -> None:
         rng = np.random.default_rng(seed)

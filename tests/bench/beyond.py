@@ -82,7 +82,7 @@ def one(kind: str, seed: int = 0, side: int = 0, waypoints: int = 0, **settings:
     reward = sparse_reward(demonstration(side, waypoints))
     table_policy.learn_tabular(sparse_reward(TWO_CELLS), LEARNERS["phase-q-learning"]())  # compiles
     if isinstance(learner, DQN | DDPG | TRPO):
-        import skills.deep.training  # noqa: F401 - torch is loaded before the clock starts
+        import skills.deep.trainer  # noqa: F401 - torch is loaded before the clock starts
     wall, processor = time.perf_counter(), time.process_time()
     policy = learnt(reward, learner, seed)
     wall_s, cpu_s, peak = time.perf_counter() - wall, time.process_time() - processor, peak_mib()
@@ -128,11 +128,11 @@ def learnt(reward: RewardMap, learner: Learner, seed: int) -> Policy:
     """Learn in this process, as the service's learning process does."""
     if not isinstance(learner, DQN | DDPG | TRPO):
         return table_policy.learn_tabular(reward, learner, seed)
-    from skills.deep import training
+    from skills.deep import trainer
 
     request, answer = BytesIO(), BytesIO()
     packing.write(request, NetworkLesson(reward, learner, seed), KNOWN)
-    training.train(request, answer)
+    trainer.train(request, answer)
     found = packing.read(answer, KNOWN)
     q = network_q(reward, learner, found.network)
     return Policy(reward.path, reward.levels, learner, seed, found.training, q, found.network)

@@ -18,7 +18,7 @@ from rich.table import Table
 
 from skills.formats.reader_process import ConfinedReader
 from skills.sandbox import ProcessLimits, forked
-from skills.sandbox.containment import Place, code_folders, enter, offered, shut
+from skills.sandbox.containment import Allowance, code_folders, enter, offered, shut
 from skills.sandbox.forked import ForkServer, call_alone, layers_held
 from skills.simulation.player import play
 from tests.bench.timing import in_turn
@@ -34,7 +34,7 @@ def containing(table: Table) -> None:
     """Measure each with the layers that hold here, and with none."""
     table.add_row("containment: layers that hold here", f"{len(layers_held())}", ", ".join(layers_held()))
     with tempfile.TemporaryDirectory() as folder:
-        place = Place(folder, tuple(code_folders()))
+        place = Allowance(folder, tuple(code_folders()))
         (found_s,) = in_turn(partial(offered, place), rounds=ROUNDS, clock=_processor_s)
         entered_s, shut_s = map(min, zip(*(_entering_s(place) for _ in range(ROUNDS)), strict=True))
     table.add_row("  finding out which hold, once for each service", f"{found_s * 1e3:.1f} ms", "")
@@ -54,7 +54,7 @@ def containing(table: Table) -> None:
 READY = "skills.formats.reader_process:get_ready"
 
 
-def _entering_s(place: Place) -> tuple[float, float]:
+def _entering_s(place: Allowance) -> tuple[float, float]:
     """Return the processor time that a fork needs to enter the layers of a server, and those of a fork."""
     held = layers_held()
     receive, send = os.pipe()

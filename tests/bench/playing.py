@@ -14,7 +14,7 @@ from skills.library.plans import trajectory_of
 from skills.planning.handoff import HOLDING_RAD, PsmM
 from skills.planning.plan import SuturePoint, stack
 from skills.planning.trajectory import Trajectory, joint_ratios, time_parametrise
-from skills.simulation import player, scene
+from skills.simulation import player, simulator
 from skills.verification.asked import asked_of
 from skills.verification.bodies import bodies_clearance
 from skills.verification.intent import compare
@@ -103,13 +103,13 @@ def two_at_once(trajectory: Trajectory, table: Table) -> None:
 def measure(asked: dict[str, Any]) -> None:
     """Do the work of a check in the simulator, except for the picture."""
     instrument, rate_hz = str(asked["instrument"]), float(asked["rate_hz"])
-    with scene.opened(instrument, rate_hz) as one:
+    with simulator.opened(instrument, rate_hz) as one:
         one.place_pad(asked["tip_mm"], float(asked["pad_top_mm"]))
         one.place_psm_m(asked["m_base_mm"], asked["m_base_xyzw"], instrument)
-        scene.kinematic_pass(one, asked)
-    with scene.opened(instrument, rate_hz) as one:
+        simulator.kinematic_pass(one, asked)
+    with simulator.opened(instrument, rate_hz) as one:
         one.place_pad(asked["tip_mm"], float(asked["pad_top_mm"]))
-        scene.servo_pass(one, asked)
+        simulator.servo_pass(one, asked)
 
 
 def plain(asked: dict[str, Any], at_once: bool = False) -> None:
@@ -118,25 +118,25 @@ def plain(asked: dict[str, Any], at_once: bool = False) -> None:
     `at_once` sets six joints in one call (`resetJointStatesMultiDof`), as `measure` does; the plain way is six calls.
     """
     instrument, rate_hz = str(asked["instrument"]), float(asked["rate_hz"])
-    arm_rows, m_rows = (scene.in_metres(asked[name]).tolist() for name in ("joints", "m_joints"))
-    with scene.opened(instrument, rate_hz) as one:
+    arm_rows, m_rows = (simulator.in_metres(asked[name]).tolist() for name in ("joints", "m_joints"))
+    with simulator.opened(instrument, rate_hz) as one:
         one.place_pad(asked["tip_mm"], float(asked["pad_top_mm"]))
         one.place_psm_m(asked["m_base_mm"], asked["m_base_xyzw"], instrument)
         _plain_kinematic(one, arm_rows, m_rows, set(asked["looks"].tolist()), at_once)
-    with scene.opened(instrument, rate_hz) as one:
+    with simulator.opened(instrument, rate_hz) as one:
         one.place_pad(asked["tip_mm"], float(asked["pad_top_mm"]))
         _plain_servo(one, arm_rows, rate_hz)
 
 
 def _plain_kinematic(
-    one: scene.Scene, arm_rows: list[list[float]], m_rows: list[list[float]], due: set[int], at_once: bool
+    one: simulator.Simulator, arm_rows: list[list[float]], m_rows: list[list[float]], due: set[int], at_once: bool
 ) -> None:
     bullet, client, arm, m, pad = one.bullet, one.client, one.arm, one.psm_m, one.pad
     assert m is not None
-    seen_m = CLEARANCE_SEEN_MM * scene.MM
+    seen_m = CLEARANCE_SEEN_MM * simulator.MM
     reset, together = bullet.resetJointState, bullet.resetJointStatesMultiDof
 
-    def put(body: scene.SceneBody, row: list[float]) -> None:
+    def put(body: simulator.SceneBody, row: list[float]) -> None:
         if at_once:
             together(body.number, body.joints, [[value] for value in row], physicsClientId=client)
         else:
@@ -156,10 +156,10 @@ def _plain_kinematic(
             bullet.getLinkState(arm.number, arm.shaft, 0, 1, physicsClientId=client)
 
 
-def _plain_servo(one: scene.Scene, rows: list[list[float]], rate_hz: float) -> None:
+def _plain_servo(one: simulator.Simulator, rows: list[list[float]], rate_hz: float) -> None:
     bullet, client, arm, pad = one.bullet, one.client, one.arm, one.pad
     driven = [*arm.joints, *arm.fingers]
-    forces = [*one.tool.arm.effort, scene.FINGER_EFFORT, scene.FINGER_EFFORT]
+    forces = [*one.tool.arm.effort, simulator.FINGER_EFFORT, simulator.FINGER_EFFORT]
     fingers = [HOLDING_RAD] * 2
     for row, following in pairwise(rows):
         bullet.setJointMotorControlArray(
@@ -169,8 +169,8 @@ def _plain_servo(one: scene.Scene, rows: list[list[float]], rate_hz: float) -> N
             targetPositions=row + fingers,
             targetVelocities=[(b - a) * rate_hz for a, b in zip(row, following, strict=True)] + [0.0, 0.0],
             forces=forces,
-            positionGains=[scene.POSITION_GAIN] * 8,
-            velocityGains=[scene.VELOCITY_GAIN] * 8,
+            positionGains=[simulator.POSITION_GAIN] * 8,
+            velocityGains=[simulator.VELOCITY_GAIN] * 8,
             physicsClientId=client,
         )
         bullet.stepSimulation(physicsClientId=client)

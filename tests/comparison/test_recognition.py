@@ -7,7 +7,7 @@ from skills.comparison.distances import STATES
 from skills.comparison.recognition import (
     FAMILIES,
     NUMBERS,
-    Settings,
+    MetricSettings,
     Validated,
     calibrate,
     fit,
@@ -22,7 +22,7 @@ from skills.comparison.recognition import (
 from skills.errors import BadInput
 from tests.comparison.cohort import Cohort, cohort
 
-TEMPO = Settings(("tempo",), 0.1)
+TEMPO = MetricSettings(("tempo",), 0.1)
 
 
 def signatures(drawn: Cohort) -> np.ndarray:
@@ -146,7 +146,7 @@ def test_the_metric_is_the_linear_discriminant_of_another_library():
     numbers = np.full((120, NUMBERS), np.nan)
     mixed = rng.normal(size=(11, 11))
     numbers[:, FAMILIES["tempo"]] = rng.normal(size=(120, 11)) @ mixed + 0.5 * truth[:, None] * rng.normal(size=11)
-    metric = fit(numbers, truth, 3, Settings(("tempo",), 0.0))
+    metric = fit(numbers, truth, 3, MetricSettings(("tempo",), 0.0))
     known = numbers[:, FAMILIES["tempo"]]
     theirs = LinearDiscriminantAnalysis(solver="lsqr", priors=np.full(3, 1 / 3)).fit(known, truth)
     # Theirs divides the covariance by N instead of N - S; ours counts the uncertainty of the means.

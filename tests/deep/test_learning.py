@@ -45,15 +45,15 @@ def test_the_seed_determines_the_learnt_bytes_and_the_training_is_counted(learne
 def test_numpy_answers_what_torch_answered(learner):
     import torch
 
-    from skills.deep import training
+    from skills.deep import trainer
 
     found: list = []
-    kept = training._network
-    training._network = lambda one, model: found.append(model) or kept(one, model)
+    kept = trainer._network
+    trainer._network = lambda one, model: found.append(model) or kept(one, model)
     try:
-        network = training.learn(NetworkLesson(REWARD, learner, 1)).network
+        network = trainer.learn(NetworkLesson(REWARD, learner, 1)).network
     finally:
-        training._network = kept
+        trainer._network = kept
     (model,) = found
     if isinstance(learner, DQN):
         cells = SMALL.cells_of(np.arange(27))

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from skills.demonstration.partner import Transfer, closed_jaw, find_transfers
+from skills.demonstration.partner import NeedleTransfer, closed_jaw, find_transfers
 from skills.demonstration.recording import Label, Recording, Signal, base_frames
 from skills.demonstration.segments import propose_by_arm
 from skills.formats.jigsaws import read_jigsaws
@@ -20,12 +20,12 @@ from tests.needs import need
 WITHIN_S = 0.5
 
 
-def found_in(recording: Recording) -> tuple[Transfer, ...]:
+def found_in(recording: Recording) -> tuple[NeedleTransfer, ...]:
     closed = {arm: closed_jaw(recording, arm) for arm in recording.arms}
     return find_transfers(recording, closed, base_frames(recording))
 
 
-def matched(found: tuple[Transfer, ...], given: list[Given]) -> list[bool]:
+def matched(found: tuple[NeedleTransfer, ...], given: list[Given]) -> list[bool]:
     """Return for each transfer found whether it is a true one; no true one is counted twice."""
     left, right = list(given), []
     for one in found:

@@ -6,7 +6,7 @@ import pytest
 from playwright.sync_api import Browser, Page, expect
 
 from skills.client import Client
-from skills.formats.writer import write_mcap
+from skills.formats.bag_writer import write_mcap
 from skills.seeds.recordings import sample_recordings
 from tests.e2e.browsers import Watched, axe, colours
 from tests.e2e.conftest import Service

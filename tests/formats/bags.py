@@ -13,7 +13,7 @@ from mcap_ros2.writer import Writer
 
 from skills.demonstration.recording import Motion, Recording, Signal
 from skills.formats import topics
-from skills.formats.writer import DEFINITIONS
+from skills.formats.bag_writer import DEFINITIONS
 from tests.needs import need
 
 START_NS = 1_760_000_000_000_000_000

@@ -9,8 +9,8 @@ import zipfile
 from collections.abc import Iterable
 from pathlib import Path
 
-from skills.formats import topics, writer
-from skills.formats.writer import write_messages
+from skills.formats import bag_writer, topics
+from skills.formats.bag_writer import write_messages
 from tests.formats import bags, hostile, records
 
 RULE = "=" * 80
@@ -128,11 +128,11 @@ def costly_to_tell() -> dict[str, bytes]:
 def slow(samples: int, step_s: float) -> bytes:
     """Write an MCAP file in which one arm moves back and forth."""
 
-    def said() -> Iterable[writer.Message]:
+    def said() -> Iterable[bag_writer.Message]:
         for k in range(samples):
             place = (0.01 * (k // 2 % 2), 0.05, -0.12)
             at_ns = bags.START_NS + round(k * step_s * 1e9)
-            yield writer.pose("/PSM1/local/measured_cp", at_ns, "PSM1_base", place, (0.0, 0.0, 0.0, 1.0))
+            yield bag_writer.pose("/PSM1/local/measured_cp", at_ns, "PSM1_base", place, (0.0, 0.0, 0.0, 1.0))
 
     out = io.BytesIO()
     write_messages(said(), out)
@@ -142,13 +142,13 @@ def slow(samples: int, step_s: float) -> bytes:
 def arms(count: int, samples: int) -> bytes:
     """Write an MCAP file in which many arms move and grip."""
 
-    def said() -> Iterable[writer.Message]:
+    def said() -> Iterable[bag_writer.Message]:
         for arm in range(count):
             for k in range(samples):
                 at_ns = bags.START_NS + k * bags.STEP_NS
                 name, place = f"/PSM{arm}", (0.01 * (k % 7), 0.05, -0.12)
-                yield writer.pose(f"{name}/local/measured_cp", at_ns, "PSM_base", place, (0.0, 0.0, 0.0, 1.0))
-                yield writer.joint_state(f"{name}/jaw/measured_js", at_ns, [0.8 * (k % 2)], ["jaw"])
+                yield bag_writer.pose(f"{name}/local/measured_cp", at_ns, "PSM_base", place, (0.0, 0.0, 0.0, 1.0))
+                yield bag_writer.joint_state(f"{name}/jaw/measured_js", at_ns, [0.8 * (k % 2)], ["jaw"])
 
     out = io.BytesIO()
     write_messages(said(), out)

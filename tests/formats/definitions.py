@@ -1,9 +1,9 @@
 """Definitions of the messages that a dVRK's recorder stores: those we write, and the older one of a pose."""
 
-from skills.formats import topics, writer
+from skills.formats import bag_writer, topics
 
 _RULE = "=" * 80
-_POSE = writer.DEFINITIONS[topics.POSE]
+_POSE = bag_writer.DEFINITIONS[topics.POSE]
 _HEADER = _POSE[_POSE.index(f"{_RULE}\nMSG: std_msgs/Header") :]
 _QUATERNION = f"{_RULE}\nMSG: geometry_msgs/Quaternion\nfloat64 x\nfloat64 y\nfloat64 z\nfloat64 w\n"
 
@@ -20,4 +20,4 @@ float64 x
 float64 y
 float64 z
 {_QUATERNION}{_HEADER}"""
-DEFINITIONS = {**writer.DEFINITIONS, topics.TRANSFORM: TRANSFORM}
+DEFINITIONS = {**bag_writer.DEFINITIONS, topics.TRANSFORM: TRANSFORM}

@@ -16,7 +16,7 @@ import lz4.frame
 import numpy as np
 
 from skills.formats import topics
-from skills.formats.writer import DEFINITIONS
+from skills.formats.bag_writer import DEFINITIONS
 from tests.formats import records
 from tests.formats.records import Part
 

@@ -15,7 +15,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from skills.demonstration.recording import Joints, Motion, Signal
 from skills.formats import topics
-from skills.formats.writer import Message
+from skills.formats.bag_writer import Message
 from tests.formats.bags import START_NS, STEP_NS, assert_same, recording
 
 JAZZY, NOETIC = get_typestore(Stores.ROS2_JAZZY), get_typestore(Stores.ROS1_NOETIC)

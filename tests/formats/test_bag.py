@@ -9,9 +9,9 @@ import zstandard
 
 from skills.demonstration.recording import Label
 from skills.errors import MixedFrames, NoUsableTopic, UnreadableRecording
-from skills.formats import read_recording, write_mcap, writer
+from skills.formats import bag_writer, read_recording, write_mcap
 from skills.formats.bag_folder import Metadata, read_metadata
-from skills.formats.writer import messages_of, write_messages
+from skills.formats.bag_writer import messages_of, write_messages
 from tests.formats.bags import LOCAL, START_NS, STEP_NS, assert_same, pose_bag, recording, sample_folder, straight
 from tests.formats.others import assert_all_the_same, folder_members, rosbag2, whole, zipped
 
@@ -174,7 +174,7 @@ def test_two_parts_in_two_frames_are_refused():
 
 
 def test_a_part_without_an_arm_is_refused_with_what_to_do():
-    clutch = written([writer.joy("/console/clutch", START_NS, [1])])
+    clutch = written([bag_writer.joy("/console/clutch", START_NS, [1])])
     with pytest.raises(NoUsableTopic, match=r"'x_1.mcap'.*Join the parts first"):
         read({"x_0.mcap": pose_bag(straight()), "x_1.mcap": clutch})
 

@@ -8,7 +8,7 @@ import pytest
 from skills.errors import BackwardStamps, NotFinite, NoUsableTopic, SkillsError
 from skills.formats import topics
 from skills.formats.mcap import read_mcap
-from skills.formats.topics import Kind
+from skills.formats.topics import TopicKind
 from tests.formats import large
 from tests.formats.bags import LOCAL, START_NS, STEP_NS, bag, header, pose, straight
 from tests.formats.definitions import DEFINITIONS
@@ -135,22 +135,22 @@ def test_a_definition_without_what_is_wanted_is_left_out():
 @pytest.mark.parametrize(
     ("topic", "message_type", "kind", "whose"),
     [
-        ("/PSM2/local/measured_cp", topics.POSE, Kind.MOTION, "PSM2"),
-        ("/PSM2/measured_cp", topics.TRANSFORM, Kind.MOTION, "PSM2"),
-        ("/CRTK/psm2/measured_cp", topics.POSE, Kind.MOTION, "psm2"),
-        ("/dvrk/PSM1/position_cartesian_current", topics.POSE, Kind.MOTION, "PSM1"),
-        ("/MTML1/measured_cp", topics.POSE, Kind.MASTER, "MTML1"),
-        ("/MTMR2/gripper/measured_js", topics.JOINT_STATE, Kind.GRIPPER, "MTMR2"),
-        ("/CRTK/psm1/measured_js", topics.JOINT_STATE, Kind.JOINTS, "psm1"),
-        ("/PSM3/jaw/measured_js", topics.JOINT_STATE, Kind.JAW, "PSM3"),
-        ("/console/clutch", topics.BOOL, Kind.PEDAL, "/console/clutch"),
-        ("/dvrk/footpedals/bicoag", topics.JOY, Kind.PEDAL, "/dvrk/footpedals/bicoag"),
-        ("/MTML_PSM1/following", topics.BOOL, Kind.FOLLOWING, "MTML_PSM1"),
-        ("/PSM1/tool_type", topics.STRING, Kind.TOOL, "PSM1"),
-        ("/PSM2/setpoint_cp", topics.POSE, Kind.SETPOINT, "PSM2"),
-        ("/CRTK/psm2/local/setpoint_cp", topics.TRANSFORM, Kind.SETPOINT, "psm2"),
-        ("/dvrk/PSM2/position_cartesian_desired", topics.POSE, Kind.SETPOINT, "PSM2"),
-        ("/PSM2/jaw/setpoint_js", topics.JOINT_STATE, Kind.JAW_SETPOINT, "PSM2"),
+        ("/PSM2/local/measured_cp", topics.POSE, TopicKind.MOTION, "PSM2"),
+        ("/PSM2/measured_cp", topics.TRANSFORM, TopicKind.MOTION, "PSM2"),
+        ("/CRTK/psm2/measured_cp", topics.POSE, TopicKind.MOTION, "psm2"),
+        ("/dvrk/PSM1/position_cartesian_current", topics.POSE, TopicKind.MOTION, "PSM1"),
+        ("/MTML1/measured_cp", topics.POSE, TopicKind.MASTER, "MTML1"),
+        ("/MTMR2/gripper/measured_js", topics.JOINT_STATE, TopicKind.GRIPPER, "MTMR2"),
+        ("/CRTK/psm1/measured_js", topics.JOINT_STATE, TopicKind.JOINTS, "psm1"),
+        ("/PSM3/jaw/measured_js", topics.JOINT_STATE, TopicKind.JAW, "PSM3"),
+        ("/console/clutch", topics.BOOL, TopicKind.PEDAL, "/console/clutch"),
+        ("/dvrk/footpedals/bicoag", topics.JOY, TopicKind.PEDAL, "/dvrk/footpedals/bicoag"),
+        ("/MTML_PSM1/following", topics.BOOL, TopicKind.FOLLOWING, "MTML_PSM1"),
+        ("/PSM1/tool_type", topics.STRING, TopicKind.TOOL, "PSM1"),
+        ("/PSM2/setpoint_cp", topics.POSE, TopicKind.SETPOINT, "PSM2"),
+        ("/CRTK/psm2/local/setpoint_cp", topics.TRANSFORM, TopicKind.SETPOINT, "psm2"),
+        ("/dvrk/PSM2/position_cartesian_desired", topics.POSE, TopicKind.SETPOINT, "PSM2"),
+        ("/PSM2/jaw/setpoint_js", topics.JOINT_STATE, TopicKind.JAW_SETPOINT, "PSM2"),
     ],
 )
 def test_a_topic_and_its_type_say_what_it_tells(topic, message_type, kind, whose):

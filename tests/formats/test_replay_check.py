@@ -12,7 +12,8 @@ import pytest
 from mcap.writer import Writer as McapWriter
 
 from skills.errors import BadBag, SkillsError
-from skills.formats import writer
+from skills.formats import bag_writer
+from skills.formats.bag_writer import bag_folder
 from skills.formats.replay_bag import (
     EPOCH_NS,
     ArmMotion,
@@ -24,7 +25,6 @@ from skills.formats.replay_bag import (
     velocities_of,
 )
 from skills.formats.verify import check_bag, verify_bag
-from skills.formats.writer import bag_folder
 from tests.formats.others import zipped
 from tests.formats.replays import FRAME, PSM2, RATE_HZ, arm, checked, members, papers, trajectory
 
@@ -87,10 +87,10 @@ def stamp_of(sample: int) -> int:
 
 
 def test_a_changed_stamp_is_found():
-    def change(one: writer.Message) -> writer.Message:
+    def change(one: bag_writer.Message) -> bag_writer.Message:
         if one.topic != PSM2[2] or one.log_ns != stamp_of(7):
             return one
-        return writer.joint_state(one.topic, one.log_ns + 1, [0.1], ["jaw"], velocities=[0.0], log_ns=one.log_ns)
+        return bag_writer.joint_state(one.topic, one.log_ns + 1, [0.1], ["jaw"], velocities=[0.0], log_ns=one.log_ns)
 
     with pytest.raises(BadBag, match=r"/PSM2/jaw/setpoint_js has stamps or log times that differ"):
         checked(rewritten(change))
@@ -118,10 +118,10 @@ def test_a_missing_jaw_sample_is_found():
 
 
 def test_a_moving_jaw_is_found():
-    def change(one: writer.Message) -> writer.Message:
+    def change(one: bag_writer.Message) -> bag_writer.Message:
         if one.topic != PSM2[2] or one.log_ns < stamp_of(100):
             return one
-        return writer.joint_state(one.topic, one.log_ns, [0.9], ["jaw"], velocities=[0.0])
+        return bag_writer.joint_state(one.topic, one.log_ns, [0.9], ["jaw"], velocities=[0.0])
 
     with pytest.raises(BadBag, match="velocity that does not match"):
         checked(rewritten(change))
@@ -166,10 +166,10 @@ def test_a_leap_is_found_within_a_pass_and_between_passes(sample):
 
 
 def test_a_velocity_that_is_no_difference_is_found():
-    def change(one: writer.Message) -> writer.Message:
+    def change(one: bag_writer.Message) -> bag_writer.Message:
         if one.topic != PSM2[0] or one.log_ns != stamp_of(50):
             return one
-        return writer.joint_state(one.topic, one.log_ns, arm().joints[50].tolist(), NAMES, velocities=[0.0] * 6)
+        return bag_writer.joint_state(one.topic, one.log_ns, arm().joints[50].tolist(), NAMES, velocities=[0.0] * 6)
 
     with pytest.raises(BadBag, match="sample 50: yaw has a velocity"):
         checked(rewritten(change))
@@ -183,10 +183,10 @@ def test_other_names_of_joints_or_frames_are_found(names, frame):
     speeds = iter(velocities_of(arm().stamps_ns, arm().joints, RATE_HZ).tolist())
     joints = iter(arm().joints.tolist())
 
-    def change(one: writer.Message) -> writer.Message:
+    def change(one: bag_writer.Message) -> bag_writer.Message:
         if one.topic != PSM2[0]:
             return one
-        return writer.joint_state(one.topic, one.log_ns, next(joints), names, velocities=next(speeds), frame=frame)
+        return bag_writer.joint_state(one.topic, one.log_ns, next(joints), names, velocities=next(speeds), frame=frame)
 
     with pytest.raises(BadBag, match="other names of joints or frames"):
         checked(rewritten(change))
@@ -217,7 +217,7 @@ def test_arms_that_changed_places_are_found():
 
 
 def test_a_topic_too_many_is_found():
-    def change(one: writer.Message) -> writer.Message:
+    def change(one: bag_writer.Message) -> bag_writer.Message:
         return replace(one, topic="/PSM2/servo_jp") if one.topic == PSM2[0] else one
 
     with pytest.raises(BadBag, match=r"'/PSM2/servo_jp', which is not a setpoint topic of PSM2"):
@@ -225,8 +225,8 @@ def test_a_topic_too_many_is_found():
 
 
 def test_another_type_is_found():
-    def change(one: writer.Message) -> writer.Message:
-        return replace(writer.text(one.topic, one.log_ns, "x")) if one.topic == PSM2[1] else one
+    def change(one: bag_writer.Message) -> bag_writer.Message:
+        return replace(bag_writer.text(one.topic, one.log_ns, "x")) if one.topic == PSM2[1] else one
 
     with pytest.raises(BadBag, match="does not have the type geometry_msgs/msg/PoseStamped"):
         checked(rewritten(change))
@@ -257,7 +257,7 @@ def test_half_a_plan_is_found():
 
 
 def test_a_file_without_checksums_is_found(monkeypatch):
-    monkeypatch.setattr(writer, "Writer", partial(McapWriter, enable_crcs=False))
+    monkeypatch.setattr(bag_writer, "Writer", partial(McapWriter, enable_crcs=False))
     with pytest.raises(BadBag, match=r"Not every message of PSM2.mcap is covered by a checksum"):
         checked(remade(arm()))
 

@@ -7,9 +7,9 @@ import pytest
 from rosbags.rosbag1 import Writer as Writer1
 
 from skills.errors import BadSettings, MixedFrames, NoUsableTopic, SkillsError, UnreadableRecording
+from skills.formats import bag_writer as messages
 from skills.formats import read_recording, topics
-from skills.formats import writer as messages
-from skills.formats.writer import messages_of
+from skills.formats.bag_writer import messages_of
 from tests.formats.bags import LOCAL, START_NS, STEP_NS, assert_same, recording, sample_folder
 from tests.formats.others import (
     NOETIC,

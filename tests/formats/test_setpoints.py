@@ -10,13 +10,13 @@ from skills import packing
 from skills.demonstration.demonstration import cut_demo
 from skills.demonstration.recording import Recording
 from skills.errors import NoUsableTopic
+from skills.formats import bag_writer as messages
 from skills.formats import read_recording, topics
-from skills.formats import writer as messages
 from skills.formats.bag_folder import join
+from skills.formats.bag_writer import Message, messages_of, write_messages
 from skills.formats.columns import APART_MM
 from skills.formats.mcap import read_mcap
 from skills.formats.reader_process import KNOWN, tell
-from skills.formats.writer import Message, messages_of, write_messages
 from tests.formats import lerobots, written
 from tests.formats.bags import LOCAL, START_NS, STEP_NS, assert_same, recording
 from tests.formats.others import NOETIC, rosbag1, whole

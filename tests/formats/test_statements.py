@@ -8,7 +8,7 @@ import pytest
 
 from skills.errors import BadRecording, BadSettings
 from skills.formats import read_recording, write_mcap
-from skills.formats.writer import messages_of
+from skills.formats.bag_writer import messages_of
 from skills.schemas.requests import TableIn
 from tests.formats import bags, lerobots, others, trials, written
 from tests.formats.test_extract import rows, table

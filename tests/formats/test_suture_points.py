@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from skills.errors import MixedFrames, NotAQuaternion, NotMetres, NoUsableTopic, UnreadableRecording
-from skills.formats import writer
+from skills.formats import bag_writer
+from skills.formats.bag_writer import write_messages
 from skills.formats.reader_process import ConfinedReader
 from skills.formats.suture_points import PARSE, SuturePoints, read_scene, suture_points
-from skills.formats.writer import write_messages
 from skills.kinematics import matrix_of, quaternion_of
 from skills.sandbox import ProcessLimits
 
@@ -37,7 +37,7 @@ def scene(poses, count: int = 5) -> bytes:
     for k in range(count):
         for one in poses:
             topic, place_m, turn, frame = one(k) if callable(one) else one
-            said.append(writer.pose(topic, START_NS + k * 10_000_000, frame, tuple(place_m), tuple(turn)))
+            said.append(bag_writer.pose(topic, START_NS + k * 10_000_000, frame, tuple(place_m), tuple(turn)))
     file = io.BytesIO()
     write_messages(said, file)
     return file.getvalue()
@@ -160,7 +160,7 @@ def test_two_frames_on_one_topic_are_refused():
 
 def test_a_message_of_another_type_is_refused():
     file = io.BytesIO()
-    write_messages([writer.boolean("/Exit1/measured_cp", START_NS, True)], file)
+    write_messages([bag_writer.boolean("/Exit1/measured_cp", START_NS, True)], file)
     with pytest.raises(UnreadableRecording, match="PoseStamped"):
         read_scene(io.BytesIO(file.getvalue()))
 

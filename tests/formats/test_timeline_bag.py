@@ -8,7 +8,7 @@ from mcap_ros2.decoder import DecoderFactory
 
 from skills.errors import NoUsableTopic
 from skills.formats import read_recording
-from skills.formats.writer import timeline_mcap
+from skills.formats.bag_writer import timeline_mcap
 from skills.verification.timeline import timeline_of_recording
 from tests.verification.timelines import two_arms
 

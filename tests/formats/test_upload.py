@@ -15,8 +15,8 @@ from mcap.writer import CompressionType, Writer
 
 from skills.errors import BadInput, UnreadableRecording
 from skills.formats import read_recording, write_mcap
+from skills.formats.bag_writer import DEFINITIONS, Message, messages_of, write_bag, write_messages
 from skills.formats.upload import find_bag, lighten, ready_to_send, topics_of
-from skills.formats.writer import DEFINITIONS, Message, messages_of, write_bag, write_messages
 from tests.formats.bags import START_NS, STEP_NS, assert_same, recording
 from tests.formats.others import db3, rosbag1
 

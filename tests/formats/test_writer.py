@@ -12,9 +12,9 @@ from rosbags.typesys import Stores, get_typestore
 
 from skills.demonstration.recording import Recording
 from skills.errors import BadRecording
-from skills.formats import read_recording, write_bag, write_mcap, writer
+from skills.formats import bag_writer, read_recording, write_bag, write_mcap
 from skills.formats.bag_folder import read_metadata
-from skills.formats.writer import DEFINITIONS, messages_of
+from skills.formats.bag_writer import DEFINITIONS, messages_of
 from tests.formats.bags import START_NS, STEP_NS, recording
 from tests.formats.others import assert_all_the_same, whole
 
@@ -40,8 +40,8 @@ def folder(tmp_path_factory):
         message
         for k in range(20)
         for message in (
-            writer.pose("/PSM1/setpoint_cp", START_NS + k * STEP_NS, "PSM1_base", (0.001 * k, 0.05, -0.1), turn),
-            writer.joint_state("/PSM1/jaw/setpoint_js", START_NS + k * STEP_NS, [0.1 * k], ["jaw"]),
+            bag_writer.pose("/PSM1/setpoint_cp", START_NS + k * STEP_NS, "PSM1_base", (0.001 * k, 0.05, -0.1), turn),
+            bag_writer.joint_state("/PSM1/jaw/setpoint_js", START_NS + k * STEP_NS, [0.1 * k], ["jaw"]),
         )
     ]
     folder = tmp_path_factory.mktemp("replay")
@@ -110,14 +110,14 @@ def test_every_kind_of_message_is_what_the_other_library_writes():
         pose = JAZZY.types["geometry_msgs/msg/Pose"](point, turn)
         doubles, none = np.array([0.25, 1.5]), np.array([], dtype=np.float64)
         pairs = [
-            (writer.pose("/t", at, frame, (0.1, 0.2, 0.3), (0.0, 0.0, 0.6, 0.8)), (header, pose)),
-            (writer.joint_state("/t", at, [0.25, 1.5], ["a", "jaw"], frame=frame),
+            (bag_writer.pose("/t", at, frame, (0.1, 0.2, 0.3), (0.0, 0.0, 0.6, 0.8)), (header, pose)),
+            (bag_writer.joint_state("/t", at, [0.25, 1.5], ["a", "jaw"], frame=frame),
              (header, ["a", "jaw"], doubles, none, none)),
-            (writer.joy("/t", at, [1, -2], frame=frame),
+            (bag_writer.joy("/t", at, [1, -2], frame=frame),
              (header, np.array([], dtype=np.float32), np.array([1, -2], dtype=np.int32))),
-            (writer.boolean("/t", at, True), (True,)),
-            (writer.number("/t", at, 0.2), (0.2,)),
-            (writer.text("/t", at, frame), (frame,)),
+            (bag_writer.boolean("/t", at, True), (True,)),
+            (bag_writer.number("/t", at, 0.2), (0.2,)),
+            (bag_writer.text("/t", at, frame), (frame,)),
         ]  # fmt: skip
         for mine, fields in pairs:
             theirs = JAZZY.serialize_cdr(JAZZY.types[mine.type](*fields), mine.type)

@@ -10,8 +10,8 @@ from typer.testing import CliRunner
 
 from skills.cli import app
 from skills.errors import BadInput, BadRecording
-from skills.formats import writer as messages
-from skills.formats.writer import Message, write_messages
+from skills.formats import bag_writer as messages
+from skills.formats.bag_writer import Message, write_messages
 from skills.kinematics import forward, quaternion_of
 from skills.library.arm_errors import read_measured, stated_errors
 from skills.verification.arm_errors import SIZES, UNCALIBRATED, calibrate_arm

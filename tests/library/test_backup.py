@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from sqlalchemy import inspect, select, text
 
-from skills.db import Base, archive
+from skills.db import Base, dump
 from skills.db.models import Demonstration, Erasure, Surgeon
 from skills.db.service_tables import Executor, Job
 from skills.db.session import Database, alembic_config, revisions
@@ -54,10 +54,8 @@ def rows(database: Database) -> dict[str, list[tuple[Any, ...]]]:
     """Read everything that is backed up, as stored, except the events of restoring."""
     found = {}
     with database.reading() as session:
-        for table in archive.tables():
-            raw = archive.Dumped(
-                table.name, [[c.name, archive.kind_of(c)] for c in table.columns], 0, "", None, 0
-            ).table
+        for table in dump.tables():
+            raw = dump.Dumped(table.name, [[c.name, dump.kind_of(c)] for c in table.columns], 0, "", None, 0).table
             query = select(raw).order_by(*(raw.c[key.name] for key in table.primary_key))
             found[table.name] = [tuple(row) for row in session.execute(query)]
     found["events"] = [row for row in found["events"] if "restore" not in row]
@@ -224,9 +222,9 @@ def test_a_backup_of_an_older_schema_is_migrated(
     with pytest.raises(Conflict, match="of another version"):
         back_up(old, tmp_path / "refused.zip")
     # The backup of the first version's code: its tables, read from the database itself.
-    first = [t for t in archive.tables() if t.name in inspect(old.engine).get_table_names()]
-    monkeypatch.setattr(archive, "tables", lambda: [as_it_is(old, t) for t in first])
-    monkeypatch.setattr(archive, "revisions", lambda: (revision,))
+    first = [t for t in dump.tables() if t.name in inspect(old.engine).get_table_names()]
+    monkeypatch.setattr(dump, "tables", lambda: [as_it_is(old, t) for t in first])
+    monkeypatch.setattr(dump, "revisions", lambda: (revision,))
     back_up(old, tmp_path / "old.zip")
     monkeypatch.undo()
     restored = empty(OTHER[backend])
@@ -341,5 +339,5 @@ def test_a_copied_list_may_be_given_to_an_installation_that_knows_it(database: D
 
 
 def test_every_column_of_every_table_is_known_to_the_backup():
-    assert {t.name for t in archive.tables()} | archive.LEFT_OUT == set(Base.metadata.tables)
-    assert all(archive.kind_of(column) in archive.KINDS for table in archive.tables() for column in table.columns)
+    assert {t.name for t in dump.tables()} | dump.LEFT_OUT == set(Base.metadata.tables)
+    assert all(dump.kind_of(column) in dump.KINDS for table in dump.tables() for column in table.columns)

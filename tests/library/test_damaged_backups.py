@@ -11,7 +11,7 @@ from unittest.mock import ANY
 import pytest
 from sqlalchemy import func, inspect, select
 
-from skills.db import archive
+from skills.db import dump
 from skills.db.session import Database
 from skills.errors import Conflict, Corrupt, SkillsError, UnknownFormat
 from skills.library.backup import back_up, check_backup, restore
@@ -36,13 +36,13 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def how_many(database: Database) -> dict[str, int]:
     """Count the rows of every table that is backed up."""
     with database.reading() as session:
-        return {t.name: session.scalar(select(func.count()).select_from(t)) or 0 for t in archive.tables()}
+        return {t.name: session.scalar(select(func.count()).select_from(t)) or 0 for t in dump.tables()}
 
 
 def test_a_backup_is_a_zip_file_that_others_can_look_into(small: Path):
     with zipfile.ZipFile(small) as opened:
         assert opened.testzip() is None
-        assert json.loads(opened.read("manifest.json"))["format"] == archive.FORMAT
+        assert json.loads(opened.read("manifest.json"))["format"] == dump.FORMAT
         (line,) = opened.read("surgeons.rows").splitlines()
         assert "kestrel" in json.loads(line)
 
@@ -107,11 +107,11 @@ def resealed(small: Path, **changes: Any) -> bytes:
     with zipfile.ZipFile(small) as old, zipfile.ZipFile(out, "w") as new:
         for info in old.infolist():
             data = old.read(info)
-            if info.filename == archive.MANIFEST:
+            if info.filename == dump.MANIFEST:
                 data = json.dumps(json.loads(data) | changes).encode()
             new.writestr(info, data)
-        new.comment = b"0" * archive.SEAL_BYTES
-    body = out.getvalue()[: -archive.SEAL_BYTES]
+        new.comment = b"0" * dump.SEAL_BYTES
+    body = out.getvalue()[: -dump.SEAL_BYTES]
     return body + sha256(body).encode()
 
 

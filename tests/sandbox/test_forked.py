@@ -23,7 +23,7 @@ import pytest
 
 from skills.errors import Busy, Unanswered
 from skills.sandbox import ProcessLimits, fork_server, forked
-from skills.sandbox.containment import Place
+from skills.sandbox.containment import Allowance
 from skills.sandbox.forked import ForkServer, layers_held
 from tests.measured import peak_mib
 from tests.waiting import alive, children, crowded, until
@@ -289,7 +289,7 @@ def test_an_asker_that_goes_without_reading_what_it_was_told_ends_it_without_a_w
     with control, selectors.DefaultSelector() as events:
         control.send(b"ready")
         asker.close()  # the kernel tells the other side of it as a reset connection
-        fork_server._serve(control, events, {}, fork_server._Inherited(Place("", ()), (), 0))
+        fork_server._serve(control, events, {}, fork_server._Inherited(Allowance("", ()), (), 0))
 
 
 def test_an_asker_that_has_ended_before_it_was_ready_ends_it_without_a_word(tmp_path: Path):

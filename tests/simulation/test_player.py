@@ -13,7 +13,7 @@ from skills.errors import BadInput, SimulationFailed
 from skills.kinematics import POINTING_DOWN
 from skills.planning.handoff import OtherArm
 from skills.planning.trajectory import PassPath, Trajectory, time_parametrise
-from skills.simulation import scene
+from skills.simulation import simulator
 from skills.simulation.player import default_pad_top, play
 from skills.verification.gates import Limits
 from skills.verification.playback import PSM_M, Playback
@@ -203,7 +203,7 @@ def test_a_pass_of_a2_alone_is_played_and_pictured():
 
 
 def test_importing_the_simulators_package_does_not_need_pybullet():
-    code = "import sys; sys.modules['pybullet'] = None; import skills.simulation.player, skills.simulation.scene"
+    code = "import sys; sys.modules['pybullet'] = None; import skills.simulation.player, skills.simulation.simulator"
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
@@ -261,7 +261,7 @@ def test_a_simulator_that_hangs_is_refused():
 
 
 def test_without_pybullet_the_message_says_what_to_install(monkeypatch):
-    monkeypatch.setattr(scene.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(simulator.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(SimulationFailed, match="pip install pybullet"):
         play(TRAJECTORY)
 

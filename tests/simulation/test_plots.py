@@ -145,5 +145,5 @@ def test_the_same_playback_gives_the_same_picture_and_nothing_is_cut_off():
 
 
 def test_the_simulator_starts_without_matplotlib():
-    code = "import sys, skills.simulation.scene, skills.simulation.film; sys.exit('matplotlib' in sys.modules)"
+    code = "import sys, skills.simulation.simulator, skills.simulation.film; sys.exit('matplotlib' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0, "it would double the time of the start"

@@ -14,12 +14,12 @@ need("simulator")
 
 import pybullet  # noqa: E402 - after the skip
 
-from skills.simulation import scene  # noqa: E402
+from skills.simulation import simulator  # noqa: E402
 
 
 @pytest.fixture(scope="module")
 def opened():
-    with scene.opened("400006", 240.0) as one:
+    with simulator.opened("400006", 240.0) as one:
         yield one
 
 
@@ -36,7 +36,7 @@ def test_the_urdf_has_the_tip_where_the_closed_form_has_it(instrument):
     joints = joints_anywhere(1000, instrument)
     tip_mm, rotation = forward(joints, instrument)
     seen_mm, seen, read = np.empty((1000, 3)), np.empty((1000, 4)), np.empty((1000, 6))
-    with scene.opened(instrument, 240.0) as one:
+    with simulator.opened(instrument, 240.0) as one:
         for k in range(1000):
             one.pose(joints[k])
             seen_mm[k], seen[k] = one.read_tip()
@@ -50,7 +50,7 @@ def test_six_joints_put_at_once_are_where_six_calls_put_them(opened):
     for joints in joints_anywhere(20):
         opened.pose(joints)
         together = opened.frame_of(opened.arm, opened.arm.tool)
-        for index, value in zip(opened.arm.joints, scene.in_metres(joints).tolist(), strict=True):
+        for index, value in zip(opened.arm.joints, simulator.in_metres(joints).tolist(), strict=True):
             pybullet.resetJointState(opened.arm.number, index, value, physicsClientId=opened.client)
         assert opened.frame_of(opened.arm, opened.arm.tool) == together
 
@@ -123,7 +123,7 @@ CAPSULES = {  # ends, mm in the link's frame, and radius, as in psm.urdf
 
 def test_distances_to_the_pad_are_those_of_the_capsules_lowest_points():
     """Boxes of this size would be wrong by 0.7 mm: the simulator rounds their edges by its margin."""
-    with scene.opened("400006", 240.0) as one:
+    with simulator.opened("400006", 240.0) as one:
         one.place_pad(np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]), -190.0)
         rng = np.random.default_rng(5)
         for _ in range(100):
@@ -135,7 +135,7 @@ def test_distances_to_the_pad_are_those_of_the_capsules_lowest_points():
 
 
 def test_distances_between_arms_are_those_of_the_capsules_axes():
-    with scene.opened("400006", 240.0) as one:
+    with simulator.opened("400006", 240.0) as one:
         one.place_psm_m(np.array([50.0, 10.0, 0.0]), np.array([0.0, 0.17, 0.0, 0.985444]))
         assert one.psm_m is not None
         rng = np.random.default_rng(6)
@@ -174,7 +174,7 @@ def off_segment(point: np.ndarray, begin: np.ndarray, along: np.ndarray) -> floa
 
 
 def test_the_pad_is_as_large_as_the_needles_closed_form_takes_it():
-    with scene.opened("400006", 240.0) as one:
+    with simulator.opened("400006", 240.0) as one:
         for width, scale in ((10.0, 1.0), (200.0, 2.0)):
             one.place_pad(np.array([[0.0, 0.0, 0.0], [0.0, width, 0.0]]), -150.0)
             [shape] = pybullet.getCollisionShapeData(one.pad, -1, physicsClientId=one.client)

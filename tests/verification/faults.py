@@ -15,7 +15,7 @@ from skills.planning.handoff import JAW_S, OtherArm, PsmM
 from skills.planning.plan import SuturePlan, SuturePoint, stack
 from skills.planning.trajectory import A2, TRANSFER, PassPath, Trajectory, time_parametrise
 from skills.verification.asked import Asked, asked_of
-from skills.verification.intent import LIMITS, Comparison, compare
+from skills.verification.intent import LIMITS, IntentComparison, compare
 from tests.planning.motions import PSM_M
 from tests.planning.test_hand import turning
 from tests.verification.hands import BASE_MM, BASE_XYZW, about
@@ -147,7 +147,7 @@ def stands(trajectory: Trajectory) -> np.ndarray:
     return still
 
 
-def broken(comparison: Comparison) -> tuple[str, int] | None:
+def broken(comparison: IntentComparison) -> tuple[str, int] | None:
     """Return the kind and the sample of the earliest deviation beyond its limit."""
     found = []
     for kind, values in comparison.values.items():

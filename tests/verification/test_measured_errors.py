@@ -11,7 +11,7 @@ from skills.verification.arm_errors import (
     LEAST_EFFECTIVE,
     SIZES,
     UNCALIBRATED,
-    Measured,
+    MeasuredArm,
     calibrate_arm,
     effective_number,
     rotation_of,
@@ -26,14 +26,14 @@ def lasting(rng, count: int, keeps: float, axes: int = 3) -> np.ndarray:
     return made
 
 
-def recorded(count: int = 3000, keeps: float = 0.9, seed: int = 0) -> Measured:
+def recorded(count: int = 3000, keeps: float = 0.9, seed: int = 0) -> MeasuredArm:
     """Return an arm that moves about, with errors of 0.2 mm and 0.5 degrees that last 10 samples or so."""
     rng = np.random.default_rng(seed)
     phase = np.linspace(0, 40, count)[:, None] * [1.0, 0.7, 0.9, 0.5, 1.3, 1.1] + [0, 1, 2, 3, 4, 5]
     joints = [0.0, 0.0, 150.0, 0.0, 0.0, 0.0] + np.sin(phase) * [0.4, 0.3, 30.0, 1.0, 0.6, 0.6]
     tip, jaw = forward(joints)
     turned = jaw @ rotation_of(np.radians(0.5) * lasting(rng, count, keeps))
-    return Measured(tip, jaw, tip + 0.2 * lasting(rng, count, keeps), turned, np.arange(count) * 0.01)
+    return MeasuredArm(tip, jaw, tip + 0.2 * lasting(rng, count, keeps), turned, np.arange(count) * 0.01)
 
 
 def test_the_effective_number_is_that_of_a_noise_whose_autocorrelation_is_known():

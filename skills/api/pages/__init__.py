@@ -26,7 +26,7 @@ from markupsafe import Markup
 from skills.api.authorisation import Caller, Role
 from skills.errors import UnknownFormat
 from skills.formats import READABLE
-from skills.library.overview import Style
+from skills.library.overview import StyleState
 from skills.library.playbacks import error_called
 
 HTML = "text/html"
@@ -153,7 +153,7 @@ def share(value: float | None, digits: int = 1) -> str:
     return f"{text} %"
 
 
-def outline(style: Style) -> dict[str, Any] | None:
+def outline(style: StyleState) -> dict[str, Any] | None:
     """Return the drawing of a style as a thumbnail: its path in the box of its grid, in a square of 100 by 100 units.
 
     The view is orthographic, from above one corner. None if there is nothing to draw.

@@ -14,7 +14,7 @@ from skills.api.routes.policies import Accept
 from skills.errors import UnknownFormat
 from skills.fields import as_json
 from skills.formats import MCAP
-from skills.formats.writer import timeline_mcap
+from skills.formats.bag_writer import timeline_mcap
 from skills.library.timelines import Source, check_export, chosen, motion_named, timeline_of
 from skills.schemas.given import MotionTimeline
 from skills.settings import MEBIBYTE

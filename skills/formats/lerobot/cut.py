@@ -20,8 +20,8 @@ from typing import IO, Any, BinaryIO
 from skills.errors import BadInput, UnreadableRecording
 from skills.formats.archive import MAGIC, Archive, pack, refusing
 from skills.formats.lerobot import INFO, SAID, TASK_LINES, Dataset, Json, read_dataset, root_of
+from skills.formats.lerobot.episode import several_episodes
 from skills.formats.lerobot.parquet import open_parquet, read_rows
-from skills.formats.lerobot.recording import several_episodes
 
 EPISODES = 100_000
 _EPISODE_FILE = re.compile(r"episode_(\d{1,9})\.parquet$")

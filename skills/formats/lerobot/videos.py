@@ -27,8 +27,8 @@ from skills.errors import BadInput, Corrupt
 from skills.formats.archive import Archive
 from skills.formats.lerobot import INFO, Dataset, Json
 from skills.formats.lerobot.cut import EPISODES, Episode, cut_episode, episodes_of, find_dataset
+from skills.formats.lerobot.episode import episode_stamps
 from skills.formats.lerobot.parquet import open_parquet, printable, read_rows
-from skills.formats.lerobot.recording import episode_stamps
 from skills.formats.lerobot.writer import CHUNK, MANIFEST, NO_PICTURES, joined_stats
 from skills.formats.mp4 import Mp4, read_mp4
 
@@ -62,7 +62,7 @@ class Clip:
 
 
 @dataclass(frozen=True)
-class Source:
+class EpisodeSource:
     """An episode of a folder.
 
     Attributes:
@@ -111,7 +111,7 @@ def find_recorded(
     *,
     columns: Mapping[str, str] | None = None,
     tools: Mapping[str, str] | None = None,
-) -> dict[str, Source]:
+) -> dict[str, EpisodeSource]:
     """Return the episodes of some datasets by the SHA-256 of the recordings that uploads of them make.
 
     Args:
@@ -124,7 +124,7 @@ def find_recorded(
         BadInput: A folder is no dataset, has no videos, or another rate.
         UnreadableRecording: A dataset is damaged.
     """
-    found: dict[str, Source] = {}
+    found: dict[str, EpisodeSource] = {}
     for folder in folders:
         if not (folder / INFO).is_file():
             raise BadInput(f"{folder} is not the folder of a LeRobot dataset: it has no {INFO}.")
@@ -148,7 +148,7 @@ def _recorded(
     episode: Episode,
     columns: Mapping[str, str] | None,
     tools: Mapping[str, str] | None,
-) -> tuple[str, Source]:
+) -> tuple[str, EpisodeSource]:
     with TemporaryFile() as packed:
         cut_episode(dataset, episode, packed, columns=columns, tools=tools)
         packed.seek(0)
@@ -157,7 +157,7 @@ def _recorded(
         stamps_ns = episode_stamps(Archive(packed), "")
     even_ns = np.arange(len(stamps_ns)) * (1e9 / dataset.fps)
     drift = float(np.abs(stamps_ns - stamps_ns[0] - even_ns).max()) * dataset.fps / 1e9
-    return digest, Source(folder, episode.number, len(stamps_ns), drift, dataset.fps)
+    return digest, EpisodeSource(folder, episode.number, len(stamps_ns), drift, dataset.fps)
 
 
 def _cameras(folder: Path, dataset: Dataset) -> list[str]:
@@ -178,7 +178,7 @@ def _cameras(folder: Path, dataset: Dataset) -> list[str]:
 # ---- the choice of videos --------------------------------------------------------------------------------------------
 
 
-def choose_videos(recordings: Sequence[str], sources: Mapping[str, Source], version: str) -> Videos:
+def choose_videos(recordings: Sequence[str], sources: Mapping[str, EpisodeSource], version: str) -> Videos:
     """Return the videos of the episodes of a dataset, after all checks that need no dataset.
 
     Args:
@@ -225,7 +225,7 @@ class _Shown:
     stats: dict[tuple[str, int], Stats]
 
 
-def _shown(folder: Path, chosen: Iterable[Source]) -> _Shown:
+def _shown(folder: Path, chosen: Iterable[EpisodeSource]) -> _Shown:
     with find_dataset(folder) as dataset:
         assert dataset is not None
         cameras = _cameras(folder, dataset)
@@ -273,7 +273,7 @@ def _files(folder: Path) -> dict[_Key, Path]:
 
 
 def _clip(
-    source: Source, camera: str, places: Mapping[int, Json] | None, files: Mapping[tuple[str, int, int], Path]
+    source: EpisodeSource, camera: str, places: Mapping[int, Json] | None, files: Mapping[tuple[str, int, int], Path]
 ) -> Clip:
     first, key = 0, (camera, -1, source.number)
     if places is not None:

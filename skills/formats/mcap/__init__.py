@@ -50,7 +50,7 @@ from skills.formats.mcap.cdr import (
 )
 from skills.formats.mcap.reader import MAGIC, Channel, MessageSchema, Part, Stretch, Walker
 from skills.formats.mcap.records import RECOVER
-from skills.formats.topics import Kind, Meaning
+from skills.formats.topics import Meaning, TopicKind
 
 __all__ = ["MAGIC", "NeedsRosbags", "read_mcap"]
 
@@ -58,7 +58,7 @@ TOOL_LIMIT = 200  # characters of an instrument's name
 _INSERTION = 2  # the PSM's only prismatic joint
 
 _POSITION = Wanted(("position",), first=True)
-_ANGLES = (Kind.JAW, Kind.GRIPPER, Kind.JAW_SETPOINT)  # continuous values, the first of a joint state
+_ANGLES = (TopicKind.JAW, TopicKind.GRIPPER, TopicKind.JAW_SETPOINT)  # continuous values, the first of a joint state
 _WANTED = {
     topics.POSE: WANTED_POSE,
     topics.TRANSFORM: Wanted(
@@ -119,7 +119,7 @@ class _Topic:
     @property
     def is_needed(self) -> bool:
         """True if a demonstration needs the topic."""
-        return self.meaning.kind in (Kind.MOTION, Kind.JAW) or self.name in topics.CLUTCH_TOPICS
+        return self.meaning.kind in (TopicKind.MOTION, TopicKind.JAW) or self.name in topics.CLUTCH_TOPICS
 
 
 @dataclass
@@ -230,45 +230,45 @@ def _ros2_name(name: str) -> str:
 
 def _recording(log: _Log) -> Recording:
     motions, masters, joints, tools, setpoints = [], [], [], [], []
-    signals: dict[Kind, dict[str, Signal]] = {kind: {} for kind in Kind}
+    signals: dict[TopicKind, dict[str, Signal]] = {kind: {} for kind in TopicKind}
     for topic in sorted(log.topics.values(), key=lambda topic: topic.name):
         if not topic.parts:
             continue
         kind, whose = topic.meaning.kind, topic.meaning.whose
         try:
-            if kind is Kind.MOTION:
+            if kind is TopicKind.MOTION:
                 motions.append(_motion(topic))
-            elif kind is Kind.MASTER:
+            elif kind is TopicKind.MASTER:
                 masters.append(_motion(topic))
-            elif kind is Kind.SETPOINT:
+            elif kind is TopicKind.SETPOINT:
                 setpoints.append(_motion(topic))
-            elif kind is Kind.JOINTS:
+            elif kind is TopicKind.JOINTS:
                 joints.append(_joints(topic))
-            elif kind is Kind.TOOL:
+            elif kind is TopicKind.TOOL:
                 tools.append((whose, _tool(topic)))
             else:
                 signals[kind][whose] = _signal(topic)
         except SkillsError as error:
             log.leave_out(topic, error)
-    pedals = signals[Kind.PEDAL]
+    pedals = signals[TopicKind.PEDAL]
     return Recording(
         format="mcap",
         integrity=log.walker.integrity,
         motions=tuple(motions),
-        jaws=tuple(signals[Kind.JAW].items()),
+        jaws=tuple(signals[TopicKind.JAW].items()),
         clutch=next((pedals[name] for name in topics.CLUTCH_TOPICS if name in pedals), None),
         topics=_topics(log),
         joints=tuple(joints),
         masters=tuple(masters),
-        grippers=tuple(signals[Kind.GRIPPER].items()),
+        grippers=tuple(signals[TopicKind.GRIPPER].items()),
         pedals=tuple(pedals.items()),
-        following=tuple(signals[Kind.FOLLOWING].items()),
-        scales=tuple(signals[Kind.SCALE].items()),
+        following=tuple(signals[TopicKind.FOLLOWING].items()),
+        scales=tuple(signals[TopicKind.SCALE].items()),
         tools=tuple(tools),
         notes=tuple(sorted(log.walker.notes.items())),
         left_out=tuple(sorted(log.left_out.items())),
         setpoints=tuple(setpoints),
-        jaw_setpoints=tuple(signals[Kind.JAW_SETPOINT].items()),
+        jaw_setpoints=tuple(signals[TopicKind.JAW_SETPOINT].items()),
     )
 
 

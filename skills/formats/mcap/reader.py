@@ -32,9 +32,9 @@ from skills.formats.mcap.records import (
     PRIVATE,
     RECOVER,
     Bytes,
+    ByteSource,
     Chain,
     Fields,
-    Source,
     check_records,
     follow,
     unpack,
@@ -145,7 +145,7 @@ class Walker:
         self.channels: dict[int, Channel] = {}
         self.counts: Counter[int] = Counter()
         self.notes: dict[str, str] = {}
-        self._source = Source(file)
+        self._source = ByteSource(file)
         self._records = 0
         self._chunks = 0
         self._unpacked_bytes = 0

@@ -38,7 +38,7 @@ DEFINITIONS = (Opcode.SCHEMA, Opcode.CHANNEL)
 PRIVATE = 0x80  # opcodes from here on are application extensions (specification, "Opcodes")
 
 
-class Source:
+class ByteSource:
     """A file that is read sequentially, with a running checksum."""
 
     def __init__(self, file: BinaryIO) -> None:

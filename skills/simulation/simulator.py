@@ -1,4 +1,4 @@
-"""The scene in PyBullet, and the two passes over a trajectory in it. PyBullet's side is in metres.
+"""The simulator: a scene in PyBullet, and the two passes over a trajectory in it. PyBullet's side is in metres.
 
 The scene has PSM_A, the pad, the needle and, if its place is known, PSM_M. This is the only module that imports
 pybullet, and only when a scene is opened; `skills.simulation.film` uses the scene too. `simulate` makes both passes and
@@ -68,7 +68,7 @@ def require_pybullet() -> None:
 
 
 @contextmanager
-def opened(instrument: str, rate_hz: float) -> Iterator["Scene"]:
+def opened(instrument: str, rate_hz: float) -> Iterator["Simulator"]:
     """Open a fresh scene with PSM_A, and close it at the end; a fresh one gives the same numbers each time."""
     require_pybullet()
     import pybullet
@@ -78,7 +78,7 @@ def opened(instrument: str, rate_hz: float) -> Iterator["Scene"]:
         pybullet.setTimeStep(1.0 / rate_hz, physicsClientId=client)
         pybullet.setGravity(0, 0, -9.81, physicsClientId=client)
         pybullet.setPhysicsEngineParameter(deterministicOverlappingPairs=1, physicsClientId=client)
-        yield Scene(pybullet, client, instrument_of(instrument))
+        yield Simulator(pybullet, client, instrument_of(instrument))
     finally:
         pybullet.disconnect(physicsClientId=client)
 
@@ -95,7 +95,7 @@ class SceneBody:
     surfaces: tuple[int, ...]
 
 
-class Scene:
+class Simulator:
     """One simulation. Lengths in arguments are in mm, except in `drive` and in cameras, which use PyBullet's metres."""
 
     def __init__(self, bullet: ModuleType, client: int, tool: InstrumentConstants) -> None:
@@ -345,7 +345,7 @@ def simulate(given: BinaryIO, answer: BinaryIO) -> None:
     packing.write(answer, measured, {})
 
 
-def _set_up(scene: Scene, asked: Asked) -> None:
+def _set_up(scene: Simulator, asked: Asked) -> None:
     scene.place_pad(asked["tip_mm"], asked["pad_top_mm"])
     if "m_joints" in asked:
         scene.place_psm_m(asked["m_base_mm"], asked["m_base_xyzw"], asked["m_instrument"])
@@ -354,7 +354,7 @@ def _set_up(scene: Scene, asked: Asked) -> None:
 # ---- the kinematic pass ----------------------------------------------------------------------------------------
 
 
-def kinematic_pass(scene: Scene, asked: Asked) -> Asked:
+def kinematic_pass(scene: Simulator, asked: Asked) -> Asked:
     """Set the joints at every sample and read them back, and measure distances.
 
     Distances are measured at the requested samples, and then at all others where links may be near each other.
@@ -407,7 +407,7 @@ def _closer(seen_mm: Floats, asked: Asked) -> Ints:
 class _Look:
     """The measurements at some samples, with PSM_A already posed there; PSM_M, if it is in the scene, is posed here."""
 
-    def __init__(self, scene: Scene, asked: Asked) -> None:
+    def __init__(self, scene: Simulator, asked: Asked) -> None:
         self._scene = scene
         self._m_joints = asked.get("m_joints")
         self._pairs = _pairs_of_bodies(scene)
@@ -459,7 +459,7 @@ class _BodyPair:
     columns: dict[tuple[int, int], int]
 
 
-def _pairs_of_bodies(scene: Scene) -> list[_BodyPair]:
+def _pairs_of_bodies(scene: Simulator) -> list[_BodyPair]:
     """Return the pairs of bodies in the scene, with columns numbered as in `link_pairs`."""
     assert scene.pad is not None
     on_pad = range(len(LINKS))
@@ -477,7 +477,7 @@ def _pairs_of_bodies(scene: Scene) -> list[_BodyPair]:
 # ---- the servo pass --------------------------------------------------------------------------------------------
 
 
-def servo_pass(scene: Scene, asked: Asked) -> Asked:
+def servo_pass(scene: Simulator, asked: Asked) -> Asked:
     """Let the motors follow, and return the tip's error, the motors' efforts, the pad's force, and seconds per step."""
     wanted = np.pad(in_metres(asked["joints"]), ((0, 0), (0, 2)), constant_values=HOLDING_RAD)
     velocities = np.diff(wanted, axis=0) * asked["rate_hz"]
