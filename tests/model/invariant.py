@@ -22,6 +22,9 @@ Nothing here depends on the service. `Model` is updated after each action of a u
     Objects that were erased or withdrawn before another restore, and uploaded again since, end again as well: the
     list only removes. A restore never fails because of an entry of the list.
 5.  **Keys.** A key is valid until it is revoked or has expired, and not after.
+6.  **Proposals.** A proposal is accepted while a demonstration that was cut there is stored, also a withdrawn one.
+    Otherwise it is as was last decided, and open at the beginning. After a restore the decisions are as in the
+    backup: an open proposal gives nobody a permission, so the list has no rejections.
 """
 
 from collections.abc import Set
@@ -142,6 +145,7 @@ class Model:
     subjects: dict[str, int] = field(default_factory=dict)  # identities: a later surgeon may reuse a pseudonym
     erased: set[str] = field(default_factory=set)
     recordings: dict[str, set[str]] = field(default_factory=dict)  # the surgeons named at upload
+    decided: dict[str, tuple[str, str | None]] = field(default_factory=dict)  # on the proposal of a recording, and why
     demos: dict[str, Demo] = field(default_factory=dict)
     versions: dict[str, Version] = field(default_factory=dict)
     plans: dict[str, str] = field(default_factory=dict)  # the versions that they are made of
@@ -191,6 +195,10 @@ class Model:
     def cut_from(self, recording: str) -> list[Demo]:
         return [one for one in self.demos.values() if one.recording == recording]
 
+    def proposal(self, recording: str) -> str:
+        """Return the state of the only proposal of a recording."""
+        return "accepted" if self.cut_from(recording) else self.decided.get(recording, ("open", None))[0]
+
     def may_export(self, recording: str) -> bool:
         return all(self.may(one.style[0], "export") for one in self.cut_from(recording))
 
@@ -214,8 +222,12 @@ class Model:
     def add_recording(self, recording: str, surgeon: str | None) -> None:
         self.recordings.setdefault(recording, set()).update(() if surgeon is None else (surgeon,))
 
+    def decide(self, recording: str, state: str, note: str | None) -> None:
+        if self.proposal(recording) != state or recording in self.decided:
+            self.decided[recording] = state, note
+
     def delete_recording(self, recording: str) -> None:
-        del self.recordings[recording]
+        self._drop(recording)
         self._note("deleted recording", recording)
 
     def release(self, version: Version) -> None:
@@ -322,6 +334,10 @@ class Model:
         """End releases; if the served version's release is among them, end all that stand."""
         self._withdraw(standing if standing and standing[0] in ending else ending)
 
+    def _drop(self, recording: str) -> None:
+        del self.recordings[recording]
+        self.decided.pop(recording, None)
+
     def _erase_demo(self, sha256: str) -> None:
         demo = self.demos.pop(sha256)
         recording, style = demo.recording, demo.style
@@ -330,14 +346,14 @@ class Model:
         self.releases = [one for one in self.releases if sha256 not in one.version.demos]
         self.jobs = {name: one for name, one in self.jobs.items() if one.batch or sha256 not in one.demos}
         if not self.cut_from(recording) and self.recordings[recording] <= {style[0]}:
-            del self.recordings[recording]
+            self._drop(recording)
 
     def _erase_surgeon(self, surgeon: str) -> None:
         for one in [one for one in self.demos.values() if one.style[0] == surgeon]:
             self._erase_demo(one.sha256)
         for recording, brought_as in list(self.recordings.items()):
             if brought_as == {surgeon} and not self.cut_from(recording):
-                del self.recordings[recording]
+                self._drop(recording)
             brought_as.discard(surgeon)
         self.jobs = {name: one for name, one in self.jobs.items() if one.surgeon != surgeon}
         del self.surgeons[surgeon]

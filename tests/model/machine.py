@@ -11,29 +11,20 @@ for backups. The date, the reader of uploads and the job engine are replaced (`t
 
 import shutil
 import tempfile
-from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from copy import copy
 from datetime import timedelta
-from functools import cache
 from pathlib import Path
 from typing import Any, ClassVar
 
-import numpy as np
 from hypothesis import strategies as st
-from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
-from sqlalchemy import LargeBinary, select
+from hypothesis.stateful import rule
+from sqlalchemy import select
 
-from skills.comparison.distances import distances_of, shape_of
-from skills.db import Base
-from skills.db.models import Demonstration, MeasuredShape
-from skills.db.packed import Packed
 from skills.db.service_tables import Job as JobRow
 from skills.db.session import Database
-from skills.demonstration.demonstration import cut_demo
 from skills.errors import NotFound, SkillsError
-from skills.formats import read_recording
 from skills.jobs.workflows import Work
 from skills.library import perform_job
 from skills.library.atlas import atlas_of
@@ -44,14 +35,12 @@ from skills.settings import Settings
 from tests import backends
 from tests.api.service import CSV, Service
 from tests.library import cases
+from tests.model.checks import ACTIVE, FILES, PROPOSED, Compared
 from tests.model.invariant import ALL_USES, Consent, Demo, Job, Key, Model, Style, Version
-from tests.model.replaced import ADMIN, FIRST_DAY, Clock, Interruptible, settled
+from tests.model.replaced import FIRST_DAY, Clock, Interruptible, settled
 
 SURGEONS = ("kestrel", "heron", "lark", "wren")
 SUTURES = (cases.SUTURE, "horizontal-mattress")
-FILES = [cases.table(cases.points_mm((0.0, 2.5 * shift, 0.0), samples=4)) for shift in range(4)]
-NAMES = {sha256(data): data for data in FILES}
-ACTIVE = ("queued", "running")
 MOST_BACKUPS = 3
 WHY = "The needle fell."
 
@@ -80,10 +69,11 @@ ADD_DEMO = step("add_demo", SURGEON, SUTURE, FILE)
 WITHDRAW_DEMO, ERASE_DEMO = step("withdraw_demo", INDEX), step("erase_demo", INDEX)
 ERASE_SURGEON = step("erase_surgeon", st.sampled_from(SURGEONS), st.integers(0, 3))
 MARK = step("mark", INDEX, st.sampled_from(["failure", "failure", "recovery", "success"]))
+DECIDE = step("decide", st.sampled_from(["rejected", "rejected", "open"]), st.sampled_from([None, WHY]))
 RELEASE, WITHDRAW, CANCEL = step("release", INDEX), step("withdraw", INDEX), step("cancel", INDEX)
 PASS_A_DAY, BACK_UP = step("pass_a_day"), step("back_up")
 ENDING = (WITHDRAW_DEMO, MARK, ERASE_DEMO, ERASE_SURGEON, WITHDRAW, CANCEL)
-ELSEWHERE = (AGREE, ADD_DEMO, RELEASE, *ENDING, PASS_A_DAY, BACK_UP)
+ELSEWHERE = (AGREE, ADD_DEMO, DECIDE, RELEASE, *ENDING, PASS_A_DAY, BACK_UP)
 MEANWHILE = st.none() | st.tuples(st.integers(1, 8), st.one_of(*ELSEWHERE, AGREE, ERASE_DEMO))
 ANY_OUTCOME = st.sampled_from([False, False, False, True])
 TRAIN = step("train", SURGEON, SUTURE, DEMOS, SEED, FLAG, MEANWHILE, ANY_OUTCOME)
@@ -115,7 +105,7 @@ STEPS = (
 )
 
 
-class Installation(RuleBasedStateMachine):
+class Installation(Compared):
     """The state machine of all user actions; two surgeons have a demonstration each at the beginning."""
 
     backend: ClassVar[str]
@@ -173,16 +163,6 @@ class Installation(RuleBasedStateMachine):
         finally:
             machine.teardown()
 
-    def call(self, method: str, path: str, *expected: int, **how: Any) -> Any:
-        """Call the service, check the status and conformance of the response, and return its content."""
-        answer = self.service.http.request(method, path, **how)
-        said = f"{method} {path}: {answer.status_code}, not {expected}: {answer.text[:300]}"
-        assert answer.status_code in expected, said
-        return answer.json() if answer.content and "json" in answer.headers["content-type"] else None
-
-    def _unknown(self, surgeon: str) -> int:
-        return 410 if surgeon in self.model.erased else 404
-
     # ---- surgeons, recordings, demonstrations ----
 
     def _agree(self, surgeon: str, uses: frozenset[str] | None = None, days: int | None = None) -> None:
@@ -229,6 +209,17 @@ class Installation(RuleBasedStateMachine):
         else:
             self.call("DELETE", f"/recordings/{recording}", 204)
             self.model.delete_recording(recording)
+
+    def _decide(self, state: str, note: str | None = None) -> None:
+        """Decide on the proposal of the recording that has one."""
+        where, body = f"/recordings/{PROPOSED}/proposals/1", {"state": state, "note": note}
+        if PROPOSED not in self.model.recordings:
+            self.call("PUT", where, 404, json=body)
+        elif self.model.cut_from(PROPOSED):
+            self.call("PUT", where, 409, json=body)
+        else:
+            assert self.call("PUT", where, 200, json=body)["state"] == state
+            self.model.decide(PROPOSED, state, note)
 
     def _withdraw_demo(self, index: int) -> None:
         if (demo := pick(self.model.demos, index)) is not None:
@@ -554,108 +545,7 @@ class Installation(RuleBasedStateMachine):
         self._open()
         self.model = self.model.restored(backup)
 
-    # ---- the invariant ----
-
-    @invariant()
-    def check(self) -> None:
-        """Compare the served and stored objects with the model."""
-        self._check_served()
-        self._check_answers()
-        stored = self._rows()
-        self._check_library(stored)
-        self._check_books(stored)
-        self._check_distances()
-        for table, rows in stored.items():
-            said = str(rows)
-            assert not any(surgeon in said for surgeon in self.model.erased), f"'{table}' names an erased surgeon"
-
-    def _check_served(self) -> None:
-        model = self.model
-        self.styles |= {one.style for one in model.versions.values()}
-        due = {style: model.served(style) for style in self.styles}
-        listed = self.call("GET", "/policies", 200)["items"]
-        assert {(one["surgeon"], one["suture"]): one["sha256"] for one in listed} == {
-            style: version.sha256 for style, version in due.items() if version is not None
-        }, "what is listed as served"
-        for style, version in due.items():
-            said = self.call("GET", f"/policies/{'/'.join(style)}", 200 if version else self._unknown(style[0]))
-            assert version is None or (said["sha256"], said["version"]) == (version.sha256, version.number)
-            assert version is None or version.of_any or not any(model.demos[one].failed for one in version.demos)
-
-    def _check_answers(self) -> None:
-        """Check that every training reports whether its version is the served one."""
-        for one in self.call("GET", "/jobs?kind=training&state=succeeded&limit=200", 200)["items"]:
-            served = self.model.served((one["request"]["surgeon"], one["request"]["suture"]))
-            made = one["result"]
-            assert made["released"] == (served is not None and served.sha256 == made["sha256"]), made
-
-    def _check_library(self, stored: dict[str, Any]) -> None:
-        model = self.model
-        assert {one.slug: one.consent for one in stored["surgeons"]} == {
-            surgeon: consent.written for surgeon, consent in model.surgeons.items()
-        }
-        assert {one.sha256 for one in stored["recordings"]} == set(model.recordings)
-        assert {one.recording for one in stored["recording_chunks"]} == {one.row for one in stored["recordings"]}
-        assert {one.sha256: one.withdrawn_at is not None for one in stored["demonstrations"]} == {
-            one.sha256: one.withdrawn for one in model.demos.values()
-        }
-        marks = {one.demonstration_row: one.outcome for one in stored["demonstration_outcomes"]}  # the newest of each
-        assert {one.sha256: marks.get(one.row) for one in stored["demonstrations"]} == {
-            one.sha256: one.mark and one.mark[0] for one in model.demos.values()
-        }
-        slugs = {one.row: one.slug for one in stored["surgeons"]}
-        assert {(one.sha256, slugs[one.surgeon_row], one.suture, one.version) for one in stored["policy_versions"]} == {
-            (one.sha256, *one.style, one.number) for one in model.versions.values()
-        }
-        versions = {one.row: one.sha256 for one in stored["policy_versions"]}
-        assert Counter(
-            (versions[one.policy_row], one.withdrawn_at is not None) for one in stored["releases"]
-        ) == Counter((one.version.sha256, one.withdrawn) for one in model.releases)
-
-    def _check_books(self, stored: dict[str, Any]) -> None:
-        model = self.model
-        assert {one.id: one.revoked_at is not None for one in stored["keys"] if one.owner != ADMIN} == {
-            name: key.revoked for name, key in model.keys.items()
-        }
-        jobs = {one.id: one.state for one in stored["jobs"] if one.kind != PART}
-        assert {name for name, state in jobs.items() if state in ACTIVE} == {
-            one.id for one in model.jobs.values() if one.state in ACTIVE
-        }
-
-    def _rows(self) -> dict[str, Any]:
-        """Read all tables, without packed values."""
-        with self.service.database.engine.connect() as connection:
-            return {name: connection.execute(query).all() for name, query in _plain_columns().items()}
-
-    def _check_distances(self) -> None:
-        """Check that each cached distance of the atlas is between two stored demonstrations, and correct."""
-        with self.service.database.reading() as session:
-            files = {one.row: one.recording.sha256 for one in session.scalars(select(Demonstration))}
-            kept = session.execute(select(MeasuredShape.demonstration_row, MeasuredShape.measured)).all()
-        for row, measured in kept:
-            assert row in files
-            for other, mm in zip(measured.others.tolist(), measured.apart_mm.tolist(), strict=True):
-                assert other in files, "a distance from an erased demonstration is kept"
-                assert np.isclose(mm, distance_mm(files[row], files[other])), "a distance is another demonstration's"
-
 
 def pick(some: Any, index: int) -> Any:
     """Choose an item by index modulo their number, or None if there is none."""
     return list(some)[index % len(some)] if some else None
-
-
-@cache
-def distance_mm(one: str, other: str) -> float:
-    """Measure the distance of two recordings anew."""
-    shapes = [shape_of(cut_demo(read_recording(cases.upload(NAMES[name]).file))) for name in (one, other)]
-    return float(distances_of(np.array(shapes), np.array([(0, 1)]))[0])
-
-
-@cache
-def _plain_columns() -> dict[str, Any]:
-    packed = (LargeBinary, Packed)
-    tables = Base.metadata.tables.items()
-    return {
-        name: select(*(c for c in table.c if not isinstance(c.type, packed))).order_by(*table.primary_key)
-        for name, table in tables
-    }

@@ -16,7 +16,7 @@ from skills.comparison.distances import Measured
 from skills.db.models import Demonstration, MeasuredShape
 from skills.db.packed import pack
 from skills.db.session import Database
-from skills.library import atlas, backup, locks, training
+from skills.library import atlas, backup, locks, proposals, training
 from tests import backends
 from tests.by_day import some
 from tests.library import cases
@@ -90,6 +90,20 @@ FOUND: dict[str, list[Step]] = {
         ("atlas", cases.SUTURE, (6, ("erase_demo", 2))),  # before the last transaction, which stores the distance
     ],
     "a_recording_without_a_demonstration_is_deleted": [("add_recording", 2), ("delete_recording", 2)],
+    "a_rejected_proposal_is_opened_and_accepted_after_the_backup": [
+        ("add_recording", 3),
+        ("decide", "rejected", "The needle fell."),
+        ("back_up",),
+        ("decide", "open"),
+        ("add_demo", "kestrel", cases.SUTURE, 3),
+        ("decide", "rejected"),
+        ("withdraw_demo", 2),
+        ("restore", 0),
+        ("decide", "open"),
+        ("decide", "rejected"),
+        ("delete_recording", 3),
+        ("add_recording", 3),
+    ],
 }
 
 
@@ -170,6 +184,12 @@ PUT_BACK: dict[str, tuple[ModuleType, str, Callable[..., object], str]] = {
         "keep_shapes",
         keep_without_looking,
         "a_demonstration_is_erased_while_the_atlas_measures",
+    ),
+    "an_accepted_proposal_may_be_rejected": (
+        proposals,
+        "_cut_there",
+        lambda *_: None,
+        "a_rejected_proposal_is_opened_and_accepted_after_the_backup",
     ),
 }
 
