@@ -358,7 +358,8 @@ GUARDS = (
     Guard(
         "skills/verification/gates.py", 36,
         ("tests/verification/test_limits.py", "tests/verification/test_playback.py",
-         "tests/verification/test_scene_clearance.py"),
+         "tests/verification/test_scene_clearance.py", "tests/verification/test_bodies.py",
+         "tests/verification/test_intent.py::test_the_verdict_names_it_though_the_arms_did_as_the_trajectory_says"),
         ("figures_of", "_arm", "_rotation_error_deg", "Limits", "_Gate", "first_failure", "_gates", "_joint_gates",
          "_clearance_gates", "_handing_over"),
     ),
@@ -425,6 +426,19 @@ EQUIVALENT: dict[tuple[str, str], str] = {
         "_delete_recordings: size = select(func.coalesce(func.sum(StoredRecording.size_bytes), 1))"
         ".where(StoredRecording.row.in_(rows))",
     ): "of no recording; 1 is no more than AT_ONCE_BYTES either, and there is nothing to delete",
+    (
+        "skills/verification/gates.py",
+        "figures_of: if m is not None or playback.psm_m_tip_mm is not None:",
+    ): "a verdict refuses a playback with PSM_M of a trajectory without, and the reverse, before there are figures",
+    (
+        "skills/verification/intent.py",
+        "_Pass._recording: at, firm = hand.index(clock_s), ~(clock_s <= firm_s)",
+    ): "differs for a sample exactly at that moment alone, which is also one of those that it is then compared with",
+    (
+        "skills/verification/intent.py",
+        "_Pass._recording: rests_s = np.where(np.minimum(passed_s, passed_s[-1] - passed_s) < REST_S / self.tempo, "
+        "3 * REST_S, 0.0)",
+    ): "within `REST_S` of an end a stand grows by no more than that: a longer one was too long before",
     (
         "skills/verification/intent.py",
         "_Pass._stands: if speed.max(initial=0.0) <= _LEAST_MM:",

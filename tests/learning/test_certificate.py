@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from skills.errors import BadSettings
 from skills.gridworld.grid import MOVES, GridPath, GridWorld
 from skills.gridworld.reward import sparse_reward
-from skills.learning.certificate import certify, coverage, mdp_of
+from skills.learning.certificate import FAINT, certify, coverage, least_gamma, mdp_of
 from skills.learning.dynamic_programming import ValueIteration, exact_values
 from skills.learning.policy import learn_tabular, rollout_from
 from skills.learning.q_learning import CellQLearning, PhaseQLearning
@@ -230,6 +230,19 @@ def test_on_a_long_grid_an_action_is_optimal_where_it_comes_nearer(learner):
         assert certificate.faint > 100 * 9
         assert certificate.suboptimal == further
         assert (further == 0) == certificate.every_action_optimal == optimal
+
+
+def test_the_advised_gamma_is_the_least_hundredth_that_keeps_the_furthest_value():
+    """The furthest cell is 448 moves away; each multiplies a value by gamma, and by 0.8 where a fifth of them slips."""
+    policy = learn_tabular(sparse_reward(long_path()), PhaseQLearning())
+    for slip in (0.0, 0.2):
+        gamma = least_gamma(replace(policy, learner=ValueIteration(slip=slip)))
+        kept, faint = (policy.levels.visited * (one * (1 - slip)) ** 448 for one in (gamma, gamma - 0.01))
+        assert kept >= FAINT > faint
+    assert least_gamma(replace(policy, learner=ValueIteration(slip=0.9))) is None
+    alone = GridWorld((0.0, 0.0, 0.0), 1.0, (2, 1, 1))  # every cell is on the path
+    beside = learn_tabular(sparse_reward(GridPath(alone, np.arange(2))), PhaseQLearning())
+    assert least_gamma(beside) == 0.01
 
 
 @pytest.mark.nightly  # by day shorter grids

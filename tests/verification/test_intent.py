@@ -200,7 +200,7 @@ def test_the_verdict_names_it_though_the_arms_did_as_the_trajectory_says(name):
     assert judge(ideal(faulty), faulty).feasible
     report = judge(ideal(faulty), faulty, intent=compare(asked, faulty))
     assert not report.feasible
-    assert (report.failure.quantity, report.failure.phase) == (kind, phase)
+    assert (report.failure.quantity, report.failure.unit, report.failure.phase) == (kind, LIMITS[kind][0], phase)
     assert f"the limit is {LIMITS[kind][1]:.4g}" in str(report.failure)
     assert {one.kind for one in report.intent} == set(LIMITS)
 

@@ -13,7 +13,19 @@ from skills.verification.asked import asked_of
 from skills.verification.intent import compare
 from tests.planning.motions import PSM_M
 from tests.planning.test_hand import turning
-from tests.verification.faults import RATE_HZ, Fault, Faults, Motion, broken, check_named, poses, timed
+from tests.verification.faults import (
+    RATE_HZ,
+    Fault,
+    Faults,
+    Motion,
+    Z,
+    broken,
+    check_named,
+    planned,
+    poses,
+    sound,
+    timed,
+)
 from tests.verification.hands import BASE_MM, BASE_XYZW
 
 A_LETS_GO = "PSM_A's jaw opens before PSM_M's holds"
@@ -141,3 +153,21 @@ def test_a_jaw_that_was_not_recorded_stays_closed_in_a1():
     rows = motion.rows(A1, 0)[300:]
     motion.jaw[rows] += 0.01
     assert broken(compare(asked, motion.built())) == (A_LETS_GO, rows[0])
+
+
+def test_an_arm_that_slips_at_the_last_moment_was_not_standing_while_the_jaws_moved():
+    asked, motion = sound()
+    changed = poses(motion)
+    closing = changes(changed)
+    changed.still[closing[-1]] = False
+    changed.m_tip[closing[-1]] += 0.01 * Z
+    assert broken(compare(asked, changed.built())) == ("PSM_M's jaw not open as it comes in", closing[0])
+
+
+def test_a_jaw_without_psm_m_keeps_between_its_angles_at_the_ends_of_a_transfer():
+    asked, psm_m = replace(sound()[0], psm_m=PsmM(PSM_M)), PsmM(PSM_M)
+    motion = timed(planned().pass_paths, psm_m)
+    assert broken(compare(asked, motion)) is None
+    opened, rows = np.array(motion.jaw_rad), np.flatnonzero((motion.pass_index == 1) & (motion.phase == TRANSFER))
+    opened[rows] = min(opened[rows[0] - 1], opened[rows[-1] + 1]) - 0.1
+    assert broken(compare(asked, replace(motion, jaw_rad=opened))) == ("opening of the jaw off the recording", rows[0])

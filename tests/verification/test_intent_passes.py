@@ -5,6 +5,8 @@ import pytest
 
 from skills.kinematics import quaternion_of
 from skills.planning.trajectory import A1, A2, TRANSFER
+from skills.verification.asked import Asked
+from skills.verification.clearance import stands_from
 from skills.verification.intent import compare
 from tests.planning.motions import PSM_M
 from tests.verification.faults import (
@@ -231,6 +233,26 @@ def test_a_stall_makes_the_clock_late_by_the_time_that_it_takes_of_the_recording
     stall(A1, 0, 0.2)(changed)
     late_s = compare(asked, changed.built()).values["clock of A1 off the recording's"]
     assert late_s[changed.rows(A1, 0)[-1]] == pytest.approx(0.5 * motion.tempo, abs=0.02)
+
+
+def test_a_rollout_that_joins_the_recording_later_goes_by_the_clock_of_its_end(monkeypatch):
+    """As where a policy of several demonstrations leaves the start of this one on another's way."""
+    asked, motion = sound()
+    changed = poses(motion)
+    stall(A1, 0, 0.2)(changed)
+    monkeypatch.setattr(Asked, "joined_s", lambda _asked, _states: (0.5, 0.9))
+    assert not compare(asked, changed.built()).values["clock of A1 off the recording's"].any()
+
+
+def test_nobody_stands_still_from_the_moment_at_which_the_needle_changes_hands():
+    asked, motion = sound()
+    changed = poses(motion)
+    stood = compare(asked, motion).values["standing still"]
+    for number, phase in ((0, A2), (1, TRANSFER), (1, A2)):
+        last = np.flatnonzero((changed.passes == number) & (changed.phase == phase))[-1]
+        begins = stands_from(motion, int(last))
+        assert stood[begins - 1] > 0  # at the end of the move before
+        assert not stood[begins:last].any()
 
 
 @pytest.mark.parametrize(("phase", "part"), [(A1, 0.2), (TRANSFER, 0.5)])

@@ -92,6 +92,14 @@ def test_a_turn_of_the_jaw_is_measured_in_degrees():
     assert report.failure.value == pytest.approx(0.011, rel=1e-6)
 
 
+def test_a_rotation_that_is_none_fails_though_its_axis_and_angle_are_right():
+    rotation = np.array(TRAJECTORY.rotation_xyzw)
+    rotation[SAMPLE] *= 1.1
+    report = judge(replace(ideal_playback(TRAJECTORY), rotation_xyzw=rotation), TRAJECTORY)
+    assert failed(report) == ("rotation off the closed form", SAMPLE)
+    assert np.isnan(report.failure.value)
+
+
 def test_at_the_goal_the_alignment_has_its_own_limit():
     loose = Limits(fk_deg=1.0)
     assert judge(turned(0.2, SAMPLE), TRAJECTORY, loose).feasible
