@@ -61,6 +61,12 @@ def test_version_licence_and_name_are_those_of_the_project():
     assert CITATION["title"].startswith(PROJECT["name"])
 
 
+def test_the_changelog_begins_with_this_release_or_the_next_one():
+    newest = (ROOT / "CHANGELOG.md").read_text().split("\n## ")[1].partition("\n")[0]
+    assert newest == f"{CITATION['version']}, {CITATION['date-released']}" or newest.endswith(", unreleased")
+    assert f"version {'.'.join(CITATION['version'].split('.')[:2])}." in (ROOT / "README.md").read_text()
+
+
 @pytest.mark.parametrize("wrong", [{"family": "Varier"}, {"given-names": "V", "name": "Varier"}, {}])
 def test_an_author_with_a_wrong_key_would_be_found(wrong):
     assert wrong_authors([wrong]) == [wrong]

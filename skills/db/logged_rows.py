@@ -6,6 +6,7 @@ constraints are logged as if each of them were a row.
 
 import hashlib
 import json
+import re
 from collections import namedtuple
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -242,8 +243,20 @@ _OBJECTS = {
 }
 
 
+# PostgreSQL writes `IN ('a', 'b')` in one form where a migration made it, in another once `pg_dump` has copied it.
+_COPIED = re.compile(r"ANY \(ARRAY\[((?:\('(?:[^']|'')*'::character varying\)::text(?:, )?)+)\]\)")
+_ONE = re.compile(r"\(('(?:[^']|'')*'::character varying)\)::text")
+
+
 def schema_of(connection: Connection) -> dict[str, str]:
-    """Return the definitions of triggers, functions, constraints, indexes and (on SQLite) tables, by kind and name."""
+    """Return the definitions of triggers, functions, constraints, indexes and (on SQLite) tables, by kind and name.
+
+    They are the same for a database that was copied by `pg_dump`.
+    """
     kind = connection.dialect.name
     given = {"tables": list(Base.metadata.tables)} if kind == "postgresql" else {}
-    return {name: sql for name, sql in connection.execute(text(_OBJECTS[kind]), given)}  # noqa: C416 - mypy
+    return {name: _as_migrated(sql) for name, sql in connection.execute(text(_OBJECTS[kind]), given)}
+
+
+def _as_migrated(sql: str) -> str:
+    return _COPIED.sub(lambda found: "ANY ((ARRAY[" + _ONE.sub(r"\1", found[1]) + "])::text[])", sql)

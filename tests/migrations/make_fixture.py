@@ -5,6 +5,7 @@
     releases/VERSION/expected.json        ETag and SHA-256 of each policy that it serves, as JSON and as arrays; of
                                           arrays also the digest of their numbers, because their compression
                                           depends on the zlib that Python was built with
+    releases/VERSION/signing.key          the key of its history; it signs nothing else
 
 The installation is made once, through the service's own calls, on SQLite; PostgreSQL gets it by restoring a backup.
 The dump holds the tables as that version made them, so it does not require our migrations to stay unchanged; written
@@ -15,6 +16,7 @@ import gzip
 import hashlib
 import io
 import json
+import os
 import sqlite3
 import subprocess
 import tempfile
@@ -29,12 +31,16 @@ from skills import __version__
 from skills.db.models import StoredPictures, StoredPlayback
 from skills.db.session import Database, revisions
 from skills.library.backup import back_up, restore
+from skills.library.calibrations import Rated, calibrate_on, keep
+from skills.library.history import sign_history
 from skills.packing import canonical, sha256
 from skills.seeds.recordings import sample_recordings
+from skills.settings import settings
 from skills.verification.playback import Pictures
 from tests import backends
-from tests.api.service import CSV, MCAP, Service, serving
+from tests.api.service import CSV, GOAL_MM, KESTREL, MCAP, Service, serving
 from tests.library import cases
+from tests.scoring.cohorts import cohort
 
 RELEASES = Path(__file__).parent / "releases"
 SURGEONS = ("kestrel", "heron")
@@ -45,11 +51,14 @@ def main() -> None:
     """Write the fixture of this version anew."""
     target = RELEASES / __version__
     target.mkdir(parents=True, exist_ok=True)
+    os.environ["SKILLS_SIGNING_KEY"] = str(target / "signing.key")
+    settings.cache_clear()
     with tempfile.TemporaryDirectory(prefix="skills-fixture-") as name:
         folder = Path(name)
         url = backends.fresh("sqlite", folder)
         with serving(url) as service:
             populate(service)
+            sign_history(service.database, None)
             expected = {"schema": revisions()[0], "zlib": zlib.ZLIB_RUNTIME_VERSION, "policies": policies_of(service)}
             back_up(service.database, folder / "backup.zip")
         write_sqlite(Path(make_url(url).database or ""), target / "skills.sqlite")
@@ -62,25 +71,36 @@ def main() -> None:
 def populate(service: Service) -> None:
     """Make at least one row of every table, through the service's own calls."""
     client = service.client
-    client.put_surgeon("kestrel", skill_level="expert", consent={"uses": ["training", "export"], "until": None})
-    client.add_demo(cases.hand_off(), media_type=CSV, surgeon="kestrel", suture=cases.SUTURE)
-    client.put_surgeon("heron", handedness="left")
+    every_use = {"uses": ["training", "export", "atlas"], "until": None}
+    client.put_surgeon("kestrel", skill_level="expert", consent=every_use)
+    tables = [cases.hand_off((0.0, y_mm, 0.0)) for y_mm in (0.5, 0.0)]
+    both = [client.add_demo(one, media_type=CSV, **KESTREL)["id"] for one in tables]
+    client.put_surgeon("heron", handedness="left", consent=every_use)
     bag = next(sample.data for sample in sample_recordings() if sample.surgeon == "heron")
     client.add_demo(bag, media_type=MCAP, surgeon="heron", suture=cases.SUTURE)
     withdrawn = client.add_demo(cases.hand_off((0.0, 2.5, 0.0)), media_type=CSV, surgeon="heron", suture=cases.SUTURE)
-    client.withdraw_demo(withdrawn["sha256"])
+    client.withdraw_demo(withdrawn["id"])
+    turned = client.add_demo(cases.bag(), media_type=MCAP, **KESTREL)["id"]
+    client.mark_demo(turned, "recovery", reason="the needle was grasped twice")
+    between_rests = np.pad(cases.points_mm(), ((100, 100), (0, 0)), "edge")
+    recording = client.add_recording(cases.bag(tip=between_rests), media_type=MCAP, surgeon="kestrel")["id"]
+    client.decide_proposal(recording, 1, "rejected", note="another needle")
     client.put_surgeon("wren")
     client.erase_surgeon("wren")
     client.retrain(release=True)
     client.cancel(client.train(surgeon="heron", suture=cases.SUTURE, seed=3)["id"])
-    client.train(surgeon="kestrel", suture=cases.SUTURE, learner={"kind": "value-iteration"}, release=True)
+    client.train(**KESTREL, demos=both, combine="corridor")
+    client.train(**KESTREL, learner={"kind": "value-iteration"}, release=True)
+    client.export_dataset(surgeons=["heron"])
     service.work()
-    plan = client.plan("kestrel", cases.SUTURE, [{"position_mm": [5.0, 55.0, -125.0]}], handoff="none")
-    client.play(plan["sha256"])
+    client.nearest(both[0])
+    plan = client.plan(**KESTREL, suture_points=[GOAL_MM], handoff="none")
+    client.play(plan["id"])
     service.work()
-    with service.database.writing() as session:  # real ones are as large as all the rest; their job stays queued
+    with service.database.writing() as session:  # real pictures are as large as all the rest; their job stays queued
         playback = session.scalars(select(StoredPlayback.row)).one()
         session.add(StoredPictures(playback_row=playback, drawn=Pictures(b"mp4", b"gif", b"png", b"png")))
+        keep(session, calibrate_on(Rated(cohort(), {}, {}), permutations=39), "test")
 
 
 def policies_of(service: Service) -> dict[str, Any]:

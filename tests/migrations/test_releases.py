@@ -21,9 +21,10 @@ from typer.testing import CliRunner
 
 from skills.cli import app
 from skills.db import Base
-from skills.db.models import StoredRecording
+from skills.db.models import ParsedRecording, PolicyVersion, StoredRecording
 from skills.db.session import Database, alembic_config, revision_of
-from skills.formats.reader_process import Told, read_told
+from skills.formats.reader_process import READER_VERSION, Told, read_told
+from skills.learning.policy import LEARNER_VERSION
 from skills.library.inspection import inspect_installation
 from skills.library.recordings import stored_recording
 from skills.settings import settings
@@ -34,8 +35,8 @@ from tests.migrations.test_migrations import go, tables
 from tests.waiting import END_S
 
 KEPT = sorted(folder.name for folder in RELEASES.iterdir() if folder.is_dir())
-# The downgrade to the first version removes these; the upgrade fills one of them again, from the events.
 HISTORY = {"history", "history_checkpoints", "history_tiles"}  # begun anew by migrations from before; verified below
+# The downgrade to the first version removes these; the upgrade fills one of them again, from the events.
 ADDED_LATER = {
     "retraining_styles", "playback_pictures", "keys", "key_surgeons", "sign_ins", "recording_uploads",
     "measured_shapes", "calibrations", "policy_demonstrations", "recording_surgeons",
@@ -45,6 +46,8 @@ ADDED_LATER = {
 }  # fmt: skip
 FILLED_AGAIN = {"recording_uploads", *HISTORY}
 KEYS = {"keys", "key_surgeons", "sign_ins"}  # empty: with a key, the installation would answer its tests with 401
+# a worker removes their rows after a while, or a backup, of which the PostgreSQL dumps are made, leaves them out
+PASSING = {"executors", "loose_chunks", "erased_surgeons", "parsed_recordings", "parsed_chunks"}
 REFUSED = "This database was written by a newer version of suture-skills"
 
 
@@ -52,10 +55,13 @@ Released = tuple[Database, dict[str, Any]]
 
 
 @pytest.fixture(params=[f"{version} {backend}" for version in KEPT for backend in backends.BACKENDS])
-def release(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Released]:
-    """Yield a copy of an older version's installation, not migrated, and the responses of that version."""
+def release(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Released]:
+    """Yield a copy of a version's installation, not migrated, and the responses of that version."""
     version, backend = request.param.split()
     kept = RELEASES / version
+    if (key := kept / "signing.key").exists():  # version 0.1.0 had no history
+        monkeypatch.setenv("SKILLS_SIGNING_KEY", str(key))
+        settings.cache_clear()
     url = backends.blank(backend, tmp_path)
     if backend == "sqlite":
         shutil.copy(kept / "skills.sqlite", make_url(url).database or "")
@@ -67,6 +73,8 @@ def release(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Released
     yield database, json.loads((kept / "expected.json").read_text())
     database.close()
     backends.drop(url)
+    monkeypatch.undo()
+    settings.cache_clear()
 
 
 def test_a_release_is_taken_over_and_serves_the_same_bytes(release: Released):
@@ -86,16 +94,15 @@ def test_a_release_is_taken_over_and_serves_the_same_bytes(release: Released):
         pytest.skip("ARRAYS WERE COMPARED BY THEIR NUMBERS ALONE: this Python compresses with another zlib")
 
 
-def test_an_old_version_is_served_again_after_one_with_another_rule(release: Released):
+def test_the_version_of_a_release_is_served_again_after_a_new_one(release: Released):
     database, _ = release
     with serving(database.url) as service:
         kept = service.http.get(POLICY)
-        assert "ties" not in kept.json()
-        assert service.client.learnt(**KESTREL).ties is None
+        assert (service.client.learnt(**KESTREL).ties is None) == ("ties" not in kept.json())
         service.train(seed=9, release=True)
         new = service.http.get(POLICY).json()
-        assert new["ties"]["kind"] == "shortest-way"
-        assert new["actions"] != kept.json()["actions"]
+        assert new["version"] > kept.json()["version"] and new["ties"]["kind"] == "shortest-way"
+        assert "ties" in kept.json() or new["actions"] != kept.json()["actions"]  # one of 0.1.0 has another rule
         service.client.release(**KESTREL, version=kept.json()["version"])
         again = service.http.get(POLICY)
         times = {"released_at", "released_by"}
@@ -105,39 +112,48 @@ def test_an_old_version_is_served_again_after_one_with_another_rule(release: Rel
 def test_all_of_a_release_is_whole_after_its_migration(release: Released):
     database, _ = release
     before = rows(database)
-    assert {table for table, found in before.items() if not found} == {"executors", *KEYS}
+    assert {table for table, found in before.items() if not found} <= PASSING | KEYS
     database.migrate()
     assert kept_of(rows(database), before) == before
     found = {part.what: part for part in inspect_installation(database, relearn=settings())}
     assert {part.what: part.wrong for part in found.values() if part.wrong} == {}
-    # other learners and gates may give other results: such a version is never called whole
-    assert all("made by an older learner" in why for _, why in found["policies learnt again"].left_out)
-    assert len(found["certificates"].left_out) == found["policy_versions"].count
+    with database.reading() as session:
+        learnt = session.scalars(select(PolicyVersion).order_by(PolicyVersion.row)).all()
+        # other learners may give other results: such a version is never called whole
+        older = {f"policy_versions {one.row}" for one in learnt if one.manifest["learner_version"] < LEARNER_VERSION}
+    again = found["policies learnt again"]
+    assert again.count == len(learnt)
+    assert {name for name, why in again.left_out if "made by an older learner" in why} == older
+    assert {name for name, _ in again.left_out} == older
 
 
 def test_a_recording_of_a_release_is_decoded_once_and_then_cached(release: Released):
     database, _ = release
     database.migrate()
-    assert rows(database)["parsed_recordings"] == []
     with database.reading() as session:
-        sha256s = session.scalars(select(StoredRecording.sha256)).all()
+        known = select(ParsedRecording.recording_row).where(ParsedRecording.version == READER_VERSION)
+        cached = session.scalars(known).all()
+        recordings = {one.row: one.sha256 for one in session.scalars(select(StoredRecording))}
+        waiting = [sha256 for row, sha256 in recordings.items() if row not in cached]
     decoded: list[str] = []
-    for one in [*sha256s, *sha256s]:
+    for one in [*recordings.values(), *recordings.values()]:
 
         def read(file: BinaryIO, of: str = one, **how: Any) -> Told:
             decoded.append(of)
             return read_told(file, **how)
 
         stored_recording(database, one, read)
-    assert decoded == list(sha256s) != []
+    assert decoded == waiting
     assert {part.what: part.wrong for part in inspect_installation(database, decode_all=True) if part.wrong} == {}
 
 
-def test_down_and_up_again_keeps_every_row_and_every_answer(release: Released):
+def test_down_to_a_release_and_up_again_keeps_every_row_and_every_answer(release: Released):
     database, expected = release
     database.migrate()
-    before = rows(database)
-    for script in list(ScriptDirectory.from_config(alembic_config()).walk_revisions())[:-1]:
+    before = there = rows(database)
+    # the first tables hold all that 0.1.0 stored; from 0.2.0 on, marks and combined policies forbid to go further
+    oldest = "0001" if expected["schema"] == "0006" else expected["schema"]
+    for script in ScriptDirectory.from_config(alembic_config()).iterate_revisions("head", oldest):
         go(database, command.downgrade, str(script.down_revision))
         there = rows(database)
         assert kept_of(before, there) == there
@@ -145,7 +161,7 @@ def test_down_and_up_again_keeps_every_row_and_every_answer(release: Released):
     database.migrate()
     again = {table: there for table, there in rows(database).items() if table not in HISTORY}
     before = {table: there for table, there in before.items() if table not in HISTORY}
-    assert again == before | {table: [] for table in ADDED_LATER - FILLED_AGAIN}
+    assert again == before | {table: [] for table in before.keys() - there.keys() - FILLED_AGAIN}
     with serving(database.url) as service:
         for path, kinds in expected["policies"].items():
             assert answer_of(service, path, JSON) == kinds[JSON]
