@@ -370,7 +370,7 @@ class AxisErrors:
         band: Lower and upper end of the band.
         coverage: Part of the samples within the band of the other blocks, by blocked cross-validation.
         width: Mean width of these bands.
-        assumed_coverage: Part of the samples within the band of a calibrated arm, `errors.CALIBRATED`.
+        assumed_coverage: Part of the samples within the band of a calibrated arm, `CALIBRATED`.
         assumed_width: Width of that band.
     """
 
