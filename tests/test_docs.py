@@ -284,7 +284,7 @@ def cut(surgeon: str) -> skills.Demo:
 
 
 def pose_styles(reader: Reader) -> None:
-    from skills.learning.tube import TubeLimits
+    from skills.learning.tube_certificate import TubeLimits
     from tests.demonstration.test_partner import A, Kind, session
     from tests.demonstration.test_partner import cut as cut_session
 

@@ -9,17 +9,8 @@ from skills.client.policies import Position
 from skills.client.transport import Progress
 from skills.errors import BadInput
 from skills.remedies import did_you_mean
-from skills.schemas.given import (
-    Comparison,
-    Job,
-    MotionTimeline,
-    Plan,
-    PlanSummary,
-    Playback,
-    Reach,
-    SuturePoints,
-    Trajectory,
-)
+from skills.schemas.given import Job, SuturePoints
+from skills.schemas.plans import Comparison, MotionTimeline, Plan, PlanSummary, Playback, Reach, Trajectory
 
 BAG, MCAP = "application/zip", "application/vnd.mcap"
 Source = Literal["recordings", "demos", "policy-versions", "plans"]

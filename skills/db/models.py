@@ -42,7 +42,8 @@ from skills.learning.networks import Network
 from skills.learning.policy import LEARNERS, Policy
 from skills.learning.pose_style import PosePath
 from skills.learning.q_learning import PhaseQLearning, Training
-from skills.learning.tube import CertifiedPoses, TubeCertificate, TubeLimits
+from skills.learning.tube import CertifiedPoses
+from skills.learning.tube_certificate import TubeCertificate, TubeLimits
 from skills.packing import added_later, few_numbers
 from skills.planning.handoff import PsmM
 from skills.planning.motion_laws import Pose

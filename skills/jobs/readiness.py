@@ -33,7 +33,8 @@ from skills.learning.evaluation import dtw, measure
 from skills.learning.policy import learn_tabular, rollout_from
 from skills.learning.pose_style import PosePath
 from skills.learning.q_learning import PhaseQLearning
-from skills.learning.tube import TubeLimits, certify_tube, next_pose
+from skills.learning.tube import certify_tube, next_pose
+from skills.learning.tube_certificate import TubeLimits
 from skills.packing import palette_of
 from skills.remedies import Action, Remedy
 from skills.settings import Settings

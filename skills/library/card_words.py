@@ -8,7 +8,7 @@ from skills import __version__
 from skills.db.models import PolicyVersion
 from skills.demonstration.quality import times_in_words
 from skills.gridworld.domain import REACH
-from skills.schemas.policies import Citation, StartCounts
+from skills.schemas.cards import Citation, StartCounts
 from skills.verification.arm_errors import CALIBRATED_MM, UNCALIBRATED_MM
 
 USE = "Research use only; not a medical device. Never move an arm by it on or near a person."

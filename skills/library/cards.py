@@ -43,7 +43,7 @@ from skills.library.integrity import covered, learnt, shares, what_identifies
 from skills.library.policies import combined_of, learnt_from
 from skills.remedies import Action, Remedy
 from skills.schemas import PolicyName
-from skills.schemas.policies import (
+from skills.schemas.cards import (
     CardCombined,
     CardCoverage,
     CardDemonstration,

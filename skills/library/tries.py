@@ -47,7 +47,8 @@ from skills.library.playbacks import (
 from skills.library.recordings import Teller, confined_reader, find_recording, stored_recording
 from skills.library.training import learn_style, lessons, near_limits, odds_limits, store_style, training_request
 from skills.remedies import Remedy
-from skills.schemas.requests import DemoIn, PlanIn, SuturePointIn, TrainingIn
+from skills.schemas.plans import PlanIn, SuturePointIn
+from skills.schemas.requests import DemoIn, TrainingIn
 from skills.schemas.tries import Choice, StepName, TryIn, TryStep
 from skills.settings import Settings
 from skills.verification.gates import SCENE

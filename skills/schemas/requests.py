@@ -14,22 +14,10 @@ from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, StrictBool, St
 from skills.comparison.combining import COMBININGS, Combining
 from skills.gridworld.grid import MAX_HYSTERESIS, GridMode
 from skills.gridworld.scene import MOST_BODIES, MOST_HEIGHTS, Scene, SceneCosts, Surroundings
-from skills.kinematics import INSTRUMENTS, JAW_TIP_MM
+from skills.kinematics import INSTRUMENTS
 from skills.learning.policy import LEARNERS, MAX_SEED, Learner, learner_of
-from skills.planning.handoff import Enters
-from skills.planning.plan import (
-    MAX_OUTSIDE_MM,
-    MAX_PASSES,
-    MAX_TIP_OFFSET_MM,
-    RATE_HZ,
-    A2Target,
-    SuturePoint,
-    Turning,
-)
-from skills.planning.trajectory import MAX_SPEED_MM_S
 from skills.schemas import DemoOutcome, Handedness, ProposalDecision, SkillLevel
 from skills.settings import Role
-from skills.verification.arm_errors import NAMED, ArmErrors, checked_own
 
 SLUG = r"^[a-z0-9][a-z0-9_-]{0,63}$"
 DIGEST = r"^[0-9a-f]{8,64}$"  # in full, or a prefix that no other digest has
@@ -76,7 +64,7 @@ Number = Annotated[float, Field(strict=True)]  # strict, so that true is not acc
 Size = Annotated[Number, Field(ge=0, le=1000)]
 Source = Annotated[str, Field(min_length=1, max_length=600, pattern=LINE)]
 Coordinate = Annotated[Number, Field(ge=-10_000, le=10_000)]
-Point = tuple[Coordinate, Coordinate, Coordinate]
+PointIn = tuple[Coordinate, Coordinate, Coordinate]
 Hysteresis = Annotated[
     float,
     Field(
@@ -274,15 +262,15 @@ SceneCostsIn: Any = _settings(SceneCosts, "SceneCostsIn")
 class BoxIn(Schema):
     """A box that must not be entered, along the axes of the frame."""
 
-    low_mm: Point
-    high_mm: Point
+    low_mm: PointIn
+    high_mm: PointIn
 
 
 class CapsuleIn(Schema):
     """A cylinder with round ends, such as a link of the other arm."""
 
-    a_mm: Point
-    b_mm: Point
+    a_mm: PointIn
+    b_mm: PointIn
     radius_mm: Annotated[Number, Field(gt=0, le=10_000)]
 
 
@@ -292,9 +280,9 @@ class TissueIn(Schema):
     `normal` points out of the tissue, `along` is the direction of the map's rows.
     """
 
-    at_mm: Point
-    normal: Point
-    along: Point
+    at_mm: PointIn
+    normal: PointIn
+    along: PointIn
     step_mm: Annotated[Number, Field(gt=0, le=10_000)] = 1.0
     heights_mm: Annotated[
         list[Annotated[list[Coordinate], Field(min_length=1, max_length=MOST_HEIGHTS)]],
@@ -345,7 +333,7 @@ class TrainingIn(Schema):
         default="success",
         description="success refuses demonstrations that are marked recovery or failure; any learns from them too.",
     )
-    depth_along: Point | None = Field(
+    depth_along: PointIn | None = Field(
         default=None,
         description="Direction in which depth increases, of a demonstration whose frame is not the base of its arm: of "
         "equally short ways the policy takes the shallower one. In a base frame depth is the distance from the origin.",
@@ -444,7 +432,7 @@ class RolloutIn(Schema):
 
     model_config = shown({"start_mm": [0.0, 50.0, -120.0]})
 
-    start_mm: Point
+    start_mm: PointIn
     version: Annotated[StrictInt, Field(ge=1, le=2**31)] | None = None
 
 
@@ -459,7 +447,7 @@ class NextIn(Schema):
         {"position_mm": [-15.0, 55.0, -130.0], "phase": 1},
     )
 
-    position_mm: Point
+    position_mm: PointIn
     rotation_xyzw: tuple[Component, Component, Component, Component] | None = None
     phase: Annotated[StrictInt, Field(ge=0, le=10**6)] | None = None
 
@@ -467,152 +455,9 @@ class NextIn(Schema):
 class PoseIn(Schema):
     """A message of a session: a pose that was reached, and its phase; null: that of the answer before."""
 
-    position_mm: Point
+    position_mm: PointIn
     rotation_xyzw: tuple[Component, Component, Component, Component]
     phase: Annotated[StrictInt, Field(ge=0, le=10**6)] | None = None
-
-
-class SuturePointIn(Schema):
-    """The position of a pass's goal, and the rotation of its grid world about this position."""
-
-    position_mm: Point
-    rotation_xyzw: tuple[Component, Component, Component, Component] = (0.0, 0.0, 0.0, 1.0)
-
-    @property
-    def value(self) -> SuturePoint:
-        """The suture point as a value of the domain."""
-        return SuturePoint(self.position_mm, self.rotation_xyzw)
-
-
-class BaseIn(Schema):
-    """The position and rotation of PSM_M's base, its remote centre, in the base frame of the demonstrated arm."""
-
-    position_mm: Point
-    rotation_xyzw: tuple[Component, Component, Component, Component]
-
-
-class PsmMIn(Schema):
-    """The arm that takes the needle, in the frame of the arm that was demonstrated."""
-
-    approach: tuple[Component, Component, Component] | None = Field(
-        default=None, description="Its direction towards the needle; left out, the demonstrated one."
-    )
-    base: BaseIn | None = Field(
-        default=None,
-        description="Left out, the demonstrated one; where that is not known, PSM_M is in no scene or bag.",
-    )
-    instrument: Annotated[str, Field(pattern=f"^({'|'.join(INSTRUMENTS)})$")] | None = None
-    enters: Enters = "after_A1"
-    source: Name | None = Field(default=None, description="Where these numbers come from; the plan repeats it.")
-
-
-class PlanIn(Schema):
-    """A plan: grid worlds of a style, stacked at suture points."""
-
-    model_config = shown(
-        {
-            "surgeon": "kestrel",
-            "suture": "simple-running",
-            "suture_points": [{"position_mm": [5.0, 55.0, -125.0]}],
-            "handoff": "none",
-        }
-    )
-
-    surgeon: SlugField
-    suture: SlugField
-    version: Annotated[StrictInt, Field(ge=1, le=2**31)] | None = None
-    suture_points: Annotated[list[SuturePointIn], Field(min_length=1, max_length=MAX_PASSES)]
-    starts_mm: Annotated[list[Point | None], Field(max_length=MAX_PASSES)] | None = Field(
-        default=None,
-        description=f"Up to {MAX_OUTSIDE_MM:g} mm outside a pass's grid world a transfer leads into it.",
-    )
-    arm: Name | None = None
-    frame: Name | None = None
-    instrument: Name | None = None
-    speed_mm_s: Annotated[Number, Field(gt=0, le=1000)] = Field(
-        default=20.0,
-        description="Greatest speed of the tip: the surgeon's tempo is slowed to it, all along the pass alike. At most "
-        f"{MAX_SPEED_MM_S:g}.",
-    )
-    orientation: Turning | None = Field(
-        default=None,
-        description="recorded: the jaw turns as the surgeon's along the pass; constant: it is held as in the "
-        "demonstration's first sample, and the answer states the departure. By default recorded where it was.",
-    )
-    a2: A2Target | None = Field(
-        default=None,
-        description="recorded: A2 ends in the demonstrated hand-off, in the poses of both arms; paper: PSM_A turns "
-        "across PSM_M's approach. By default recorded where both poses were, unless psm_m gives another approach.",
-    )
-    rate_hz: Annotated[Number, Field(ge=RATE_HZ[0], le=RATE_HZ[1])] = 200.0
-    tip_offset_mm: Annotated[Number, Field(ge=0, le=MAX_TIP_OFFSET_MM)] = Field(
-        default=0.0,
-        description=f"How far down the jaw's approach from its hinge suture points and starts are meant; "
-        f"{JAW_TIP_MM:g} for the finger tips.",
-    )
-    psm_m: PsmMIn | None = Field(
-        default=None, description="Left out, it is taken from the demonstration where that has PSM_M's pose."
-    )
-    scene: SceneIn | None = Field(
-        default=None,
-        description="Tissue and obstacles in the frame of the arm, against which the verdict compares the motion. Left "
-        "out, it is the scene that the policy was learnt in.",
-    )
-    tissue_mm: Coordinate | None = Field(
-        default=None,
-        description="Height of level tissue, along z of the arm's frame: it is that of the scene. No motion is "
-        "exported without tissue, of this, of the scene, or of the policy's.",
-    )
-    realignment: StrictBool = Field(
-        default=True, description="false plans A1 alone, without A2's turn; handoff 'none' is the way to say so now."
-    )
-    handoff: Literal["none"] | None = Field(
-        default=None,
-        description="none asks for a plan that hands nothing over: A1 alone. Without it a plan is refused for which "
-        "neither psm_m nor the demonstration says where PSM_M is.",
-    )
-
-
-class ErrorSources(Schema):
-    """For each size of an arm's errors its source, and the reason for its value."""
-
-    registration_mm: Source
-    registration_deg: Source
-    wrist_deg: Source
-    tip_bias_mm: Source
-    tip_noise_mm: Source
-    tip_correlation_s: Source
-
-
-class ArmErrorsIn(Schema):
-    """A laboratory's own errors of its arms, standard deviations along or about each axis (docs/errors.md)."""
-
-    name: Annotated[str, Field(min_length=1, max_length=60, pattern=LINE)]
-    registration_mm: Size = Field(description="Offset of PSM_M's base.")
-    registration_deg: Size = Field(description="Rotation of PSM_M's base about its remote centre.")
-    wrist_deg: Size = Field(description="Rotation of either arm's jaws about their hinge.")
-    tip_bias_mm: Size = Field(description="Offset of either arm that stays over a pass.")
-    tip_noise_mm: Size = Field(description="Offset of either arm that varies during a pass.")
-    tip_correlation_s: Size = Field(description="Correlation time of that noise.")
-    sources: ErrorSources
-
-
-class PlaybackIn(Schema):
-    """A playback: the plan to play in the simulator, and the errors of the arms to judge it under."""
-
-    model_config = shown({"plan": "0123456789abcdef" * 4}, {"plan": "0123456789abcdef" * 4, "errors": "calibrated"})
-
-    plan: DigestField
-    errors: Literal["calibrated", "uncalibrated"] | ArmErrorsIn | None = Field(
-        default=None, description="The errors of the arms that are to play it; by default those of the installation."
-    )
-
-    @property
-    def arm_errors(self) -> ArmErrors | None:
-        """The errors as a value of the domain."""
-        if self.errors is None or isinstance(self.errors, str):
-            return None if self.errors is None else NAMED[self.errors]
-        return checked_own(ArmErrors(**self.errors.model_dump()))
 
 
 class DatasetIn(Schema):

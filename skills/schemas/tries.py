@@ -11,7 +11,8 @@ from pydantic import Field, StrictBool
 
 from skills.gridworld.grid import MAX_HYSTERESIS
 from skills.schemas import Given
-from skills.schemas.requests import ArmErrorsIn, Coordinate, DigestField, PsmMIn, Schema, SlugField, shown
+from skills.schemas.plans import ArmErrorsIn, PsmMIn
+from skills.schemas.requests import Coordinate, DigestField, Schema, SlugField, shown
 from skills.verification.arm_errors import NAMED, ArmErrors, checked_own
 
 LOSS_MM = 2.6  # ours: samples spread evenly in the paper's cells of 5 mm are 2.5 mm (RMSE, 3-D) from the centres

@@ -2,7 +2,7 @@
 
     Trajectory --doubt--> Doubt: how often each pass stays clear and its needle is caught
 
-A *variation* of a pass draws the errors of `verification.arm_errors`, independently of one another:
+A *variation* of a pass draws the errors of `skills.verification.arm_errors`, independently of one another:
 
 * Arms. PSM_M's base, both wrists and both tips are off by errors of stated sizes (`ArmErrors`). Joints stay as
   commanded; the arms are elsewhere than those joints say.

@@ -20,7 +20,7 @@ The arms' outer bodies are sent at fewer times, because they are large and slow 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -32,13 +32,15 @@ from skills.demonstration.partner import STEADY_MM
 from skills.demonstration.recording import Motion, Recording
 from skills.fields import Column, Count, schema
 from skills.kinematics import INSTRUMENTS, forward, matrix_of, quaternion_of
-from skills.learning.pose_style import PosePath
 from skills.planning.motion_laws import PHASES
 from skills.planning.trajectory import Trajectory
 from skills.verification.bodies import Parts, between, names_of, parts_of, radii_of
 from skills.verification.clearance import FINGER_MM
 from skills.verification.gates import Limits
 from skills.verification.playback import PSM_A, PSM_M, Playback
+
+if TYPE_CHECKING:  # it imports scipy, which clients that read a timeline do not need
+    from skills.learning.pose_style import PosePath
 
 Kind = Literal["recording", "demonstration", "learnt path", "plan"]
 
@@ -370,7 +372,7 @@ def _session(recording: Recording, start_s: float, end_s: float) -> dict[str, An
 # ---- learnt paths and plans ----------------------------------------------------------------------------------------
 
 
-def timeline_of_path(path: PosePath, *, arm: str, frame: str) -> Timeline:
+def timeline_of_path(path: "PosePath", *, arm: str, frame: str) -> Timeline:
     """Return the motion that a pose style gives at its own place, in the tempo of its demonstrations."""
     clock = _Clock.of(0.0, float(path.elapsed_s[-1]), RATE_HZ)
     jaw = None if path.jaw_rad is None else (path.elapsed_s, path.jaw_rad)

@@ -22,7 +22,7 @@ from skills.api.sessions import WITHDRAWN
 from skills.client import AsyncClient, Client, NotReached, NotUnderstood, Problem, Retrying, SessionClosed
 from skills.client.sessions import LOST
 from skills.errors import BadInput, BadSettings
-from skills.learning.tube import TubeCertificate, TubeLimits
+from skills.learning.tube_certificate import TubeCertificate, TubeLimits
 from skills.library.keys import create_key
 from skills.schemas.given import NextPose, SessionOpening, SessionPose
 from skills.schemas.policies import SessionLimits

@@ -9,7 +9,8 @@ from scipy.spatial.transform import Rotation, Slerp
 from skills.errors import BadInput, BadSettings
 from skills.learning import tube
 from skills.learning.pose_style import PHASES, PosePath
-from skills.learning.tube import Hands, TubeLimits, Update, advance, certify_tube, next_pose
+from skills.learning.tube import Hands, Update, advance, certify_tube, next_pose
+from skills.learning.tube_certificate import TubeLimits
 from tests.learning.test_kernels import both
 
 LIMITS = TubeLimits(step_mm=6.0, step_rad=0.2, disturbance_mm=1.0, disturbance_rad=0.02, start_mm=20.0, start_rad=0.5)

@@ -27,7 +27,8 @@ from skills.library.plans import plan_sutures
 from skills.library.recordings import Upload
 from skills.library.training import request_training
 from skills.packing import sha256
-from skills.schemas.requests import DemoIn, PlanIn, TrainingIn
+from skills.schemas.plans import PlanIn
+from skills.schemas.requests import DemoIn, TrainingIn
 from skills.settings import Settings
 
 SUTURE = "simple-running"

@@ -25,7 +25,7 @@ from skills.library.playbacks import trajectory_digest
 from skills.library.policies import find_version
 from skills.library.replay import check_doubt, cleared, replay_bag
 from skills.packing import canonical, sha256
-from skills.schemas.requests import PlanIn
+from skills.schemas.plans import PlanIn
 from skills.transparency import PublicKey, read_notes
 from skills.verification.arm_errors import CALIBRATED, UNCALIBRATED, ArmErrors
 from skills.verification.playback import Playback, link_pairs

@@ -8,7 +8,7 @@ from pydantic import ValidationError
 
 from skills.errors import BadSettings
 from skills.library.arm_errors import stated_errors
-from skills.schemas.requests import PlaybackIn
+from skills.schemas.plans import PlaybackIn
 from skills.settings import Settings
 from skills.verification.arm_errors import CALIBRATED, CALLED, NAMED, SIZES, UNCALIBRATED, ArmErrors
 from tests.arms import ARMS

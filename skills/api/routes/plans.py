@@ -45,10 +45,10 @@ from skills.library.playbacks import find_playback, playback_json
 from skills.library.replay import compare_with_plan, replay_bag
 from skills.planning.plan import MAX_PASSES
 from skills.planning.trajectory import Trajectory
-from skills.schemas.given import Comparison, Page, Plan, PlanSummary, Playback, Reach, SuturePoints
-from skills.schemas.given import Trajectory as GivenTrajectory
-from skills.schemas.reach import ReachIn
-from skills.schemas.requests import DIGEST, FRAME, Name, PlanIn, PlaybackIn, Schema
+from skills.schemas.given import Page, SuturePoints
+from skills.schemas.plans import Comparison, Plan, PlanIn, PlanSummary, Playback, PlaybackIn, Reach, ReachIn
+from skills.schemas.plans import Trajectory as GivenTrajectory
+from skills.schemas.requests import DIGEST, FRAME, Name, Schema
 from skills.settings import MEBIBYTE, Settings
 from skills.verification.playback import Pictures
 

@@ -16,7 +16,7 @@ from skills.fields import as_json
 from skills.formats import MCAP
 from skills.formats.bag_writer import timeline_mcap
 from skills.library.timelines import Source, check_export, chosen, motion_named, timeline_of
-from skills.schemas.given import MotionTimeline
+from skills.schemas.plans import MotionTimeline
 from skills.settings import MEBIBYTE
 
 router = router_of(tags=["timelines"], max_body_size=MEBIBYTE)

@@ -1,0 +1,478 @@
+"""Plans, their motion, and the verdict on it: the requests, and the responses.
+
+The verdict on a plan consists of gates, figures, and Monte Carlo probabilities of success in worlds that differ from
+the plan. A figure is null if it could not be measured; a gate with such a figure has failed.
+"""
+
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Annotated, Literal
+
+from pydantic import Field, StrictBool, StrictInt
+
+from skills.fields import Count, Point, Quaternion, Sha256, Slug, stored_schema
+from skills.gridworld.scene import Scene
+from skills.kinematics import INSTRUMENTS, JAW_TIP_MM
+from skills.planning.handoff import Enters
+from skills.planning.plan import (
+    MAX_OUTSIDE_MM,
+    MAX_PASSES,
+    MAX_TIP_OFFSET_MM,
+    RATE_HZ,
+    A2Target,
+    Departure,
+    SuturePoint,
+    Turning,
+)
+from skills.planning.trajectory import MAX_SPEED_MM_S, Seam, Transfer
+from skills.schemas import Given, PolicyName
+from skills.schemas.requests import (
+    LINE,
+    Component,
+    Coordinate,
+    DigestField,
+    Name,
+    Number,
+    PointIn,
+    SceneIn,
+    Schema,
+    Size,
+    SlugField,
+    Source,
+    shown,
+)
+from skills.verification.arm_errors import NAMED, ArmErrors, checked_own
+from skills.verification.probabilities import Doubt, Probability
+from skills.verification.reach import MAX_PLACES, ReachPlace
+from skills.verification.scene_clearance import SceneReport
+from skills.verification.timeline import Timeline
+from skills.verification.verdict import PlaybackReport
+
+
+class SuturePointIn(Schema):
+    """The position of a pass's goal, and the rotation of its grid world about this position."""
+
+    position_mm: PointIn
+    rotation_xyzw: tuple[Component, Component, Component, Component] = (0.0, 0.0, 0.0, 1.0)
+
+    @property
+    def value(self) -> SuturePoint:
+        """The suture point as a value of the domain."""
+        return SuturePoint(self.position_mm, self.rotation_xyzw)
+
+
+class BaseIn(Schema):
+    """The position and rotation of PSM_M's base, its remote centre, in the base frame of the demonstrated arm."""
+
+    position_mm: PointIn
+    rotation_xyzw: tuple[Component, Component, Component, Component]
+
+
+class PsmMIn(Schema):
+    """The arm that takes the needle, in the frame of the arm that was demonstrated."""
+
+    approach: tuple[Component, Component, Component] | None = Field(
+        default=None, description="Its direction towards the needle; left out, the demonstrated one."
+    )
+    base: BaseIn | None = Field(
+        default=None,
+        description="Left out, the demonstrated one; where that is not known, PSM_M is in no scene or bag.",
+    )
+    instrument: Annotated[str, Field(pattern=f"^({'|'.join(INSTRUMENTS)})$")] | None = None
+    enters: Enters = "after_A1"
+    source: Name | None = Field(default=None, description="Where these numbers come from; the plan repeats it.")
+
+
+class PlanIn(Schema):
+    """A plan: grid worlds of a style, stacked at suture points."""
+
+    model_config = shown(
+        {
+            "surgeon": "kestrel",
+            "suture": "simple-running",
+            "suture_points": [{"position_mm": [5.0, 55.0, -125.0]}],
+            "handoff": "none",
+        }
+    )
+
+    surgeon: SlugField
+    suture: SlugField
+    version: Annotated[StrictInt, Field(ge=1, le=2**31)] | None = None
+    suture_points: Annotated[list[SuturePointIn], Field(min_length=1, max_length=MAX_PASSES)]
+    starts_mm: Annotated[list[PointIn | None], Field(max_length=MAX_PASSES)] | None = Field(
+        default=None,
+        description=f"Up to {MAX_OUTSIDE_MM:g} mm outside a pass's grid world a transfer leads into it.",
+    )
+    arm: Name | None = None
+    frame: Name | None = None
+    instrument: Name | None = None
+    speed_mm_s: Annotated[Number, Field(gt=0, le=1000)] = Field(
+        default=20.0,
+        description="Greatest speed of the tip: the surgeon's tempo is slowed to it, all along the pass alike. At most "
+        f"{MAX_SPEED_MM_S:g}.",
+    )
+    orientation: Turning | None = Field(
+        default=None,
+        description="recorded: the jaw turns as the surgeon's along the pass; constant: it is held as in the "
+        "demonstration's first sample, and the answer states the departure. By default recorded where it was.",
+    )
+    a2: A2Target | None = Field(
+        default=None,
+        description="recorded: A2 ends in the demonstrated hand-off, in the poses of both arms; paper: PSM_A turns "
+        "across PSM_M's approach. By default recorded where both poses were, unless psm_m gives another approach.",
+    )
+    rate_hz: Annotated[Number, Field(ge=RATE_HZ[0], le=RATE_HZ[1])] = 200.0
+    tip_offset_mm: Annotated[Number, Field(ge=0, le=MAX_TIP_OFFSET_MM)] = Field(
+        default=0.0,
+        description=f"How far down the jaw's approach from its hinge suture points and starts are meant; "
+        f"{JAW_TIP_MM:g} for the finger tips.",
+    )
+    psm_m: PsmMIn | None = Field(
+        default=None, description="Left out, it is taken from the demonstration where that has PSM_M's pose."
+    )
+    scene: SceneIn | None = Field(
+        default=None,
+        description="Tissue and obstacles in the frame of the arm, against which the verdict compares the motion. Left "
+        "out, it is the scene that the policy was learnt in.",
+    )
+    tissue_mm: Coordinate | None = Field(
+        default=None,
+        description="Height of level tissue, along z of the arm's frame: it is that of the scene. No motion is "
+        "exported without tissue, of this, of the scene, or of the policy's.",
+    )
+    realignment: StrictBool = Field(
+        default=True, description="false plans A1 alone, without A2's turn; handoff 'none' is the way to say so now."
+    )
+    handoff: Literal["none"] | None = Field(
+        default=None,
+        description="none asks for a plan that hands nothing over: A1 alone. Without it a plan is refused for which "
+        "neither psm_m nor the demonstration says where PSM_M is.",
+    )
+
+
+class ErrorSources(Schema):
+    """For each size of an arm's errors its source, and the reason for its value."""
+
+    registration_mm: Source
+    registration_deg: Source
+    wrist_deg: Source
+    tip_bias_mm: Source
+    tip_noise_mm: Source
+    tip_correlation_s: Source
+
+
+class ArmErrorsIn(Schema):
+    """A laboratory's own errors of its arms, standard deviations along or about each axis (docs/errors.md)."""
+
+    name: Annotated[str, Field(min_length=1, max_length=60, pattern=LINE)]
+    registration_mm: Size = Field(description="Offset of PSM_M's base.")
+    registration_deg: Size = Field(description="Rotation of PSM_M's base about its remote centre.")
+    wrist_deg: Size = Field(description="Rotation of either arm's jaws about their hinge.")
+    tip_bias_mm: Size = Field(description="Offset of either arm that stays over a pass.")
+    tip_noise_mm: Size = Field(description="Offset of either arm that varies during a pass.")
+    tip_correlation_s: Size = Field(description="Correlation time of that noise.")
+    sources: ErrorSources
+
+
+class PlaybackIn(Schema):
+    """A playback: the plan to play in the simulator, and the errors of the arms to judge it under."""
+
+    model_config = shown({"plan": "0123456789abcdef" * 4}, {"plan": "0123456789abcdef" * 4, "errors": "calibrated"})
+
+    plan: DigestField
+    errors: Literal["calibrated", "uncalibrated"] | ArmErrorsIn | None = Field(
+        default=None, description="The errors of the arms that are to play it; by default those of the installation."
+    )
+
+    @property
+    def arm_errors(self) -> ArmErrors | None:
+        """The errors as a value of the domain."""
+        if self.errors is None or isinstance(self.errors, str):
+            return None if self.errors is None else NAMED[self.errors]
+        return checked_own(ArmErrors(**self.errors.model_dump()))
+
+
+MAX_ROTATIONS = 48
+Length = Annotated[Number, Field(ge=0, le=400)]
+
+
+class ReachIn(Schema):
+    """A map of the suture points at which a style can be planned: a box of places, and rotations of the grid world."""
+
+    model_config = shown(
+        {"surgeon": "kestrel", "suture": "simple-running", "size_mm": [40.0, 40.0, 0.0], "handoff": "none"}
+    )
+
+    surgeon: SlugField
+    suture: SlugField
+    version: Annotated[StrictInt, Field(ge=1, le=2**31)] | None = None
+    centre_mm: PointIn | None = Field(
+        default=None, description="Middle of the box, in the frame of the arm; left out, the demonstrated goal."
+    )
+    size_mm: tuple[Length, Length, Length] = Field(default=(80.0, 80.0, 0.0), description="Edges of the box.")
+    step_mm: Annotated[Number, Field(ge=1, le=100)] = Field(
+        default=8.0, description=f"Distance of the places, of which there are at most {MAX_PLACES}."
+    )
+    rotations_xyzw: Annotated[
+        list[tuple[Component, Component, Component, Component]], Field(min_length=1, max_length=MAX_ROTATIONS)
+    ] = Field(
+        default=[(0.0, 0.0, 0.0, 1.0)],
+        description="Rotations of the grid world about each place, as of a suture point.",
+    )
+    orientation: Turning | None = Field(default=None, description="As in a plan; so are all that follow.")
+    a2: A2Target | None = None
+    tip_offset_mm: Annotated[Number, Field(ge=0, le=MAX_TIP_OFFSET_MM)] = Field(
+        default=0.0, description=f"{JAW_TIP_MM:g} for the finger tips."
+    )
+    psm_m: PsmMIn | None = None
+    scene: SceneIn | None = None
+    tissue_mm: Coordinate | None = None
+    handoff: Literal["none"] | None = None
+
+    def plan_at(self, position_mm: PointIn) -> PlanIn:
+        """Return the request of a plan with one pass at this place for each rotation."""
+        alike = {name: getattr(self, name) for name in PlanIn.model_fields if name in type(self).model_fields}
+        points = [SuturePointIn(position_mm=position_mm, rotation_xyzw=turned) for turned in self.rotations_xyzw]
+        return PlanIn.model_construct(**alike, suture_points=points)
+
+
+class Reach(Given):
+    """Where a style can be planned.
+
+    `places` has all positions of the first rotation, x slowest and z fastest, then those of the second, and so on.
+    """
+
+    surgeon: Slug
+    suture: Slug
+    policy: PolicyName
+    arm: str
+    frame: str
+    step_mm: float
+    counts: tuple[Count, Count, Count] = Field(description="Number of places along x, y and z.")
+    rotations: Count
+    places: list[ReachPlace]
+    in_words: str
+
+
+@stored_schema
+@dataclass(frozen=True, kw_only=True)
+class Verdict(PlaybackReport):
+    """The verdict and its figures; peak ratios and margins are PSM_A's, `arms` has all joints.
+
+    Attributes:
+        failure_in_words: The failure as a sentence.
+        doubt: Probabilities of success in worlds that differ from the plan.
+        plan: Digest of the plan.
+        trajectory: Digest of the stamps and joints that were checked.
+        policy: The policy version that the plan follows.
+        frame: Frame of the plan.
+        scene: Distances from the plan's scene; null: it has none, so nothing was compared with tissue.
+        tissue: Whether the motion was compared with tissue; null in older verdicts.
+        stated_by: Source of the errors of the arms, the playback's request or the installation; null in older verdicts.
+    """
+
+    failure_in_words: str | None
+    doubt: Doubt
+    plan: Sha256
+    trajectory: Sha256
+    policy: PolicyName
+    frame: str
+    scene: SceneReport | None = None
+    tissue: Literal["judged", "not given"] | None = None
+    stated_by: Literal["request", "installation"] | None = None
+
+
+class Sources(Given):
+    """The sources of PSM_M's values."""
+
+    approach: str
+    base: str | None
+
+
+class PsmM(Given):
+    """The arm that takes the needle, in the frame of the arm that hands it over."""
+
+    approach: Point
+    base_mm: Point | None
+    base_xyzw: Quaternion | None
+    instrument: str
+    enters: str = Field(description="start or after_A1.")
+    from_: Sources = Field(alias="from")
+
+
+class Pass(Given):
+    """One grid world of a plan: its placement, and the path in it."""
+
+    position_mm: Point
+    rotation_xyzw: Quaternion
+    start_mm: Point
+    states: list[int]
+    path_mm: list[Point]
+    jaw_xyzw: Quaternion = Field(description="The jaw at the start of A1.")
+    turn_deg: float = Field(default=0.0, description="Greatest angle of the jaw from its start during A1.")
+    target_xyzw: Quaternion | None = Field(description="The jaw after A2; null where A1 alone is planned.")
+    transfer: Transfer | None
+
+
+class Timetable(Given):
+    """A plan as a function of time."""
+
+    rate_hz: float
+    samples: Count
+    duration_s: float
+    seconds_by_phase: dict[str, float]
+    speed_used_mm_s: float
+    tempo: float | None = Field(
+        default=None, description="The part of the surgeon's tempo in A1, at most 1; null where none is followed."
+    )
+    jaw: str = Field(default="constant", description="recorded along A1, or constant.")
+    peak_joint_speed_ratio: float
+    peak_joint_acceleration_ratio: float
+    deviation_mm: float
+    psm_m_moves: bool
+    seams: list[Seam]
+
+
+class PlanScene(Given):
+    """The scene of a plan, in the frame of the arm; it does not move with the passes."""
+
+    sha256: Sha256
+    learnt_sha256: Sha256 | None = Field(description="Of the scene that the policy was learnt in; null: in none.")
+    differs: list[str] = Field(description="The differences from that scene, in words; empty if there are none.")
+    scene: Scene
+
+
+class Plan(Given):
+    """Grid worlds stacked at suture points."""
+
+    id: Sha256
+    sha256: Sha256
+    surgeon: Slug
+    suture: Slug
+    policy: PolicyName
+    arm: str
+    frame: str
+    instrument: str
+    orientation: str = Field(
+        description="recorded: turns as the surgeon's; demonstrated: constant, the demonstration's first; or assumed "
+        "tool-down, which is constant too."
+    )
+    departure: Departure | None = Field(
+        default=None, description="Of a constant orientation from the recorded one; null where there is none."
+    )
+    a2: str | None = Field(
+        default=None, description="recorded: ends in the demonstrated hand-off; or paper. Null without a hand-off."
+    )
+    path: str = Field(description="fitted, or cell centres.")
+    psm_m: PsmM | None
+    realignment: bool
+    scene: PlanScene | None = Field(
+        default=None, description="Tissue and obstacles; null: none was stated, and nothing is compared with them."
+    )
+    speed_mm_s: float
+    tip_offset_mm: float
+    passes: list[Pass]
+    trajectory: Timetable
+    hands_over: bool = Field(default=True, description="Whether a hand-off is planned: A2 towards PSM_M.")
+    in_words: str = Field(default="", description="What the plan does and what it leaves out.")
+    created_at: datetime
+
+
+class PlanSummary(Given):
+    """A plan in a list."""
+
+    id: Sha256
+    surgeon: Slug
+    suture: Slug
+    policy: PolicyName
+    passes: Count
+    hands_over: bool
+    playback: Sha256 | None = Field(description="Its newest playback; null where it was not played.")
+    feasible: bool | None = Field(description="Of that playback.")
+    created_at: datetime
+
+
+class Trajectory(Given):
+    """The motion of a plan, sampled: `rows` of `columns`, whose names contain their units."""
+
+    rate_hz: float
+    columns: list[str]
+    rows: list[list[float]]
+
+
+class MotionTimeline(Given):
+    """A recording, a demonstration, a learnt path or a plan as columns on one clock, to be played."""
+
+    source: Literal["recordings", "demos", "policy-versions", "plans"]
+    sha256: Sha256
+    timeline: Timeline
+
+
+class StandingPolicy(PolicyName):
+    """The policy version that a plan follows, and whether it is released now."""
+
+    released: bool
+
+
+class PictureLinks(Given):
+    """Links to the pictures; all but the first are drawn after the verdict."""
+
+    picture: str
+    animation_mp4: str
+    animation_gif: str
+    joints: str
+    clearance: str
+
+
+class Headline(Given):
+    """A playback's headline: the verdict, the missing parts of the plan, and its probability of success."""
+
+    level: Literal["good", "caution", "bad"] = Field(
+        description="good: hands over, and succeeds as surely as the installation asks for a replay; bad: not "
+        "feasible, or surely succeeds in less than half of the worlds."
+    )
+    word: str = Field(description="The level in a word or two.")
+    text: str
+    errors: str = Field(
+        description="Name of the errors of the arms: those of the playback's request, or else of the installation."
+    )
+    probability: Probability | None = Field(description="Of the whole plan; null where it was not judged.")
+    counts: Literal["hand-over", "clearance"] | None = Field(
+        default=None,
+        description="The event of the probability: the needle is handed over in every pass, or, without a hand-off, "
+        "the motion only stays within reach and clear; null where it was not judged.",
+    )
+    not_judged: list[str] = Field(default=[], description="What the probability leaves out, in words.")
+    costs_most: str | None = Field(description="The error that costs the most, in words; null where none was judged.")
+
+
+class Playback(Given):
+    """The simulator's verdict on a plan."""
+
+    id: Sha256
+    sha256: Sha256
+    plan: Sha256
+    feasible: bool = Field(description="In an exact simulation, as far as the plan goes; read `headline`.")
+    headline: Headline | None = None
+    report: Verdict
+    picture: str
+    pictures: PictureLinks
+    created_at: datetime
+    policy: StandingPolicy
+
+
+class Comparison(Given):
+    """A recorded replay compared with a pass of its plan; triples are x, y and z."""
+
+    plan: Sha256
+    demo: Sha256
+    pass_index: Count = Field(alias="pass")
+    mean_mm: float
+    max_mm: float
+    start_mm: float = Field(description="Between the first samples.")
+    end_mm: float = Field(description="Between the last samples.")
+    dtw_mean_mm: Point
+    rmse_mm: Point
+    planned_s: float
+    recorded_s: float
+    tie_break: str
