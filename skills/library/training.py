@@ -31,12 +31,11 @@ from skills.db.service_tables import Job, record_events
 from skills.db.session import Database
 from skills.deep import Tell, learn_policy, require_installed
 from skills.demonstration.demonstration import Demo
-from skills.errors import BadInput, BadPlan, Conflict, NotFound, SkillsError
+from skills.errors import BadInput, Conflict, NotFound, SkillsError
 from skills.fields import as_json
 from skills.gridworld.grid import discretisation_rmse
 from skills.gridworld.reward import RewardLevels, RewardMap, sparse_reward
 from skills.gridworld.scene import Surroundings, hazards_of, refuse_unfit
-from skills.kinematics import instrument_of
 from skills.learning.certificate import (
     Certificate,
     NearLimits,
@@ -44,11 +43,10 @@ from skills.learning.certificate import (
     NearStarts,
     OddsLimits,
     certify,
-    least_gamma,
     near_odds,
     near_starts,
 )
-from skills.learning.dynamic_programming import FAINT, rule_in
+from skills.learning.dynamic_programming import rule_in
 from skills.learning.evaluation import check_in_space, measure
 from skills.learning.in_scene import SceneCertificate, certify_in_scene, learn_in_scene, scene_learner
 from skills.learning.policy import (
@@ -70,8 +68,9 @@ from skills.library.demos import find_demo
 from skills.library.integrity import policy_identity_of, poses_identity_of, scene_digest
 from skills.library.jobs import QUEUED, RequestedJob, Store, TrainingRequest, did_nothing
 from skills.library.policies import BEST, choose_demos, combining_of, describe_combined, find_by_digest
+from skills.library.releases import driven_or_refused, refusals
 from skills.packing import canonical, sha256
-from skills.planning.plan import DrivenPass, driven_pass
+from skills.planning.plan import DrivenPass
 from skills.remedies import Action, Remedy
 from skills.schemas.policies import JOINING_FORMAT, Coverage, GridCertificate, Joining
 from skills.schemas.requests import TrainingIn
@@ -397,7 +396,7 @@ def certified(lesson: Lesson, request: TrainingRequest, demo: Demo, policy: Poli
         covered = replace(covered, finishing=odds.finishes, touching=odds.touches)
     poses = certified_poses([unpack_as(Demo, one) for one in lesson.shown] or [demo], lesson.at)
     numbers, coverage = seal(policy), seal(covered)
-    driven, undriven = _driven(policy, demo)
+    driven, undriven = driven_or_refused(policy, demo)
     assert covered.share is not None, "a new certificate has the shares"
     limits = NearLimits(**request.get("near", {}))
     near = near_starts(policy, covered.share, limits)
@@ -508,94 +507,6 @@ def _version(learnt: Learnt, version: int) -> dict[str, Any]:
         "learnt": learnt.policy,
         "covered": learnt.coverage,
     }
-
-
-def refusals(policy: Policy, certificate: Certificate, near: NearStarts, odds: NearOdds | None = None) -> list[str]:
-    """Return the reasons on the grid against a release; the comparisons are written so that NaN fails.
-
-    In a scene the odds count in place of optimal actions and of starts that reach the goal: sampled values are not
-    exact beside rare and costly touches, and cells in tissue reach nothing.
-    """
-    if odds is not None:
-        return [*_unlikely(odds), *_not_the_style(policy, certificate, near)]
-    reasons = []
-    if not certificate.every_action_optimal:
-        reasons.append(f"{certificate.suboptimal} of {certificate.checked} greedy actions are not optimal")
-    if not certificate.every_action_optimal and certificate.faint:
-        gamma = least_gamma(policy)
-        reasons.append(
-            f"{certificate.faint} of them are so far from the path that their values, with gamma "
-            f"{policy.learner.gamma:g}, are below {FAINT:g}, too small to be learnt; train with larger cells, or with "
-            f"a gamma {'nearer to 1' if gamma is None else f'of {gamma:g}'}"
-        )
-    if certificate.starts_reaching < certificate.starts:
-        missing = certificate.starts - certificate.starts_reaching
-        reasons.append(f"{missing} of {certificate.starts} starts do not reach the goal")
-    if certificate.off_rule:
-        reasons.append(
-            f"{certificate.off_rule} of {certificate.checked} greedy actions are not the ones that the rule among "
-            "equally good actions selects"
-        )
-    return reasons + _not_the_style(policy, certificate, near)
-
-
-def _unlikely(odds: NearOdds) -> list[str]:
-    """Return the reason why the odds in a scene are against a release, if they are."""
-    if odds.within:
-        return []
-    return [
-        f"of {odds.starts} starts near the demonstrated one, one finishes with a probability of {odds.finishing:.1%}, "
-        f"and one touches the scene with {odds.touching:.1%}; the gate requires at least {odds.least_finishing:.0%} "
-        f"and at most {odds.most_touching:.0%}"
-    ]
-
-
-def _not_the_style(policy: Policy, certificate: Certificate, near: NearStarts) -> list[str]:
-    """Return the reasons why a policy does not follow the demonstration from its start or near it."""
-    reasons = []
-    if policy.learner.phased and not certificate.demonstration_reproduced:
-        reasons.append("the rollout from the demonstrated start is not the demonstration")
-    if policy.learner.phased and not near.within:
-        reasons.append(
-            f"of {near.starts} starts within {near.radius_mm:g} mm of the demonstrated one, one follows only "
-            f"{near.share:.0%} of the demonstration, and the gate requires {near.least_share:.0%}; train with a "
-            f"joining rule such as --join {max(near.least_share, 0.5):g}, which leads them back to an earlier part"
-        )
-    return reasons
-
-
-def _driven(policy: Policy, demo: Demo) -> tuple[DrivenPass | None, list[str]]:
-    """Solve the demonstrated pass in closed form; return the result, None if impossible, and reasons against a release.
-
-    NaN fails: a position is within the limits only if joints within the limits were found that put the tip there.
-    """
-    if not demo.frame.endswith("_base"):
-        return None, [
-            f"the frame '{demo.frame}' is not the arm's base, so its joint limits cannot be checked; demonstrate on a "
-            "topic in the frame of the arm's base, such as local/measured_cp of a dVRK, or record its joints beside "
-            "the poses"
-        ]
-    try:
-        driven = driven_pass(policy, demo)
-    except BadPlan as refused:
-        why = refused.message.removesuffix(".")
-        return None, [f"the demonstrated pass cannot be driven, so the joint limits were not checked: {why}"]
-    if driven.beyond == 0:
-        return driven, []
-    nearest, arm = driven.nearest_limit, instrument_of(demo.instrument).arm.name
-    where = ", ".join(f"{value:.1f}" for value in nearest.tip_mm)
-    needs = (
-        "no joints put the tip there"
-        if nearest.value is None or nearest.margin is None
-        else f"the arm needs {nearest.joint} {nearest.value:.4f} {nearest.unit}, {-nearest.margin:.4f} {nearest.unit} "
-        f"beyond the limit {nearest.limit:.4f} of the {arm} with {demo.instrument}"
-    )
-    what = "the fitted path" if driven.path == "fitted" else "through the centres of its cells"
-    return driven, [
-        f"the demonstrated pass as it is driven ({what}) leaves the joint limits: at ({where}) mm in {demo.frame} "
-        f"{needs}, the furthest of {driven.beyond} of {driven.samples} places; demonstrate it further from that limit, "
-        "or with the arm's base elsewhere"
-    ]
 
 
 def describe_policy(

@@ -15,8 +15,9 @@ from skills.learning.policy import Policy, learn_tabular
 from skills.learning.q_learning import CellQLearning, PhaseQLearning
 from skills.library import releases
 from skills.library.integrity import learnt, shares
+from skills.library.releases import refusals
 from skills.library.retraining import request_retraining
-from skills.library.training import near_limits, refusals, request_training
+from skills.library.training import near_limits, request_training
 from skills.schemas.requests import RetrainingIn, TrainingIn
 from skills.settings import Settings
 from tests.library import cases

@@ -141,7 +141,7 @@ def reasons(policy: Policy) -> list[str]:
     """Return the reasons on the grid against a release of a policy."""
     certificate, covered = certify(policy)
     assert covered.share is not None
-    return training.refusals(policy, certificate, near_starts(policy, covered.share, NearLimits(least_share=0.0)))
+    return releases.refusals(policy, certificate, near_starts(policy, covered.share, NearLimits(least_share=0.0)))
 
 
 @pytest.mark.parametrize(
@@ -177,10 +177,10 @@ def test_a_rollout_that_is_not_the_demonstration_is_a_reason_of_its_own():
     assert "the rollout from the demonstrated start is not the demonstration" in reasons(still)
     certificate, covered = certify(policy)
     near = near_starts(policy, covered.share, NearLimits())
-    assert training.refusals(policy, certificate, near) == []
+    assert releases.refusals(policy, certificate, near) == []
     unlike = replace(certificate, demonstration_reproduced=False)
-    assert len(training.refusals(policy, unlike, near)) == 1
-    assert training.refusals(learnt("an angle", phased=False), unlike, replace(near, share=0.0)) == []
+    assert len(releases.refusals(policy, unlike, near)) == 1
+    assert releases.refusals(learnt("an angle", phased=False), unlike, replace(near, share=0.0)) == []
 
 
 @pytest.mark.parametrize(
@@ -196,9 +196,9 @@ def test_a_rollout_that_is_not_the_demonstration_is_a_reason_of_its_own():
 def test_a_place_beyond_the_limits_is_told_with_its_joint_or_without(value, margin, words, path, way, monkeypatch):
     nearest = SimpleNamespace(tip_mm=(1, 2, 3), joint="pitch", unit="rad", limit=-0.8, value=value, margin=margin)
     driven = SimpleNamespace(beyond=2, samples=9, path=path, nearest_limit=nearest)
-    monkeypatch.setattr(training, "driven_pass", lambda _policy, _demo: driven)
+    monkeypatch.setattr(releases, "driven_pass", lambda _policy, _demo: driven)
     demo = SimpleNamespace(frame="PSM2_base", instrument="400006")
-    found, (reason,) = training._driven(learnt("an angle"), demo)
+    found, (reason,) = releases.driven_or_refused(learnt("an angle"), demo)
     assert found is driven
     assert f"at (1.0, 2.0, 3.0) mm in PSM2_base {words}" in reason
     assert way in reason and "of 2 of 9 places" in reason
@@ -206,17 +206,17 @@ def test_a_place_beyond_the_limits_is_told_with_its_joint_or_without(value, marg
 
 def test_a_pass_that_cannot_be_checked_is_refused(monkeypatch):
     policy, demo = learnt("an angle"), SimpleNamespace(frame="PSM2_base", instrument="400006")
-    found, (reason,) = training._driven(policy, SimpleNamespace(frame="ECM"))
+    found, (reason,) = releases.driven_or_refused(policy, SimpleNamespace(frame="ECM"))
     assert found is None and "'ECM' is not the arm's base" in reason
     within = SimpleNamespace(beyond=0)
-    monkeypatch.setattr(training, "driven_pass", lambda _policy, _demo: within)
-    assert training._driven(policy, demo) == (within, [])
+    monkeypatch.setattr(releases, "driven_pass", lambda _policy, _demo: within)
+    assert releases.driven_or_refused(policy, demo) == (within, [])
 
     def refusing(_policy: object, _demo: object) -> None:
         raise BadPlan("It is too short.")
 
-    monkeypatch.setattr(training, "driven_pass", refusing)
-    found, (reason,) = training._driven(policy, demo)
+    monkeypatch.setattr(releases, "driven_pass", refusing)
+    found, (reason,) = releases.driven_or_refused(policy, demo)
     assert found is None and reason.endswith("not checked: It is too short")
 
 

@@ -23,8 +23,9 @@ from skills.learning.slip import FollowPolicy, draw_slips, follows, walk
 from skills.library import releases
 from skills.library.integrity import covered, learnt, scene_digest
 from skills.library.policies import about_rollout
+from skills.library.releases import refusals
 from skills.library.retraining import request_retraining
-from skills.library.training import odds_limits, refusals
+from skills.library.training import odds_limits
 from skills.schemas.requests import RetrainingIn
 from skills.settings import Settings
 from tests.library import cases
