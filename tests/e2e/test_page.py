@@ -535,6 +535,24 @@ def accept_as_a_failure(tab: Watched, surgeon: str) -> None:
     expect(page.get_by_text("Mark the outcome of a demonstration")).to_be_visible()
 
 
+def sent_from(tab: Watched) -> bytes:
+    """Return the bytes of the folder "theatre" that the page will send."""
+    expect(tab.page.locator("#chosen")).to_contain_text("theatre.zip")
+    sent = tab.page.evaluate("document.getElementById('file').files[0].arrayBuffer().then(b => [...new Uint8Array(b)])")
+    return bytes(sent)
+
+
+def drop(tab: Watched, onto: str, file: Path) -> None:
+    """Drag a file or a folder of the disk onto an element and drop it, as a file manager does."""
+    box = tab.page.locator(onto).bounding_box()
+    assert box is not None
+    browser = tab.context.new_cdp_session(tab.page)
+    held = {"items": [], "files": [str(file)], "dragOperationsMask": 1}
+    for step in ("dragEnter", "dragOver", "drop"):
+        place = {"x": box["x"] + box["width"] / 2, "y": box["y"] + 5}
+        browser.send("Input.dispatchDragEvent", {"type": step, "data": held, **place})
+
+
 def test_the_folder_of_a_bag_is_sent_as_one_file_without_its_pictures(flat: Watched, tmp_path: Path) -> None:
     bag = tmp_path / "theatre"
     (bag / "camera").mkdir(parents=True)
@@ -542,13 +560,13 @@ def test_the_folder_of_a_bag_is_sent_as_one_file_without_its_pictures(flat: Watc
     (bag / "camera" / "0.png").write_bytes(b"not sent")
     flat.open("/pages/recordings/new")
     flat.page.get_by_label("or a bag's folder").set_input_files(bag)
-    expect(flat.page.locator("#chosen")).to_contain_text("theatre.zip")
-    sent = flat.page.evaluate(
-        "document.getElementById('file').files[0].arrayBuffer().then(b => [...new Uint8Array(b)])"
-    )
-    with ZipFile(io.BytesIO(bytes(sent))) as packed:
+    chosen = sent_from(flat)
+    with ZipFile(io.BytesIO(chosen)) as packed:
         assert packed.testzip() is None
         assert packed.namelist() == ["theatre/part_0.mcap"]
+    flat.open("/pages/recordings/new")
+    drop(flat, "#drop", bag)
+    assert sent_from(flat) == chosen
     flat.page.get_by_role("button", name="Preview").click()
     expect(flat.page.locator("#seen")).to_contain_text("PSM1")
     expect(flat.page.get_by_role("button", name="Store it")).to_be_enabled()
