@@ -19,11 +19,15 @@ PREFIX = "SKILLS_"
 FOR_TESTS = "SKILLS_TEST_"  # prefix of the test suite's variables, which nothing in the package reads
 Role = Literal["reader", "uploader", "trainer", "releaser", "admin"]
 PROXY_SECRET_LENGTH = 32  # characters; random ones of this length cannot be guessed
+DATABASE = "skills.sqlite"  # the default one's file
 LOOPBACK = ("localhost", "127.0.0.1", "[::1]")
 
 
 def _data_folder() -> Path:
-    return Path.home() / ".local" / "share" / "suture-skills"
+    """Return the folder of the default database; versions before 0.2.0 took the one in the home folder always."""
+    before, within = Path.home() / ".local" / "share" / "suture-skills", Path(os.environ.get("XDG_DATA_HOME", ""))
+    named = within / "suture-skills" if within.is_absolute() else before
+    return before if (before / DATABASE).exists() and not (named / DATABASE).exists() else named
 
 
 def _cores() -> int:
@@ -41,7 +45,7 @@ class Settings(BaseSettings):
 
     model_config = SettingsConfigDict(env_prefix=PREFIX, frozen=True, extra="ignore")
 
-    database_url: str = Field(default_factory=lambda: f"sqlite:///{_data_folder() / 'skills.sqlite'}")
+    database_url: str = Field(default_factory=lambda: f"sqlite:///{_data_folder() / DATABASE}")
     host: str = "127.0.0.1"
     port: int = Field(default=8000, ge=0, le=65535)
     root_path: str = ""

@@ -98,3 +98,25 @@ def test_an_invalid_variable_is_named_without_repeating_its_value(monkeypatch: p
     with pytest.raises(BadSettings, match=r"SKILLS_PORT: .*65535; SKILLS_WORKERS: .*integer") as refused:
         settings.__wrapped__()
     assert "s3cret" not in str(refused.value)
+
+
+def test_the_default_database_follows_xdg_and_one_of_before_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.delenv("SKILLS_DATABASE_URL", raising=False)
+    monkeypatch.setattr(Path, "home", lambda: tmp_path / "home")
+    before, named = (tmp_path / f"{one}/suture-skills/skills.sqlite" for one in ("home/.local/share", "data"))
+
+    def place() -> str:
+        return Settings().database_url.removeprefix("sqlite:///")
+
+    monkeypatch.delenv("XDG_DATA_HOME", raising=False)
+    assert place() == str(before)
+    monkeypatch.setenv("XDG_DATA_HOME", "relative")  # the XDG specification has such a path ignored
+    assert place() == str(before)
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+    assert place() == str(named)
+    before.parent.mkdir(parents=True)
+    before.touch()
+    assert place() == str(before)
+    named.parent.mkdir(parents=True)
+    named.touch()
+    assert place() == str(named)
