@@ -48,6 +48,17 @@ def load_samples(client: Client) -> Iterator[Demonstration]:
             )
 
 
+def write_samples(folder: Path) -> list[tuple[Path, str]]:
+    """Write the recordings of the synthetic surgeons as MCAP files; return each file and its surgeon."""
+    folder.mkdir(parents=True, exist_ok=True)
+    written = []
+    for sample in sample_recordings():
+        file = folder / f"{sample.name}.mcap"
+        file.write_bytes(sample.data)
+        written.append((file, sample.surgeon))
+    return written
+
+
 NOT_FOUND = "not-found"
 
 

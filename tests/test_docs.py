@@ -88,7 +88,7 @@ RUN_BY: dict[str, list[str]] = {
     "scenes.md": [SCENES, SCENES, RUN],
     "scoring.md": 3 * [RUN],
     "tables.md": [*3 * [TABLES], "tests/test_references.py::test_every_call_of_a_page_exists", RUN, *2 * [TABLES]],
-    "tutorial.md": 4 * ["tests/test_tutorial.py::test_every_command_of_the_tutorial_prints_its_transcript"],
+    "tutorial.md": 5 * ["tests/test_tutorial.py::test_every_command_of_the_tutorial_prints_its_transcript"],
 }
 
 

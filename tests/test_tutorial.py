@@ -64,7 +64,7 @@ def lasting(printed: str) -> str:
 
 def test_every_command_of_the_tutorial_prints_its_transcript(bare: None) -> None:
     shown = COMMAND.findall(PAGE.read_text())
-    assert len(shown) == 5
+    assert len(shown) == 6
     for command, code, printed in shown:
         result = run(command)
         assert result.exit_code == int(code or 0), result.output
@@ -85,6 +85,15 @@ def test_a_user_at_a_terminal_is_asked_what_is_open(bare: None, monkeypatch: pyt
     assert run("skills try five-hand-offs.mcap --folder kept --segment 9").exit_code == 1
     refused = run("skills try five-hand-offs.mcap --folder kept --tissue high")
     assert (refused.exit_code, "neither a height in mm nor none" in refused.output) == (1, True)
+
+
+def test_the_samples_are_the_bags_of_the_page(bare: None) -> None:
+    assert run("skills seed --files samples").exit_code == 0
+    for name, sample in (("hand-off", "wren-simple-running"), ("five-hand-offs", "kestrel-five-hand-offs")):
+        assert f"`{name}.mcap` is `samples/{sample}.mcap`" in PAGE.read_text()
+        assert Path(f"samples/{sample}.mcap").read_bytes() == Path(f"{name}.mcap").read_bytes()
+    refused = run("skills seed --files hand-off.mcap")
+    assert refused.exit_code != 0 and "is a file" in refused.output
 
 
 def test_the_command_of_a_choice_keeps_what_was_typed(bare: None) -> None:

@@ -80,10 +80,21 @@ def migrate(as_json: AsJson = False) -> None:
 
 @commands.command()
 @refusing
-def seed(as_json: AsJson = False) -> None:
+def seed(
+    to: Annotated[
+        Path | None,
+        typer.Option("--files", help="Only write the recordings as files, into this folder.", file_okay=False),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
     """Load the synthetic sample surgeons and their recordings."""
-    from skills.samples import load_samples
+    from skills.samples import load_samples, write_samples
 
+    if to is not None:
+        with files():
+            written = write_samples(to)
+        show([{"file": str(file), "surgeon": surgeon} for file, surgeon in written], as_json, ("file", "surgeon"))
+        return
     with service() as client, err.status("loading"):
         show(list(load_samples(client)), as_json, ("surgeon", "suture", "id", "report.path_states"))
 
