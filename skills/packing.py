@@ -94,7 +94,10 @@ def sha256(data: bytes) -> str:
 
 def canonical(data: Any) -> bytes:
     """Serialise JSON in the one form that digests are computed from: sorted keys, no spaces, no NaN."""
-    return json.dumps(data, sort_keys=True, separators=(",", ":"), allow_nan=False, ensure_ascii=True).encode()
+    return _canonical(data).encode()
+
+
+_canonical = json.JSONEncoder(sort_keys=True, separators=(",", ":"), allow_nan=False).encode
 
 
 def write(file: IO[bytes], value: Any, classes: Known) -> None:

@@ -6,7 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as some
 
+from skills.db.logged_rows import compact
 from skills.errors import Corrupt
+from skills.packing import canonical
 from skills.transparency import (
     TILE_WIDTH,
     Checkpoint,
@@ -131,3 +133,11 @@ def test_a_key_is_read_from_its_text_and_never_shown():
     for text in ("", "PRIVATE+KEY", str(KEY).replace("suture", "other"), str(KEY)[:-9] + "\n"):
         with pytest.raises(Corrupt):
             SigningKey.read(text)
+
+
+ASCII = some.text(some.characters(max_codepoint=126))
+
+
+@given(some.dictionaries(ASCII, ASCII | some.none()))
+def test_what_is_hashed_of_a_row_is_its_canonical_form(texts):
+    assert compact(texts).encode() == canonical(texts)

@@ -26,6 +26,7 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Any, cast
 
+import orjson
 from sqlalchemy import (
     JSON,
     BigInteger,
@@ -45,16 +46,18 @@ from sqlalchemy.orm import Mapped, mapped_column
 from skills.db import Base, RowId, now, rfc3339
 from skills.db.logged_rows import (
     CACHES,
+    OF_LEAF,
     ROWS_AT_ONCE,
     Logged,
     commitment_to,
+    compact,
     digests_of,
-    encode,
     logged,
     schema_of,
+    united,
+    united_rows,
 )
 from skills.errors import BadSettings, Corrupt
-from skills.packing import canonical
 from skills.remedies import Action, Remedy
 from skills.transparency import HASH_BYTES, Checkpoint, Seal, SigningKey, Tree, leaf_hash, read_notes
 
@@ -117,8 +120,10 @@ NOTING_CONNECTION = "-c skills.noting=0"  # for the options of a connection
 FORGET_NOTES = "DELETE FROM history_notes"
 _TAKEN = {
     "sqlite": "DELETE FROM history_notes RETURNING rowid, table_name, change, key, changed",
+    # The rows are then read by their keys: one plan for all numbers of them, where planning took longer than reading.
     "postgresql": "SELECT current_setting('skills.noting', true), current_setting('skills.notes0', true), "
-    "set_config('skills.notes0', '', true)",
+    "set_config('skills.notes0', '', true), set_config('plan_cache_mode', 'force_generic_plan', true), "
+    "set_config('enable_seqscan', 'off', true)",
 }
 _FURTHER = (
     "SELECT current_setting('skills.notes' || n, true), set_config('skills.notes' || n, '', true), "
@@ -156,7 +161,7 @@ def take_notes(connection: Connection) -> list[Any]:
     taken = connection.exec_driver_sql(_TAKEN[connection.dialect.name])
     if connection.dialect.name == "sqlite":
         return [note for _, *note in sorted(taken, key=itemgetter(0))]
-    last, noted, _ = taken.one()
+    last, noted, *_ = taken.one()
     if int(last or 0):
         noted += "".join(part for part, *_ in connection.exec_driver_sql(_FURTHER, (int(last),)))
     return [json.loads(note) for note in noted.splitlines()] if noted else []
@@ -465,10 +470,6 @@ def latest_leaves(connection: Connection, table: str, keys: Sequence[str] | None
     return found
 
 
-_OF_LEAF, _SALT = ("table_name", "key", '"row"', "entry", "salt", "digests"), (4,)
-_Query = tuple[tuple[str, ...], tuple[int, ...], str, str]
-
-
 def changed_rows(
     connection: Connection, effects: Mapping[str, Mapping[str, Effect]]
 ) -> tuple[dict[str, list[Any]], dict[str, dict[str, Latest]]]:
@@ -478,31 +479,28 @@ def changed_rows(
     """
     rows: dict[str, list[Any]] = {table: [] for table in effects}
     latest: dict[str, dict[str, Latest]] = {table: {} for table in effects}
-    statements: list[_Query] = []
-    given: list[tuple[str, Any]] = []
-    parts: list[tuple[Logged, frozenset[str]]] = []
-    dialect = connection.dialect
-    for table, of_table in effects.items():
-        left = [key for key, effect in of_table.items() if effect.after]
-        if left:
-            known = logged()[table]
-            parts.append((known, frozenset(left)))
-            statements.append((known.names, known.of_bytes, table, f'"{known.keys[0]}"'))
-            given.append(("text" if known.of_text else "bigint", known.firsts_of(left)))
-    for table, of_table in effects.items():
-        logged_before = [key for key, effect in of_table.items() if effect.before or table in CACHES]
-        if logged_before:
-            statements.append((_OF_LEAF, _SALT, "history", f"table_name = '{table}' AND key"))
-            given.append(("text", logged_before))
-    found = []
-    for part, values in _united(connection, statements, given):
+    left = {table: [key for key, effect in of_table.items() if effect.after] for table, of_table in effects.items()}
+    before = {
+        table: [key for key, effect in of_table.items() if effect.before or table in CACHES]
+        for table, of_table in effects.items()
+    }
+    parts = [logged()[table] for table, keys in left.items() if keys]
+    given: list[Sequence[Any]] = [known.firsts_of(left[known.raw.name]) for known in parts]
+    given += [keys for keys in before.values() if keys]
+    if not given:
+        return rows, latest
+    dialect, found = connection.dialect, []
+    logged_before = tuple(table for table, keys in before.items() if keys)
+    statement, of_bytes = united(dialect.name, tuple(known.raw.name for known in parts), logged_before)
+    for part, values in united_rows(connection, statement, of_bytes, given):
         if part >= len(parts):
-            found.append(values[: len(_OF_LEAF)])
+            found.append(values[: len(OF_LEAF)])
             continue
-        known, some = parts[part]
-        readers = known.readers(dialect)
-        row = known.row(*(value if read is None else read(value) for read, value in zip(readers, values, strict=False)))
-        if known.key_of(row) in some:
+        known = parts[part]
+        for at, read in known.readers(dialect):
+            values[at] = read(values[at])
+        row = known.row(*values[: len(known.columns)])
+        if (effect := effects[known.raw.name].get(known.key_of(row))) and effect.after:
             rows[known.raw.name].append(row)
     for table, key, row, entry, salt, digests in sorted(found, key=itemgetter(2)):
         if dialect.name == "sqlite":
@@ -511,67 +509,29 @@ def changed_rows(
     return rows, latest
 
 
-def _united(
-    connection: Connection, statements: Sequence[_Query], given: Sequence[tuple[str, Any]]
-) -> Iterator[tuple[int, Sequence[Any]]]:
-    """Yield the rows of several queries that are sent as one, each with the number of its query.
-
-    Args:
-        connection: In the transaction.
-        statements: For each query its columns, the positions of those of bytes, the table, and the column that is
-            compared, after further conditions.
-        given: For each query the type and the values of that column.
-    """
-    if not statements:
-        return
-    if connection.dialect.name == "sqlite":
-        widest = max(len(columns) for columns, *_ in statements)
-        queries = [
-            f"SELECT {number}, {', '.join((*columns, *('NULL',) * (widest - len(columns))))} FROM {table} "  # noqa: S608
-            f"WHERE {compared} IN (SELECT value FROM json_each(?))"
-            for number, (columns, _, table, compared) in enumerate(statements)
-        ]
-        values = tuple(json.dumps(values) for _, values in given)
-        for number, *row in connection.exec_driver_sql(" UNION ALL ".join(queries), values):
-            yield number, row
-        return
-    most = max(len(of_bytes) for _, of_bytes, *_ in statements)
-    queries = []
-    for number, ((columns, of_bytes, table, compared), (kind, _)) in enumerate(zip(statements, given, strict=True)):
-        plain = ("NULL" if at in of_bytes else column for at, column in enumerate(columns))
-        beside = [f", {columns[at]}" for at in of_bytes] + [", NULL::bytea"] * (most - len(of_bytes))
-        queries.append(
-            f"SELECT {number}, json_build_array({', '.join(plain)})::text{''.join(beside)} FROM {table} "  # noqa: S608
-            f"WHERE {compared} = ANY(%s::{kind}[])"
-        )
-    values = tuple(values for _, values in given)
-    for number, as_json, *contents in connection.exec_driver_sql(" UNION ALL ".join(queries), values):
-        row = json.loads(as_json)
-        for at, content in zip(statements[number][1], contents, strict=False):
-            row[at] = content
-        yield number, row
-
-
 _ADDED = ("table_name", "key", "entry", "seal", "salt", "digests")
 _ADDING = {
     "sqlite": "INSERT INTO history (table_name, key, entry, seal, salt, digests) VALUES (?, ?, ?, ?, ?, ?)",
-    "postgresql": "INSERT INTO history (table_name, key, entry, seal, salt, digests) "
-    "SELECT a, b, c, d, e, f::json FROM unnest(%s::text[], %s::text[], %s::text[], %s::bytea[], %s::bytea[], "
-    "%s::text[]) AS given(a, b, c, d, e, f)",
+    "postgresql": "INSERT INTO history (table_name, key, entry, seal, salt, digests) SELECT leaf->>0, leaf->>1, "
+    "leaf->>2, decode(leaf->>3, 'hex'), decode(leaf->>4, 'hex'), (leaf->>5)::json "
+    "FROM json_array_elements(%s::json) AS given(leaf)",
 }
 
 
 def add_leaves(connection: Connection, leaves: Sequence[Mapping[str, Any]]) -> None:
-    """Insert leaves in their order, in one statement on PostgreSQL."""
-    rows: list[tuple[Any, ...]] = []
-    for leaf in leaves:
-        *values, digests = (leaf[name] for name in _ADDED)
-        rows.append((*values, None if digests is None else encode(digests)))
+    """Insert leaves in their order, in one statement on PostgreSQL.
+
+    There all of them are one text: a driver escapes each quote of each text in an array by itself, which took longer
+    than the rest of the history together.
+    """
+    rows = [[leaf[name] for name in _ADDED] for leaf in leaves]
     if connection.dialect.name == "sqlite":
-        connection.exec_driver_sql(_ADDING["sqlite"], rows)
+        added = [(*values, None if digests is None else compact(digests)) for *values, digests in rows]
+        connection.exec_driver_sql(_ADDING["sqlite"], added)
     else:
-        columns = tuple(list(column) for column in zip(*rows, strict=True))
-        connection.exec_driver_sql(_ADDING["postgresql"], columns)
+        for row in rows:
+            row[3], row[4] = (None if part is None else part.hex() for part in (row[3], row[4]))
+        connection.exec_driver_sql(_ADDING["postgresql"], (orjson.dumps(rows).decode(),))
 
 
 Digested = tuple[bytes, dict[str, str]]
@@ -596,7 +556,7 @@ def new_leaf(
         "previous": None if after is None else after.hash,
     }
     return {
-        "table_name": table, "key": key, "entry": canonical(entry).decode(), "salt": salt, "digests": digests,
+        "table_name": table, "key": key, "entry": compact(entry), "salt": salt, "digests": digests,
     }  # fmt: skip
 
 
