@@ -18,7 +18,7 @@ from skills.api.openapi import complete
 from skills.api.policy_cache import AtHand, PolicyCache
 from skills.api.problems import TOO_LARGE, answer_refusals
 from skills.api.responses import DOWNLOADS_READ, Encoded, Watching
-from skills.api.routes import catalogue, demos, operating, pages, plans, policies, timelines
+from skills.api.routes import catalogue, demos, operating, pages, plans, policies
 from skills.api.sessions import Sessions
 from skills.db.session import Database
 from skills.jobs import Engine
@@ -92,7 +92,7 @@ def create_app(settings: Settings) -> FastAPI:
         plans.trajectory_router,
         plans.suture_point_router,
         plans.picture_router,
-        timelines.router,
+        plans.timeline_router,
         policies.retraining_router,
         policies.card_router,
         demos.dataset_router,
@@ -102,7 +102,7 @@ def create_app(settings: Settings) -> FastAPI:
         operating.reference_router,
         pages.router,
         demos.page_router,
-        timelines.page_router,
+        plans.timeline_page_router,
         operating.sign_in_router,
         catalogue.key_router,
     ):

@@ -12,7 +12,7 @@ every surgeon who is recorded in it, also of one whose demonstration was added t
 
 import weakref
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
 from hashlib import file_digest
@@ -49,6 +49,7 @@ from skills.demonstration.recording import Recording
 from skills.errors import BadInput, Conflict, NotFound, TooLarge
 from skills.formats.lerobot import INFO
 from skills.formats.lerobot.writer import (
+    SHARES,
     SPLITS,
     AboutDataset,
     ExportedEpisode,
@@ -57,7 +58,6 @@ from skills.formats.lerobot.writer import (
     action_rule,
     dataset_files,
 )
-from skills.formats.lerobot.writer import splits_by_surgeon as splits_by_group
 from skills.library import consent, jobs
 from skills.library.catalogue import find_surgeon, find_suture_type
 from skills.library.demos import find_demo
@@ -185,7 +185,7 @@ def _splits(chosen: Sequence[_Chosen], asked: DatasetIn) -> dict[int, Split]:
         marked |= {episode[one.row]: cast(Split, outcome) for one in chosen if one.outcome == outcome}
     groups = _groups(chosen, asked)
     left = {episode[one.row]: groups[one.row] for one in chosen if episode[one.row] not in marked}
-    of_group = splits_by_group({f"{group:020}": episodes for group, episodes in Counter(left.values()).items()})
+    of_group = splits_by_surgeon({f"{group:020}": episodes for group, episodes in Counter(left.values()).items()})
     return {
         one.row: marked[at] if (at := episode[one.row]) in marked else of_group[f"{groups[one.row]:020}"]
         for one in chosen
@@ -570,3 +570,22 @@ def drop_exports(session: Session, job_rows: Sequence[int]) -> None:
             delete(Job).where(Job.row.in_(some)),
         ):
             session.execute(statement, **UNSYNCHRONISED)
+
+
+def splits_by_surgeon(episodes: Mapping[str, int]) -> dict[str, Split]:
+    """Assign each surgeon to training, validation or test, so that nobody is in two of them.
+
+    Args:
+        episodes: Surgeons and their numbers of episodes.
+
+    Returns:
+        The split of each surgeon. The shares of the episodes approach `SHARES` as well as whole surgeons allow; one
+        surgeon alone is for training.
+    """
+    wanted: dict[Split, float] = {split: SHARES[split] * sum(episodes.values()) for split in SPLITS[:3]}
+    chosen: dict[str, Split] = {}
+    for surgeon, count in sorted(episodes.items(), key=lambda one: (-one[1], one[0])):
+        split = max(SPLITS[:3], key=lambda split: wanted[split])
+        chosen[surgeon] = split
+        wanted[split] -= count
+    return chosen

@@ -25,8 +25,8 @@ from skills.formats.lerobot.writer import (
     ExportedEpisode,
     action_rule,
     dataset_files,
-    splits_by_surgeon,
 )
+from skills.library.datasets import splits_by_surgeon
 from tests.formats import lerobots
 
 ABOUT = AboutDataset("Sutures", ("PSM1", "PSM2"), licence="CC-BY-4.0", consent="Export, until 2030.")

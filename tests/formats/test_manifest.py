@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from skills.errors import BadInput, Corrupt, UnreadableRecording
-from skills.formats.lerobot.manifest import check_dataset, unpack_dataset
-from skills.formats.lerobot.writer import MANIFEST, dataset_files
+from skills.formats.lerobot import MANIFEST, check_dataset, unpack_dataset
+from skills.formats.lerobot.writer import dataset_files
 from tests.formats.test_lerobot_writer import ABOUT, episodes
 
 

@@ -1,9 +1,9 @@
-"""Routes of plans: suture points, plans, trajectories, replay bags, playbacks and pictures.
+"""Routes of plans: suture points, plans, trajectories, replay bags, playbacks and pictures; and of timelines.
 
 `POST /suture-points` reads the suture points for a plan from a simulator's recording, `POST /reach` maps where they can
-be. The motion of a plan is returned
-as JSON, as a table, or as the bag that a robot replays; a recording of the replay is compared with the plan. A still
-picture of a playback comes with its verdict; the film and the plots are drawn afterwards.
+be. The motion of a plan is returned as JSON, as a table, or as the bag that a robot replays; a recording of the replay
+is compared with the plan. A still picture of a playback comes with its verdict; the film and the plots are drawn
+afterwards. A timeline is the columns of any motion, the same as a file for viewers, and the page that plays them.
 """
 
 import csv
@@ -12,10 +12,10 @@ from collections.abc import Callable
 from typing import Annotated, Any, Literal
 
 import orjson
-from fastapi import Query, Response
+from fastapi import Query, Request, Response
 from pydantic import Field
 
-from skills.api.authorisation import needs
+from skills.api.authorisation import Asking, needs
 from skills.api.dependencies import (
     Actor,
     Configured,
@@ -27,15 +27,20 @@ from skills.api.dependencies import (
     Read,
     RowCursor,
     Strict,
+    Tell,
     room_for_a_job,
 )
 from skills.api.openapi import gives, gives_file, gives_page, makes, router_of, says, starts_job
+from skills.api.pages import render
 from skills.api.responses import JSON, Giving, accepted, as_asked, say, stored
 from skills.api.routes.demos import RAW_BODY
+from skills.api.routes.pages import PageRoute
 from skills.api.routes.policies import Accept
 from skills.db.session import Database
 from skills.errors import UnknownFormat
-from skills.formats import BYTES
+from skills.fields import as_json
+from skills.formats import BYTES, MCAP
+from skills.formats.bag_writer import timeline_mcap
 from skills.formats.replay_bag import rows_of_pass
 from skills.library import locks, overview, plans, playbacks
 from skills.library.arm_errors import stated_errors
@@ -43,10 +48,21 @@ from skills.library.jobs import QUEUED, did_nothing
 from skills.library.plans import find_suture_points, map_style, motion_of, plan_json, plan_summary_json, trajectory_of
 from skills.library.playbacks import find_playback, playback_json
 from skills.library.replay import compare_with_plan, replay_bag
+from skills.library.timelines import Source, check_export, chosen, motion_named, timeline_of
 from skills.planning.plan import MAX_PASSES
 from skills.planning.trajectory import Trajectory
 from skills.schemas.given import Page, SuturePoints
-from skills.schemas.plans import Comparison, Plan, PlanIn, PlanSummary, Playback, PlaybackIn, Reach, ReachIn
+from skills.schemas.plans import (
+    Comparison,
+    MotionTimeline,
+    Plan,
+    PlanIn,
+    PlanSummary,
+    Playback,
+    PlaybackIn,
+    Reach,
+    ReachIn,
+)
 from skills.schemas.plans import Trajectory as GivenTrajectory
 from skills.schemas.requests import DIGEST, FRAME, Name, Schema
 from skills.settings import MEBIBYTE, Settings
@@ -303,3 +319,70 @@ def draw_pictures(playback: Digest, db: Db, actor: Actor) -> Response:
 def _drawn(db: Database, playback: str, which: Callable[[Pictures], bytes]) -> bytes:
     with db.reading() as session:
         return which(playbacks.find_pictures(session, find_playback(session, playback)))
+
+
+timeline_router = router_of(tags=["timelines"], max_body_size=MEBIBYTE)
+timeline_page_router = router_of(route_class=PageRoute, include_in_schema=False, max_body_size=MEBIBYTE)
+
+SPAN, MOST_MARKS = r"^\d{1,6}(\.\d{1,6})?-\d{1,6}(\.\d{1,6})?$", 20
+
+
+@timeline_router.get(
+    "/timelines/{source}/{digest}",
+    dependencies=[needs("reader")],
+    **gives(MotionTimeline, 404, 409, 415, as_well=(MCAP,)),
+)
+def get_timeline(source: Source, digest: Digest, db: Db, tell: Tell, give: Giving, accept: Accept = "*/*") -> Response:
+    """Return a recording, a demonstration, a learnt path or a plan as columns on one clock, to be played.
+
+    At most 200 rows a second and 24,000 in all. `Accept: application/vnd.mcap` returns an MCAP file for viewers such as
+    Foxglove, which is not for execution. 409: the surgeon's consent does not cover training, for a policy version or a
+    plan, or an export, for the file of a recording or a demonstration.
+    """
+    mcap = _is_mcap(accept)
+    if mcap:
+        with db.reading() as session:
+            check_export(session, source, digest)
+    found = timeline_of(db, source, digest, tell)
+    if not mcap:
+        return give({"source": source, "sha256": digest, "timeline": as_json(found)})
+    given = give.bytes(timeline_mcap(found, f"{source}/{digest}"), MCAP)
+    given.headers["Content-Disposition"] = f'attachment; filename="{source}-{digest[:12]}-to-look-at.mcap"'
+    return given
+
+
+def _is_mcap(accept: str) -> bool:
+    """Return whether the client names MCAP before JSON.
+
+    Raises:
+        UnknownFormat: It accepts neither.
+    """
+    for one in (part.partition(";")[0].strip().lower() for part in accept.split(",")):
+        if one == MCAP:
+            return True
+        if one in (JSON, "application/*", "*/*"):
+            return False
+    raise UnknownFormat(f"A timeline is available as {JSON} or {MCAP}; name one of them in Accept.")
+
+
+@timeline_page_router.get("/pages/player/{source}/{digest}", dependencies=[needs("reader")])
+def show_player(
+    source: Source,
+    digest: Digest,
+    request: Request,
+    caller: Asking,
+    db: Db,
+    beside: Annotated[str | None, Query(max_length=100)] = None,
+    mark: Annotated[list[Annotated[str, Query(pattern=SPAN)]] | None, Query(max_length=MOST_MARKS)] = None,
+) -> Response:
+    """Show the player of a motion; `beside` is another one, such as `plans/DIGEST`, to be played in step with it.
+
+    Each `mark` is a part to show, such as `1.5-2.25`: seconds on the clock of the first motion.
+    """
+    with db.reading() as session:
+        shown, choices = chosen(session, source, digest)
+        other = motion_named(session, beside) if beside else None
+        if other is not None and other not in choices:
+            choices = [other, *choices]  # such as one of a link to an older demonstration than those of the list
+        marks = [[float(end) for end in one.split("-")] for one in mark or ()]
+        return render(request, "player.html", caller, shown=shown, choices=choices, other=other, marks=marks)

@@ -25,11 +25,11 @@ import numpy as np
 
 from skills.errors import BadInput, Corrupt
 from skills.formats.archive import Archive
-from skills.formats.lerobot import INFO, Dataset, Json
+from skills.formats.lerobot import INFO, MANIFEST, Dataset, Json
 from skills.formats.lerobot.cut import EPISODES, Episode, cut_episode, episodes_of, find_dataset
 from skills.formats.lerobot.episode import episode_stamps
 from skills.formats.lerobot.parquet import open_parquet, printable, read_rows
-from skills.formats.lerobot.writer import CHUNK, MANIFEST, NO_PICTURES, joined_stats
+from skills.formats.lerobot.writer import CHUNK, NO_PICTURES, joined_stats
 from skills.formats.mp4 import Mp4, read_mp4
 
 V21_VIDEO = "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4"

@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from skills.arrays import Floats, Ints
 from skills.demonstration.recording import Motion, Recording, Signal
 from skills.errors import BadInput, MixedFrames, NoUsableTopic, UnreadableRecording
-from skills.formats.lerobot import INFO, SAID, TASK_LINES, TASK_TABLE, Json
+from skills.formats.lerobot import INFO, MANIFEST, SAID, TASK_LINES, TASK_TABLE, Json
 
 Version = Literal["v2.1", "v3.0"]
 ActionRule = Literal["next state", "setpoint"]
@@ -45,7 +45,6 @@ FILE_EPISODES = 1000  # in it at most, for the places of their row groups are in
 TABLE_ROWS = 100  # episodes that are written to the table of v3.0 together, since its columns are many
 PARTS = (*(f"position.{axis}" for axis in "xyz"), *(f"orientation.{axis}" for axis in "xyzw"))
 QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
-MANIFEST = "SHA256SUMS"
 NO_PICTURES = "There are no pictures."  # in the README, where `skills.formats.lerobot.videos` names the cameras instead
 
 _V21_DATA = "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
@@ -148,25 +147,6 @@ def action_rule(episodes: Iterable[ExportedEpisode], about: AboutDataset) -> Act
         except (NoUsableTopic, UnreadableRecording):
             return "next state"
     return "setpoint"
-
-
-def splits_by_surgeon(episodes: Mapping[str, int]) -> dict[str, Split]:
-    """Assign each surgeon to training, validation or test, so that nobody is in two of them.
-
-    Args:
-        episodes: Surgeons and their numbers of episodes.
-
-    Returns:
-        The split of each surgeon. The shares of the episodes approach `SHARES` as well as whole surgeons allow; one
-        surgeon alone is for training.
-    """
-    wanted: dict[Split, float] = {split: SHARES[split] * sum(episodes.values()) for split in SPLITS[:3]}
-    chosen: dict[str, Split] = {}
-    for surgeon, count in sorted(episodes.items(), key=lambda one: (-one[1], one[0])):
-        split = max(SPLITS[:3], key=lambda split: wanted[split])
-        chosen[surgeon] = split
-        wanted[split] -= count
-    return chosen
 
 
 def dataset_files(
