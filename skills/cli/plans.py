@@ -322,6 +322,9 @@ def calibrate(
     arm: Annotated[str | None, typer.Option(help="The arm of a recording with several.")] = None,
     instrument: Annotated[str, typer.Option(help="Number of the instrument, for a table.")] = "400006",
     rate_hz: Annotated[float | None, typer.Option(help="Samples per second of a table without times.")] = None,
+    tracker: Annotated[
+        str | None, typer.Option(help="The topic of a bag with a tracker's positions of a marker on the tool.")
+    ] = None,
     to: Annotated[
         Path | None, typer.Option(help="Write the errors to this JSON file, for `play --errors` and SKILLS_ARM_ERRORS.")
     ] = None,
@@ -336,7 +339,8 @@ def calibrate(
     from skills.verification.arm_errors import calibrate_arm
 
     try:
-        found = calibrate_arm(read_measured(bag, arm=arm, instrument=instrument, rate_hz=rate_hz), name=name)
+        measured = read_measured(bag, arm=arm, instrument=instrument, rate_hz=rate_hz, tracker=tracker)
+        found = calibrate_arm(measured, name=name)
         if to is not None:
             to.write_bytes(canonical(plain(found.errors)) + b"\n")
     except OSError as error:

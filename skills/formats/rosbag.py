@@ -24,15 +24,18 @@ from pathlib import Path
 from typing import IO, Any, BinaryIO, Literal
 
 import apsw
+import numpy as np
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
+from skills.arrays import Floats, Ints
 from skills.demonstration.recording import Format, Integrity, Recording, Topic
-from skills.errors import NoUsableTopic, UnreadableRecording
+from skills.errors import BackwardStamps, NoUsableTopic, UnreadableRecording
 from skills.formats import bag_writer, topics
 from skills.formats.archive import refusing
 from skills.formats.bag_writer import Message, write_messages
 from skills.formats.mcap import read_mcap
+from skills.remedies import did_you_mean
 
 TABLES = frozenset({"schema", "metadata", "topics", "message_definitions", "messages"})
 STATISTICS = frozenset({"sqlite_stat1", "sqlite_stat4", "sqlite_sequence", "sqlite_schema", "sqlite_temp_schema"})
@@ -203,6 +206,48 @@ def topics_in(paths: Sequence[Path]) -> tuple[Topic, ...]:
         return _topics(reader)
 
 
+def positions_on(path: Path, topic: str) -> tuple[Ints, Floats]:
+    """Return the positions on any topic of a bag, such as a tracker's of a marker; messages without one are left out.
+
+    Args:
+        path: The bag, with the suffix of its format.
+        topic: A topic of PoseStamped, TransformStamped or PointStamped messages.
+
+    Returns:
+        Stamps of the headers in ns, ascending, shape (N,), and positions in mm, shape (N, 3).
+
+    Raises:
+        UnreadableRecording: rosbags cannot read it.
+        NoUsableTopic: There is no such topic of such messages, or it has no position.
+        BackwardStamps: The stamps do not increase.
+    """
+    with _reading([path]) as reader, _refusing(path):
+        kinds = [(one.topic, one.msgtype) for one in reader.connections]
+        wanted = [one for one in reader.connections if one.topic == topic and one.msgtype in _PLACES]
+        if not wanted:
+            fitting = sorted({name for name, kind in kinds if kind in _PLACES})
+            raise NoUsableTopic(
+                f"The bag has no positions on {topic}: a tracker's topic has {', '.join(_PLACES)} messages. It has "
+                f"such messages on {', '.join(fitting[:20]) or 'no topic'}.",
+                *did_you_mean(topic, fitting),
+                topic=topic,
+            )
+        stamps, places = [], []
+        for connection, _, data in reader.messages(connections=wanted):
+            said = reader.deserialize(data, connection.msgtype)
+            place = _PLACES[connection.msgtype](said)
+            stamps.append(_stamp_ns(said.header))
+            places.append((place.x, place.y, place.z))
+    place_mm = 1000.0 * np.array(places, np.float64).reshape(-1, 3)
+    seen = np.isfinite(place_mm).all(axis=1)  # a tracker that has lost its marker says NaN
+    stamps_ns = np.array(stamps, np.int64)[seen]
+    if not len(stamps_ns):
+        raise NoUsableTopic(f"{topic} has no position.", topic=topic)
+    if not (np.diff(stamps_ns) > 0).all():
+        raise BackwardStamps(f"The stamps of {topic} do not increase; record the tracker's own stamps.", topic=topic)
+    return stamps_ns, place_mm[seen]
+
+
 @contextmanager
 def _reading(paths: Sequence[Path]) -> Iterator[AnyReader]:
     with ExitStack() as stack:
@@ -285,6 +330,13 @@ _WRITERS: dict[str, Callable[[str, int, Any], Message]] = {
     topics.BOOL: lambda topic, log_ns, said: bag_writer.boolean(topic, log_ns, said.data),
     topics.FLOAT64: lambda topic, log_ns, said: bag_writer.number(topic, log_ns, said.data),
     topics.STRING: lambda topic, log_ns, said: bag_writer.text(topic, log_ns, said.data),
+}
+
+
+_PLACES: dict[str, Callable[[Any], Any]] = {
+    topics.POSE: lambda said: said.pose.position,
+    topics.TRANSFORM: lambda said: said.transform.translation,
+    topics.POINT: lambda said: said.point,
 }
 
 

@@ -16,6 +16,7 @@ from enum import Enum, auto
 
 POSE = "geometry_msgs/msg/PoseStamped"
 TRANSFORM = "geometry_msgs/msg/TransformStamped"
+POINT = "geometry_msgs/msg/PointStamped"
 JOINT_STATE = "sensor_msgs/msg/JointState"
 JOY = "sensor_msgs/msg/Joy"
 BOOL = "std_msgs/msg/Bool"

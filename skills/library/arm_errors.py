@@ -4,7 +4,8 @@
     recording or table --read_measured--> Measured --calibrate_arm--> ArmCalibration
 
 A *recording* needs `measured_cp` and `setpoint_cp` of the arm in one frame. Each measured pose is compared with the
-setpoint before or after it that is nearest in time.
+setpoint before or after it that is nearest in time. With a tracker on a topic of the bag (a ROS 1 bag, .db3 or MCAP
+file) it is compared with the marker too, interpolated between the two positions that the tracker saw around it.
 
 A *table* needs the columns `measured_q1` to `measured_q6` and `setpoint_q1` to `setpoint_q6`, in rad and m as the
 dVRK's `measured_js` has them. With a tracker it also has `marker_x`, `marker_y` and `marker_z`, in m; with times `t_s`.
@@ -12,17 +13,22 @@ dVRK's `measured_js` has them. With a tracker it also has `marker_x`, `marker_y`
 
 import csv
 import json
+import shutil
+import tempfile
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 
-from skills.arrays import Floats
+from skills.arrays import Floats, Ints
 from skills.errors import BadInput, BadRecording, BadSettings
-from skills.formats import read_recording
+from skills.formats import SUFFIXES, media_type_of, read_recording
+from skills.formats.rosbag import Suffix, positions_on
 from skills.kinematics import DEFAULT_INSTRUMENT, INSERTION, forward, matrix_of
 from skills.verification.arm_errors import NAMED, SIZES, ArmErrors, MeasuredArm, checked_own
 
 MOST_ROWS = 1_000_000
+LOST_PERIODS = 3.0  # ours: between positions further apart than so many of its periods the tracker had lost the marker
 _JOINTS = tuple(f"q{number}" for number in range(1, 7))
 _NEEDED = tuple(f"{kind}_{joint}" for kind in ("measured", "setpoint") for joint in _JOINTS)
 _MARKER = ("marker_x", "marker_y", "marker_z")
@@ -49,7 +55,12 @@ def stated_errors(stated: str) -> ArmErrors:
 
 
 def read_measured(
-    file: Path, *, arm: str | None = None, instrument: str = DEFAULT_INSTRUMENT, rate_hz: float | None = None
+    file: Path,
+    *,
+    arm: str | None = None,
+    instrument: str = DEFAULT_INSTRUMENT,
+    rate_hz: float | None = None,
+    tracker: str | None = None,
 ) -> MeasuredArm:
     """Read setpoints and measured poses of an arm.
 
@@ -58,18 +69,23 @@ def read_measured(
         arm: The arm of a recording with several.
         instrument: Number of the instrument, for a table.
         rate_hz: Samples per second of a table without times; None: its times stay unknown.
+        tracker: The topic of a recording with a tracker's positions of a marker on the tool; None: there is none.
 
     Raises:
-        BadInput: The table lacks a column, has a cell that is no number, or too many rows.
+        BadInput: The table lacks a column, has a cell that is no number, or too many rows; or a tracker is named for
+            a table.
         BadRecording: The recording cannot be used, or has no setpoints of the arm.
         OSError: The file cannot be read.
     """
     with file.open("rb") as opened:
         header = opened.readline(4096).decode("utf-8", "replace").strip().lower().split(",")
         if set(_NEEDED) & set(header):
+            if tracker is not None:
+                raise BadInput(f"A table has the tracker's positions in {', '.join(_MARKER)}; omit the topic.")
             return _of_table(file, instrument, rate_hz)
         opened.seek(0)
         recording = read_recording(opened)
+        kind = media_type_of(opened)
     motion = recording.motion_of(arm=arm)
     setpoints = recording.setpoint_of(motion)
     if setpoints is None:
@@ -87,13 +103,42 @@ def read_measured(
     beside = np.abs(setpoints.stamps_ns[nearest] - motion.stamps_ns) <= period_ns
     if not beside.any():
         raise BadRecording("No setpoint was recorded within one period of a measured pose; record both at once.")
+    marker_mm = None
+    if tracker is not None:
+        if SUFFIXES[kind] not in get_args(Suffix):
+            raise BadInput(
+                "A tracker is read from a ROS 1 bag, a .db3 or an MCAP file; give the file in the bag's folder."
+            )
+        marker_mm = _marker_mm(file, SUFFIXES[kind], tracker, motion.stamps_ns)
+        beside &= np.isfinite(marker_mm).all(axis=1)
+        if not beside.any():
+            raise BadRecording(
+                f"At no time of {motion.topic} did {tracker} see its marker; record both at once, with one clock."
+            )
+        marker_mm = marker_mm[beside]
     return MeasuredArm(
         setpoint_mm=setpoints.tip_mm[nearest][beside],
         setpoint=matrix_of(setpoints.rotation_xyzw[nearest][beside]),
         measured_mm=motion.tip_mm[beside],
         measured=matrix_of(motion.rotation_xyzw[beside]),
         stamps_s=recording.seconds(motion.stamps_ns[beside]),
+        marker_mm=marker_mm,
     )
+
+
+def _marker_mm(file: Path, suffix: str, tracker: str, at_ns: Ints) -> Floats:
+    """Return the marker's positions at the stamps, (N, 3); NaN where it was not seen shortly before and after."""
+    with tempfile.TemporaryDirectory() as folder:  # rosbags knows a format by its suffix alone
+        named = Path(folder) / f"bag{suffix}"
+        shutil.copyfile(file, named)
+        stamps_ns, place_mm = positions_on(named, tracker)
+    begin = stamps_ns[0]
+    times, at = (stamps_ns - begin).astype(np.float64), (at_ns - begin).astype(np.float64)
+    found = np.stack([np.interp(at, times, axis, left=np.nan, right=np.nan) for axis in place_mm.T], axis=1)
+    gaps = np.diff(times)
+    if len(gaps):
+        found[gaps[np.searchsorted(times[1:-1], at)] > LOST_PERIODS * np.median(gaps)] = np.nan
+    return found
 
 
 def _of_table(file: Path, instrument: str, rate_hz: float | None) -> MeasuredArm:

@@ -2,6 +2,8 @@
 
 import io
 import json
+import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,14 +11,14 @@ import pytest
 from typer.testing import CliRunner
 
 from skills.cli import app
-from skills.errors import BadInput, BadRecording
+from skills.errors import BadInput, BadRecording, NoUsableTopic
 from skills.formats import bag_writer as messages
 from skills.formats.bag_writer import Message, write_messages
 from skills.kinematics import forward, quaternion_of
 from skills.library.arm_errors import read_measured, stated_errors
-from skills.verification.arm_errors import SIZES, UNCALIBRATED, calibrate_arm
+from skills.verification.arm_errors import SIZES, UNCALIBRATED, MeasuredArm, calibrate_arm, rotation_of
 from tests.formats.bags import sample_folder
-from tests.verification.test_measured_errors import recorded
+from tests.verification.test_measured_errors import lasting, recorded
 
 NAMES = [f"{kind}_q{k}" for kind in ("measured", "setpoint") for k in range(1, 7)]
 
@@ -26,8 +28,38 @@ def table(file: Path, rows: int = 30, names: list[str] = NAMES, cell: str = "0.1
     return file
 
 
+MARKER_MM = [3.0, -20.0, 12.0]  # in the tool frame
+CABLES_MM = 1.2
+
+
+def seen(count: int) -> MeasuredArm:
+    """Return an arm that cables put off by 1.2 mm along each axis, as its encoders and a tracker see it."""
+    made = recorded(count)
+    off = CABLES_MM * lasting(np.random.default_rng(5), count, 0.98)
+    marker = made.setpoint_mm + off + made.setpoint @ MARKER_MM
+    turn = rotation_of(np.array([[0.3, -1.0, 2.0]]))[0]
+    return replace(made, marker_mm=marker @ turn.T + [100.0, -300.0, 1300.0])
+
+
+def tracked_bag(file: Path, count: int = 4000, late_ns: int = 0) -> Path:
+    """Write a bag with the marker's pose at 50 Hz, half a period beside the arm's; for 5 s it is lost, for 1 s NaN."""
+    marker_mm = seen(count).marker_mm
+    said = poses(count)
+    for k in range(0, count - 1, 2):
+        at_ns = 10**15 + k * 10**7 + 5 * 10**6 + late_ns
+        place = (marker_mm[k] + marker_mm[k + 1]) / 2000 if not 2000 <= k < 2100 else [np.nan] * 3
+        if not 1000 <= k < 1500:
+            said.append(messages.pose("/NDI/tool/measured_cp", at_ns, "NDI", tuple(place), (0, 0, 0, 1), log_ns=at_ns))
+    return written(file, said)
+
+
 def bag(file: Path, count: int = 1500, setpoints: bool = True) -> Path:
-    """Write an arm's poses at 100 Hz, with its setpoints 1 ms before each of them."""
+    """Write a bag with an arm's poses, with or without its setpoints."""
+    return written(file, poses(count, setpoints))
+
+
+def poses(count: int, setpoints: bool = True) -> list[Message]:
+    """Return an arm's poses at 100 Hz, with its setpoints 1 ms before each of them."""
     made = recorded(count)
     said: list[Message] = []
     for topic, tips, jaws, before_ns in (
@@ -38,6 +70,10 @@ def bag(file: Path, count: int = 1500, setpoints: bool = True) -> Path:
             for k, (tip, turn) in enumerate(zip(tips / 1000, quaternion_of(jaws), strict=True)):
                 at_ns = 10**15 + k * 10**7 - before_ns
                 said.append(messages.pose(topic, at_ns, "PSM1_base", tuple(tip), tuple(turn), log_ns=at_ns))
+    return said
+
+
+def written(file: Path, said: list[Message]) -> Path:
     with io.BytesIO() as out:
         write_messages(sorted(said, key=lambda one: one.log_ns), out)
         file.write_bytes(out.getvalue())
@@ -68,6 +104,43 @@ def test_a_bag_gives_what_was_put_in(tmp_path: Path):
     assert found.errors.tip_bias_mm == UNCALIBRATED.tip_bias_mm
     with pytest.raises(BadRecording, match="no setpoints of PSM1"):
         read_measured(bag(tmp_path / "alone.mcap", 50, setpoints=False))
+
+
+def test_a_trackers_topic_in_a_bag_shows_the_tips_constant_error(tmp_path: Path):
+    file = tracked_bag(tmp_path / "arm.mcap")
+    measured = read_measured(file, tracker="/NDI/tool/measured_cp")
+    # Not where the marker was lost, or beyond the tracker's first and last position.
+    assert measured.marker_mm is not None and 3380 < len(measured.marker_mm) < 3400
+    lost = (measured.stamps_s > 10.01) & (measured.stamps_s < 15.0)
+    assert not lost.any() and np.isfinite(measured.marker_mm).all()
+    found = calibrate_arm(measured, name="ours")
+    assert found.errors.tip_bias_mm == pytest.approx(CABLES_MM, rel=0.25)
+    assert found.errors.tip_noise_mm == pytest.approx(0.2, rel=0.15)
+    assert "The tracker shows the tip's" in found.in_words
+    ran = CliRunner().invoke(app, ["calibrate-arm", str(file), "--tracker", "/NDI/tool/measured_cp"])
+    assert ran.exit_code == 0 and "tip, tracked z mm" in ran.output
+
+
+def test_between_a_trackers_positions_the_marker_is_interpolated(tmp_path: Path):
+    count = 400
+    measured = read_measured(tracked_bag(tmp_path / "arm.mcap", count), tracker="/NDI/tool/measured_cp")
+    exactly = seen(count).marker_mm[np.round(measured.stamps_s * 100).astype(int)]
+    assert np.abs(measured.marker_mm - exactly).max() < 2.0 and np.abs(measured.marker_mm - exactly).mean() < 0.3
+
+
+def test_a_tracker_that_cannot_be_used_is_refused(tmp_path: Path):
+    file = tracked_bag(tmp_path / "arm.mcap", 300, late_ns=3600 * 10**9)
+    with pytest.raises(BadRecording, match="one clock"):
+        read_measured(file, tracker="/NDI/tool/measured_cp")
+    with pytest.raises(NoUsableTopic, match="such messages on /NDI/tool/measured_cp, /PSM1/measured_cp"):
+        read_measured(file, tracker="/NDI/tool/measured_cq")
+    with pytest.raises(BadInput, match="omit the topic"):
+        read_measured(table(tmp_path / "joints.csv"), tracker="/NDI/tool/measured_cp")
+    folder = tmp_path / "folder.zip"
+    with zipfile.ZipFile(folder, "w") as out:
+        out.write(file, "bag/bag_0.mcap")
+    with pytest.raises(BadInput, match=r"ROS 1 bag, a \.db3 or an MCAP"):
+        read_measured(folder, tracker="/NDI/tool/measured_cp")
 
 
 def test_a_table_is_read_as_the_joints_that_it_has(tmp_path: Path):
