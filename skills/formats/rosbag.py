@@ -234,7 +234,7 @@ def positions_on(path: Path, topic: str) -> tuple[Ints, Floats]:
             )
         stamps, places = [], []
         for connection, _, data in reader.messages(connections=wanted):
-            said = reader.deserialize(data, connection.msgtype)
+            said: Any = reader.deserialize(data, connection.msgtype)
             place = _PLACES[connection.msgtype](said)
             stamps.append(_stamp_ns(said.header))
             places.append((place.x, place.y, place.z))
