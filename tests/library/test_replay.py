@@ -76,7 +76,8 @@ def judged(database: Database, plan: Plan, *, feasible: bool = True, digest: str
 
 
 def doubt(*lower: float | None, errors: ArmErrors = UNCALIBRATED, stated_by: str = "installation") -> dict[str, Any]:
-    passes = [{"succeeds": {"count": 990, "of": 1000, "lower": bound}} for bound in lower]
+    faults = {"place": 0, "arms": 0, "pad": 0}
+    passes = [{"succeeds": {"count": 990, "of": 1000, "lower": bound}, "faults": faults} for bound in lower]
     under = [{"errors": asdict(errors), "passes": passes, "plan": {"count": 700}}]
     without = {"count": 880, "probability": 0.88}
     costs = [{"error": "registration_mm", "without": without}]
