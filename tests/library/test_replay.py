@@ -76,7 +76,7 @@ def judged(database: Database, plan: Plan, *, feasible: bool = True, digest: str
 
 
 def doubt(*lower: float | None, errors: ArmErrors = UNCALIBRATED, stated_by: str = "installation") -> dict[str, Any]:
-    faults = {"place": 0, "arms": 0, "pad": 0}
+    faults = {"place": None, "arms": None, "pad": 0}  # of a plan without a hand-off
     passes = [{"succeeds": {"count": 990, "of": 1000, "lower": bound}, "faults": faults} for bound in lower]
     under = [{"errors": asdict(errors), "passes": passes, "plan": {"count": 700}}]
     without = {"count": 880, "probability": 0.88}
@@ -334,6 +334,8 @@ def papers_say_whose_it_is_and_how_far_it_goes(data: bytes, plan: Plan) -> None:
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         papers = {name: json.loads(archive.read(name)) for name in archive.namelist() if name.endswith(".json")}
         readme = archive.read("README.txt").decode()
+    assert "Every pass is likely enough to stay within reach and clear with the errors of" in readme
+    assert "Not judged: a hand-off, the other arm, how exactly the tip meets its points." in readme
     assert all("Research use only" in paper["use"] for paper in papers.values())
     assert papers["plan.json"]["passes"] == plan.about["passes"]
     assert papers["policy.json"]["surgeon"] == papers["plan.json"]["surgeon"] == "kestrel"

@@ -8,7 +8,7 @@ import pytest
 
 from skills.errors import BadInput, BadSettings, SimulationFailed
 from skills.kinematics import matrix_of, quaternion_of
-from skills.planning.handoff import HELD_MM, JAW_CLOSED_RAD, OPEN_RAD, TAKEN_MM
+from skills.planning.handoff import HELD_MM, JAW_CLOSED_RAD, JAW_S, OPEN_RAD, TAKEN_MM
 from skills.simulation import referee as refereeing
 from skills.simulation.referee import Physics, Refereed, referee
 from skills.verification.arm_errors import draw, rotation_of
@@ -122,6 +122,24 @@ def test_the_arms_are_followed_until_they_stand_and_the_jaws_then_move_as_planne
     assert (mine[0], theirs[0]) == (JAW_CLOSED_RAD, 2 * OPEN_RAD)
     assert (mine[-1], theirs[-1]) == (2 * OPEN_RAD, JAW_CLOSED_RAD)
     assert theirs[1] < theirs[0] and (theirs[mine > mine[0]] == JAW_CLOSED_RAD).all()
+    # The trial commands these angles at the plan's own times, and then goes back no faster than the plan.
+    strokes = refereeing._strokes(ONE, 0, int(end))
+    np.testing.assert_array_equal(strokes["jaws_rad"], [mine, theirs])
+    np.testing.assert_allclose(strokes["jaws_s"], ONE.stamps_s[end : last + 1] - ONE.stamps_s[end])
+    assert strokes["jaws_s"][-1] == pytest.approx(2 * JAW_S, abs=0.011)
+    assert strokes["back_s"] == pytest.approx(1.875 * 18 / ONE.speed_mm_s)
+
+
+def test_a_jaw_that_holds_less_than_closed_grips_with_all_its_torque_until_it_opens():
+    held = np.where(ONE.jaw_rad == JAW_CLOSED_RAD, 0.1, ONE.jaw_rad)
+    end = int(refereeing._watched(ONE, 0)[-1])
+    (mine, _) = refereeing._strokes(replace(ONE, jaw_rad=held), 0, end)["jaws_rad"]
+    np.testing.assert_array_equal(mine, ONE.jaw_rad[end : ONE.last_samples[0] + 1])
+
+
+def test_a_motion_whose_jaws_were_not_planned_is_not_refereed():
+    with pytest.raises(BadInput, match="angles of both jaws"):
+        exactly(replace(ONE, psm_m=replace(ONE.psm_m, jaw_rad=None)))
 
 
 def test_fingers_that_come_never_near_are_watched_for_one_sample():
@@ -190,7 +208,8 @@ def refereed(plans: tuple[int, ...], trials: int, varied: int = 0) -> list[Refer
         if 0 <= band < len(left) and left[band]:
             left[band] -= 1
             others = varied if len(found) % 10 == 0 else 0
-            found.append(referee(trajectory, errors=errors, trials=trials, varied=others, settings=settings))
+            asked = {"trials": trials, "varied": others, "seed": seed, "settings": settings}  # draws of its own
+            found.append(referee(trajectory, errors=errors, **asked))
         seed += 1
     return found
 
