@@ -8,11 +8,11 @@ by the same draws as in the closed form. What happens then is decided by forces 
 
 1. PSM_A closes on the needle, and gravity begins.
 2. Both arms follow the planned motion from where PSM_M's fingers cannot have touched anything yet, until both stand.
-3. PSM_M closes; both hold the needle. PSM_A opens, and PSM_M goes straight back with the needle, as plans do. The jaws
-   move in the planned order, PSM_M's from the planned opening and PSM_A's to it, but faster than in the planned 0.8 s.
+3. Both jaws follow the plan at its own times: PSM_M's closes, then PSM_A's opens. PSM_M goes straight back with the
+   needle, from rest to rest and no faster than the plan, as plans do.
 
 The needle is *held* if at the end both of PSM_M's fingers touch it, and neither of PSM_A's. A trial is lost "before" if
-PSM_A has lost the needle by the time PSM_M has closed, "missed" if PSM_M has closed without it between its fingers, and
+PSM_A has lost the needle when PSM_M begins to close, "missed" if PSM_M has closed without it between its fingers, and
 "dropped" if it is lost afterwards.
 
 **Bodies.** The needle is the rigid arc of `urdf/needle.urdf` as round pieces. A finger is the box of `urdf/psm.urdf`
@@ -42,7 +42,8 @@ from skills import packing
 from skills.arrays import Flags, Floats, Ints
 from skills.errors import BadInput, BadSettings, SimulationFailed
 from skills.kinematics import JAW_TIP_MM, matrix_of, quaternion_of
-from skills.planning.handoff import HELD_MM, NEEDLE_RADIUS_MM, OPEN_RAD
+from skills.planning.handoff import HELD_MM, JAW_CLOSED_RAD, NEEDLE_RADIUS_MM, OPEN_RAD
+from skills.planning.motion_laws import PEAK
 from skills.planning.trajectory import A2, Trajectory
 from skills.sandbox import ProcessLimits
 from skills.simulation.player import array_from, simulated
@@ -66,7 +67,7 @@ LOST = ("before", "missed", "dropped")
 QUANTITIES = ("friction", "grip", "arm", "contact")  # the last two are stiffnesses: of arm and wrist, and of contacts
 FACTORS = (0.5, 2.0)
 _FREE_MM = 6.0  # beyond the fingers' reach: so much nearer may errors bring the arms before the trial begins
-_TRIAL_S = 5.0  # of the timeout for each trial; it takes about 0.15 s
+_TRIAL_S = 5.0  # of the timeout for each trial; it takes about 0.3 s
 
 
 @dataclass(frozen=True)
@@ -232,7 +233,7 @@ def referee(
     displaced = drawn.under(errors, trajectory.stamps_s[watched])
     says = _closed_form(trajectory, number, drawn, displaced, conditions)
     others = [(quantity, factor) for quantity in QUANTITIES for factor in FACTORS if varied]
-    request = _worlds(trajectory, watched, drawn, displaced)
+    request = _worlds(trajectory, watched, drawn, displaced) | _strokes(trajectory, number, int(watched[-1]))
     request["physics"] = np.array([astuple(plain), *(astuple(plain.times(*one)) for one in others)])
     request["trials"] = np.array([trials, *(varied for _ in others)], np.int64)
     total = int(request["trials"].sum())
@@ -288,6 +289,25 @@ def _watched(trajectory: Trajectory, number: int) -> Ints:
     return samples[min(begin, stand) : stand + 1]
 
 
+def _strokes(trajectory: Trajectory, number: int, stand: int) -> dict[str, Floats]:
+    """Return the planned angles of both jaws from where both arms stand, (2, J), their times, and that of the way back.
+
+    PSM_A holds the needle with all its grip until its jaw is planned to move.
+    """
+    psm_m = trajectory.psm_m
+    assert psm_m is not None
+    if trajectory.jaw_rad is None or psm_m.jaw_rad is None:
+        raise BadInput("A motion without angles of both jaws hands nothing over; plan it again.", pass_index=number)
+    at = slice(stand, int(trajectory.last_samples[number]) + 1)
+    mine, theirs = trajectory.jaw_rad[at], psm_m.jaw_rad[at]
+    holds = np.logical_and.accumulate(mine == mine[0])
+    return {
+        "jaws_s": trajectory.stamps_s[at] - trajectory.stamps_s[stand],
+        "jaws_rad": np.stack([np.where(holds, JAW_CLOSED_RAD, mine), theirs]),
+        "back_s": np.array([PEAK * _BACK_MM / trajectory.speed_mm_s]),
+    }
+
+
 def _closed_form(
     trajectory: Trajectory, number: int, drawn: Drawn, displaced: Displaced, conditions: DoubtSettings
 ) -> Flags:
@@ -331,10 +351,9 @@ _INERTIA = 50.0  # times the needle's own; its weight stays
 _FALL = -9810.0
 _JAW_KG, _FINGER_KG_MM2 = 0.05, 2.0  # half of what moves at an arm's hinge; inertia of a finger with its motor
 _SATURATED_RAD = 0.05  # error of a jaw's opening at which its motor gives its greatest torque
-_SHUT_RAD = -0.2  # commanded opening of jaws that hold: beyond shut, so that the torque is at its limit
 _FIRST_RAD = 0.15  # opening of each of PSM_A's fingers as it begins to close on the needle
-# Durations in s: PSM_A closes, [the planned motion,] rest, PSM_M closes, both hold, PSM_A opens, PSM_M goes back, rest.
-_GRIP_S, _REST_S, _CLOSE_S, _BOTH_S, _OPEN_S, _BACK_S, _END_S = 0.12, 0.06, 0.12, 0.08, 0.08, 0.3, 0.08
+# Durations in s: PSM_A closes, [the planned motion, the planned jaws, PSM_M goes back,] rest.
+_GRIP_S, _END_S = 0.12, 0.08
 _BACK_MM = 18.0  # the needle's circle is 16.6 mm across
 _ARM_CONTROLS, _OPENING = 7, 6  # controls of an arm: three of its place, three of its rotation, its jaw's opening
 
@@ -352,7 +371,9 @@ def trials(given: BinaryIO, answer: BinaryIO) -> None:
         model = mujoco.MjModel.from_xml_string(_scene(physics))
         for k in range(count):
             world = {name: asked[name][k] for name in ("tip_mm", "jaw", "needle_mm", "needle")}
-            how, moved = _Trial(mujoco, model, asked["stamps_s"], **world).run(physics.step_s)
+            shared = {name: asked[name] for name in ("stamps_s", "jaws_s", "jaws_rad")}
+            trial = _Trial(mujoco, model, back_s=float(asked["back_s"][0]), **shared, **world)
+            how, moved = trial.run(physics.step_s)
             ended.append(how)
             motion.append(moved)
     found = {"ended": np.array(ended, np.int64), "motion": np.array(motion, np.float64)}
@@ -442,6 +463,9 @@ class _Trial:
         mujoco: Any,
         model: Any,
         stamps_s: Floats,
+        jaws_s: Floats,
+        jaws_rad: Floats,
+        back_s: float,
         tip_mm: Floats,
         jaw: Floats,
         needle_mm: Floats,
@@ -449,6 +473,8 @@ class _Trial:
     ) -> None:
         self.mujoco, self.model, self.data = mujoco, model, mujoco.MjData(model)
         self.stamps_s, self.tip_mm = stamps_s, tip_mm
+        self.jaws_s, self.jaws_rad, self.back_s = jaws_s, jaws_rad, back_s
+        self.closed_s = float(jaws_s[np.argmin(jaws_rad[1])])  # then PSM_M's jaw has closed
         self.last = jaw[:, -1]  # the rotation at the hand-off, from which all others are counted
         self.turn = [_vectors(last.T @ one) for last, one in zip(self.last, jaw, strict=True)]
         self.arms = [model.body(name).id for name in "am"]
@@ -462,21 +488,21 @@ class _Trial:
 
     def run(self, step_s: float) -> tuple[int, tuple[float, float, float]]:
         """Return how it ended, as 0 or 1 + index in `LOST`, and slip, turn and angle to the hinge of a held needle."""
-        lasts = [_GRIP_S, float(self.stamps_s[-1]), _REST_S, _CLOSE_S, _BOTH_S, _OPEN_S, _BACK_S, _END_S]
+        lasts = [_GRIP_S, float(self.stamps_s[-1]), self.closed_s, self.jaws_s[-1] - self.closed_s, self.back_s, _END_S]
         ends = np.cumsum(lasts)
-        steps = np.round(ends / step_s).astype(int).tolist()
-        controls = self._controls((np.arange(steps[-1]) + 1) * step_s, ends)
+        gripped, stand, closed, _, _, last = np.round(ends / step_s).astype(int).tolist()
+        controls = self._controls((np.arange(last) + 1) * step_s, ends)
         self.model.opt.gravity[:] = 0.0
-        self._through(controls[: steps[0]])
+        self._through(controls[:gripped])
         self.model.opt.gravity[2] = _FALL
-        self._through(controls[steps[0] : steps[2]])
+        self._through(controls[gripped:stand])
         kept = all(self._touched()[0])
-        self._through(controls[steps[2] : steps[4]])
+        self._through(controls[stand:closed])
         caught = all(self._touched()[1])
         place, rotation = self._in_jaws()
         if not (kept and caught):
             return (2 if kept else 1), (0.0, 0.0, 0.0)
-        self._through(controls[steps[4] :])
+        self._through(controls[closed:])
         touched = self._touched()
         if not all(touched[1]) or any(touched[0]):
             return 3, (0.0, 0.0, 0.0)
@@ -492,11 +518,13 @@ class _Trial:
             wanted = np.concatenate([self.tip_mm[arm], self.turn[arm]], axis=1)
             for k in range(_OPENING):
                 controls[:, arm * _ARM_CONTROLS + k] = np.interp(along, self.stamps_s, wanted[:, k])
-        opens, begins = 2 * OPEN_RAD, 2 * _FIRST_RAD
-        back = np.interp(at_s, ends[5:7], [0.0, _BACK_MM])
+        u = np.clip((at_s - ends[3]) / self.back_s, 0.0, 1.0)
+        back = _BACK_MM * u**3 * (10 - 15 * u + 6 * u * u)
         controls[:, _ARM_CONTROLS : _ARM_CONTROLS + 3] -= back[:, None] * self.last[1, :, 2]
-        controls[:, _OPENING] = np.interp(at_s, [0.0, ends[0] / 2, *ends[4:6]], [begins, _SHUT_RAD, _SHUT_RAD, opens])
-        controls[:, _ARM_CONTROLS + _OPENING] = np.interp(at_s, ends[2:4], [opens, _SHUT_RAD])
+        first = np.interp(at_s, [0.0, ends[0] / 2], [2 * _FIRST_RAD, self.jaws_rad[0, 0]])
+        planned = [np.interp(at_s - ends[1], self.jaws_s, angles) for angles in self.jaws_rad]
+        controls[:, _OPENING] = np.where(at_s < ends[1], first, planned[0])
+        controls[:, _ARM_CONTROLS + _OPENING] = planned[1]
         return controls
 
     def _through(self, controls: Floats) -> None:
