@@ -245,7 +245,7 @@ def test_steps_take_fewer_jobs_while_they_take_longer_than_others_may_wait(datab
 
     event.listen(database.engine, "before_cursor_execute", note)
     sweep_erased(database)
-    assert steps == [300, 150, 37, 74, 148, 290]
+    assert steps == [75, 37, 20, 40, 80, 160, 300, 287]
 
 
 def test_an_erasure_does_not_walk_along_the_jobs_that_have_ended(database: Database):
