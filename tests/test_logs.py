@@ -1,5 +1,6 @@
 """The logs: a line for each request and each job, with their ids, and no personal data."""
 
+import inspect
 import io
 import json
 import logging
@@ -60,6 +61,19 @@ def test_a_line_has_its_moment_its_ids_and_its_fields(said: io.StringIO):
     assert line.pop("at").endswith("+00:00")
     expected = {"level": "info", "logger": "skills.test", "message": "request", "status": 200, "ms": 1.5}
     assert line == expected | {"request_id": "deadbeef"}
+
+
+def test_a_job_that_is_cancelled_while_it_runs_is_no_error_of_the_engine(said: io.StringIO):
+    from dbos import _core
+    from dbos._error import DBOSAwaitedWorkflowCancelledError
+
+    engine = logging.getLogger("dbos")
+    for adopted in ("the owner's recorded outcome", "the recorded outcome"):
+        assert f"Waiting for {adopted}" in inspect.getsource(_core)
+        engine.warning(f"Workflow 9-1 is no longer owned by this execution. Waiting for {adopted}")
+    for error in (DBOSAwaitedWorkflowCancelledError("9-1"), RuntimeError("x")):
+        engine.error("Exception encountered in background workflow:", exc_info=error)
+    assert [line["error"] for line in lines(said)] == ["RuntimeError"]
 
 
 def test_as_text_it_is_a_line_too():
