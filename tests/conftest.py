@@ -6,7 +6,7 @@ import subprocess
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from copy import deepcopy
 from importlib.util import find_spec
@@ -277,3 +277,35 @@ def pytest_unconfigure(config: pytest.Config) -> None:
     reasons = Counter(said[2].removeprefix("Skipped: ") for said in skipped if isinstance(said, tuple))
     for reason, count in reasons.items():
         reporter.write_line(f"{count} NOT TESTED - {reason}", yellow=True, bold=True)
+
+
+@pytest.fixture
+def with_worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., tuple[int, str]]]:
+    """Yield a function that runs a command on a separate database and returns its exit code and its output."""
+    from typer.testing import CliRunner
+
+    from skills.cli import app
+    from tests import backends
+
+    monkeypatch.setenv("SKILLS_DATABASE_URL", backends.place(tmp_path / "skills.sqlite"))
+    monkeypatch.setenv("SKILLS_WORKERS", "1")  # tests/jobs has several
+    monkeypatch.delenv("SKILLS_SERVER", raising=False)
+    settings.cache_clear()
+
+    def run(*words: str) -> tuple[int, str]:
+        result = CliRunner().invoke(app, list(words))
+        return result.exit_code, result.output
+
+    yield run
+    settings.cache_clear()
+
+
+@pytest.fixture
+def skills(
+    with_worker: Callable[..., tuple[int, str]], monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., tuple[int, str]]:
+    """Return the function of `with_worker`, of commands that start no worker."""
+    from tests.library import cases
+
+    monkeypatch.setattr("skills.serving.working", cases.working)
+    return with_worker

@@ -12,7 +12,7 @@ import re
 import sys
 import tokenize
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import median
@@ -127,14 +127,11 @@ def add(found: Measures, file: Path, name: Path) -> None:
     for token in comments:
         found.words += words_of(token.string)
     found.lines += code_lines(text, tree)
-    if name.name != "__init__.py":
-        found.places[name.stem].add(f"module {name}")
+    add_names(found, ast.walk(tree), name)
     for node in ast.walk(tree):
         if isinstance(node, ast.Module | ast.ClassDef | Function) and (said := ast.get_docstring(node)):
             found.docstrings.append(said)
             found.words += words_of(said)
-        if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
-            found.places[node.name].add(f"class {name}")
         if isinstance(node, Function):
             found.functions.append((node.end_lineno or node.lineno) - node.lineno + 1)
             if node.name.startswith("test_"):
@@ -145,6 +142,15 @@ def add(found: Measures, file: Path, name: Path) -> None:
             if isinstance(node, Function) and not node.name.startswith("_") and node.args.args:
                 found.public += 1
                 found.with_args += "Args:" in (ast.get_docstring(node) or "")
+
+
+def add_names(found: Measures, nodes: Iterable[ast.AST], name: Path) -> None:
+    """Add the names of a module and of its public classes."""
+    if name.name != "__init__.py":
+        found.places[name.stem].add(f"module {name}")
+    for node in nodes:
+        if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+            found.places[node.name].add(f"class {name}")
 
 
 def code_lines(text: str, tree: ast.Module) -> int:

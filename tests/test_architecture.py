@@ -12,6 +12,7 @@ import pytest
 from importlinter.cli import lint_imports
 
 import skills
+from tests import house
 
 ROOT = Path(skills.__file__).parent
 PROJECT = ROOT.parent
@@ -115,6 +116,14 @@ def test_the_table_of_rooms_names_each_after_those_that_it_imports():
 )
 def test_each_outside_library_has_one_door(library, door):
     assert [file for file in importers(library) if not file.startswith(door)] == []
+
+
+def test_one_name_stands_for_one_thing():
+    """A name that a layer shares with another by design is in `NOUNS` of tests/house.py, with the reason."""
+    found = house.Measures()
+    for file in house.sources(ROOT):
+        house.add_names(found, nodes(file), Path(named(file)))
+    assert found.two_things() == []
 
 
 @pytest.mark.parametrize("library", ["pickle", "cPickle", "dill", "cloudpickle", "joblib", "shelve", "marshal"])

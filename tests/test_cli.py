@@ -5,63 +5,31 @@ Jobs are carried out by a thread (`cases.working`), except in one test, where th
 
 import io
 import json
-import os
-import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
-from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 import pytest
-from typer.main import get_command
 from typer.testing import CliRunner
 
 from skills.cli import app
-from skills.cli.policies import MANY, PHASED
-from skills.cli.shell import complete_surgeons, complete_sutures, connect
+from skills.cli.policies import MANY
+from skills.cli.shell import connect
 from skills.db.session import Database
 from skills.formats import read_recording, write_mcap
 from skills.formats.lerobot.cut import find_dataset
 from skills.formats.lerobot.writer import AboutDataset, ExportedEpisode, dataset_files
 from skills.gridworld.scene import Scene
-from skills.learning.policy import LEARNERS
 from skills.library.catalogue import put_surgeon
 from skills.seeds.recordings import sample_recordings
 from skills.settings import Settings, settings
 from skills.simulation import film
-from tests import backends
 from tests.arms import ARMS
-from tests.by_day import some
 from tests.formats import bags, lerobots, trials, videos
 from tests.library import cases, exports
 
 STYLE = ("wren", "simple-running")
-
-
-@pytest.fixture
-def with_worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Yield a function that runs a command on a separate database and returns its exit code and its output."""
-    monkeypatch.setenv("SKILLS_DATABASE_URL", backends.place(tmp_path / "skills.sqlite"))
-    monkeypatch.setenv("SKILLS_WORKERS", "1")  # tests/jobs has several
-    monkeypatch.delenv("SKILLS_SERVER", raising=False)
-    settings.cache_clear()
-
-    def run(*words: str) -> tuple[int, str]:
-        result = CliRunner().invoke(app, list(words))
-        return result.exit_code, result.output
-
-    yield run
-    settings.cache_clear()
-
-
-@pytest.fixture
-def skills(with_worker, monkeypatch: pytest.MonkeyPatch):
-    """Return the same function, of commands that start no worker."""
-    monkeypatch.setattr("skills.serving.working", cases.working)
-    return with_worker
 
 
 def test_a_command_that_waits_for_one_job_starts_one_worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -562,141 +530,3 @@ def test_what_is_printed_for_programs_is_one_document_and_nothing_else(skills, t
         result = CliRunner().invoke(app, [*words, "--json"])
         assert result.exit_code == 0, (words, result.output)
         assert json.loads(result.stdout) is not None, words
-
-
-def groups(group: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
-    for name, command in group.commands.items():
-        if hasattr(command, "commands"):
-            yield from groups(command, (*path, name))
-        else:
-            yield (*path, name), command
-
-
-def test_every_command_of_the_interface_is_there_and_speaks_to_programs() -> None:
-    every = dict(groups(get_command(app)))
-    named = "serve worker migrate seed backup restore verify train retrain rollout plan play export erase report"
-    assert {(name,) for name in named.split()} <= set(every)
-    for group, names in {
-        "recording": "add show",
-        "demo": "add list show report save mark withdraw",
-        "policy": "list versions show card release withdraw export",
-        "keys": "create list revoke",
-        "job": "list show wait cancel",
-        "surgeon": "put list show",
-    }.items():
-        assert {(group, name) for name in names.split()} <= set(every)
-    silent = {path for path, command in every.items() if not any("--json" in one.opts for one in command.params)}
-    assert silent == {("serve",), ("worker",)}, "they answer nothing"
-
-
-def test_the_version_is_printed(skills) -> None:
-    assert skills("--version") == (0, f"{version('suture-skills')}\n")
-
-
-@pytest.mark.parametrize("words", [(), ("serve",), ("policy",), ("policy", "show")])
-def test_minus_h_is_help(words: tuple[str, ...], skills) -> None:
-    code, said = skills(*words, "-h")
-    assert (code, said) == skills(*words, "--help")
-    assert (code, "Usage" in said) == (0, True)
-
-
-def test_an_address_on_the_command_line_is_checked_like_the_setting(skills) -> None:
-    code, said = skills("serve", "--host", "0.0.0.0")
-    assert (code, "keys must not be sent unencrypted" in said) == (1, True)
-
-
-HEAVY = {  # pydantic is not among them: typer itself uses it to parse arguments
-    *("numpy", "numba", "scipy", "matplotlib", "sqlalchemy", "alembic", "fastapi", "starlette", "uvicorn"),
-    *("pydantic_settings", "httpx2", "orjson", "mcap", "rosbags", "dbos", "pybullet", "jinja2", "psycopg"),
-}
-
-
-@pytest.mark.parametrize("words", some([["--help"], ["train", "--help"], ["policy", "--help"]], 3))
-def test_help_is_quick_because_nothing_heavy_is_imported_for_it(words: list[str]) -> None:
-    script = (
-        "import sys; from skills.cli import app\n"
-        "try: app(sys.argv[1:])\n"
-        "finally: print(*{name.partition('.')[0] for name in sys.modules}, file=sys.stderr)"
-    )
-    ended = subprocess.run([sys.executable, "-c", script, *words], capture_output=True, text=True)
-    assert ended.returncode == 0 and "Usage" in ended.stdout
-    loaded = set(ended.stderr.split())
-    assert {"typer", "skills"} <= loaded
-    assert loaded & HEAVY == set()
-    assert "pydantic" not in loaded or words != ["--help"]
-
-
-def completed(line: str, **settings: str) -> tuple[list[str], str]:
-    """Press Tab at the end of a line, in bash; return the proposals, and all other output."""
-    words = line.split(" ")
-    environment = {name: value for name, value in os.environ.items() if not name.startswith("SKILLS_")} | settings
-    asked = {"_SKILLS_COMPLETE": "complete_bash", "COMP_WORDS": line, "COMP_CWORD": str(len(words) - 1)}
-    script = "import sys; sys.argv = ['skills']; from skills.cli import app; app(prog_name='skills')"
-    ended = subprocess.run(
-        [sys.executable, "-c", script], env=environment | asked, capture_output=True, text=True, check=False
-    )
-    return ended.stdout.split(), ended.stderr
-
-
-def test_tab_proposes_the_surgeons_and_sutures_that_there_are(skills, tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr("skills.cli.shell.LIMIT_S", 60.0)
-    (tmp_path / "skills.sqlite").unlink()
-    assert complete_surgeons("") == [], "there is no database yet"
-    assert not (tmp_path / "skills.sqlite").exists()
-    for name in ("kestrel", "kite", "wren"):
-        assert skills("surgeon", "put", name)[0] == 0
-    assert (complete_surgeons(""), complete_surgeons("k")) == (["kestrel", "kite", "wren"], ["kestrel", "kite"])
-    assert complete_sutures("simple-") == ["simple-buried", "simple-interrupted", "simple-running"]
-    monkeypatch.setenv("SKILLS_SERVER", "http://127.0.0.1:9")
-    settings.cache_clear()
-    assert complete_surgeons("") == [], "where a service is set, it alone is asked"
-
-
-def test_tab_in_a_shell_proposes_commands() -> None:
-    assert completed("skills poli") == (["policy"], "")
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"SKILLS_DATABASE_URL": "sqlite:///{folder}/no.sqlite"},
-        pytest.param({"SKILLS_SERVER": "http://127.0.0.1:9"}, marks=pytest.mark.nightly),
-        pytest.param({"SKILLS_DATABASE_URL": "no url at all"}, marks=pytest.mark.nightly),
-        pytest.param({"SKILLS_PORT": "no port"}, marks=pytest.mark.nightly),
-    ],
-    ids=lambda wrong: " ".join(wrong.values()),
-)
-def test_tab_in_a_shell_is_silent_whatever_is_wrong(wrong: dict[str, str], tmp_path: Path) -> None:
-    given = {name: value.format(folder=tmp_path) for name, value in wrong.items()}
-    (tmp_path / "no.sqlite").write_bytes(b"this is no database" * 100)
-    assert completed("skills policy show k", **given) == ([], "")
-
-
-def test_tab_is_silent_if_a_library_is_still_at_work_when_time_is_up() -> None:
-    """The destructor of the thread's own data aborts, as a library in C++ does whose thread is made to exit."""
-    script = (
-        "import ctypes, time; from skills.cli import shell; shell.LIMIT_S = 0.1\n"
-        "def hangs():\n"
-        "    libc, key = ctypes.CDLL(None), ctypes.c_uint()\n"
-        "    libc.pthread_key_create(ctypes.byref(key), libc.abort)\n"
-        "    libc.pthread_setspecific(key, ctypes.c_void_p(1))\n"
-        "    while True: time.sleep(0.0001)\n"
-        "print(shell._in_time(hangs, ''))"
-    )
-    ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
-    assert (ended.returncode, ended.stdout, ended.stderr) == (0, "[]\n", "")
-
-
-def test_the_commands_know_every_learner_that_has_a_joining_rule() -> None:
-    assert set(PHASED) == {kind for kind, learner in LEARNERS.items() if learner.phased}
-
-
-@pytest.mark.parametrize("of", [6, pytest.param(1, marks=pytest.mark.nightly)])
-def test_every_command_explains_each_option_within_eighty_columns(of: int) -> None:
-    for number, (path, command) in enumerate(groups(get_command(app))):
-        assert [one.name for one in command.params if not getattr(one, "help", "")] == [], path
-        if number % of:
-            continue  # by day every sixth is printed
-        result = CliRunner().invoke(app, [*path, "--help"], terminal_width=80, env={"COLUMNS": "80"})
-        assert result.exit_code == 0, result.output
-        assert [line for line in result.output.splitlines() if len(line) > 80 or "…" in line] == [], path

@@ -44,7 +44,7 @@ def test_a_layer_that_is_not_entered_is_not_said_to_hold(tmp_path):
     """Each in turn is replaced by one that does nothing; another one may close the same."""
     code = (
         "import json, sys; from skills.sandbox import containment as c; "
-        "place = c.Place(sys.argv[1], tuple(c.code_folders())); held = {}\n"
+        "place = c.Allowance(sys.argv[1], tuple(c.code_folders())); held = {}\n"
         "for layers in (c._OF_SERVER, c._OF_FORK):\n"
         "    for name, (apply, holds) in layers.items():\n"
         "        layers[name] = lambda place: None, holds\n"
@@ -102,7 +102,7 @@ def test_missing_layers_are_logged_by_the_first_process_alone(monkeypatch, caplo
 
 def test_a_server_that_cannot_enter_a_demanded_layer_calls_nothing(monkeypatch):
     filtered = (  # a process whose kernel refuses namespaces
-        "from skills.sandbox import containment as c; place = c.Place('/', ()); "
+        "from skills.sandbox import containment as c; place = c.Allowance('/', ()); "
         "c._no_new_privileges(place); c._system_calls(place); "
     )
     monkeypatch.setattr(forked, "_layers", ("own network",))
