@@ -1,4 +1,8 @@
-"""Distances between all shapes: against another library, by hand, and by laws."""
+"""Shapes and their distances: against another library, by hand, and by laws.
+
+Place, rotation about the vertical, tempo and size make no difference. Parts in which two shapes differ are worked by
+hand. The chart is exact if the distances fit into a plane, and is reported with its quality otherwise.
+"""
 
 import numpy as np
 import pytest
@@ -6,9 +10,25 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skills.comparison import _kernels
-from skills.comparison.distances import WORTH_A_THREAD, distances, distances_of, medoid, spread
+from skills.comparison.distances import (
+    MANY,
+    STATES,
+    VERSION,
+    WORTH_A_THREAD,
+    chart,
+    difference,
+    distances,
+    distances_of,
+    in_lengths,
+    medoid,
+    placed,
+    resampled,
+    shape_of,
+    spread,
+)
+from skills.errors import BadPath
 from skills.learning.evaluation import dtw
-from tests.comparison.cohort import cohort
+from tests.comparison.cohort import cohort, demo_of
 
 
 def by_tslearn(shape, other):
@@ -85,3 +105,143 @@ def test_threads_change_no_bit_and_a_pair_is_what_it_is_among_all():
     assert (found == distances(shapes, shapes).ravel()).all()
     assert [*found[:5]] == [distances_of(shapes, [pair])[0] for pair in every[:5]]
     assert distances_of(shapes, np.empty((0, 2))).shape == (0,)
+
+
+HUMPS_MM = np.array([[3.0, 6.0], [1.0, -2.0], [0.0, 1.0]])
+PINNED_MM = [[10.769038, 2.972388, 2.66079], [22.036847, 3.008288, 4.690078], [33.111112, 1.089212, 6.643578]]
+
+
+def test_a_quarter_circle_worked_by_hand():
+    angle = np.linspace(0.0, np.pi / 2, 2001)
+    path = np.stack([10 * np.sin(angle), np.zeros_like(angle), 10 * (1 - np.cos(angle))], axis=1)
+    shape = placed(resampled(path, 3))  # its start, the middle of its path, its goal
+    half, long = 10 * (np.sqrt(2.0) - 1.0) / np.sqrt(2.0), 10 * np.sqrt(2.0)
+    np.testing.assert_allclose(shape, [[0, 0, 0], [long / 2, 0, -(10 - long / 2)], [long, 0, 0]], atol=1e-4)
+    assert half == pytest.approx(10 - long / 2)
+
+
+@settings(deadline=None)  # the first call compiles
+@given(st.floats(-np.pi, np.pi), st.tuples(*[st.floats(-50, 50)] * 3), st.floats(1.5, 6.0), st.floats(0.3, 3.0))
+def test_place_turn_tempo_and_size_say_nothing(turn_rad, place_mm, duration_s, size):
+    plain = demo_of(HUMPS_MM, 0.0, np.zeros(3), 3.0)
+    moved = demo_of(HUMPS_MM, turn_rad, np.array(place_mm), duration_s)
+    assert distances([shape_of(plain)], [shape_of(moved)])[0, 0] / STATES < 0.1  # mm: the window smooths over time
+    once, larger = resampled(plain.tip_mm), resampled(plain.tip_mm * size)
+    np.testing.assert_allclose(placed(once, scaled=True), placed(larger, scaled=True), atol=1e-9)
+    np.testing.assert_allclose(placed(once) * size, placed(larger), atol=1e-9)
+
+
+def test_standing_still_and_sampling_say_nothing():
+    way = np.linspace(0.0, 1.0, 50)[:, None] * np.array([30.0, 10.0, 5.0])
+    rested = np.repeat(way, [20 if row == 25 else 1 + row % 3 for row in range(50)], axis=0)
+    np.testing.assert_allclose(resampled(way), resampled(rested), atol=1e-9)
+
+
+def test_a_shape_begins_at_the_origin_and_goes_along_x_with_z_upwards():
+    shape = shape_of(demo_of(HUMPS_MM, 0.7, np.array([1.0, 2.0, -100.0]), 3.0))
+    assert shape.shape == (STATES, 3)
+    np.testing.assert_allclose(shape[0], 0.0, atol=1e-12)
+    np.testing.assert_allclose(shape[-1, 1:], 0.0, atol=1e-9)
+    assert shape[-1, 0] > 35
+    assert shape[STATES // 2, 2] > 3  # its largest hump points upwards
+
+
+def test_straight_up_is_a_way_too_and_none_at_all_is_refused():
+    up = np.linspace(0.0, 1.0, 20)[:, None] * np.array([0.0, 0.0, -30.0])
+    np.testing.assert_allclose(placed(up)[-1], [30.0, 0.0, 0.0], atol=1e-12)
+    around = np.array([[0.0, 0, 0], [20.0, 0, 0], [0.5, 0, 0]])
+    with pytest.raises(BadPath, match=r"0\.50 mm"):
+        placed(around)
+    with pytest.raises(BadPath):
+        placed(np.full((3, 3), np.nan))
+
+
+def test_a_shape_in_lengths_is_the_scaled_one():
+    demo = demo_of(HUMPS_MM, 0.7, np.array([1.0, 2.0, -100.0]), 3.0)
+    np.testing.assert_allclose(in_lengths(shape_of(demo)), shape_of(demo, scaled=True), atol=1e-12)
+
+
+def test_cached_shapes_have_a_version_that_is_raised_when_they_change():
+    """A failure means that shapes differ from before: raise `distances.VERSION`, then update these numbers."""
+    shape = shape_of(demo_of(HUMPS_MM, 0.7, np.array([1.0, 2.0, -100.0]), 3.0))
+    assert VERSION == 2
+    np.testing.assert_allclose(shape[[25, 50, 75]], PINNED_MM, atol=1e-6)
+
+
+def along(states: int) -> np.ndarray:
+    return np.linspace(0.0, 1.0, states)[:, None] * np.array([300.0, 0.0, 0.0])
+
+
+def test_a_hump_in_the_last_third_is_found_there_with_its_sign():
+    reference = along(30)
+    shape = reference.copy()
+    shape[22:28, 2] += 4.0
+    found = difference(shape, reference)
+    assert found.where == ("last third", "upwards")
+    assert found.total == pytest.approx(24.0)
+    assert found.offsets[2, 2] == pytest.approx(2.4)
+    assert found.shares[2, 2] == pytest.approx(1.0)
+    assert found.shares.sum() == pytest.approx(1.0)
+    np.testing.assert_allclose(found.along, shape - reference)
+    assert difference(reference, shape).offsets[2, 2] == pytest.approx(-2.4)
+
+
+def test_a_shift_sideways_is_everywhere():
+    found = difference(along(12) - np.array([0.0, 2.0, 0.0]), along(12))
+    assert found.where[1] == "sideways"
+    np.testing.assert_allclose(found.offsets[:, 1], -2.0)
+    np.testing.assert_allclose(found.shares[:, 1], 1 / 3)
+
+
+def test_nothing_differs_from_itself():
+    found = difference(along(9), along(9))
+    assert found.total == 0.0
+    assert not found.offsets.any()
+    assert not found.shares.any()
+
+
+def test_where_they_cross_neither_lies_further():
+    reference = along(30)
+    shape = reference.copy()
+    shape[10:15, 1], shape[15:20, 1] = 3.0, -3.0
+    found = difference(shape, reference)
+    assert found.where == ("middle third", "sideways")
+    share, offset, size = found.most
+    assert (share, offset, size) == (pytest.approx(1.0), pytest.approx(0.0), pytest.approx(3.0))
+    assert found.direction is None
+    assert difference(reference + np.array([0, 0, 1.0]), reference).direction == "higher"
+    assert difference(reference, reference + np.array([0, 1.0, 0])).direction == "further right"
+
+
+def apart(points: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(points[:, None] - points[None, :], axis=2)
+
+
+@given(st.integers(0, 500), st.integers(2, 30))
+def test_what_lies_in_a_plane_keeps_all_its_distances(seed, size):
+    points = np.random.default_rng(seed).normal(0, 10, (size, 2))
+    places, right = chart(apart(points))
+    np.testing.assert_allclose(apart(places), apart(points), atol=1e-5)
+    np.testing.assert_allclose(places.mean(axis=0), 0.0, atol=1e-9)
+    assert right == pytest.approx(1.0, abs=1e-6)
+
+
+def test_many_are_placed_as_few_are_and_always_alike(monkeypatch):
+    points = np.random.default_rng(3).normal(0, 1, (MANY + 20, 5)) * [9, 5, 2, 1, 1]
+    places, right = chart(apart(points))
+    assert (chart(apart(points))[0] == places).all()
+    monkeypatch.setattr("skills.comparison.distances.MANY", 1000)
+    few, the_same = chart(apart(points))
+    np.testing.assert_allclose(places, few, atol=1e-7)
+    assert right == pytest.approx(the_same)
+
+
+def test_the_corners_of_a_cube_are_not_all_shown():
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
+    assert 0.5 < chart(apart(corners))[1] < 0.9
+
+
+def test_one_and_equal_ones_have_places_too():
+    assert chart(np.zeros((1, 1))) == (pytest.approx(np.zeros((1, 2))), 1.0)
+    places, right = chart(np.zeros((4, 4)))
+    assert not places.any() and right == 1.0

@@ -18,7 +18,7 @@ from skills.kinematics import forward, quaternion_of
 from skills.library.arm_errors import read_measured, stated_errors
 from skills.verification.arm_errors import SIZES, UNCALIBRATED, MeasuredArm, calibrate_arm, rotation_of
 from tests.formats.bags import sample_folder
-from tests.verification.test_measured_errors import lasting, recorded
+from tests.verification.test_arm_errors import lasting, recorded
 
 NAMES = [f"{kind}_q{k}" for kind in ("measured", "setpoint") for k in range(1, 7)]
 

@@ -1,3 +1,5 @@
+"""Written bags, and timelines as MCAP files: read by another library, and a timeline is refused as a recording."""
+
 import io
 import zipfile
 from dataclasses import replace
@@ -11,12 +13,14 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 from skills.demonstration.recording import Recording
-from skills.errors import BadRecording
+from skills.errors import BadRecording, NoUsableTopic
 from skills.formats import bag_writer, read_recording, write_bag, write_mcap
 from skills.formats.bag_folder import read_metadata
-from skills.formats.bag_writer import DEFINITIONS, messages_of
+from skills.formats.bag_writer import DEFINITIONS, messages_of, timeline_mcap
+from skills.verification.timeline import timeline_of_recording
 from tests.formats.bags import START_NS, STEP_NS, recording
 from tests.formats.others import assert_all_the_same, whole
+from tests.verification.timelines import two_arms
 
 JAZZY = get_typestore(Stores.ROS2_JAZZY)
 
@@ -129,3 +133,30 @@ def test_a_recording_that_starts_before_1970_cannot_be_written():
     early = replace(motion, stamps_ns=motion.stamps_ns - 2 * START_NS)
     with pytest.raises(BadRecording, match="1970"):
         messages_of(Recording(format="csv", integrity="none", motions=(early,)))
+
+
+def test_a_viewers_file_has_the_poses_in_metres_and_says_that_it_is_to_look_at():
+    timeline = timeline_of_recording(two_arms(3.0))
+    data = timeline_mcap(timeline, "recordings/abc")
+    reader = make_reader(io.BytesIO(data), decoder_factories=[DecoderFactory()])
+    (notes,) = reader.iter_metadata()
+    assert notes.metadata["use"] == "to look at; not for execution" and notes.metadata["source"] == "recordings/abc"
+    seen: dict[str, list] = {}
+    for _, channel, message, said in reader.iter_decoded_messages():
+        seen.setdefault(channel.topic, []).append((message.log_time, said))
+    assert set(seen) >= {
+        "/shown/arm_PSM1/pose",
+        "/shown/arm_PSM2/joints",
+        "/shown/arm_PSM1/jaw",
+        "/shown/stage",
+        "/shown/Outer_bodies_apart",
+    }
+    assert all(topic.startswith("/shown/") for topic in seen)
+    stamp_ns, pose = seen["/shown/arm_PSM2/pose"][100]  # every second row
+    assert stamp_ns == 1_000_000_000 and pose.header.frame_id == "ECM"
+    assert pose.pose.position.x == pytest.approx(timeline.arms[1].tip_mm[200, 0] / 1000)
+    assert seen["/shown/arm_PSM1/joints"][0][1].position[2] == pytest.approx(timeline.arms[0].joints[0, 2] / 1000)
+    assert [said.data for _, said in seen["/shown/stage"]] == ["grasping", "driving", "hand-off"]
+    assert timeline_mcap(timeline, "recordings/abc") == data
+    with pytest.raises(NoUsableTopic):
+        read_recording(io.BytesIO(data))
