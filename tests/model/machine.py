@@ -39,6 +39,7 @@ from tests.model.checks import ACTIVE, FILES, PROPOSED, Compared
 from tests.model.invariant import ALL_USES, Consent, Demo, Job, Key, Model, Style, Version
 from tests.model.replaced import FIRST_DAY, Clock, Interruptible, settled
 
+REQUESTS = ("train", "ask_training", "retrain", "ask_retraining")
 SURGEONS = ("kestrel", "heron", "lark", "wren")
 SUTURES = (cases.SUTURE, "horizontal-mattress")
 MOST_BACKUPS = 3
@@ -76,10 +77,19 @@ ENDING = (WITHDRAW_DEMO, MARK, ERASE_DEMO, ERASE_SURGEON, WITHDRAW, CANCEL)
 ELSEWHERE = (AGREE, ADD_DEMO, DECIDE, RELEASE, *ENDING, PASS_A_DAY, BACK_UP)
 MEANWHILE = st.none() | st.tuples(st.integers(1, 8), st.one_of(*ELSEWHERE, AGREE, ERASE_DEMO))
 ANY_OUTCOME = st.sampled_from([False, False, False, True])
-TRAIN = step("train", SURGEON, SUTURE, DEMOS, SEED, FLAG, MEANWHILE, ANY_OUTCOME)
+
+
+def training(surgeon: str) -> Any:
+    """Return a training during which, more often than anything else, this surgeon's consent to it ends."""
+    ends = step("agree", st.just(surgeon), st.just(frozenset({"atlas", "export"})), st.none())
+    meanwhile = st.none() | st.tuples(st.integers(1, 5), st.one_of(*ELSEWHERE, *[ends] * 4))
+    return step("train", st.just(surgeon), SUTURE, DEMOS, SEED, FLAG, meanwhile, ANY_OUTCOME)
+
+
+TRAIN = SURGEON.flatmap(training)
 PLAN = step("plan", SURGEON, MEANWHILE)
-ERASED = st.tuples(st.integers(3, 7), ERASE_DEMO)  # while distances are measured
-ATLAS = step("atlas", SUTURE, st.one_of(MEANWHILE, ERASED))
+ERASED = st.tuples(st.integers(4, 7), ERASE_DEMO)  # while distances are measured
+ATLAS = step("atlas", SUTURE, st.one_of(MEANWHILE, ERASED, ERASED))
 STEPS = (
     *ELSEWHERE,
     TRAIN,
@@ -88,6 +98,8 @@ STEPS = (
     step("ask_training", SURGEON, SUTURE, DEMOS, SEED, FLAG, ANY_OUTCOME),
     step("retrain", st.none() | SURGEON, st.booleans(), FLAG, MEANWHILE),
     step("ask_retraining", st.none() | SURGEON, st.booleans(), FLAG),
+    step("again", INDEX),
+    step("again", INDEX),
     step("work", INDEX, MEANWHILE),
     PLAN,
     ATLAS,
@@ -311,6 +323,12 @@ class Installation(Compared):
         """Request a batch and wait for its end, as `skills retrain` does."""
         if (job := self._ask_retraining(surgeon, only_stale, release)) is not None:
             self._wait(job, meanwhile)
+
+    def _again(self, index: int) -> None:
+        """Request a training or a batch that was requested before, the newest first, as where an answer was lost."""
+        requests = [one for one in reversed(self.steps) if one[0] in REQUESTS]
+        if (request := pick(requests, index)) is not None:
+            self._do(request)
 
     def _ask_retraining(self, surgeon: str | None, only_stale: bool, release: bool) -> str | None:
         body = {"surgeon": surgeon, "only_stale": only_stale, "release": release}
