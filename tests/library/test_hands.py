@@ -12,7 +12,7 @@ from skills.demonstration.recording import Motion, Recording
 from skills.errors import BadPlan, Conflict
 from skills.formats import write_mcap
 from skills.kinematics import POINTING_DOWN, angle_between, matrix_of, quaternion_of
-from skills.library import releases, training
+from skills.library import releases
 from skills.library.integrity import planned
 from skills.library.plans import find_plan, trajectory_of
 from skills.planning.handoff import turn
@@ -79,8 +79,8 @@ def test_a_small_turn_may_be_held(database: Database):
 def test_a_version_checked_with_the_jaw_held_is_not_released(database: Database, monkeypatch: pytest.MonkeyPatch):
     cases.add_surgeon(database)
     cases.store(database, cases.upload(turning(), "application/vnd.mcap"), arm="PSM2")
-    real = training.driven_pass
-    monkeypatch.setattr(training, "driven_pass", lambda *given: replace(real(*given), orientation="demonstrated"))
+    real = releases.driven_pass
+    monkeypatch.setattr(releases, "driven_pass", lambda *given: replace(real(*given), orientation="demonstrated"))
     version = cases.train(database)
     monkeypatch.undo()
     with (
