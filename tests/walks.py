@@ -24,9 +24,10 @@ from tests.library import cases
 
 PACKAGE = str(Path(skills.__file__).parent)
 COMMON = ("errors", "remedies", "settings", "logs", "arrays", "fields", "packing", "compiled", "kinematics")
-COMMON += ("db/", "client/", "api/app", "jobs/__init__", "library/catalogue.py", "library/keys.py")
-PERIODIC = "forget_erased"  # its calls are part of no request, and a slow walk has them
-STARTING = "confined_reader"  # called once at the start of the service
+COMMON += ("db/", "client/", "api/app", "jobs/__init__", "library/catalogue.py", "library/keys.py", "library/locks.py")
+COMMON += ("library/history.py", "transparency.py")  # what is written is logged, whoever writes it
+PERIODIC = ("forget_erased", "forget_gone")  # part of no request, and a slow walk has them
+STARTING = ("confined_reader", "stated_errors")  # called once at the start of the service
 
 
 def room(file: str) -> str:
@@ -46,12 +47,16 @@ class Trace:
         if event != "call" or code in self.stations or not code.co_filename.startswith(PACKAGE):
             return
         file = code.co_filename.removeprefix(f"{PACKAGE}/")
-        if "." in code.co_qualname or code.co_name.startswith(("_", "<", STARTING)) or file.startswith(COMMON):
+        if (
+            "." in code.co_qualname
+            or code.co_name.startswith(("_", "<", *PERIODIC, *STARTING))
+            or file.startswith(COMMON)
+        ):
             return
         caller = frame.f_back
         while caller is not None and not caller.f_code.co_filename.startswith(PACKAGE):
             caller = caller.f_back
-        if caller is not None and caller.f_code.co_name == PERIODIC:
+        if caller is not None and caller.f_code.co_name in PERIODIC:
             return
         if caller is None or room(caller.f_code.co_filename) != room(code.co_filename):
             self.stations[code] = f"{code.co_qualname}  {file}"
