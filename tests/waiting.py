@@ -3,6 +3,7 @@
 import os
 import time
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from pathlib import Path
 from subprocess import Popen
 
@@ -37,16 +38,26 @@ def alive(pid: int) -> bool:
 
 
 def children(pid: int) -> list[int]:
-    """Return the process ids of those children of a process that lead a process group, as servers and forks do.
+    """Return the process ids of the children of a process, whichever of its threads started them.
 
-    A contained process cannot tell its own to a test.
+    The kernel's lists of each thread's children name one twice, or never, if the thread ends while they are read.
     """
-    lists = Path(f"/proc/{pid}/task").glob("*/children")
-    try:
-        found = [int(one) for file in lists for one in file.read_text().split()]
-        return [one for one in found if os.getpgid(one) == one]
-    except (ProcessLookupError, FileNotFoundError):  # a thread, or a process, has just ended
-        return []
+    found = []
+    for process in Path("/proc").glob("[0-9]*"):
+        with suppress(ProcessLookupError, FileNotFoundError):  # it has just ended
+            parent = int((process / "stat").read_text().rpartition(")")[2].split()[1])
+            found += [int(process.name)] if parent == pid else []
+    return found
+
+
+def leaders(pid: int) -> list[int]:
+    """Return those children of a process that lead a process group, as servers and forks do.
+
+    A contained process cannot tell its own id to a test.
+    """
+    with suppress(ProcessLookupError):
+        return [one for one in children(pid) if os.getpgid(one) == one]
+    return []
 
 
 def crowded() -> float:

@@ -24,7 +24,7 @@ from skills.simulation.player import play
 from tests.bench.timing import in_turn
 from tests.formats import large
 from tests.simulation.test_player import TRAJECTORY
-from tests.waiting import children
+from tests.waiting import leaders
 
 LIMITS = ProcessLimits(memory_bytes=1 << 30, wall_s=60.0, threads=False)
 ROUNDS, FORKS = 7, 50
@@ -111,7 +111,7 @@ def _processor_s() -> float:
     """Return the processor time of the processes that this one has started, and of those that they have started."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     ticks = 0
-    for pid in children(os.getpid()):
+    for pid in leaders(os.getpid()):
         ticks += sum(map(int, Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[11:15]))
     return used.ru_utime + used.ru_stime + ticks / os.sysconf("SC_CLK_TCK")
 

@@ -18,7 +18,7 @@ from skills.settings import Settings
 from skills.simulation import film
 from tests import backends
 from tests.library import cases
-from tests.waiting import END_S, until
+from tests.waiting import END_S, children, until
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
@@ -63,8 +63,7 @@ class Service:
         workers: set[int] = set()
 
         def ready() -> bool:
-            with suppress(OSError):  # a thread or a child may end while it is looked at
-                workers.update(self.children(WORKER))
+            workers.update(self.children(WORKER))
             assert len(workers) <= int(self.environment["SKILLS_WORKERS"]) + REPLACED, "its workers die at their start"
             return answers(client, path)
 
@@ -79,9 +78,11 @@ class Service:
     def children(self, word: str) -> list[int]:
         """Return the child processes with a word on their command lines."""
         assert self.process is not None
-        tasks = Path(f"/proc/{self.process.pid}/task")  # any of its threads may have started the child
-        children = [pid for task in tasks.iterdir() for pid in (task / "children").read_text().split()]
-        return [int(pid) for pid in children if word in Path(f"/proc/{pid}/cmdline").read_text()]
+        found = []
+        for pid in children(self.process.pid):
+            with suppress(ProcessLookupError, FileNotFoundError):  # it has just ended
+                found += [pid] if word in Path(f"/proc/{pid}/cmdline").read_text() else []
+        return found
 
     def kill(self) -> None:
         assert self.process is not None

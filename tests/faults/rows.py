@@ -31,7 +31,7 @@ from tests.faults.installation import Installation
 from tests.faults.ledger import Ledger
 from tests.faults.shim import Shim, compiler
 from tests.needs import NEEDS
-from tests.waiting import END_S, alive, until
+from tests.waiting import END_S, alive, children, until
 
 HOUR_NS = 3600 * 10**9
 AHEAD_NS = 400 * 24 * HOUR_NS  # longer than every retention
@@ -211,7 +211,7 @@ class Postgres:
         """Kill the server and all its processes with SIGKILL."""
         file = self._server.pgdata / "postmaster.pid"
         pid = int(file.read_text().split()[0])
-        pids = [pid, *map(int, Path(f"/proc/{pid}/task/{pid}/children").read_text().split())]
+        pids = [pid, *children(pid)]
         for one in pids:
             with suppress(ProcessLookupError):
                 os.kill(one, signal.SIGKILL)

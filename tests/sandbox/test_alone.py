@@ -16,7 +16,7 @@ from skills.errors import BadInput, Unanswered
 from skills.sandbox import ProcessLimits
 from skills.sandbox.forked import call_alone
 from tests.by_day import some
-from tests.waiting import alive, children, crowded, until
+from tests.waiting import alive, crowded, leaders, until
 
 GIB = 1 << 30
 
@@ -70,7 +70,7 @@ def test_an_answer_that_is_too_large_is_not_read():
 
 def forks_of(pid: int) -> list[int]:
     """Return the process ids of the forks of every server of a process."""
-    return [fork for server in children(pid) for fork in children(server)]
+    return [fork for server in leaders(pid) for fork in leaders(server)]
 
 
 def test_one_that_hangs_is_killed_when_its_time_is_over():

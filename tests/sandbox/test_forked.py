@@ -26,7 +26,7 @@ from skills.sandbox import ProcessLimits, fork_server, forked
 from skills.sandbox.containment import Allowance
 from skills.sandbox.forked import ForkServer, layers_held
 from tests.measured import peak_mib
-from tests.waiting import alive, children, crowded, until
+from tests.waiting import alive, crowded, leaders, until
 
 LIMITS = ProcessLimits(memory_bytes=256 << 20, wall_s=20.0, cpu_s=20, file_bytes=16 << 20, threads=False)
 
@@ -161,7 +161,7 @@ def test_one_that_hangs_is_killed_when_its_time_is_over(server, given):
 def only_fork(server: ForkServer) -> int:
     """Wait for a fork and return its process id."""
     found: list[int] = []
-    until(lambda: server.pid and (found.extend(children(server.pid)) or found))
+    until(lambda: server.pid and (found.extend(leaders(server.pid)) or found))
     return found[0]
 
 
@@ -275,8 +275,8 @@ def test_it_ends_with_its_asker(tmp_path):
     asker = subprocess.Popen(
         [sys.executable, "-c", code], cwd=Path(__file__).parents[2], env=os.environ | {"TMPDIR": str(tmp_path)}
     )
-    until(lambda: told.exists() and told.read_text() and children(int(told.read_text())), by=[asker])
-    (forked,) = children(int(told.read_text()))
+    until(lambda: told.exists() and told.read_text() and leaders(int(told.read_text())), by=[asker])
+    (forked,) = leaders(int(told.read_text()))
     asker.send_signal(signal.SIGKILL)
     asker.wait()
     until(lambda: not alive(int(told.read_text())))
