@@ -41,7 +41,7 @@ from skills.formats import BYTES
 from skills.library import policies
 from skills.library.integrity import covered, learnt
 from skills.library.jobs import ACTIVE, find_job, find_jobs, job_json
-from skills.library.policies import Served, pose_style_json, poses_of
+from skills.library.policies import Served, has_poses, pose_style_json, poses_of
 from skills.library.proofs import sign_files
 from skills.library.recordings import damaged
 from skills.library.releases import outcomes_of
@@ -212,7 +212,7 @@ class Encoded:
             "policy-version.json": self.policy(policy, None, JSON),
             "policy.npz": self.policy(policy, release, NPZ),
         }
-        if policy.poses is not None:
+        if has_poses(policy):
             bodies["pose-style.json"] = self.pose_style(policy)
         digests = {name: body.etag.strip('"') for name, body in bodies.items()}
         facts = {"surgeon": policy.surgeon.slug, "suture": policy.suture, "version": policy.version}

@@ -209,7 +209,7 @@ class Sessions:
         said = {
             **{"version": pinned.version, "sha256": pinned.sha256, "arm": poses.arm, "frame": poses.frame},
             **{"phases": len(poses.path.tip_mm), "tick_s": poses.tick_s, "tube": as_json(poses.tube)},
-            "limits": limits,
+            **{"scene": None if poses.scene is None else as_json(poses.scene), "limits": limits},
         }
         return json_of(said).decode()
 

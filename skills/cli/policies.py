@@ -336,6 +336,8 @@ def policy_pose_style(surgeon: Surgeon, suture: Suture, as_json: AsJson = False)
     out.print(f"tube    {tube.radius_mm:.1f} mm and {tube.radius_deg:.1f} degrees, at the end after {tube.ticks} ticks")
     out.print(f"step    {limits.step_mm:g} mm and {turn:.1f} degrees a tick of {1000 * style.tick_s:.0f} ms")
     out.print(f"assumes {limits.disturbance_mm:g} mm and {degrees(limits.disturbance_rad):.1f} degrees of disturbance")
+    if (near := style.scene) is not None:
+        out.print(f"scene   {near.least_mm:.1f} mm from {near.part} after phase {near.phase}, the tube touches nothing")
 
 
 def _share(coverage: "Coverage") -> str:

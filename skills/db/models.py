@@ -68,6 +68,7 @@ added_later(Partner, "base_xyzw")
 added_later(Partner, "instrument")
 added_later(PosePath, "turn_share")
 added_later(PosePath, "partner")
+added_later(CertifiedPoses, "scene")  # never stored: the policy has the scene
 added_later(PhaseQLearning, "slip")
 added_later(ValueIteration, "slip")
 added_later(PhaseQLearning, "join_share")

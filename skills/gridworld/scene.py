@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from skills.arrays import Flags, Floats, Ints
+from skills.arrays import Flags, Floats, Ints, xyz
 from skills.errors import BadSettings
 from skills.fields import Point, schema
 from skills.gridworld.grid import MOVES, GridPath, GridWorld
@@ -38,6 +38,7 @@ MOST_BODIES = 64  # ours, boxes or capsules: two arms have twenty links, and eac
 MOST_HEIGHTS = 10_000  # ours, of a height map: 100 mm by 100 mm at 1 mm, some 200 kB of JSON
 LEAST_STEP_MM = 0.1  # ours, of a height map: a move of 5 mm is compared with tissue at 4 points a step
 LINE_STEP_MM = 0.25  # ours: a distance from a height map is at most half of this too small, for that reason
+FAR_MM = 100.0  # ours: five times the widest tube that is served
 SQUARE = 1e-9  # greatest cosine of the angle between two directions that count as perpendicular
 
 
@@ -53,6 +54,10 @@ class Box:
         _check_finite("A box", self.low_mm, self.high_mm)
         if not all(low < high for low, high in zip(self.low_mm, self.high_mm, strict=True)):
             raise BadSettings("low_mm of a box must be below high_mm along each axis.", box=astuple(self))
+
+    def grown(self, by_mm: float) -> "Box":
+        """Return the box with each face further out by a distance."""
+        return Box(xyz(np.array(self.low_mm) - by_mm), xyz(np.array(self.high_mm) + by_mm))
 
     def from_lines_mm(self, a_mm: Floats, b_mm: Floats) -> Floats:
         """Return the distances of straight lines between points, (..., 3), from the box, (...,); 0 where they touch.
@@ -272,6 +277,19 @@ class Scene:
         if self.tissue is not None:
             nearest = np.minimum(nearest, self.tissue.above_mm(points))
         return np.maximum(nearest - self.margin_mm, 0.0)
+
+    def from_lines_mm(self, a_mm: Floats, b_mm: Floats) -> dict[str, Floats]:
+        """Return the distances of straight lines between points, (..., 3), from each part by its name, (...,).
+
+        The margin is taken off: boxes grow by it along each axis, as in `touches`. Of a height map they are lower
+        bounds. A distance of more than `FAR_MM` from a height map is returned as that.
+        """
+        found = {f"box {k}": box.grown(self.margin_mm).from_lines_mm(a_mm, b_mm) for k, box in enumerate(self.boxes)}
+        for k, capsule in enumerate(self.capsules):
+            found[f"capsule {k}"] = capsule.from_lines_mm(a_mm, b_mm) - self.margin_mm
+        if self.tissue is not None:
+            found["tissue"] = self.tissue.from_lines_mm(a_mm, b_mm, within_mm=FAR_MM) - self.margin_mm
+        return found
 
     def touches(self, from_mm: ArrayLike, to_mm: ArrayLike) -> Flags:
         """Return for each straight line between two points, (..., 3), whether it touches a part, (...,).

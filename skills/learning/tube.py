@@ -2,6 +2,7 @@
 
     PosePath, pose, phase --next_pose--> the next pose and phase
     PosePath, TubeLimits --certify_tube--> TubeCertificate
+    CertifiedPoses, Scene --clear_tube--> CertifiedPoses whose tube touches nothing
 
 Phase k is the index of a pose of the path. In each tick the farthest pose of the next `ahead` phases that one step can
 reach, in mm and in rad, becomes the phase, and is where the hand is sent; if not even the present phase's pose can be
@@ -37,20 +38,23 @@ from skills.demonstration.demonstration import Demo
 from skills.demonstration.partner import Partner
 from skills.errors import BadSettings
 from skills.fields import Point, Quaternion
+from skills.gridworld.scene import Scene
 from skills.learning._kernels import nearest_pose_compiled, step_along_compiled
 from skills.learning.pose_style import UNIT_TOLERANCE, PosePath, learn_pose_style, unit_quaternion
-from skills.learning.tube_certificate import TubeCertificate, TubeLimits
+from skills.learning.tube_certificate import TubeCertificate, TubeClearance, TubeLimits
 
 __all__ = [
     "CertifiedPoses",
     "Hands",
     "PoseStep",
     "TubeCertificate",
+    "TubeClearance",
     "TubeLimits",
     "Update",
     "advance",
     "certified_poses",
     "certify_tube",
+    "clear_tube",
     "next_pose",
 ]
 
@@ -196,6 +200,8 @@ class CertifiedPoses:
         path: The motion from the start pose to the goal pose of the demonstration whose place it has.
         tube: The certificate; a motion whose certificate does not hold is not served.
         partner: The other arm as it took the needle in that demonstration; None if it was not recorded.
+        scene: How near the path comes to the scene for which the tube was narrowed; None for no scene, and where it
+            is stored.
     """
 
     arm: str
@@ -203,6 +209,7 @@ class CertifiedPoses:
     path: PosePath
     tube: TubeCertificate
     partner: Partner | None = None
+    scene: TubeClearance | None = None
 
     @property
     def tick_s(self) -> float:
@@ -277,6 +284,50 @@ def certify_tube(path: PosePath, limits: TubeLimits, update: Update = advance) -
         tried,
         (*faults, *wrong),
     )
+
+
+def clear_tube(poses: CertifiedPoses, scene: Scene) -> CertifiedPoses:
+    """Narrow a tube, if necessary, until no run in it touches a scene.
+
+    A run stays within the tube's radius of the path, so it touches nothing if the path is further than that from every
+    part of the scene. The radius follows from how far off a start may be: starts that are too far off are excluded.
+    The tip is a point, as in the grid world: fingers and shaft belong into the scene's margin.
+
+    Args:
+        poses: The motion, with the certificate of its tube.
+        scene: What must not be touched, in the frame of the motion.
+
+    Returns:
+        The motion with the distance of its path from the scene, and a tube of that radius at most. If not even a run
+        from the path itself is clear of the scene, the certificate has that as a fault, and does not hold.
+
+    Raises:
+        BadSettings: The scene is in another frame.
+    """
+    if scene.frame != poses.frame:
+        raise BadSettings(f"The scene is in the frame '{scene.frame}', the motion in '{poses.frame}'.")
+    tube, path = poses.tube, poses.path
+    limits = tube.limits
+    apart_mm = scene.from_lines_mm(path.tip_mm[:-1], path.tip_mm[1:])
+    if not apart_mm:
+        return poses
+    part = min(apart_mm, key=lambda name: float(apart_mm[name].min()))
+    near = TubeClearance(float(apart_mm[part].min()), part, int(apart_mm[part].argmin()))
+    bulge_mm = tube.radius_mm - max(limits.start_mm, limits.disturbance_mm)
+    start_mm = float(np.minimum(limits.start_mm, near.least_mm - bulge_mm - ROUNDING))
+    if not start_mm >= limits.disturbance_mm:  # written so that NaN fails
+        needed_mm = limits.disturbance_mm + bulge_mm
+        tube = replace(
+            tube,
+            faults=(
+                *tube.faults,
+                f"The path comes within {near.least_mm:.1f} mm of {part} of the scene after phase {near.phase}, and a "
+                f"run that starts on it may be {needed_mm:.1f} mm off",
+            ),
+        )
+    elif start_mm < limits.start_mm:
+        tube = certify_tube(path, replace(limits, start_mm=start_mm))
+    return replace(poses, tube=tube, scene=near)
 
 
 def _moves(path: PosePath, ahead: int) -> tuple[float, float]:

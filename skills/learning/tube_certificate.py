@@ -56,6 +56,23 @@ class TubeLimits:
 
 @schema
 @dataclass(frozen=True)
+class TubeClearance:
+    """How near the path of a tube comes to a scene; the tube is inside if its radius is not larger.
+
+    Attributes:
+        least_mm: Least distance of the path's positions, and of the straight lines between them, from a part of the
+            scene with its margin; a lower bound for a height map, negative inside tissue or a capsule.
+        part: That part: tissue, or box or capsule with its index, such as "box 0".
+        phase: The phase after which it is nearest.
+    """
+
+    least_mm: float
+    part: str
+    phase: int
+
+
+@schema
+@dataclass(frozen=True)
 class TubeCertificate:
     """The proof that a motion stays in a tube around a path and reaches its end, under the limits that it states.
 

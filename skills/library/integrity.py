@@ -26,7 +26,7 @@ from skills.gridworld.grid import GridPath
 from skills.gridworld.scene import Scene
 from skills.learning.certificate import Coverage, finishes, shares_of
 from skills.learning.policy import Policy
-from skills.learning.tube import CertifiedPoses
+from skills.learning.tube import CertifiedPoses, clear_tube
 from skills.packing import canonical, sha256
 from skills.planning.plan import SuturePlan
 from skills.remedies import Remedy
@@ -96,8 +96,10 @@ _poses: WeightedCache[str, tuple[str, CertifiedPoses]] = WeightedCache(256)  # b
 def posed(stored: StoredPoses) -> CertifiedPoses:
     """Return the pose style of a policy version, after verifying it against its digest.
 
+    Its tube is clear of the scene that the version was learnt in.
+
     Raises:
-        Corrupt: It does not match; no arm should follow it.
+        Corrupt: It, or its version, does not match; no arm should follow it.
     """
     policy = stored.policy.sha256
     sha256, poses = _poses.get(policy) or (None, None)
@@ -105,6 +107,8 @@ def posed(stored: StoredPoses) -> CertifiedPoses:
         poses = stored.poses
         if poses_identity_of(policy, digest(poses)) != stored.sha256:
             raise Corrupt("A stored pose style does not match its digest; restore it from a backup or train again.")
+        if "scene" in stored.policy.manifest and (there := learnt(stored.policy).surroundings) is not None:
+            poses = clear_tube(poses, there.scene)
         _poses.put(policy, (stored.sha256, poses))
     return poses
 

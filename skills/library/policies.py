@@ -536,7 +536,7 @@ def poses_of(version: PolicyVersion) -> CertifiedPoses:
 
     Raises:
         NotFound: It has none, with the reason: it is older than pose styles, its demonstrations have no orientation, or
-            the certificate of the tube does not hold.
+            the certificate of the tube does not hold, in the scene of the version or in any.
         Corrupt: The stored one does not match its digest.
     """
     if version.poses is None:
@@ -546,9 +546,18 @@ def poses_of(version: PolicyVersion) -> CertifiedPoses:
         raise NotFound(
             f"The pose style of version {version.version} is not served, because the certificate of its tube does not "
             f"hold: {'; '.join(poses.tube.faults)}.",
-            "Use the policy of the grid, or record the hand-off more slowly.",
+            "Use the policy of the grid, or record the hand-off more slowly, or further from the scene.",
         )
     return poses
+
+
+def has_poses(version: PolicyVersion) -> bool:
+    """Return whether a policy version has a pose style whose tube's certificate holds.
+
+    Raises:
+        Corrupt: The stored one does not match its digest.
+    """
+    return version.poses is not None and posed(version.poses).tube.holds
 
 
 def _absent(version: PolicyVersion) -> NotFound:
@@ -599,6 +608,7 @@ def pose_style_json(version: PolicyVersion, poses: CertifiedPoses) -> dict[str, 
         "turn_share": path.turn_share,
         "tick_s": poses.tick_s,
         "tube": as_json(poses.tube),
+        "scene": None if poses.scene is None else as_json(poses.scene),
         "partner": None if poses.partner is None else as_json(poses.partner),
         "created_at": rfc3339(version.created_at),
     }

@@ -15,7 +15,7 @@ from skills.learning.dynamic_programming import ShortestWay
 from skills.learning.evaluation import Metrics, SpaceRollouts
 from skills.learning.in_scene import SceneCertificate
 from skills.learning.q_learning import Training
-from skills.learning.tube_certificate import TubeCertificate
+from skills.learning.tube_certificate import TubeCertificate, TubeClearance
 from skills.planning.plan import DrivenPass
 from skills.schemas import DemoOutcome, Given, Grid, Page, PolicyName, VersionNumber
 
@@ -469,6 +469,10 @@ class SessionOpening(PolicyName):
     phases: int
     tick_s: float = Field(description="Time between two phases.")
     tube: TubeCertificate
+    scene: TubeClearance | None = Field(
+        default=None,
+        description="The distance of the path from the scene that the version was learnt in; the tube is narrower.",
+    )
     limits: SessionLimits
 
 
@@ -498,5 +502,9 @@ class PoseStyle(PolicyName):
     )
     tick_s: float = Field(description="Time between two phases.")
     tube: TubeCertificate
+    scene: TubeClearance | None = Field(
+        default=None,
+        description="The distance of the path from the scene that the version was learnt in; the tube is narrower.",
+    )
     partner: Partner | None = Field(description="The other arm as it took the needle, where that was recorded.")
     created_at: datetime

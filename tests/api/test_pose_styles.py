@@ -1,5 +1,7 @@
 """Pose styles over HTTP: the one of the released policy, the link to it, and the next pose."""
 
+import base64
+import json
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -89,3 +91,38 @@ def test_positions_alone_have_no_pose_style_and_no_link(trained: Service):
     assert "has no orientation" in assert_problem(trained.http.get(POSES), 404, "not-found")["detail"]
     with pytest.raises(Problem, match="has no orientation"):
         trained.client.next_pose(**KESTREL, position_mm=[0, 0, 0], rotation_xyzw=[0, 0, 0, 1])
+
+
+def in_a_scene(service: Service, side_mm: float) -> None:
+    """Release a version that is learnt beside a box, with its face so far from the demonstrated path."""
+    x, y, z = np.array(service.http.get(POSES).json()["position_mm"]).T
+    low, high = (x.max() + side_mm, y.min(), z.min()), (x.max() + side_mm + 5, y.max(), z.max())
+    scene = {"frame": "PSM2_base", "boxes": [{"low_mm": low, "high_mm": high}]}
+    learner = {"kind": "value-iteration", "gamma": 0.95, "slip": 0.0}
+    job = service.train(scene=scene, learner=learner, release=True)
+    assert job["result"]["released"], job["result"]
+
+
+def test_a_pose_style_beside_a_scene_has_a_narrower_tube(posed: Service):
+    in_a_scene(posed, 8.0)
+    style = posed.client.pose_style(**KESTREL)
+    assert style["scene"]["part"] == "box 0" and style["scene"]["least_mm"] == pytest.approx(8.0)
+    assert style["tube"]["radius_mm"] == pytest.approx(8.0) and style["tube"]["faults"] == []
+    nearest = style["scene"]["phase"]
+    at = np.add(style["position_mm"][nearest], (9.0, 0.0, 0.0)).tolist()
+    rotation = style["rotation_xyzw"][nearest]
+    said = posed.client.next_pose(**KESTREL, position_mm=at, rotation_xyzw=rotation, phase=nearest)
+    assert not said["inside"]
+
+
+def test_a_pose_style_too_near_to_a_scene_is_not_served(posed: Service):
+    in_a_scene(posed, 0.8)
+    assert posed.http.get(POLICY).status_code == 200  # the policy of the grid is
+    detail = assert_problem(posed.http.get(POSES), 404, "not-found")["detail"]
+    assert "The path comes within 0.8 mm of box 0 of the scene" in detail
+    with pytest.raises(Problem, match="further from the scene"):
+        posed.client.next_pose(**KESTREL, position_mm=[0, 55, -125], rotation_xyzw=[0, 0, 0, 1])
+    signed = posed.http.get(f"{POLICY}/signature")
+    assert signed.status_code == 200
+    names = [one["name"] for one in json.loads(base64.b64decode(signed.json()["payload"]))["subject"]]
+    assert "policy.json" in names and "pose-style.json" not in names

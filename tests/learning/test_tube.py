@@ -4,13 +4,25 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 
+from skills.arrays import xyz
 from skills.errors import BadInput, BadSettings
+from skills.gridworld.scene import Box, Capsule, Scene, Tissue
 from skills.learning import tube
 from skills.learning.pose_style import PHASES, PosePath
-from skills.learning.tube import Hands, Update, advance, certify_tube, next_pose
-from skills.learning.tube_certificate import TubeLimits
+from skills.learning.tube import (
+    CertifiedPoses,
+    Hands,
+    Update,
+    advance,
+    certify_tube,
+    clear_tube,
+    next_pose,
+)
+from skills.learning.tube_certificate import TubeClearance, TubeLimits
 from tests.learning.test_kernels import both
 
 LIMITS = TubeLimits(step_mm=6.0, step_rad=0.2, disturbance_mm=1.0, disturbance_rad=0.02, start_mm=20.0, start_rad=0.5)
@@ -245,3 +257,100 @@ def test_what_is_not_a_pose_or_a_phase_is_refused() -> None:
         TubeLimits(step_mm=1.0, disturbance_mm=1.0)
     with pytest.raises(BadSettings):
         TubeLimits(step_mm=float("nan"))
+
+
+STRAIGHT = np.stack([np.linspace(0.0, 60.0, PHASES), np.zeros(PHASES), np.full(PHASES, -120.0)], axis=1)
+BESIDE = Box((20.0, 10.0, -140.0), (40.0, 30.0, -100.0))  # 10 mm from the straight path
+
+
+def in_scene(scene: Scene, tip_mm: np.ndarray = STRAIGHT, limits: TubeLimits = LIMITS) -> CertifiedPoses:
+    """Return a motion without a turn, with its tube narrowed for a scene."""
+    nothing, upright = np.zeros(PHASES), np.tile([0.0, 0.0, 0.0, 1.0], (PHASES, 1))
+    path = PosePath(tip_mm, upright, np.linspace(0.0, 4.0, PHASES), nothing, nothing, nothing)
+    return clear_tube(CertifiedPoses("PSM2", "PSM2_base", path, certify_tube(path, limits)), scene)
+
+
+@pytest.mark.parametrize(
+    ("scene", "near"),
+    [
+        (Scene("PSM2_base", boxes=(BESIDE,)), TubeClearance(10.0, "box 0", 33)),
+        (Scene("PSM2_base", boxes=(BESIDE,), margin_mm=1.5), TubeClearance(8.5, "box 0", 30)),
+        (
+            Scene("PSM2_base", capsules=(Capsule((30.0, 3.0, -110.0), (30.0, 3.0, -90.0), 2.0),)),
+            TubeClearance(109**0.5 - 2, "capsule 0", 49),
+        ),
+        (
+            Scene("PSM2_base", boxes=(BESIDE,), tissue=Tissue.plane((0.0, 0.0, -125.0), (0.0, 0.0, 2.0))),
+            TubeClearance(5.0, "tissue", 0),
+        ),
+    ],
+    ids=["box", "margin", "capsule", "tissue is nearer than the box"],
+)
+def test_a_tube_is_narrowed_to_the_distance_of_the_scene(scene: Scene, near: TubeClearance):
+    poses = in_scene(scene)
+    assert poses.scene is not None and poses.tube.holds
+    assert (poses.scene.part, poses.scene.phase) == (near.part, near.phase)
+    assert poses.scene.least_mm == pytest.approx(near.least_mm)
+    assert poses.tube.radius_mm == pytest.approx(near.least_mm) and poses.tube.radius_mm <= poses.scene.least_mm
+    assert poses.tube.limits == replace(LIMITS, start_mm=poses.tube.limits.start_mm)
+
+
+def test_a_scene_far_from_the_tube_leaves_it_as_it_is():
+    far = Scene("PSM2_base", tissue=Tissue((0.0, 0.0, -150.0), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0), 5.0, ((0.0, 1.0),)))
+    poses = in_scene(far)
+    assert (poses.tube.radius_mm, poses.tube.limits) == (20.0, LIMITS)
+    assert poses.scene is not None and 20.0 < poses.scene.least_mm <= 30.0
+    nothing = in_scene(Scene("PSM2_base"))
+    assert (nothing.tube.limits, nothing.scene) == (LIMITS, None)
+    with pytest.raises(BadSettings, match="frame 'PSM1_base'"):
+        in_scene(replace(far, frame="PSM1_base"))
+
+
+def test_a_path_too_near_to_a_scene_is_not_certified():
+    poses = in_scene(Scene("PSM2_base", boxes=(BESIDE,), margin_mm=9.5))
+    assert not poses.tube.holds
+    (fault,) = poses.tube.faults
+    assert fault.startswith("The path comes within 0.5 mm of box 0 of the scene after phase 17, and a run that starts")
+
+
+def pushed(poses: CertifiedPoses, limits: TubeLimits, scene: Scene, towards_mm: np.ndarray) -> bool:
+    """Return whether one of 300 runs that are pushed towards a point at each tick touches the scene."""
+    rng = np.random.default_rng(5)
+    path, phases = poses.path, rng.integers(0, PHASES, 300)
+    way = towards_mm - path.tip_mm[phases]
+    way = way / np.linalg.norm(way, axis=1, keepdims=True) + 0.3 * unit(rng, 300)
+    tip = path.tip_mm[phases] + limits.start_mm * way / np.linalg.norm(way, axis=1, keepdims=True)
+    hands, touched = Hands(tip, path.rotation_xyzw[phases], phases), bool(scene.touches(tip, tip).any())
+    for _ in range(poses.tube.ticks):
+        sent = advance(path, hands, limits)
+        way = towards_mm - sent.tip_mm
+        length = np.linalg.norm(way, axis=1, keepdims=True)
+        reached = sent.tip_mm + limits.disturbance_mm * way / np.maximum(length, 1e-9)
+        touched |= bool(scene.touches(hands.tip_mm, reached).any())
+        hands = Hands(reached, sent.rotation_xyzw, sent.phases)
+    return touched
+
+
+@given(
+    places=st.lists(st.tuples(*[st.floats(-40, 40)] * 3), min_size=1, max_size=3),
+    size_mm=st.floats(0.5, 15),
+    margin_mm=st.sampled_from([0.0, 1.0]),
+)
+def test_no_run_in_a_narrowed_tube_touches_the_scene(
+    places: list[tuple[float, float, float]], size_mm: float, margin_mm: float
+):
+    middle = a_path().tip_mm.mean(axis=0)
+    corners = [middle + place for place in places]
+    boxes = tuple(Box(xyz(at), xyz(at + size_mm)) for at in corners)
+    scene = Scene("PSM2_base", boxes=boxes, margin_mm=margin_mm)
+    poses = in_scene(scene, a_path().tip_mm)
+    assert poses.scene is not None
+    assert poses.tube.holds == (poses.scene.least_mm >= LIMITS.disturbance_mm + 1e-9)
+    if poses.tube.holds:
+        assert not any(pushed(poses, poses.tube.limits, scene, at + size_mm / 2) for at in corners)
+
+
+def test_in_the_tube_that_is_not_narrowed_a_pushed_run_touches():
+    scene = Scene("PSM2_base", boxes=(BESIDE,))
+    poses, middle = in_scene(scene), np.array([30.0, 20.0, -120.0])
+    assert pushed(poses, LIMITS, scene, middle) and not pushed(poses, poses.tube.limits, scene, middle)
