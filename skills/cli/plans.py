@@ -325,6 +325,9 @@ def calibrate(
     tracker: Annotated[
         str | None, typer.Option(help="The topic of a bag with a tracker's positions of a marker on the tool.")
     ] = None,
+    cell_mm: Annotated[
+        float | None, typer.Option("--cell", help="Also measure the slip on a grid with cells of this size, in mm.")
+    ] = None,
     to: Annotated[
         Path | None, typer.Option(help="Write the errors to this JSON file, for `play --errors` and SKILLS_ARM_ERRORS.")
     ] = None,
@@ -337,16 +340,18 @@ def calibrate(
     from skills.library.arm_errors import read_measured
     from skills.packing import canonical
     from skills.verification.arm_errors import calibrate_arm
+    from skills.verification.arm_slip import measure_slip
 
     try:
         measured = read_measured(bag, arm=arm, instrument=instrument, rate_hz=rate_hz, tracker=tracker)
         found = calibrate_arm(measured, name=name)
+        slip = None if cell_mm is None else measure_slip(measured, cell_mm)
         if to is not None:
             to.write_bytes(canonical(plain(found.errors)) + b"\n")
     except OSError as error:
         raise BadInput(f"{error.filename}: {error.strerror}.", "Give a file that can be read, or written.") from None
     if as_json:
-        print_json(plain(found))
+        print_json(plain(found) | ({} if slip is None else {"slip": plain(slip)}))
         return
     names = ("error", "mean", "deviation", "independent", "band 90 %", "held", "width", "assumed holds", "width")
     table = Table(*names, box=None)
@@ -365,3 +370,5 @@ def calibrate(
     out.print(table)
     out.print(found.in_words, markup=False, soft_wrap=True)
     out.print(f"{found.errors.name}: {found.errors.in_words}", markup=False, soft_wrap=True)
+    if slip is not None:
+        out.print(slip.in_words, markup=False, soft_wrap=True)

@@ -351,11 +351,11 @@ def farthest_mm(walks: Walks) -> Floats:
     return np.asarray(nearest[walks.states].max(axis=0))
 
 
-def wilson(count: int, of: int) -> tuple[float, float]:
+def wilson(count: float, of: float) -> tuple[float, float]:
     """Return the score interval of a share at 95 % (Wilson, "Probable inference", JASA 1927).
 
     Args:
-        count: Number of successes.
+        count: Number of successes; no whole number, where trials count as fewer independent ones.
         of: Number of trials, at least 1.
 
     Returns:

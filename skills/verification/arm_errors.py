@@ -442,16 +442,13 @@ def calibrate_arm(measured: MeasuredArm, *, name: str, blocks: int = BLOCKS) -> 
         BadInput: The samples hold too few independent ones.
         BadSettings: The name is not possible.
     """
-    encoders_mm = measured.measured_mm - measured.setpoint_mm
+    encoders_mm = encoder_errors_mm(measured, blocks)
     turns_deg = np.degrees(_vectors(np.swapaxes(measured.setpoint, 1, 2) @ measured.measured))
-    _check_number(encoders_mm, blocks)
     assumed_mm = sqrt(CALIBRATED.tip_bias_mm**2 + CALIBRATED.tip_noise_mm**2)
     tip = _axes(encoders_mm, "mm", blocks, assumed_mm)
     tracked = None
     if measured.marker_mm is not None:
-        tracked_mm = _tracked_mm(measured, measured.marker_mm)
-        _check_number(tracked_mm, blocks)
-        tracked = _axes(tracked_mm, "mm", blocks, assumed_mm)
+        tracked = _axes(tracked_errors_mm(measured, blocks), "mm", blocks, assumed_mm)
     correlation_s = None if measured.stamps_s is None else _correlation_s(encoders_mm, measured.stamps_s)
     calibration = ArmCalibration(
         samples=len(encoders_mm),
@@ -464,6 +461,30 @@ def calibrate_arm(measured: MeasuredArm, *, name: str, blocks: int = BLOCKS) -> 
         errors=UNCALIBRATED,
     )
     return replace(calibration, errors=_stated(calibration, encoders_mm, name))
+
+
+def encoder_errors_mm(measured: MeasuredArm, blocks: int = BLOCKS) -> Floats:
+    """Return the errors of the tip in the base frame by the encoders, (N, 3).
+
+    Raises:
+        BadInput: The samples hold too few independent ones.
+    """
+    errors_mm = np.asarray(measured.measured_mm - measured.setpoint_mm)
+    _check_number(errors_mm, blocks)
+    return errors_mm
+
+
+def tracked_errors_mm(measured: MeasuredArm, blocks: int = BLOCKS) -> Floats:
+    """Return the errors of the tip in the base frame by the tracker, (N, 3).
+
+    Raises:
+        BadInput: There is no tracker, or the samples hold too few independent ones.
+    """
+    if measured.marker_mm is None:
+        raise BadInput("The recording has no tracker.")
+    errors_mm = _tracked_mm(measured, measured.marker_mm)
+    _check_number(errors_mm, blocks)
+    return errors_mm
 
 
 def _stated(found: ArmCalibration, encoders_mm: Floats, name: str) -> ArmErrors:

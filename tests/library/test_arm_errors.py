@@ -17,6 +17,7 @@ from skills.formats.bag_writer import Message, write_messages
 from skills.kinematics import forward, quaternion_of
 from skills.library.arm_errors import read_measured, stated_errors
 from skills.verification.arm_errors import SIZES, UNCALIBRATED, MeasuredArm, calibrate_arm, rotation_of
+from skills.verification.arm_slip import measure_slip
 from tests.formats.bags import sample_folder
 from tests.verification.test_arm_errors import lasting, recorded
 
@@ -94,6 +95,14 @@ def test_a_published_recording_has_bands_that_hold_what_they_say():
     assert np.mean([one.assumed_coverage for one in found.tracked]) < 0.5
     assert np.mean([one.coverage for one in found.tracked]) == pytest.approx(0.9, abs=0.05)
     assert "of the encoders and not of the tip" in found.in_words
+
+
+def test_a_published_recording_slips_in_small_cells_alone():
+    measured = read_measured(sample_folder() / "calibration" / "raw_sensor_rosbag_09_traj3.csv")
+    small, paper = measure_slip(measured, 0.5), measure_slip(measured, 5.0)
+    assert small.slip == pytest.approx(0.565, abs=0.01) and 5 < small.effective < 7
+    assert paper.slip == 0.0 and paper.interval[1] == pytest.approx(0.41, abs=0.01)
+    assert paper.tip_elsewhere == pytest.approx(0.176, abs=0.01)  # of the tip, by the tracker
 
 
 def test_a_bag_gives_what_was_put_in(tmp_path: Path):
@@ -175,7 +184,12 @@ def test_the_command_writes_errors_that_a_playback_takes(tmp_path: Path):
     stated = stated_errors(to.read_text())
     assert (stated.name, set(stated.sources)) == ("bench 3", set(SIZES))
     ran = CliRunner().invoke(app, ["calibrate-arm", str(file), "--json"])
-    assert json.loads(ran.output)["samples"] >= 1499
+    assert json.loads(ran.output)["samples"] >= 1499 and "slip" not in json.loads(ran.output)
+    ran = CliRunner().invoke(app, ["calibrate-arm", str(file), "--cell", "5"])
+    assert ran.exit_code == 0 and "In cells of 5 mm" in ran.output and "--setting slip=0`" in ran.output
+    ran = CliRunner().invoke(app, ["calibrate-arm", str(file), "--cell", "5", "--json"])
+    assert json.loads(ran.output)["slip"]["slip"] == 0.0
+    assert CliRunner().invoke(app, ["calibrate-arm", str(file), "--cell", "0"]).exit_code == 1
     few = CliRunner().invoke(app, ["calibrate-arm", str(table(tmp_path / "few.csv"))])
     assert few.exit_code == 1
     assert CliRunner().invoke(app, ["calibrate-arm", str(tmp_path / "none.bag")]).exit_code == 1
