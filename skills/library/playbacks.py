@@ -119,8 +119,14 @@ def costs_most(report: dict[str, Any]) -> str | None:
     if not costs:
         return None
     first, whole = costs[0], doubted["under"][0]["plan"]
+    if whole["count"] == whole["of"]:
+        return "No error lowers this."
     if first["without"]["count"] <= whole["count"]:
-        return "No error by itself lowers this."
+        shift_mm = doubted.get("settings", {}).get("suture_point_mm")
+        beside = f"the suture point's shift of up to {shift_mm:g} mm along each axis, or " if shift_mm else ""
+        return (
+            f"Without any single error of the arms it is not more: the rest is lost by {beside}several errors together."
+        )
     share = _percent(first["without"]["probability"])
     well = "succeed" if counted_as(doubted["under"][0]) == "hand-over" else "stay clear"
     return f"Most is lost by {error_called(first['error'])}: without it {share} of the worlds {well}."

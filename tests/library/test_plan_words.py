@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from skills.library.plans import hands_over, plan_in_words
-from skills.library.playbacks import headline
+from skills.library.playbacks import costs_most, headline
 from skills.verification.arm_errors import CALIBRATED, UNCALIBRATED
 from skills.verification.monte_carlo import doubt
 from skills.verification.probabilities import JUDGE_VERSION, DoubtSettings
@@ -136,6 +136,31 @@ def test_without_a_hand_off_no_error_is_said_to_cost_success():
     report = {"feasible": True, "doubt": {"version": JUDGE_VERSION, "under": [under], "costs": [cost]}}
     line = headline(about(1), report, errors=CALIBRATED, lower_bound=0.95)
     assert line["costs_most"].endswith("without it 100.0 % of the worlds stay clear.")
+
+
+@pytest.mark.parametrize(
+    ("count", "without", "shift_mm", "words"),
+    [
+        (20, 20, 5.0, "No error lowers this."),
+        (15, 16, 5.0, "Most is lost by "),
+        (
+            15,
+            15,
+            5.0,
+            "it is not more: the rest is lost by the suture point's shift of up to 5 mm along each axis, or sev",
+        ),
+        (15, 15, 0.0, "it is not more: the rest is lost by several errors together."),
+    ],
+)
+def test_what_lowers_a_probability_is_named_also_if_it_is_no_error_of_the_arms(count, without, shift_mm, words):
+    def some(count: int) -> dict[str, Any]:
+        return {"count": count, "of": 20, "probability": count / 20, "lower": 0.5, "upper": 1.0}
+
+    under = {"errors": asdict(CALIBRATED), "plan": some(count), "passes": [{"faults": {"place": None}}]}
+    costs = [{"error": "tip_bias_mm", "without": some(without)}]
+    settings = {"suture_point_mm": shift_mm}
+    report = {"doubt": {"version": JUDGE_VERSION, "under": [under], "costs": costs, "settings": settings}}
+    assert words in (costs_most(report) or "")
 
 
 def test_an_error_that_was_not_judged_is_said_and_not_good():
