@@ -27,7 +27,9 @@ from typing import Any
 import orjson
 from anyio import to_thread
 from pydantic import ValidationError
+from sqlalchemy import String, bindparam, func, select, type_coerce
 from sqlalchemy.exc import SQLAlchemyError
+from sqlalchemy.orm import aliased
 from starlette.types import Scope
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
@@ -35,8 +37,8 @@ from skills.api.authentication import Bucket
 from skills.api.authorisation import Caller
 from skills.api.dependencies import strictly_read
 from skills.api.responses import json_of
-from skills.db.changes import Changes
-from skills.db.models import Release
+from skills.db.changes import Changes, Unasked
+from skills.db.models import PolicyVersion, Release, Surgeon
 from skills.db.session import Database
 from skills.errors import Busy, SkillsError, TooMany
 from skills.fields import as_json
@@ -61,6 +63,25 @@ WITHDRAWN, ERASED, FORBIDDEN, SIGNED_OUT, IDLE, FLOODED, BUSY = 4404, 4410, 4403
 NO_JSON, NO_TEXT = 1007, 1003  # of RFC 6455
 UNWATCHED = "The service cannot see a withdrawal; open the session again."
 UNREADABLE = "The database cannot be read, so a withdrawal would not be seen; open the session again."
+
+
+# The columns by which `_look` judges a release, and the newest release of its style that stands.
+_NEWER = aliased(Release)
+JUDGED = (
+    select(
+        type_coerce(Release.released_at, String).label("released_at"),
+        type_coerce(Release.withdrawn_at, String).label("withdrawn_at"),
+        PolicyVersion.sha256,
+        consent.AS_TEXT.label("consent"),
+        select(func.max(_NEWER.row))
+        .where(_NEWER.surgeon_row == Release.surgeon_row, _NEWER.suture == Release.suture)
+        .where(_NEWER.withdrawn_at.is_(None))
+        .scalar_subquery(),
+    )
+    .join(Surgeon, Surgeon.row == Release.surgeon_row)
+    .join(PolicyVersion, PolicyVersion.row == Release.policy_row)
+    .where(Release.row == bindparam("release"))
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,6 +161,7 @@ class Sessions:
         self._of_key: Counter[str] = Counter()
         self._watching: list[asyncio.Task[None]] = []
         self._version: int | None = None  # of the database at the last look
+        self._rows_seen: dict[Pinned, tuple[Any, ...] | None] | None = None  # and the rows that it judged
         self._known_s = 0.0  # when the last look began that was answered
 
     @property
@@ -266,16 +288,16 @@ class Sessions:
             # Read before the tables, so that a commit in between is not missed.
             version = self._changes.version()
             looking = set(self._open)
-            if version is None or version != self._version:
+            pinned = {one.pinned for one in looking}
+            rows = None if version is None or version == self._version else await self._rows(pinned)
+            if version is not None and (version == self._version or (rows is not None and rows == self._rows_seen)):
+                self._version, self._known_s = version, began_s
+            else:
                 with suppress(SkillsError, SQLAlchemyError, TimeoutError):
                     async with asyncio.timeout(UNKNOWN_S):
-                        found = await to_thread.run_sync(
-                            _look, self._database, {one.pinned for one in looking}, abandon_on_cancel=True
-                        )
-                    self._version, self._known_s = version, began_s
+                        found = await to_thread.run_sync(_look, self._database, pinned, abandon_on_cancel=True)
+                    self._version, self._known_s, self._rows_seen = version, began_s, rows
                     _tell(looking, found)
-            else:
-                self._known_s = began_s
             for one in looking:
                 if monotonic() - self._known_s > UNKNOWN_S:
                     one.end(BUSY, UNREADABLE)
@@ -283,6 +305,21 @@ class Sessions:
                     one.end(FORBIDDEN, "The surgeon's consent has ended.")
                 elif monotonic() - one.heard_s > self._idle_s:
                     one.end(IDLE, f"No message for {self._idle_s:g} s.")
+
+    async def _rows(self, pinned: set[Pinned]) -> dict[Pinned, tuple[Any, ...] | None] | None:
+        """Return all of which `_look` judges, read on the event loop; None where that takes longer than microseconds.
+
+        On SQLite every commit changes the version, also a worker's heartbeat, and a thread at each of them would hold
+        up the answers.
+        """
+        rows = {}
+        try:
+            for one in pinned:
+                rows[one] = self._changes.first(JUDGED, {"release": one.release})
+                await asyncio.sleep(0)  # the answers that are due meanwhile
+        except Unasked:
+            return None
+        return rows
 
     async def _watch_callers(self) -> None:
         """End the sessions of callers who may not use them any more."""

@@ -1,12 +1,16 @@
 """Sessions of pose styles: poses in, next poses out, and the reasons for which one is refused or closed."""
 
 import json
+import sqlite3
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from pathlib import Path
+from threading import get_ident
+from time import sleep
 from typing import Any
 
 import pytest
+from sqlalchemy import event
 from starlette.testclient import WebSocketDenialResponse, WebSocketTestSession
 from starlette.websockets import WebSocketDisconnect
 
@@ -236,3 +240,21 @@ def test_who_may_not_open_one_is_refused_before_it_opens(posed: Service):
 def test_a_session_that_nobody_uses_is_closed(tmp_path: Path):
     with serving(of_pose_style("sqlite", tmp_path), session_idle_s=0.3) as service, opened(service) as socket:
         assert closed(socket) == (IDLE, "No message for 0.3 s.")
+
+
+def test_commits_of_others_do_not_make_sessions_read_in_a_thread(tmp_path: Path):
+    with serving(of_pose_style("sqlite", tmp_path)) as service, opened(service) as socket:
+        socket.receive_json()
+        sleep(3 * sessions.WATCH_S)  # the first look
+        threads: list[int] = []
+        event.listen(service.database.engine, "checkout", lambda *_: threads.append(get_ident()))
+        other = sqlite3.connect(service.database.engine.url.database, isolation_level=None)
+        other.execute("CREATE TABLE beats (n INTEGER)")
+        for n in range(10):
+            other.execute("INSERT INTO beats VALUES (?)", (n,))
+            sleep(sessions.WATCH_S / 2)
+        other.close()
+        assert threads == []
+        service.client.withdraw(**KESTREL)
+        assert closed(socket)[0] == WITHDRAWN
+        assert threads
