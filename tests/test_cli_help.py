@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import make_dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -13,8 +14,9 @@ from typer.main import get_command
 from typer.testing import CliRunner
 
 from skills.cli import app
-from skills.cli.policies import PHASED
+from skills.cli.policies import DEFAULT_LEARNER, _learner
 from skills.cli.shell import complete_surgeons, complete_sutures
+from skills.errors import BadInput
 from skills.learning.policy import LEARNERS
 from skills.settings import settings
 from tests.by_day import some
@@ -145,8 +147,15 @@ def test_tab_is_silent_if_a_library_is_still_at_work_when_time_is_up() -> None:
     assert (ended.returncode, ended.stdout, ended.stderr) == (0, "[]\n", "")
 
 
-def test_the_commands_know_every_learner_that_has_a_joining_rule() -> None:
-    assert set(PHASED) == {kind for kind, learner in LEARNERS.items() if learner.phased}
+def test_the_joining_option_is_for_every_learner_that_has_such_a_rule(monkeypatch: pytest.MonkeyPatch) -> None:
+    added = make_dataclass("Added", [("join_share", float, 0.0)], frozen=True)
+    monkeypatch.setitem(LEARNERS, "added", added)  # as by somebody who adds a learner, and names it nowhere else
+    for kind in (DEFAULT_LEARNER, "value-iteration", "added"):
+        assert _learner(kind, [], "0.5") == {"kind": kind, "join_share": 0.5}
+    for kind in ("cell-q-learning", "dqn", "unknown"):
+        with pytest.raises(BadInput, match=f"{kind} has no phases") as refused:
+            _learner(kind, [], "0.5")
+        assert "phase-q-learning, value-iteration, added" in str(refused.value.remedies)
 
 
 @pytest.mark.parametrize("of", [6, pytest.param(1, marks=pytest.mark.nightly)])

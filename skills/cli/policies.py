@@ -3,6 +3,7 @@
 import hashlib
 import json
 import time
+from dataclasses import fields
 from math import degrees, nan
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -64,7 +65,6 @@ OneVersion = Annotated[
 TheVersion = Annotated[int, typer.Argument(help="The number of the version.")]
 JOINING = {"nearest": 0.0, "start": 1.0}
 DEFAULT_LEARNER = "phase-q-learning"
-PHASED = (DEFAULT_LEARNER, "value-iteration")  # the learners that have a joining rule; a test compares them with all
 
 
 @learning_commands.command()
@@ -175,12 +175,20 @@ def _learner(kind: str | None, settings: list[str], join: str | None) -> dict[st
         return None
     learner: dict[str, Any] = {"kind": kind or DEFAULT_LEARNER}
     if join is not None:
-        if learner["kind"] not in PHASED:
+        joining = _joining()
+        if learner["kind"] not in joining:
             raise BadInput(
-                f"The learner {kind} has no phases, so no joining rule.", f"Name one of {', '.join(PHASED)}."
+                f"The learner {kind} has no phases, so no joining rule.", f"Name one of {', '.join(joining)}."
             )
         learner["join_share"] = _join_share(join)
     return learner | _settings("--setting", settings)
+
+
+def _joining() -> list[str]:
+    """Return the kinds of the learners that have a joining rule."""
+    from skills.learning.policy import LEARNERS  # at first use: the other commands start without the learning core
+
+    return [kind for kind, learner in LEARNERS.items() if any(one.name == "join_share" for one in fields(learner))]
 
 
 def _settings(option: str, settings: list[str]) -> dict[str, Any]:
