@@ -125,7 +125,7 @@ def test_from_a_bag_folder_to_a_released_policy_and_a_plan(skills, tmp_path: Pat
     code, said = skills("train", *STYLE, "--join", "sometimes")
     assert (code, "Write nearest, start, or a share from 0 to 1" in said) == (1, True)
     code, said = skills("train", *STYLE, "--join", "start", "--learner", "cell-q-learning")
-    assert (code, "cell-q-learning has no phases" in said) == (1, True)
+    assert (code, "cell-q-learning has no joining rule" in said) == (1, True)
     code, said = skills("train", *STYLE, "--learner", "cell-q-learning", "--setting", "gamma=0.95")
     assert (code, "use a gamma below 0.9" in said) == (1, True)
     (tmp_path / "scene.json").write_text(json.dumps(Scene(added["frame"], margin_mm=0.5).as_json()))

@@ -152,8 +152,9 @@ def test_the_joining_option_is_for_every_learner_that_has_such_a_rule(monkeypatc
     monkeypatch.setitem(LEARNERS, "added", added)  # as by somebody who adds a learner, and names it nowhere else
     for kind in (DEFAULT_LEARNER, "value-iteration", "added"):
         assert _learner(kind, [], "0.5") == {"kind": kind, "join_share": 0.5}
-    for kind in ("cell-q-learning", "dqn", "unknown"):
-        with pytest.raises(BadInput, match=f"{kind} has no phases") as refused:
+    monkeypatch.setitem(LEARNERS, "phased", make_dataclass("Phased", [], namespace={"phased": True, "join_share": 0.0}))
+    for kind in ("cell-q-learning", "dqn", "unknown", "phased"):
+        with pytest.raises(BadInput, match=f"{kind} has no joining rule") as refused:
             _learner(kind, [], "0.5")
         assert "phase-q-learning, value-iteration, added" in str(refused.value.remedies)
 

@@ -177,9 +177,7 @@ def _learner(kind: str | None, settings: list[str], join: str | None) -> dict[st
     if join is not None:
         joining = _joining()
         if learner["kind"] not in joining:
-            raise BadInput(
-                f"The learner {kind} has no phases, so no joining rule.", f"Name one of {', '.join(joining)}."
-            )
+            raise BadInput(f"The learner {kind} has no joining rule.", f"Name one of {', '.join(joining)}.")
         learner["join_share"] = _join_share(join)
     return learner | _settings("--setting", settings)
 
