@@ -80,6 +80,6 @@ class Installation(Service):
 
 
 def _alike(line: dict[str, Any]) -> str:
-    message = re.sub(r"/[\w./-]+", "PATH", line["message"])
+    message = re.sub(r"(?<!\w)/[\w./-]+", "PATH", line["message"])
     message = re.sub(r"\b[0-9a-f-]*[0-9][0-9a-f-]*\b", "#", message)[:SAID].strip()
     return f"{line['level']}: {message}" + (f" ({line['error']})" if "error" in line else "")
