@@ -1,12 +1,15 @@
 """The command line itself: its help, the version, and completion in a shell."""
 
+import json
 import os
 import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import make_dataclass
+from http.server import BaseHTTPRequestHandler, HTTPServer
 from importlib.metadata import version
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 import pytest
@@ -168,3 +171,52 @@ def test_every_command_explains_each_option_within_eighty_columns(of: int) -> No
         result = CliRunner().invoke(app, [*path, "--help"], terminal_width=80, env={"COLUMNS": "80"})
         assert result.exit_code == 0, result.output
         assert [line for line in result.output.splitlines() if len(line) > 80 or "…" in line] == [], path
+
+
+@pytest.fixture
+def elsewhere(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """Yield the address of a stand-in for a service, which is ready and has one layer of containment."""
+
+    class Answers(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            said = json.dumps({"status": "ready", "workers": 3, "containment": {"own network": True}}).encode()
+            self.send_response(200 if self.path == "/readyz" else 404)
+            self.send_header("Content-Type", "application/json")
+            self.send_header("Content-Length", str(len(said)))
+            self.end_headers()
+            self.wfile.write(said)
+
+        def log_message(self, *_: object) -> None:
+            pass
+
+    with HTTPServer(("127.0.0.1", 0), Answers) as server:
+        thread = Thread(target=server.serve_forever)
+        thread.start()
+        address = f"http://127.0.0.1:{server.server_port}"
+        monkeypatch.setenv("SKILLS_SERVER", address)
+        settings.cache_clear()
+        yield address
+        server.shutdown()
+        thread.join()
+    settings.cache_clear()
+
+
+def test_the_doctor_asks_the_service_that_is_set_and_nothing_here(skills, tmp_path: Path, elsewhere: str) -> None:
+    (tmp_path / "skills.sqlite").unlink()
+    code, said = skills("doctor", "--json")
+    checks = {one["check"]: (one["state"], one["remark"]) for one in json.loads(said)}
+    assert code == 0
+    assert checks[f"service at {elsewhere}"] == ("ok", "live workers: 3")
+    assert checks["containment: own network"] == ("ok", "")
+    assert {state for state, _ in checks.values()} == {"ok", "missing"}
+    assert not (tmp_path / "skills.sqlite").exists()
+
+
+def test_the_doctor_fails_where_the_service_does_not_answer(skills, tmp_path: Path, monkeypatch) -> None:
+    (tmp_path / "skills.sqlite").unlink()
+    monkeypatch.setenv("SKILLS_SERVER", "http://127.0.0.1:9")
+    settings.cache_clear()
+    code, said = skills("doctor", "--json")
+    (check,) = json.loads(said)
+    assert (code, check["check"], check["state"]) == (1, "service at http://127.0.0.1:9", "failed")
+    assert not (tmp_path / "skills.sqlite").exists()

@@ -1,35 +1,16 @@
 """`skills score` and `skills calibrate`, on the application in this process."""
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
-from skills.cli import app
 from skills.seeds.recordings import sample_recordings
-from skills.settings import settings
-from tests import backends
 from tests.library import rated
 
 STYLE = ("--surgeon", "kestrel", "--suture", "simple-running")
 Run = Callable[..., tuple[int, str]]
-
-
-@pytest.fixture
-def skills(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Run]:
-    """Yield a function that runs a command on a separate database and returns its exit code and its output."""
-    monkeypatch.setenv("SKILLS_DATABASE_URL", backends.place(tmp_path / "skills.sqlite"))
-    monkeypatch.delenv("SKILLS_SERVER", raising=False)
-    settings.cache_clear()
-
-    def run(*words: str) -> tuple[int, str]:
-        result = CliRunner().invoke(app, list(words))
-        return result.exit_code, result.output
-
-    yield run
-    settings.cache_clear()
 
 
 def test_a_file_is_scored_by_its_proposed_hand_off(skills: Run, tmp_path: Path) -> None:

@@ -309,25 +309,43 @@ def public_key(
 def doctor(as_json: AsJson = False) -> None:
     """Check what this installation needs to work, and which layers contain its readers; exit code 1 if a check fails.
 
-    A layer of containment that is missing fails only with SKILLS_CONTAINMENT=required.
+    A layer of containment that is missing fails only with SKILLS_CONTAINMENT=required. With SKILLS_SERVER the service
+    there is asked, and nothing here is checked.
     """
     from skills.jobs.readiness import refuse_unready
     from skills.sandbox.containment import LAYERS
     from skills.sandbox.forked import layers_held
     from skills.settings import settings
 
-    try:
-        database, said = "ok", f"live workers: {refuse_unready(settings())}"
-    except SkillsError as error:
-        database, said = "failed", str(error)
-    checks = [{"check": "databases and workers", "state": database, "remark": said}]
-    held, without = layers_held(), "failed" if settings().containment == "required" else "missing"
+    held: tuple[str, ...] | None
+    if settings().server:
+        checks, held, without = *_there(f"service at {settings().server}"), "missing"
+    else:
+        try:
+            state, remark = "ok", f"live workers: {refuse_unready(settings())}"
+        except SkillsError as error:
+            state, remark = "failed", str(error)
+        checks = [{"check": "databases and workers", "state": state, "remark": remark}]
+        held, without = layers_held(), "failed" if settings().containment == "required" else "missing"
     for name, needs in LAYERS.items():
+        if held is None:
+            break
         state, remark = ("ok", "") if name in held else (without, f"needs {needs}")
         checks.append({"check": f"containment: {name}", "state": state, "remark": remark})
     show(checks, as_json, ("check", "state", "remark"))
     if any(one["state"] == "failed" for one in checks):
         raise typer.Exit(1)
+
+
+def _there(name: str) -> tuple[list[dict[str, str]], tuple[str, ...] | None]:
+    """Return the check of the service at SKILLS_SERVER, and the layers that hold there; None if it does not answer."""
+    try:
+        with service() as client:
+            ready = client.ready()
+    except SkillsError as error:
+        return [{"check": name, "state": "failed", "remark": str(error)}], None
+    said = [{"check": name, "state": "ok", "remark": f"live workers: {ready.workers}"}]
+    return said, tuple(layer for layer, holds in ready.containment.items() if holds)
 
 
 def _without_password(source: str) -> str:

@@ -107,8 +107,8 @@ def posed(stored: StoredPoses) -> CertifiedPoses:
         poses = stored.poses
         if poses_identity_of(policy, digest(poses)) != stored.sha256:
             raise Corrupt("A stored pose style does not match its digest; restore it from a backup or train again.")
-        if "scene" in stored.policy.manifest and (there := learnt(stored.policy).surroundings) is not None:
-            poses = clear_tube(poses, there.scene)
+        if "scene" in stored.policy.manifest and (scene := learnt_in(stored.policy)) is not None:
+            poses = clear_tube(poses, scene)
         _poses.put(policy, (stored.sha256, poses))
     return poses
 

@@ -26,7 +26,7 @@ from tests import backends
 from tests.api.conformance import conformance
 from tests.api.service import KESTREL, POLICY, Service, assert_problem, serving
 from tests.jobs.house import House
-from tests.waiting import END_S, crowded
+from tests.waiting import END_S, crowded, until
 
 CANARY = "canary-7f3a91"
 LEASE_S, SHORT_S = END_S, 0.5  # a heartbeat that the test writes once lasts for the test; a silence is waited for
@@ -305,6 +305,21 @@ def test_jobs_workers_and_the_database_have_their_figures(trained: Service):
     assert found["skills_database_connections_open"] >= 1
     assert any(name.startswith("skills_build_info") for name in found)
     assert found["process_open_fds"] > 0
+
+
+def test_of_many_jobs_a_scrape_has_the_number_of_the_one_before(trained: Service, monkeypatch: pytest.MonkeyPatch):
+    def succeeded() -> float:
+        return figures(trained.http.get("/metrics").text)["skills_jobs,kind=training,state=succeeded"]
+
+    first = succeeded()
+    monkeypatch.setattr("skills.api.metrics.MANY_JOBS", 1)
+    assert succeeded() == first
+    trained.train(seed=2)
+    assert succeeded() == first  # and counts again, in a thread
+    until(lambda: succeeded() == first + 1)
+    monkeypatch.undo()
+    trained.train(seed=3)
+    until(lambda: succeeded() == first + 2)
 
 
 def test_an_installation_without_jobs_has_figures_too(service: Service):
