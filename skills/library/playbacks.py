@@ -119,8 +119,8 @@ def costs_most(report: dict[str, Any]) -> str | None:
     if not costs:
         return None
     first, whole = costs[0], doubted["under"][0]["plan"]
-    if whole["count"] == whole["of"]:
-        return "No error lowers this."
+    if whole["count"] == whole.get("of"):
+        return "No error by itself lowers this."
     if first["without"]["count"] <= whole["count"]:
         shift_mm = doubted.get("settings", {}).get("suture_point_mm")
         beside = f"the suture point's shift of up to {shift_mm:g} mm along each axis, or " if shift_mm else ""

@@ -21,7 +21,7 @@ from skills.db.session import Database
 from skills.jobs.workflows import Leases, Watch
 from skills.library import catalogue, demos, jobs, policies
 from skills.library.jobs import BATCH
-from skills.library.overview import condition_of
+from skills.library.overview import condition_of, count_jobs
 from skills.library.retraining import choose_styles, list_styles
 from skills.library.training import request_training
 from skills.schemas.requests import RetrainingIn, TrainingIn
@@ -171,7 +171,7 @@ CALLS: dict[str, Call] = {
     "jobs that succeeded": lambda s, _: jobs.list_jobs(s, PAGE, None, "succeeded"),
     "jobs that failed": lambda s, _: jobs.list_jobs(s, PAGE, None, "failed"),
     "a page of a batch's styles": lambda s, _: list_styles(s, last_batch(s), PAGE, None, None),
-    "the figures of /metrics": lambda s, _: condition_of(s, LEASE_S),
+    "the figures of /metrics": lambda s, _: (condition_of(s, LEASE_S), count_jobs(s)),
 }
 
 

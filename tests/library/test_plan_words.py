@@ -141,7 +141,7 @@ def test_without_a_hand_off_no_error_is_said_to_cost_success():
 @pytest.mark.parametrize(
     ("count", "without", "shift_mm", "words"),
     [
-        (20, 20, 5.0, "No error lowers this."),
+        (20, 20, 5.0, "No error by itself lowers this."),
         (15, 16, 5.0, "Most is lost by "),
         (
             15,
