@@ -192,6 +192,9 @@ COPIES = (
 )
 LEAST_VOTE = 1e-3  # probability: no single hand-off decides a vote by ruling a surgeon out
 LEAST = float(np.finfo(float).tiny)
+# A surgeon's own repetitions are several standard deviations apart. A copy's distance is the rounding of a difference,
+# from 0 to 1e-12 by the processor, and its logarithm would outweigh all others.
+NEAREST = 1.0
 
 
 @dataclass(frozen=True)
@@ -436,7 +439,7 @@ def recognise(
     other = sessions != sessions[one]
     truth = np.searchsorted(validated.surgeons, surgeons[other])
     metric = fit(signatures[other], truth, len(validated.surgeons), validated.settings)
-    near = np.log(metric.nearest(signatures[recordings == recordings[one]]).clip(LEAST)).mean()
+    near = np.log(metric.nearest(signatures[recordings == recordings[one]]).clip(NEAREST)).mean()
     probability = probabilities(metric.away(signatures[[one]]), validated.temperature)[0]
     return np.asarray(probability), float(_logistic(validated.telling, near))
 
@@ -466,8 +469,8 @@ def _tell_strangers(
         other = ~mine & ~np.isin(sessions, sessions[mine])  # as for a known surgeon, not even another's of that session
         other = other if other.any() else ~mine
         strange[mine] = fit(signatures[other], truth[other], surgeons, settings).nearest(signatures[mine])
-    near = _means(np.log(near[tested].clip(LEAST)), recordings[tested])
-    strange = _means(np.log(strange.clip(LEAST)), recordings)
+    near = _means(np.log(near[tested].clip(NEAREST)), recordings[tested])
+    strange = _means(np.log(strange.clip(NEAREST)), recordings)
     known, unknown = np.empty(len(near)), np.empty(len(strange))
     for one in range(surgeons):
         of_known, of_unknown = truth[tested] == one, truth == one

@@ -120,22 +120,28 @@ def test_copies_are_refused_for_the_median_distance_of_0():
 def test_recognition_of_an_untestable_demo_ignores_its_own_session():
     drawn = cohort(1)
     numbers = signatures(drawn)
-    numbers = np.append(
-        numbers, numbers[[7]], axis=0
-    )  # a motion of surgeon 1 under another name, once in another session
+    # A motion of surgeon 1 under another name, in another session and then in the same one.
+    numbers = np.append(numbers, numbers[[7]], axis=0)
     stranger = np.append(drawn.surgeons, 99)
-    own, none = recognised(numbers, stranger, np.append(drawn.sessions, 99))
-    assert own.argmax() == 1 and own[1] > 0.9 and none < 0.2
+    apart, together = np.append(drawn.sessions, 99), np.append(drawn.sessions, drawn.sessions[7])
+    recordings, last = np.arange(len(stranger)), len(stranger) - 1
+    validated = validate(numbers, stranger, apart, recordings)
+    own, none = recognise(numbers, stranger, apart, recordings, last, validated)
+    assert own.argmax() == 1 and own[1] > 0.9
     assert own[-1] == 0.0  # that name occurs in no other session
     assert own.sum() == pytest.approx(1.0)
-    together = np.append(drawn.sessions, drawn.sessions[7])  # ... and once in the same one
-    beside, none_beside = recognised(numbers, stranger, together)
+    beside, none_beside = recognise(numbers, stranger, together, recordings, last, validated)
     assert beside[1] < own[1] and none_beside > none
 
 
-def recognised(numbers: np.ndarray, surgeons: np.ndarray, sessions: np.ndarray) -> tuple[np.ndarray, float]:
-    given = numbers, surgeons, sessions, np.arange(len(surgeons))
-    return recognise(*given, len(surgeons) - 1, validate(*given))
+def test_a_copy_under_another_name_hides_no_stranger():
+    """The distance of a copy is 0 but for rounding; its logarithm once outweighed those of all other surgeons."""
+    drawn = cohort(1)
+    numbers = signatures(drawn)
+    numbers = np.append(numbers, numbers[[7]], axis=0)
+    found = validate(numbers, np.append(drawn.surgeons, 99), np.append(drawn.sessions, 99), np.arange(len(numbers)))
+    without = validate(numbers[:-1], drawn.surgeons, drawn.sessions, np.arange(len(drawn.surgeons)))
+    assert found.telling[1] > 0.5 * without.telling[1] > 0.0
 
 
 def test_one_that_was_tested_is_recognised_as_it_was():
