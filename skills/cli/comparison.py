@@ -65,9 +65,12 @@ def atlas(
 
 def _tables(found: "Atlas") -> None:
     surgeons = [
-        one.model_dump() | {"medoid": one.medoid[:SHORT], "consistency": _rounded(one.spread)} for one in found.surgeons
+        one.model_dump()
+        | {"medoid": one.medoid[:SHORT], "consistency": _rounded(one.spread)}
+        | {"share": None if one.mean_share is None else f"{one.mean_share:.0%}"}
+        for one in found.surgeons
     ]
-    show(surgeons, False, ("surgeon", "demos", "recordings", "sessions", "consistency", "medoid"))
+    show(surgeons, False, ("surgeon", "demos", "recordings", "sessions", "consistency", "share", "medoid"))
     clusters = [
         {
             "cluster": one.cluster,

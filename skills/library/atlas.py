@@ -56,6 +56,7 @@ from skills.library.catalogue import find_suture_type
 from skills.library.consent import require
 from skills.library.demos import find_demo
 from skills.library.members import Member, members_of, sessions_of, without_overlaps
+from skills.library.releases import shares_served
 from skills.library.whose import recognise_arms, recognitions, votes, whose
 from skills.schemas.comparison import (
     Apartness,
@@ -326,7 +327,7 @@ def atlas_of(
         shapes, far = np.array([in_lengths(shape) for shape in apart.shapes_mm]), apart.apart_scaled
     else:
         shapes, far = apart.shapes_mm, apart.apart_mm
-    compared = _compare(members, shapes, far / STATES, scaled, apart.signatures)
+    compared = _compare(members, shapes, far / STATES, scaled, apart.signatures, found.shares)
     return _told(suture, compared, left_out, clusters, found.asked)
 
 
@@ -339,6 +340,7 @@ class _Found:
     overlapped: list[Member]
     not_sampled: int
     asked: str | None
+    shares: dict[str, float]  # of the demonstration that a start of the served policy follows, by surgeon
 
 
 def _found(database: Database, suture: str, demo: str | None) -> _Found:
@@ -349,12 +351,13 @@ def _found(database: Database, suture: str, demo: str | None) -> _Found:
     with database.reading() as session:
         agreed, without_consent = members_of(session, find_suture_type(session, suture).slug)
         asked = None if demo is None else _asked(session, demo, suture)
+        shares = shares_served(session, suture)
     members, overlapped = without_overlaps(agreed)
     if asked in {one.sha256 for one in overlapped}:
         raise Conflict(f"{OVERLAPPED} Request a newer cut of the recording, or withdraw that one.")
     sample = {one.row for one in sorted(members, key=lambda one: (one.sha256 != asked, one.sha256))[:MOST]}
     sampled = [one for one in members if one.row in sample]
-    return _Found(sampled, without_consent, overlapped, len(members) - len(sampled), asked)
+    return _Found(sampled, without_consent, overlapped, len(members) - len(sampled), asked, shares)
 
 
 def atlases(session: Session) -> list[tuple[SutureType, int, int]]:
@@ -419,6 +422,7 @@ class _Compared:
     whose: Ints
     sessions: Ints
     signatures: Floats
+    shares: Mapping[str, float]
 
     def of(self, surgeon: int) -> Ints:
         """Return the indices of a surgeon's demonstrations."""
@@ -429,9 +433,16 @@ class _Compared:
         return self.members[one].sha256
 
 
-def _compare(members: Sequence[Member], shapes: Floats, far: Floats, scaled: bool, signatures: Floats) -> _Compared:
+def _compare(
+    members: Sequence[Member],
+    shapes: Floats,
+    far: Floats,
+    scaled: bool,
+    signatures: Floats,
+    shares: Mapping[str, float],
+) -> _Compared:
     slugs, surgeons = np.unique([one.surgeon for one in members], return_inverse=True)
-    return _Compared(members, shapes, far, scaled, slugs.tolist(), surgeons, sessions_of(members), signatures)
+    return _Compared(members, shapes, far, scaled, slugs.tolist(), surgeons, sessions_of(members), signatures, shares)
 
 
 def _told(suture: str, compared: _Compared, left_out: LeftOutOfAtlas, clusters: int | None, asked: str | None) -> Atlas:
@@ -491,6 +502,7 @@ def _cluster(compared: _Compared, cluster: int, members: Ints) -> Cluster:
 
 def _consistency(compared: _Compared, surgeon: int) -> Consistency:
     mine = compared.of(surgeon)
+    share = compared.shares.get(compared.surgeons[surgeon])
     return Consistency(
         surgeon=compared.surgeons[surgeon],
         demos=len(mine),
@@ -498,6 +510,7 @@ def _consistency(compared: _Compared, surgeon: int) -> Consistency:
         sessions=len(np.unique(compared.sessions[mine])),
         medoid=compared.name(medoid(compared.far, mine)),
         spread=_spread(compared.far, mine),
+        mean_share=None if share is None else round(share, DIGITS),
     )
 
 

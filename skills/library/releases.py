@@ -219,6 +219,18 @@ def served(session: Session, surgeon: Surgeon, suture: str) -> Release | None:
     return releases[0] if releases and consent.may(surgeon, "training") else None
 
 
+def shares_served(session: Session, suture: str) -> dict[str, float]:
+    """Return the mean share of the demonstration that the starts of each served policy follow, by surgeon.
+
+    Versions of before shares were computed are left out.
+    """
+    share = PolicyVersion.manifest["coverage", "mean_share"]
+    query = select(Surgeon.slug, share).select_from(Release).join(Surgeon, Surgeon.row == Release.surgeon_row)
+    query = query.join(PolicyVersion, PolicyVersion.row == Release.policy_row)
+    found = session.execute(query.where(Release.suture == suture, is_served()))
+    return {surgeon: mean for surgeon, mean in found if mean is not None}
+
+
 def is_served() -> ColumnElement[bool]:
     """Return a condition on `Release`: its style serves it today; build it anew for each query (it has the date)."""
     later = aliased(Release)

@@ -51,8 +51,14 @@ EXAMPLE: dict[str, Any] = {
     "silhouette": 0.84,
     "chart_shows": 0.97,
     "surgeons": [
-        {"surgeon": "heron", "demos": 2, "recordings": 2, "sessions": 2, "medoid": IDS[0], "spread": 0.9},
-        {"surgeon": "kestrel", "demos": 2, "recordings": 2, "sessions": 2, "medoid": IDS[2], "spread": 1.0},
+        {
+            **{"surgeon": "heron", "demos": 2, "recordings": 2, "sessions": 2},
+            **{"medoid": IDS[0], "spread": 0.9, "mean_share": 0.34},
+        },
+        {
+            **{"surgeon": "kestrel", "demos": 2, "recordings": 2, "sessions": 2},
+            **{"medoid": IDS[2], "spread": 1.0, "mean_share": None},
+        },
     ],
     "differences": [
         {
@@ -161,6 +167,11 @@ class Consistency(Given):
     sessions: Count
     medoid: Sha256
     spread: float | None = Field(description="Mean distance of the others to the medoid; null for a single one.")
+    mean_share: Fraction | None = Field(
+        default=None,
+        description="Mean share of the demonstration that the starts of the served policy follow; null where none is "
+        "served, or one of before shares were computed.",
+    )
 
 
 class Apartness(Given):

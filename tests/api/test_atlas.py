@@ -157,4 +157,4 @@ def drawn_from(far: np.ndarray) -> Atlas:
     ]
     shapes, signatures = np.zeros((len(far), STATES, 3)), np.random.default_rng(4).normal(size=(len(far), NUMBERS))
     left_out = LeftOutOfAtlas(without_consent=0, without_direction=[], overlapped=[], not_sampled=0, because=[])
-    return _told(cases.SUTURE, _compare(members, shapes, far, False, signatures), left_out, 4, None)
+    return _told(cases.SUTURE, _compare(members, shapes, far, False, signatures, {}), left_out, 4, None)

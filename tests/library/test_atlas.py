@@ -20,6 +20,7 @@ from skills.library.atlas import atlas_of
 from skills.library.catalogue import put_surgeon
 from skills.library.demos import withdraw_demo
 from skills.library.erasure import erase_demo, erase_surgeon
+from skills.library.releases import withdraw
 from tests import backends
 from tests.comparison.cohort import cohort
 from tests.library import cases, cohorts
@@ -281,6 +282,25 @@ def test_overlapping_cuts_of_one_recording_count_once(database: Database):
     with database.writing() as session:
         withdraw_demo(session, newest, "test")
     assert [one.id for one in atlas_of(database, SUTURE).demos] == [second, after]
+
+
+def test_a_surgeon_has_the_share_that_starts_of_the_served_policy_follow(database: Database):
+    names = ["heron", "kestrel"]
+    for number, surgeon in enumerate(names):
+        cases.add_surgeon(database, surgeon)
+        cases.add_demo(database, cases.hand_off((number, 0.0, 0.0)), surgeon)
+    policy = cases.train(database, names[0], release=True)
+    cases.train(database, names[1])  # not released
+
+    def shares() -> list[float | None]:
+        return [one.mean_share for one in atlas_of(database, SUTURE).surgeons]
+
+    served = round(policy.manifest["coverage"]["mean_share"], 4)
+    assert 0.0 < served < 1.0
+    assert shares() == [served, None]
+    with database.writing() as session:
+        withdraw(session, session.scalars(select(Surgeon).where(Surgeon.slug == names[0])).one(), SUTURE, "test")
+    assert shares() == [None, None]
 
 
 def test_of_too_many_a_sample_is_shown_and_the_rest_counted(database: Database, monkeypatch: pytest.MonkeyPatch):
