@@ -319,8 +319,10 @@ class Timetable(Given):
 
     rate_hz: float
     samples: Count
-    duration_s: float
-    seconds_by_phase: dict[str, float]
+    duration_s: float = Field(description="From the first sample to the last, with the pauses between passes.")
+    seconds_by_phase: dict[str, float] = Field(
+        description="Samples of each phase divided by `rate_hz`, without pauses: of a pass a sample more than it lasts."
+    )
     speed_used_mm_s: float
     tempo: float | None = Field(
         default=None, description="The part of the surgeon's tempo in A1, at most 1; null where none is followed."
