@@ -25,6 +25,7 @@ from typer.testing import CliRunner
 import skills
 from skills.cli import app
 from skills.client import Client
+from skills.formats import MEDIA_TYPES
 from skills.schemas.requests import PoseIn, StatedIn
 from skills.seeds.recordings import Sample, sample_recordings
 from skills.settings import PREFIX, Settings, settings
@@ -161,6 +162,11 @@ def test_the_labels_of_the_surgeons_page_are_on_the_pages_of_the_service() -> No
     labels = [re.sub(r" (\d+|of 0.6 mm)$", "", label) for label in re.findall(r"(?<!\*)\*([A-Z][^*]+)\*", page)]
     assert len(labels) > 8
     assert [label for label in labels if label.lower() not in shown] == []
+
+
+def test_the_media_type_of_every_recording_is_on_the_page_of_the_api() -> None:
+    page = (ROOT / "docs/api.md").read_text()
+    assert not [one for one in MEDIA_TYPES if f"`{one}`" not in page]
 
 
 def test_every_setting_is_on_a_page() -> None:

@@ -189,10 +189,10 @@ def read_numbers(
     decimal: Decimals = "point",
     time: tuple[int, str] | None = None,
 ) -> ParsedNumbers:
-    """Read the rows of a table below its header.
+    """Read the rows of a table below its first line, which is the header.
 
     Args:
-        text: Positioned below the header.
+        text: The whole table, wherever it is positioned, as `open_text` opens it.
         names: The names of all columns, for messages.
         groups: The indices of the columns to read, in groups of at least one.
         separator: The character between two cells.

@@ -2,10 +2,11 @@
 
 import io
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 
+from skills.demonstration.recording import Format
 from skills.errors import BadRecording, BadSettings
 from skills.formats import read_recording, write_mcap
 from skills.formats.bag_writer import messages_of
@@ -79,6 +80,11 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
 def test_every_statement_that_a_request_can_make_is_tried():
     assert set(TableIn.model_fields) == set(STATEMENTS)
     assert set(TableIn().said) <= set(STATEMENTS)
+
+
+def test_each_format_is_asked(recordings: dict[str, bytes]):
+    read = {read_recording(io.BytesIO(recordings[kind]), **NEEDS.get(kind, {})).format for kind in MEANS}
+    assert read == set(get_args(Format))
 
 
 @pytest.mark.parametrize("kind", MEANS)
