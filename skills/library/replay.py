@@ -32,6 +32,7 @@ from skills.formats.replay_bag import (
 from skills.formats.verify import EXECUTOR, PLAN, POLICY, README, SIGNATURE, VERDICT
 from skills.learning.evaluation import TIE_BREAK, dtw
 from skills.library import consent, policies, proofs, releases
+from skills.library.arm_errors import stated_errors
 from skills.library.demos import find_demo
 from skills.library.integrity import learnt, learnt_in, planned
 from skills.library.plans import describe_plan, find_plan, plan_in_words, trajectory_of
@@ -49,6 +50,7 @@ from skills.planning.handoff import JAW_CLOSED_RAD
 from skills.planning.plan import CONSTANT_TURN_DEG, SuturePlan, departure_of
 from skills.planning.trajectory import Trajectory
 from skills.remedies import Action, Remedy
+from skills.settings import Settings
 from skills.transparency import Note
 from skills.verification.arm_errors import ArmErrors
 
@@ -265,6 +267,24 @@ def cleared(
         )
     check_doubt(played.report, errors=errors, lower_bound=lower_bound)
     return played
+
+
+def conditions_of(settings: Settings) -> dict[str, Any]:
+    """Return the conditions under which an installation exports bags, as arguments of `cleared` and `replay_bag`."""
+    return {
+        "errors": stated_errors(settings.arm_errors),
+        "lower_bound": settings.replay_lower_bound,
+        "constant_turn_deg": settings.constant_turn_deg,
+    }
+
+
+def refusal_of_bag(session: Session, plan: Plan, settings: Settings) -> Conflict | Corrupt | None:
+    """Return the reason why a plan would not be exported now, also as one without a hand-off; None if it would."""
+    try:
+        cleared(session, plan, handoff="none", **conditions_of(settings))
+    except (Conflict, Corrupt) as refusal:
+        return refusal
+    return None
 
 
 def _check_departure(planned: SuturePlan, plan: Plan, constant_turn_deg: float) -> None:

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import asdict
+from html import escape
 from pathlib import Path
 
 import numpy as np
@@ -140,6 +141,9 @@ def test_a_headline_is_good_only_if_the_stated_arm_error_allows_it(tmp_path: Pat
             page = service.http.get(f"/pages/plans/{made['id']}", headers={"Accept": "text/html"}).text
             assert f'class="verdict {headline["level"]}"' in page
             assert f"{headline['word']}: feasible in an exact simulation" in page
+            bag = service.http.get(f"/plans/{made['id']}/trajectory", headers={"Accept": "application/zip"})
+            assert (bag.status_code == 200) == ("Replay bag" in page) == ('id="no-bag"' not in page)
+            assert bag.status_code == 200 or escape(bag.json()["detail"]) in page
     expected = {"bench": ("good", "Likely to succeed"), "uncalibrated": ("bad", "Likely to fail")}
     assert levels == {one.name: expected[one.name] for one in arms}
 

@@ -23,7 +23,9 @@ from skills.library.plans import find_plan, hands_over, plan_in_words
 from skills.library.playbacks import headline_of
 from skills.library.recordings import find_recording
 from skills.library.releases import outcomes_of
+from skills.library.replay import refusal_of_bag
 from skills.planning.handoff import Enters
+from skills.remedies import Door
 from skills.schemas.requests import DIGEST, ScoreIn
 from skills.settings import MEBIBYTE
 
@@ -277,6 +279,7 @@ def show_plan(plan: Digest, request: Request, caller: Asking, db: Db, settings: 
     """Show a plan with its playbacks."""
     with db.reading() as session:
         found = find_plan(session, plan)
+        refusal = refusal_of_bag(session, found, settings)
         return render(
             request,
             "plan.html",
@@ -285,6 +288,7 @@ def show_plan(plan: Digest, request: Request, caller: Asking, db: Db, settings: 
             played=[(one, headline_of(one.playback, settings)) for one in overview.playbacks_of(session, found)],
             in_words=plan_in_words(found.about),
             hands_over=hands_over(found.about),
+            no_bag=None if refusal is None else refusal.words(Door.HTTP),
             job=overview.newest_job(session, "playback", plan=found.sha256),
         )
 

@@ -43,11 +43,10 @@ from skills.formats import BYTES, MCAP
 from skills.formats.bag_writer import timeline_mcap
 from skills.formats.replay_bag import rows_of_pass
 from skills.library import locks, overview, plans, playbacks
-from skills.library.arm_errors import stated_errors
 from skills.library.jobs import QUEUED, did_nothing
 from skills.library.plans import find_suture_points, map_style, motion_of, plan_json, plan_summary_json, trajectory_of
 from skills.library.playbacks import find_playback, playback_json
-from skills.library.replay import compare_with_plan, replay_bag
+from skills.library.replay import compare_with_plan, conditions_of, replay_bag
 from skills.library.timelines import Source, check_export, chosen, motion_named, timeline_of
 from skills.planning.plan import MAX_PASSES
 from skills.planning.trajectory import Trajectory
@@ -230,12 +229,7 @@ def _contents(
     settings: Settings,
 ) -> bytes:
     if media_type == BAG:
-        asked: dict[str, Any] = {
-            "errors": stated_errors(settings.arm_errors),
-            "lower_bound": settings.replay_lower_bound,
-            "constant_turn_deg": settings.constant_turn_deg,
-        }
-        return replay_bag(db, plan, pass_index=pass_index, handoff=handoff, **asked)
+        return replay_bag(db, plan, pass_index=pass_index, handoff=handoff, **conditions_of(settings))
     with db.reading() as session:
         motion = motion_of(session, plan)
     trajectory = trajectory_of(motion)

@@ -219,7 +219,7 @@ function tell(rows) {
   });
 }
 
-const number = (value, unit) => (Number.isNaN(value) ? "–" : `${value.toFixed(1)} ${unit}`);
+const number = (value, unit) => (Number.isNaN(value) ? "–" : `${value.toFixed(1)}\u00a0${unit}`);
 const percent = (value) => (Number.isNaN(value) ? "–" : `${(Math.floor(1000 * value) / 10).toFixed(1)} %`);
 
 function tick(at) {
