@@ -28,6 +28,7 @@ from skills.simulation import film
 from tests.arms import ARMS
 from tests.formats import bags, lerobots, trials, videos
 from tests.library import cases, exports
+from tests.library.test_pose_styles import both_arms
 
 STYLE = ("wren", "simple-running")
 
@@ -262,6 +263,17 @@ def test_a_style_is_learnt_from_several_demonstrations(skills, tmp_path: Path) -
     assert (code, job["request"]["combine"], job["result"]["releasable"]) == (0, {"kind": "medoid"}, True), said
     assert sorted(job["request"]["demos"]) == sorted(named[1::2])
     assert skills("train", *style, *named[:2], "--combine", "medoid")[0] == 1
+
+
+def test_a_pose_style_names_the_other_arm_and_that_it_has_no_tube(skills, tmp_path: Path) -> None:
+    assert (skills("migrate")[0], skills("seed")[0]) == (0, 0)
+    file, style = tmp_path / "both.mcap", ("kestrel", cases.SUTURE)
+    file.write_bytes(both_arms())
+    add = ("--surgeon", style[0], "--suture", style[1], "--arm", "PSM2", "--segment", "whole")
+    assert skills("demo", "add", str(file), *add)[0] == 0
+    assert skills("train", *style, "--release")[0] == 0
+    code, said = skills("policy", "pose-style", *style)
+    assert code == 0 and "beside  PSM1 as demonstrated, without a tube; check the distance between the arms" in said
 
 
 def test_a_failure_is_marked_listed_and_learnt_from_on_request(skills, tmp_path: Path) -> None:

@@ -344,6 +344,8 @@ def policy_pose_style(surgeon: Surgeon, suture: Suture, as_json: AsJson = False)
     out.print(f"assumes {limits.disturbance_mm:g} mm and {degrees(limits.disturbance_rad):.1f} degrees of disturbance")
     if (near := style.scene) is not None:
         out.print(f"scene   {near.least_mm:.1f} mm from {near.part} after phase {near.phase}, the tube touches nothing")
+    if (other := style.partner_motion) is not None:
+        out.print(f"beside  {other.arm} as demonstrated, without a tube; check the distance between the arms")
 
 
 def _share(coverage: "Coverage") -> str:

@@ -33,6 +33,7 @@ from skills.comparison.distances import Measured
 from skills.db import Base, Number, RowId, Sha256, Slug, now
 from skills.db.packed import Packed, stored
 from skills.demonstration.demonstration import Demo, Partner, Pause
+from skills.demonstration.partner import PartnerMotion
 from skills.gridworld.grid import GridPath, GridWorld
 from skills.gridworld.reward import RewardLevels, RewardMap
 from skills.gridworld.scene import Box, Capsule, Scene, SceneCosts, Surroundings, Tissue
@@ -53,7 +54,7 @@ from skills.verification.playback import Pictures, Playback
 
 stored(GridWorld, GridPath, RewardLevels, *LEARNERS.values(), Training, Network, ShortestWay)
 stored(SuturePoint, Pass, Pause, Partner, PsmM, Hand, Pose, Departure)
-stored(PosePath, TubeLimits, TubeCertificate)
+stored(PosePath, PartnerMotion, TubeLimits, TubeCertificate)
 stored(Surroundings, Scene, SceneCosts, Box, Capsule, Tissue)
 # Left out of the serialised value while they hold their default, so that the digests of older values stay the same.
 added_later(GridPath, "hysteresis")
@@ -69,6 +70,7 @@ added_later(Partner, "instrument")
 added_later(PosePath, "turn_share")
 added_later(PosePath, "partner")
 added_later(CertifiedPoses, "scene")  # never stored: the policy has the scene
+added_later(CertifiedPoses, "partner_scene")  # likewise
 added_later(PhaseQLearning, "slip")
 added_later(ValueIteration, "slip")
 added_later(PhaseQLearning, "join_share")

@@ -200,14 +200,17 @@ def partner_motion(recording: Recording, demo: Demo) -> PartnerMotion | None:
         demo: The demonstration, as `cut_demo` returned it.
 
     Returns:
-        The motion of the arm that takes the needle; None if the demonstration has no `partner`, or if the other arm was
-        not recorded all along it.
+        The motion of the arm that takes the needle; None if the demonstration has no `partner`, if the other arm was
+        not recorded all along it, or if the demonstration was cut in another frame than it would be today.
     """
     if demo.partner is None:
         return None
     motion = recording.motion_of(arm=demo.arm, topic=demo.topic)
+    base = recording.base_under(motion)
+    if demo.frame != (motion.frame if base is None else base.local_frame):
+        return None
     seconds, bases = demo.start_s + demo.stamps_s, base_frames(recording)
-    found, base = partner_along(recording, motion, seconds, bases, demo.partner.arm), recording.base_under(motion)
+    found = partner_along(recording, motion, seconds, bases, demo.partner.arm)
     return (
         found
         if found is None or base is None

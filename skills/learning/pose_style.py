@@ -88,6 +88,8 @@ class PosePath:
         for name, shape in shapes.items():
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, frozen(getattr(self, name), np.float64, shape, name))
+        if self.partner is not None and len(self.partner.tip_mm) != count:
+            raise BadInput(f"The other arm has {len(self.partner.tip_mm)} poses, and the path {count}.")
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,7 +22,8 @@ phases the path may bulge from it; that bulge is added. Distances of poses are E
 angle of the rotation between them; both obey the triangle inequality, which is all that is used.
 
 The premises are checked, not assumed: `certify_tube` measures m and the bulge on the path, and calls the update itself
-at every phase, at the distances at which its branches meet. It does not prove anything of the arm that executes it.
+at every phase, at the distances at which its branches meet. It does not prove anything of the arm that executes it,
+and nothing of the other arm beside the path (`PosePath.partner`).
 """
 
 from collections.abc import Callable, Sequence
@@ -35,7 +36,7 @@ from scipy.spatial.transform import Rotation
 
 from skills.arrays import Flags, Floats, Ints, frozen, xyz
 from skills.demonstration.demonstration import Demo
-from skills.demonstration.partner import Partner
+from skills.demonstration.partner import Partner, PartnerMotion
 from skills.errors import BadSettings
 from skills.fields import Point, Quaternion
 from skills.gridworld.scene import Scene
@@ -202,6 +203,8 @@ class CertifiedPoses:
         partner: The other arm as it took the needle in that demonstration; None if it was not recorded.
         scene: How near the path comes to the scene for which the tube was narrowed; None for no scene, and where it
             is stored.
+        partner_scene: How near the other arm's motion comes to that scene; None for no scene or no such motion, and
+            where it is stored. No tube is around that motion, so nothing is narrowed or refused for it.
     """
 
     arm: str
@@ -210,6 +213,7 @@ class CertifiedPoses:
     tube: TubeCertificate
     partner: Partner | None = None
     scene: TubeClearance | None = None
+    partner_scene: TubeClearance | None = None
 
     @property
     def tick_s(self) -> float:
@@ -217,13 +221,20 @@ class CertifiedPoses:
         return float(self.path.elapsed_s[-1]) / (len(self.path.elapsed_s) - 1)
 
 
-def certified_poses(demos: Sequence[Demo], at: int = 0, turn_share: float | None = None) -> CertifiedPoses | None:
+def certified_poses(
+    demos: Sequence[Demo],
+    at: int = 0,
+    turn_share: float | None = None,
+    partners: Sequence[PartnerMotion | None] | None = None,
+) -> CertifiedPoses | None:
     """Learn the poses of a style, and certify the tube around them with the default limits.
 
     Args:
         demos: Demonstrations of one arm in one frame.
         at: The index of the one at whose start and goal pose the motion lies.
         turn_share: The share of their mean turn in the motion; default: the one that `learn_pose_style` chooses.
+        partners: The other arm along each demonstration; it is in the motion if every one has it, of the same arm. It
+            has no part in the certificate.
 
     Returns:
         The motion, whether its certificate holds or not; None if a demonstration has no orientation.
@@ -235,7 +246,8 @@ def certified_poses(demos: Sequence[Demo], at: int = 0, turn_share: float | None
     place = demos[at] if demos else None
     if place is not None and (place.rotation_xyzw is None or any(one.rotation_xyzw is None for one in demos)):
         return None
-    style = learn_pose_style(demos)
+    arms = {None if one is None else one.arm for one in partners or ()}
+    style = learn_pose_style(demos, partners if len(arms) == 1 and None not in arms else None)
     style = style if turn_share is None else replace(style, turn_share=turn_share)
     assert place is not None and place.rotation_xyzw is not None, "checked above, and by `learn_pose_style`"
     path = style.between(place.tip_mm[0], place.rotation_xyzw[0], place.tip_mm[-1], place.rotation_xyzw[-1])
@@ -299,7 +311,8 @@ def clear_tube(poses: CertifiedPoses, scene: Scene) -> CertifiedPoses:
 
     Returns:
         The motion with the distance of its path from the scene, and a tube of that radius at most. If not even a run
-        from the path itself is clear of the scene, the certificate has that as a fault, and does not hold.
+        from the path itself is clear of the scene, the certificate has that as a fault, and does not hold. The distance
+        of the other arm's motion is stated, and decides nothing: a part of the scene may be that arm itself.
 
     Raises:
         BadSettings: The scene is in another frame.
@@ -308,11 +321,9 @@ def clear_tube(poses: CertifiedPoses, scene: Scene) -> CertifiedPoses:
         raise BadSettings(f"The scene is in the frame '{scene.frame}', the motion in '{poses.frame}'.")
     tube, path = poses.tube, poses.path
     limits = tube.limits
-    apart_mm = scene.from_lines_mm(path.tip_mm[:-1], path.tip_mm[1:])
-    if not apart_mm:
+    near = _nearest(scene, path.tip_mm)
+    if near is None:
         return poses
-    part = min(apart_mm, key=lambda name: float(apart_mm[name].min()))
-    near = TubeClearance(float(apart_mm[part].min()), part, int(apart_mm[part].argmin()))
     bulge_mm = tube.radius_mm - max(limits.start_mm, limits.disturbance_mm)
     start_mm = float(np.minimum(limits.start_mm, near.least_mm - bulge_mm - ROUNDING))
     if not start_mm >= limits.disturbance_mm:  # written so that NaN fails
@@ -321,13 +332,23 @@ def clear_tube(poses: CertifiedPoses, scene: Scene) -> CertifiedPoses:
             tube,
             faults=(
                 *tube.faults,
-                f"The path comes within {near.least_mm:.1f} mm of {part} of the scene after phase {near.phase}, and a "
-                f"run that starts on it may be {needed_mm:.1f} mm off",
+                f"The path comes within {near.least_mm:.1f} mm of {near.part} of the scene after phase {near.phase}, "
+                f"and a run that starts on it may be {needed_mm:.1f} mm off",
             ),
         )
     elif start_mm < limits.start_mm:
         tube = certify_tube(path, replace(limits, start_mm=start_mm))
-    return replace(poses, tube=tube, scene=near)
+    beside = None if path.partner is None else _nearest(scene, path.partner.tip_mm)
+    return replace(poses, tube=tube, scene=near, partner_scene=beside)
+
+
+def _nearest(scene: Scene, tip_mm: Floats) -> TubeClearance | None:
+    """Return how near positions, (N, 3), and the straight lines between them come to a scene; None for an empty one."""
+    apart_mm = scene.from_lines_mm(tip_mm[:-1], tip_mm[1:])
+    if not apart_mm:
+        return None
+    part = min(apart_mm, key=lambda name: float(apart_mm[name].min()))
+    return TubeClearance(float(apart_mm[part].min()), part, int(apart_mm[part].argmin()))
 
 
 def _moves(path: PosePath, ahead: int) -> tuple[float, float]:

@@ -11,6 +11,7 @@ several workers would leave no room for others.
 
 import logging
 from collections.abc import Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import zip_longest
@@ -35,8 +36,18 @@ from skills.library.consent import refusal
 from skills.library.demos import newest_demos
 from skills.library.jobs import PartRequest, RetrainingRequest, Store, TrainingRequest
 from skills.library.policies import LearntIn, Recipe, kept_of, learner_kept, recipes_of, refuse_unlike
+from skills.library.recordings import Teller, confined_reader
 from skills.library.releases import fit_of, not_worse, shown_mm, taught, way_of
-from skills.library.training import Learnt, Lesson, Stored, combined_lesson, learn_style, lessons, store_styles
+from skills.library.training import (
+    Learnt,
+    Lesson,
+    Stored,
+    combined_lesson,
+    learn_style,
+    lessons,
+    store_styles,
+    with_partners,
+)
 from skills.schemas.policies import FitOnTheSame, PolicyFigures, StoredComparison
 from skills.settings import Settings
 
@@ -126,13 +137,14 @@ _Group = Sequence[_Style]  # started in one transaction, trained one after anoth
 
 @dataclass(frozen=True)
 class _Batch:
-    """The request that all styles of a batch share, and the part of it that is trained."""
+    """The request that all styles of a batch share, the part of it that is trained, and the reader of recordings."""
 
     row: int
     part: int
     request: RetrainingRequest
     asked_by: str
     settings: Settings
+    tell: Teller
 
     def training_of(self, style: _Style, demos: Sequence[str], how: Combining | None = None) -> TrainingRequest:
         """Return the request for one style as `request_training` writes it, so that an equal training is recognised."""
@@ -167,10 +179,12 @@ def retrain_part(database: Database, request: PartRequest, settings: Settings) -
     A style that is refused has failed; a style at which the service itself fails stays queued for the next attempt at
     this part.
     """
+    reader = confined_reader(settings)
     with database.reading() as session:
         job = session.get_one(Job, request["retraining"])
-        batch = _Batch(job.row, request["part"], cast(RetrainingRequest, job.request), job.asked_by, settings)
-    with AT_WORK:
+        shared = cast(RetrainingRequest, job.request)
+        batch = _Batch(job.row, request["part"], shared, job.asked_by, settings, reader.tell)
+    with AT_WORK, closing(reader.server):  # it starts only if a recording is not cached
         _train_all(database, batch)
 
     def store(session: Session, _actor: str) -> dict[str, Any]:
@@ -253,6 +267,7 @@ def _learn(database: Database, batch: _Batch, style: _Style) -> Learnt | SkillsE
     lesson, recipe = style.lesson, style.recipe
     try:
         if recipe is None:
+            (lesson,) = with_partners(database, [lesson], batch.tell)
             return learn_style(lesson, batch.training_of(style, [lesson.sha256]), batch.settings)
         with database.reading() as session:
             newest = newest_demos(session, lesson.surgeon.row, lesson.suture, recipe.demos)
@@ -260,10 +275,13 @@ def _learn(database: Database, batch: _Batch, style: _Style) -> Learnt | SkillsE
             found = lessons(session, [one.row for one in newest])
         if not found:
             return Conflict("All demonstrations of the style were withdrawn or marked since the batch was requested.")
+        found = with_partners(database, found, batch.tell)
         if len(found) == 1:  # the others were withdrawn since, and the served policy with them
             return learn_style(found[0], batch.training_of(style, [found[0].sha256]), batch.settings)
         asked = batch.training_of(style, [one.sha256 for one in found], recipe.how)
         return learn_style(combined_lesson(found, recipe.how), asked, batch.settings)
+    except Busy:  # the database or a reader, for now: the part is tried again
+        raise
     except SkillsError as refused:
         return refused
 

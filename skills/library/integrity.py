@@ -90,7 +90,7 @@ def learnt(version: PolicyVersion) -> Policy:
     return policy
 
 
-_poses: WeightedCache[str, tuple[str, CertifiedPoses]] = WeightedCache(256)  # by the policy's digest; some 10 kB each
+_poses: WeightedCache[str, tuple[str, CertifiedPoses]] = WeightedCache(256)  # by the policy's digest; 10 or 15 kB each
 
 
 def posed(stored: StoredPoses) -> CertifiedPoses:

@@ -576,11 +576,14 @@ def _absent(version: PolicyVersion) -> NotFound:
 
 
 def poses_of_demonstrations(version: PolicyVersion, turn_share: float | None = None) -> CertifiedPoses | None:
-    """Compute the pose style of a policy version from its demonstrations; None if one has no orientation.
+    """Compute the pose style of a policy version from its demonstrations, without the other arm's motion.
 
     Args:
         version: The version.
         turn_share: The share of the demonstrations' mean turn; default: the one that `learn_pose_style` chooses.
+
+    Returns:
+        It; None if a demonstration has no orientation.
     """
     demos, combined = version.demonstrations, version.manifest.get("combined")
     at = 0 if combined is None else [one.sha256 for one in demos].index(combined["at"])
@@ -610,13 +613,33 @@ def pose_style_json(version: PolicyVersion, poses: CertifiedPoses) -> dict[str, 
         "tube": as_json(poses.tube),
         "scene": None if poses.scene is None else as_json(poses.scene),
         "partner": None if poses.partner is None else as_json(poses.partner),
+        **_beside(poses),
         "created_at": rfc3339(version.created_at),
     }
 
 
+def _beside(poses: CertifiedPoses) -> dict[str, Any]:
+    """Return the field of the other arm's motion; none where there is none, as it was before there were any."""
+    other, near = poses.path.partner, poses.partner_scene
+    if other is None:
+        return {}
+    moved = {"arm": other.arm, "position_mm": other.tip_mm.tolist(), "rotation_xyzw": other.rotation_xyzw.tolist()}
+    return {"partner_motion": {**moved, "scene": None if near is None else as_json(near)}}
+
+
 def next_json(poses: CertifiedPoses, step: PoseStep) -> dict[str, Any]:
     """Return the JSON of a step (`schemas.policies.PoseAnswer`)."""
-    return {**vars(step), "inside": poses.tube.contains(step.off_mm, step.off_rad)}
+    inside = poses.tube.contains(step.off_mm, step.off_rad)
+    return {**vars(step), "inside": inside, "partner_pose": _partner_pose(poses, step.phase)}
+
+
+def _partner_pose(poses: CertifiedPoses, phase: int) -> dict[str, Any] | None:
+    """Return the JSON of the other arm's pose at a phase (`schemas.policies.PartnerPose`); None if it has none."""
+    other = poses.path.partner
+    if other is None:
+        return None
+    pose = {"position_mm": other.tip_mm[phase].tolist(), "rotation_xyzw": other.rotation_xyzw[phase].tolist()}
+    return {"arm": other.arm, **pose}
 
 
 def about_next(

@@ -18,18 +18,20 @@ from sqlalchemy.orm import Session
 from skills.db.models import Demonstration, PolicyVersion, StoredRecording
 from skills.db.packed import digest, seal, unpack_as
 from skills.db.session import Database
-from skills.demonstration.demonstration import Demo, cut_demo
+from skills.demonstration.demonstration import Demo, cut_demo, partner_motion
+from skills.demonstration.partner import PartnerMotion
 from skills.errors import NotFound
 from skills.formats.reader_process import Told
 from skills.gridworld.grid import GridPath, discretize
 from skills.gridworld.reward import sparse_reward
 from skills.learning.certificate import NearLimits, OddsLimits
 from skills.learning.policy import LEARNER_VERSION, Policy
+from skills.learning.tube import CertifiedPoses
 from skills.library.consent import refusal
 from skills.library.integrity import learnt
 from skills.library.jobs import TrainingRequest
 from skills.library.policies import combining_of
-from skills.library.recordings import Teller, recording_bytes
+from skills.library.recordings import Teller, alike, recording_bytes
 from skills.library.training import (
     ANY,
     GATE_VERSION,
@@ -45,6 +47,7 @@ from skills.packing import canonical
 from skills.settings import Settings
 
 NUMBERS = "its values"
+BESIDE = "the other arm's motion in its pose style"
 
 
 @dataclass(frozen=True)
@@ -78,6 +81,8 @@ def compute_again(database: Database, row: int) -> Again:
 def learn_again(database: Database, row: int, recordings: "StoredRecordings", settings: Settings) -> Again:
     """Cut the demonstrations of a version out of their recordings again, learn from them, and compare the result.
 
+    The other arm's motion in its pose style is compared too. A pose style of before has none, and stays without.
+
     Args:
         database: The database, without restriction.
         row: The row of the version.
@@ -93,6 +98,7 @@ def learn_again(database: Database, row: int, recordings: "StoredRecordings", se
         if (other := _other_learner(version) or _other_demos(version)) is not None:
             return Again(left_out=f"{other}, not learnt again")
         stored, gate = _Stored.of(version), _other_gate(version)
+        beside = None if version.poses is None else version.poses.poses.path.partner  # its row is checked by itself
         if stored.policy.network is not None:
             return Again(left_out="learnt by a network, whose values depend on the machine, not learnt again")
         if (refused := refusal(version.surgeon, "training")) is not None:
@@ -101,12 +107,15 @@ def learn_again(database: Database, row: int, recordings: "StoredRecordings", se
         found = lessons(session, [one.row for one in version.demonstrations])
     differing: list[str] = []
     for at, cut in enumerate(cuts):
-        demo, path = cut.again(recordings)
+        demo, path, partner = cut.again(recordings)
         if (digest(demo), digest(path)) != (cut.demo, cut.path):
             differing.append(f"its demonstration {cut.sha256[:12]}, cut out of its recording again")
         reward = sparse_reward(path, stored.policy.levels)
-        found[at] = replace(found[at], demo=seal(demo).packed, reward=seal(reward).packed)
-    differing += stored.differing(learn_style(stored.lesson(found), stored.request, settings), numbers_only=bool(gate))
+        found[at] = replace(found[at], demo=seal(demo).packed, reward=seal(reward).packed, partners=(partner,))
+    made = learn_style(stored.lesson(found), stored.request, settings)
+    differing += stored.differing(made, numbers_only=bool(gate))
+    if beside is not None and not alike(beside, _beside(made)):
+        differing.append(BESIDE)
     return Again(tuple(differing), None if gate is None else f"{gate}, only its values were compared")
 
 
@@ -115,6 +124,11 @@ def _found(session: Session, row: int) -> PolicyVersion:
     if version is None:
         raise NotFound("There is no such policy version.")
     return version
+
+
+def _beside(made: Learnt) -> PartnerMotion | None:
+    """Return the other arm's motion in the pose style of what was learnt; None if there is none."""
+    return None if made.poses is None else unpack_as(CertifiedPoses, made.poses.packed).path.partner
 
 
 class StoredRecordings:
@@ -171,9 +185,10 @@ class _Cut:
         named = {name: getattr(demo, name) for name in ("arm", "topic", "start_s", "end_s")}
         return cls(row.recording_row, row.sha256, named, (path.grid, path.hysteresis), digest(demo), digest(path))
 
-    def again(self, told: StoredRecordings) -> tuple[Demo, GridPath]:
-        demo = cut_demo(told.read(self.recording).recording, **self.named)
-        return demo, discretize(demo.tip_mm, *self.of_grid)
+    def again(self, told: StoredRecordings) -> tuple[Demo, GridPath, PartnerMotion | None]:
+        recording = told.read(self.recording).recording
+        demo = cut_demo(recording, **self.named)
+        return demo, discretize(demo.tip_mm, *self.of_grid), partner_motion(recording, demo)
 
 
 @dataclass(frozen=True)

@@ -2,11 +2,13 @@
 
     request_training --> Job
     Job's request --train_style--> Learnt --store_style--> PolicyVersion and its pose style
+    Lessons, their recordings --with_partners--> Lessons with the other arm's motion, for the pose style
 
 Learning and certifying run outside any transaction; the result is packed before the transaction that stores it.
 """
 
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from typing import Any, NamedTuple, cast
 
@@ -22,6 +24,7 @@ from skills.db.models import (
     PolicyDemonstration,
     PolicyVersion,
     StoredPoses,
+    StoredRecording,
     StoredRewardMap,
     Surgeon,
     newest_mark,
@@ -30,7 +33,9 @@ from skills.db.packed import Sealed, seal, unpack_as
 from skills.db.service_tables import Job, record_events
 from skills.db.session import Database
 from skills.deep import Tell, learn_policy, require_installed
-from skills.demonstration.demonstration import Demo
+from skills.demonstration.demonstration import Demo, partner_motion
+from skills.demonstration.partner import PartnerMotion
+from skills.demonstration.recording import Recording
 from skills.errors import BadInput, Conflict, NotFound, SkillsError
 from skills.fields import as_json
 from skills.gridworld.grid import discretisation_rmse
@@ -68,6 +73,7 @@ from skills.library.demos import find_demo
 from skills.library.integrity import policy_identity_of, poses_identity_of, scene_digest
 from skills.library.jobs import QUEUED, RequestedJob, Store, TrainingRequest, did_nothing
 from skills.library.policies import BEST, choose_demos, combining_of, describe_combined, find_by_digest
+from skills.library.recordings import Teller, confined_reader, stored_recording
 from skills.library.releases import driven_or_refused, refusals
 from skills.packing import canonical, sha256
 from skills.planning.plan import DrivenPass
@@ -99,8 +105,9 @@ KNOWN = select(_VERSIONS.c.sha256, _VERSIONS.c.row, _VERSIONS.c.version).where(
 )
 HAVE_POSES = select(StoredPoses.policy_row).where(StoredPoses.policy_row.in_(bindparam("policies", expanding=True)))
 ADD = insert(_VERSIONS).returning(_VERSIONS.c.sha256, _VERSIONS.c.row, _VERSIONS.c.version)
+ERASED = "A demonstration was erased while the training used it."
 ANY = "any"  # `outcomes` of a training from demonstrations of any outcome
-POSES_VERSION = 2  # part of a training's identity: raise it when equal demonstrations give another pose style
+POSES_VERSION = 3  # part of a training's identity: raise it when equal demonstrations give another pose style
 GATE_VERSION = 4  # part of a training's identity: raise it when the gate's result for an equal policy changes
 CERTIFICATE_NOTE = (
     "Checked on the grid: every greedy action against exact dynamic programming, and every start by following it; "
@@ -256,7 +263,8 @@ class Lesson:
     For several combined demonstrations it is the one at whose place their path lies; `others` are the rows of the rest,
     and `combined` is the description of the combination in the manifest. `outcomes` are those of all its
     demonstrations, the oldest first; None is not known. `shown` are these demonstrations, still packed, and `at` is the
-    index of the one at whose place they lie; empty for a single one.
+    index of the one at whose place they lie; empty for a single one. `partners` is the other arm's motion along each of
+    them (`with_partners`), and `recording` the digest of the recording of a single one.
     """
 
     row: int
@@ -266,6 +274,8 @@ class Lesson:
     demo: bytes
     reward: bytes
     outcomes: tuple[str | None, ...]
+    recording: str
+    partners: tuple[PartnerMotion | None, ...] = (None,)
     others: tuple[int, ...] = ()
     combined: dict[str, Any] | None = None
     shown: tuple[bytes, ...] = ()
@@ -296,6 +306,9 @@ def train_style(database: Database, request: TrainingRequest, settings: Settings
     """Learn, certify and measure the requested style; the returned function stores the result."""
     with database.reading() as session:
         found = lessons(session, [find_demo(session, one).row for one in request["demos"]])
+    reader = confined_reader(settings)
+    with closing(reader.server):  # it starts only if a recording is not cached
+        found = with_partners(database, found, reader.tell)
     lesson = combined_lesson(found, combining_of(request["combine"])) if "combine" in request else found[0]
     learnt = learn_style(lesson, request, settings, jobs.telling(database, "training", request))
 
@@ -318,16 +331,55 @@ def lessons(session: Session, demonstrations: Sequence[int]) -> list[Lesson]:
     of = Demonstration
     packed = type_coerce(of.demo, LargeBinary), type_coerce(StoredRewardMap.map, LargeBinary)
     query = (
-        select(of.row, of.sha256, Surgeon, of.suture, *packed, of.outcome)
+        select(of.row, of.sha256, Surgeon, of.suture, *packed, of.outcome, StoredRecording.sha256)
         .join(Surgeon, Surgeon.row == of.surgeon_row)
+        .join(StoredRecording, StoredRecording.row == of.recording_row)
         .join(StoredRewardMap, StoredRewardMap.demonstration_row == of.row)
         .where(of.row.in_(demonstrations))
     )
     found = session.execute(query.order_by(of.row))
     return [
-        Lesson(row, sha256, surgeon, suture, demo, reward, (outcome,))
-        for row, sha256, surgeon, suture, demo, reward, outcome in found
+        Lesson(row, sha256, surgeon, suture, demo, reward, (outcome,), recording)
+        for row, sha256, surgeon, suture, demo, reward, outcome, recording in found
     ]
+
+
+def with_partners(database: Database, lessons: Sequence[Lesson], tell: Teller) -> list[Lesson]:
+    """Return lessons of one style with the other arm's motion along each demonstration, if every one has it.
+
+    It is computed from the recordings, because a demonstration has only the pose in which the other arm takes the
+    needle. A recording that cannot be read refuses the training: an equal one would have another result elsewhere.
+
+    Args:
+        database: The database; no transaction is open while a recording is read.
+        lessons: At least one, none of them combined.
+        tell: The reader of recordings that are not cached.
+
+    Raises:
+        Conflict: The surgeon's consent does not cover training.
+        NotFound: A demonstration was erased since.
+        Corrupt: A value does not match its digest.
+        BadRecording: A recording is not cached, and cannot be read any more.
+    """
+    require(lessons[0].surgeon, "training")  # before a recording is read
+    demos = [unpack_as(Demo, one.demo) for one in lessons]
+    arms = {None if demo.partner is None or demo.rotation_xyzw is None else demo.partner.arm for demo in demos}
+    if len(arms) > 1 or None in arms:
+        return [*lessons]
+    found: list[Lesson] = []
+    recording: Recording | None = None
+    for number, (lesson, demo) in enumerate(zip(lessons, demos, strict=True)):
+        if recording is None or lesson.recording != lessons[number - 1].recording:
+            recording = None  # before the next one is read, so that only one is in memory
+            try:
+                recording = stored_recording(database, lesson.recording, tell).recording
+            except NotFound:
+                raise NotFound(ERASED) from None
+        motion = partner_motion(recording, demo)
+        if motion is None:
+            return [*lessons]
+        found.append(replace(lesson, partners=(motion,)))
+    return found
 
 
 def combined_lesson(lessons: Sequence[Lesson], how: Combining) -> Lesson:
@@ -346,6 +398,7 @@ def combined_lesson(lessons: Sequence[Lesson], how: Combining) -> Lesson:
         reward=seal(sparse_reward(found.path, rewards[at].levels)).packed,
         outcomes=tuple(outcome for lesson in lessons for outcome in lesson.outcomes),
         shown=tuple(lesson.demo for lesson in lessons),
+        partners=tuple(partner for lesson in lessons for partner in lesson.partners),
         at=at,
         others=tuple(lesson.row for lesson in lessons if lesson is not lessons[at]),
         combined=describe_combined(found, how, [lesson.sha256 for lesson in lessons]),
@@ -394,7 +447,8 @@ def certified(lesson: Lesson, request: TrainingRequest, demo: Demo, policy: Poli
     if policy.hazards is not None:
         in_scene, odds = certify_in_scene(policy, policy.hazards)
         covered = replace(covered, finishing=odds.finishes, touching=odds.touches)
-    poses = certified_poses([unpack_as(Demo, one) for one in lesson.shown] or [demo], lesson.at)
+    shown = [unpack_as(Demo, one) for one in lesson.shown] or [demo]
+    poses = certified_poses(shown, lesson.at, partners=lesson.partners)
     numbers, coverage = seal(policy), seal(covered)
     driven, undriven = driven_or_refused(policy, demo)
     assert covered.share is not None, "a new certificate has the shares"
@@ -483,7 +537,7 @@ def _refusal(session: Session, learnt: Learnt, standing: Any) -> SkillsError | N
     """
     others = [session.get(Demonstration, row) for row in learnt.lesson.others]
     if standing is None or None in others:
-        return NotFound("A demonstration was erased while the training used it.")
+        return NotFound(ERASED)
     if any(one.withdrawn_at is not None for one in (standing, *others)):
         return Conflict("A demonstration was withdrawn while the training used it.")
     marked = [one.outcome for one in (standing, *others) if one.outcome not in (None, SUCCESS)]

@@ -45,7 +45,15 @@ from skills.library.playbacks import (
     playback_request,
 )
 from skills.library.recordings import Teller, confined_reader, find_recording, stored_recording
-from skills.library.training import learn_style, lessons, near_limits, odds_limits, store_style, training_request
+from skills.library.training import (
+    learn_style,
+    lessons,
+    near_limits,
+    odds_limits,
+    store_style,
+    training_request,
+    with_partners,
+)
 from skills.remedies import Remedy
 from skills.schemas.plans import PlanIn, SuturePointIn
 from skills.schemas.requests import DemoIn, TrainingIn
@@ -142,7 +150,7 @@ def try_recording(database: Database, asked: TryIn, actor: str, settings: Settin
         yield _done("cut", chosen.because, added.sha256)
         yield _done("report", " ".join(added.report["advice"]) or "Nothing to improve in the recording.")
         at = "train"
-        version, trained = _learn(database, asked, added.sha256, settings)
+        version, trained = _learn(database, asked, added.sha256, settings, read)
         yield trained
         at = "certify"
         certified = _certified(version, others)
@@ -304,12 +312,15 @@ def _change(cells: Cells) -> dict[str, Any]:
     return {"cell_mm": cells.cell_mm, "hysteresis": cells.hysteresis}
 
 
-def _learn(database: Database, asked: TryIn, demo: str, settings: Settings) -> tuple[PolicyVersion, TryStep]:
+def _learn(
+    database: Database, asked: TryIn, demo: str, settings: Settings, read: Teller
+) -> tuple[PolicyVersion, TryStep]:
     """Learn and certify a style from a demonstration and store it; return its version, and the step."""
     with database.reading() as session:
         training = TrainingIn(surgeon=asked.surgeon, suture=asked.suture, demos=[demo])
         request, _ = training_request(session, training, near_limits(settings), odds_limits(settings))
-        (lesson,) = lessons(session, [find_demo(session, demo).row])
+        found = lessons(session, [find_demo(session, demo).row])
+    (lesson,) = with_partners(database, found, read)
     made = learn_style(lesson, request, settings)
     with database.writing([locks.surgeon(asked.surgeon)]) as session:
         version = session.get_one(PolicyVersion, store_style(session, made).row)

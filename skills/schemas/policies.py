@@ -422,6 +422,35 @@ class NextStep(PolicyName):
     correction_mm: Point | None = Field(description="The way back to the path; null on it.")
 
 
+class PartnerPose(Given):
+    """A pose of the other arm, PSM_M, as it was demonstrated relative to the hand-off, for one phase.
+
+    No tube is certified for it: nothing is proven of how near that arm is to it, nor to the arm that follows the pose
+    style, nor of how far it moves in a tick. The caller checks the distance between the arms.
+    """
+
+    arm: str
+    position_mm: Point = Field(description="Of its tip, in the frame of the pose style.")
+    rotation_xyzw: Quaternion
+
+
+class PartnerPath(Given):
+    """The motion of the other arm, PSM_M, at the phases of the pose style, as demonstrated relative to the hand-off.
+
+    No tube is certified for it: the caller checks the distance between the arms. Its steps are not limited, and it is
+    neither refused nor changed beside a scene.
+    """
+
+    arm: str
+    position_mm: list[Point] = Field(description="Of its tip, in the frame of the pose style.")
+    rotation_xyzw: list[Quaternion]
+    scene: TubeClearance | None = Field(
+        default=None,
+        description="How near it comes to the scene that the version was learnt in, of which a part may be this arm "
+        "itself; negative or 0 where it touches.",
+    )
+
+
 class PoseAnswer(Given):
     """The next pose for a pose that was reached.
 
@@ -437,6 +466,11 @@ class PoseAnswer(Given):
     off_rad: float
     inside: bool = Field(description="Whether the pose that was sent lies in the tube.")
     finished: bool = Field(description="Whether the last pose was reached.")
+    partner_pose: PartnerPose | None = Field(
+        default=None,
+        description="Where the other arm was demonstrated to be at `phase`; no tube is certified for it, so check the "
+        "distance between the arms. null where its motion was not learnt.",
+    )
 
 
 class NextPose(PoseAnswer, PolicyName):
@@ -507,4 +541,9 @@ class PoseStyle(PolicyName):
         description="The distance of the path from the scene that the version was learnt in; the tube is narrower.",
     )
     partner: Partner | None = Field(description="The other arm as it took the needle, where that was recorded.")
+    partner_motion: PartnerPath | None = Field(
+        default=None,
+        description="The other arm's motion at the same phases, where every demonstration's recording has it all "
+        "along; no tube is certified for it.",
+    )
     created_at: datetime

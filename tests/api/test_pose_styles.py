@@ -9,12 +9,15 @@ import numpy as np
 import pytest
 
 from skills.client import Problem
+from skills.learning.pose_style import PHASES
 from skills.library.keys import create_key
 from skills.library.policies import FORMAT
+from skills.schemas.policies import NextPose, PoseStyle
 from tests import backends
-from tests.api.posed import of_pose_style
+from tests.api.posed import of_both_arms, of_pose_style
 from tests.api.service import KESTREL, POLICY, Service, assert_problem, serving
 from tests.library import cases
+from tests.library.test_pose_styles import AWAY_MM, BESIDE_MM
 
 POSES, NEXT = f"{POLICY}/pose-style", f"{POLICY}/next"
 
@@ -23,6 +26,15 @@ POSES, NEXT = f"{POLICY}/pose-style", f"{POLICY}/next"
 def posed(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Service]:
     """Yield a service in which kestrel's style, with orientation, is released."""
     url = of_pose_style(request.param, tmp_path)
+    with serving(url) as service:
+        yield service
+    backends.drop(url)
+
+
+@pytest.fixture(params=backends.BACKENDS)
+def both(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Service]:
+    """Yield a service that serves a pose style with the other arm's motion."""
+    url = of_both_arms(request.param, tmp_path)
     with serving(url) as service:
         yield service
     backends.drop(url)
@@ -66,6 +78,55 @@ def test_a_pose_outside_the_tube_is_named(posed: Service):
     assert_problem(posed.http.post(NEXT, json=body | {"rotation_xyzw": [0, 0, 0, 2]}), 422)
     assert_problem(posed.http.post(NEXT, json=body | {"phase": 101}), 422)
     assert posed.http.post(NEXT, json={"position_mm": far}).json().keys() >= {"action", "correction_mm"}
+
+
+def test_the_other_arm_is_served_at_the_same_phases(both: Service):
+    style = both.client.pose_style(**KESTREL)
+    other = style["partner_motion"]
+    assert (other["arm"], style["partner"]["arm"], style["frame"], other["scene"]) == (*2 * ["PSM1"], "PSM2_base", None)
+    assert len(other["position_mm"]) == len(other["rotation_xyzw"]) == len(style["position_mm"])
+    assert np.abs(other["position_mm"] - np.linspace(AWAY_MM, BESIDE_MM, PHASES)).max() < 1e-6  # by hand
+    assert other["position_mm"][-1] == pytest.approx(style["partner"]["position_mm"], abs=1e-6)
+    played = both.http.get(f"/timelines/policy-versions/{style['sha256']}").json()["timeline"]
+    assert [arm["arm"] for arm in played["arms"]] == ["PSM2", "PSM1"]
+
+
+def test_next_has_the_other_arm_at_the_phase_that_it_answers(both: Service):
+    style = both.client.pose_style(**KESTREL)
+    other = style["partner_motion"]
+    pose, phase = {name: style[name][30] for name in ("position_mm", "rotation_xyzw")}, None
+    for _ in range(3):
+        step = both.client.next_pose(**KESTREL, **pose, phase=phase)
+        phase = step["phase"]
+        at = {name: other[name][phase] for name in ("position_mm", "rotation_xyzw")}
+        assert step["partner_pose"] == {"arm": "PSM1", **at}
+        pose = {name: step[name] for name in pose}
+    assert phase == 33
+    far = np.add(pose["position_mm"], (0.0, 0.0, -21.0)).tolist()  # outside the tube the phase waits, and it with it
+    step = both.client.next_pose(**KESTREL, **pose | {"position_mm": far}, phase=phase)
+    assert (step["inside"], step["phase"]) == (False, 33)
+    assert step["partner_pose"]["position_mm"] == other["position_mm"][33]
+
+
+def test_where_one_arm_was_recorded_the_answers_have_no_other(posed: Service):
+    style = posed.client.pose_style(**KESTREL)
+    assert "partner_motion" not in style and style["partner"] is None  # the bytes of before
+    pose = {name: style[name][0] for name in ("position_mm", "rotation_xyzw")}
+    assert posed.client.next_pose(**KESTREL, **pose)["partner_pose"] is None
+    older = {name: value for name, value in posed.client.next_pose(**KESTREL, **pose).items() if name != "partner_pose"}
+    assert NextPose.model_validate(older).partner_pose is None  # of an older service
+    assert PoseStyle.model_validate(style).partner_motion is None
+
+
+def test_beside_a_scene_the_distance_of_the_other_arm_is_stated(both: Service):
+    """By hand: the box is 13 to 18 mm along x, 8 mm from PSM_A's path, and the other arm enters it after phase 96."""
+    in_a_scene(both, 8.0)
+    style = both.client.pose_style(**KESTREL)
+    assert style["scene"]["least_mm"] == pytest.approx(8.0) and style["tube"]["faults"] == []
+    assert style["partner_motion"]["scene"] == {"least_mm": 0.0, "part": "box 0", "phase": 96}
+    assert both.client.next_pose(
+        **KESTREL, position_mm=style["position_mm"][0], rotation_xyzw=style["rotation_xyzw"][0]
+    )["partner_pose"]
 
 
 def test_a_withdrawn_policy_has_no_pose_style(posed: Service):

@@ -36,7 +36,7 @@ from skills.library.keys import create_key, revoke_key
 from skills.library.policies import find_version
 from skills.library.releases import release
 from tests import backends
-from tests.api.posed import of_pose_style
+from tests.api.posed import of_both_arms, of_pose_style
 from tests.api.service import KESTREL, POLICY, Service, serving
 from tests.library import cases
 from tests.waiting import END_S, until
@@ -105,6 +105,25 @@ def test_a_session_follows_the_poses_as_next_does(posed: Service):
             assert answer == {name: asked[name] for name in answer if name in asked} | {"newer_version": None}
             hand, phase = {name: answer[name] for name in hand}, answer["phase"]
     assert phase == 20
+
+
+@pytest.mark.parametrize("backend", backends.BACKENDS)
+def test_a_session_has_the_other_arm_as_next_does(backend: str, tmp_path: Path):
+    url = of_both_arms(backend, tmp_path)
+    with serving(url) as service:
+        hand, phase = start_of(service), None
+        there = service.http.get(f"{POLICY}/pose-style").json()["partner_motion"]
+        with opened(service) as socket:
+            socket.receive_json()
+            for _ in range(5):
+                socket.send_json(hand)
+                answer = socket.receive_json()
+                asked = service.http.post(f"{POLICY}/next", json=hand | {"phase": phase}).json()
+                hand, phase = {name: answer[name] for name in hand}, answer["phase"]
+                other = {"arm": "PSM1", **{name: there[name][phase] for name in hand}}
+                assert answer["partner_pose"] == asked["partner_pose"] == other
+        until(lambda: service.app.state.sessions.count == 0)
+    backends.drop(url)
 
 
 def test_a_message_that_is_no_pose_is_answered_and_the_session_stays(posed: Service):

@@ -18,6 +18,7 @@ from skills.comparison.distances import STATES, Measured
 from skills.db import packed  # the tables declare the types that may be stored
 from skills.db.packed import FORMAT, Packed, digest, pack, seal, unpack
 from skills.demonstration.demonstration import Demo, Partner, Pause, cut_demo
+from skills.demonstration.partner import PartnerMotion
 from skills.errors import Corrupt
 from skills.formats import read_recording
 from skills.gridworld.grid import PAPER_GRID, GridWorld, discretize
@@ -110,6 +111,7 @@ VALUES = [
     replace(PLAN, psm_m=PsmM((1.0, 0.0, 0.0), (160.0, 20.0, 20.0), (0.0, 0.0, 0.0, 1.0), "420006", "start", "a", "b")),
     certify(POLICY)[1],
     certified_poses([DEMO]),
+    certified_poses([DEMO], partners=[PartnerMotion("PSM1", DEMO.tip_mm + 9.0, DEMO.rotation_xyzw)]),
     PLAYBACK,
     Pictures(b"mp4", b"gif", b"joints", b"clearance"),
     Measured(None, np.array([], np.int64), np.array([]), np.array([])),

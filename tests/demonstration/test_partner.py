@@ -108,6 +108,13 @@ def test_a_motion_that_was_not_recorded_all_along_is_none(recorded):
     assert partner_motion(replace(value, motions=motions), demo) is None
 
 
+def test_a_demonstration_cut_in_another_frame_than_today_has_none(recorded):
+    value, _ = recorded
+    demo = cut(value)
+    assert partner_motion(value, demo) is not None
+    assert partner_motion(value, replace(demo, frame="ECM")) is None
+
+
 # ---- its base ---------------------------------------------------------------------------------------------------
 
 

@@ -12,6 +12,7 @@ from skills.demonstration.demonstration import Demo
 from skills.demonstration.partner import PartnerMotion
 from skills.errors import BadInput, MixedFrames
 from skills.learning.pose_style import PHASES, learn_pose_style, mean_rotation
+from skills.learning.tube import certified_poses
 from tests.bench.pose_styles import drawn, interval, laid_medoid, left_out, line, motions, ours, surgeons
 from tests.by_day import some
 
@@ -204,6 +205,47 @@ def test_the_other_arm_stays_in_step_where_tempos_differ() -> None:
     )
     assert path.partner is not None
     assert np.abs(path.partner.tip_mm - path.tip_mm - (4.0, -9.0, 2.0)).max() < 1e-9
+
+
+@given(st.integers(0, 10_000))
+def test_the_served_motion_of_the_other_arm_moves_with_the_demonstration(seed: int) -> None:
+    """The law: a rigid motion of demonstration and other arm is that of what is served of both."""
+    demo = a_demo(seed % 50)
+    assert demo.rotation_xyzw is not None
+    shift, turn = poses(seed)
+    rigid = Rotation.from_quat(turn)
+    other, there = beside(demo), replace(demo, tip_mm=rigid.apply(np.array(demo.tip_mm)) + shift)
+    there = replace(there, rotation_xyzw=(rigid * Rotation.from_quat(demo.rotation_xyzw)).as_quat())
+    moved = PartnerMotion(
+        other.arm,
+        rigid.apply(np.array(other.tip_mm)) + shift,
+        (rigid * Rotation.from_quat(other.rotation_xyzw)).as_quat(),
+    )
+    found = [certified_poses([one], partners=[arm]) for one, arm in ((demo, other), (there, moved))]
+    here, away = (None if one is None else one.path.partner for one in found)
+    assert here is not None and away is not None
+    assert np.abs(away.tip_mm - rigid.apply(np.array(here.tip_mm)) - shift).max() < 1e-9
+    assert angle(away.rotation_xyzw, (rigid * Rotation.from_quat(here.rotation_xyzw)).as_quat()) < 1e-6
+
+
+def test_the_other_arm_is_served_only_if_all_demonstrations_have_the_same() -> None:
+    shown = [a_demo(0), a_demo(1)]
+    both = [beside(one) for one in shown]
+    for partners, there in (
+        (both, True),
+        ([both[0], None], False),
+        ([both[0], replace(both[1], arm="PSM3")], False),
+        ([], False),
+        (None, False),
+    ):
+        found = certified_poses(shown, partners=partners)
+        assert found is not None and (found.path.partner is not None) == there
+
+
+def test_another_arm_of_fewer_poses_is_none_of_the_path() -> None:
+    path = learn_pose_style([a_demo()]).between(*poses(1), *poses(2))
+    with pytest.raises(BadInput, match="The other arm has 10 poses, and the path 101"):
+        replace(path, partner=PartnerMotion("PSM1", path.tip_mm[:10], path.rotation_xyzw[:10]))
 
 
 def test_other_arms_that_are_not_those_of_the_demonstrations_are_refused() -> None:

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 
 from skills.arrays import xyz
+from skills.demonstration.partner import PartnerMotion
 from skills.errors import BadInput, BadSettings
 from skills.gridworld.scene import Box, Capsule, Scene, Tissue
 from skills.learning import tube
@@ -263,10 +264,15 @@ STRAIGHT = np.stack([np.linspace(0.0, 60.0, PHASES), np.zeros(PHASES), np.full(P
 BESIDE = Box((20.0, 10.0, -140.0), (40.0, 30.0, -100.0))  # 10 mm from the straight path
 
 
-def in_scene(scene: Scene, tip_mm: np.ndarray = STRAIGHT, limits: TubeLimits = LIMITS) -> CertifiedPoses:
+def in_scene(
+    scene: Scene,
+    tip_mm: np.ndarray = STRAIGHT,
+    limits: TubeLimits = LIMITS,
+    other: PartnerMotion | None = None,
+) -> CertifiedPoses:
     """Return a motion without a turn, with its tube narrowed for a scene."""
     nothing, upright = np.zeros(PHASES), np.tile([0.0, 0.0, 0.0, 1.0], (PHASES, 1))
-    path = PosePath(tip_mm, upright, np.linspace(0.0, 4.0, PHASES), nothing, nothing, nothing)
+    path = PosePath(tip_mm, upright, np.linspace(0.0, 4.0, PHASES), nothing, nothing, nothing, partner=other)
     return clear_tube(CertifiedPoses("PSM2", "PSM2_base", path, certify_tube(path, limits)), scene)
 
 
@@ -304,6 +310,21 @@ def test_a_scene_far_from_the_tube_leaves_it_as_it_is():
     assert (nothing.tube.limits, nothing.scene) == (LIMITS, None)
     with pytest.raises(BadSettings, match="frame 'PSM1_base'"):
         in_scene(replace(far, frame="PSM1_base"))
+
+
+def test_the_distance_of_the_other_arm_is_stated_and_decides_nothing():
+    """By hand: the edge at (20, 10) is 400 / sqrt(3625) mm from its line, and the capsule's axis crosses it."""
+    scene = Scene("PSM2_base", boxes=(Box((20.0, 10.0, -80.0), (40.0, 30.0, -60.0)),))
+    along = np.linspace((60.0, 0.0, -70.0), (0.0, 5.0, -70.0), PHASES)
+    other = PartnerMotion("PSM1", along, np.tile([0.0, 1.0, 0.0, 0.0], (PHASES, 1)))
+    poses = in_scene(scene, other=other)
+    assert poses.partner_scene == TubeClearance(pytest.approx(400 / 3625**0.5), "box 0", 67)
+    assert (poses.tube, poses.scene) == (in_scene(scene).tube, in_scene(scene).scene)
+    itself = replace(scene, capsules=(Capsule((30.0, 2.5, -90.0), (30.0, 2.5, -50.0), 4.0),))
+    inside = in_scene(itself, other=other)
+    assert inside.tube.holds and inside.partner_scene is not None
+    assert (inside.partner_scene.least_mm, inside.partner_scene.part) == (pytest.approx(-4.0), "capsule 0")
+    assert in_scene(scene).partner_scene is None
 
 
 def test_a_path_too_near_to_a_scene_is_not_certified():

@@ -2,52 +2,105 @@
 
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
-from sqlalchemy import func, select, text
+from sqlalchemy import delete, func, select, text
 
-from skills.db.models import Demonstration, PolicyVersion, StoredPoses
+from skills.comparison.combining import Corridor
+from skills.db.models import Demonstration, ParsedChunk, ParsedRecording, PolicyVersion, StoredPoses
 from skills.db.session import Database
 from skills.demonstration.motion import Motion
+from skills.demonstration.partner import PartnerMotion
 from skills.demonstration.recording import Recording
-from skills.errors import Corrupt, NotFound
+from skills.errors import Busy, Corrupt, NotFound
 from skills.formats import write_mcap
+from skills.formats.reader_process import read_told
 from skills.learning.pose_style import PHASES
 from skills.learning.tube import certified_poses
 from skills.library import training
 from skills.library.backup import back_up, restore
+from skills.library.batch_work import retrain_part
+from skills.library.catalogue import put_surgeon
 from skills.library.demos import withdraw_demo
 from skills.library.erasure import erase_demo
 from skills.library.inspection import HISTORY, inspect_installation
 from skills.library.policies import poses_of
 from skills.remedies import Action, Remedy
+from skills.settings import Settings
 from tests import backends
 from tests.library import cases
-from tests.library.styles import retrain
+from tests.library.styles import NO_CONSENT, ask_retraining, parts_of, retrain, states_of
 
 MCAP = "application/vnd.mcap"
 
 
-def turning(shift_mm: float = 0.0, *, tip: np.ndarray | None = None, detour_deg: float = 0.0) -> bytes:
-    """Return a hand-off of PSM2 that turns by 60 degrees about the shaft on its way, and aside and back by a detour."""
+# PSM_M goes straight to 12 mm beside where PSM_A ends; PSM_A's base stands at BASE_MM in the camera's frame.
+AWAY_MM, BESIDE_MM, BASE_MM = (45.0, 55.0, -125.0), (17.0, 55.0, -125.0), np.array([30.0, -40.0, 180.0])
+
+
+def turning(
+    shift_mm: float = 0.0,
+    *,
+    tip: np.ndarray | None = None,
+    detour_deg: float = 0.0,
+    other: str | None = None,
+    other_s: float = 0.0,
+) -> bytes:
+    """Return a hand-off of PSM2 that turns by 60 degrees about the shaft on its way, and aside and back by a detour.
+
+    Args:
+        shift_mm: Where it lies, along x.
+        tip: The positions; default: those of `cases`.
+        detour_deg: The detour.
+        other: The other arm, which goes from `AWAY_MM` to `BESIDE_MM`; None: it was not recorded.
+        other_s: It was recorded from so long after the start on.
+    """
     tip = cases.points_mm((shift_mm, 0.0, 0.0)) if tip is None else tip
     stamps_ns = cases.START_NS + np.arange(len(tip)) * (10**9 // cases.RATE_HZ)
     spin = Rotation.from_rotvec(np.radians(np.linspace(0.0, 60.0, len(tip)))[:, None] * [0.0, 0.0, 1.0])
     aside = Rotation.from_rotvec(np.radians(detour_deg) * np.sin(np.linspace(0, np.pi, len(tip)))[:, None] * [1, 0, 0])
     turned = (Rotation.from_quat([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0]) * spin * aside).as_quat()
-    motion = Motion("PSM2", "/PSM2/local/measured_cp", "PSM2_base", stamps_ns, tip, turned)
-    return write_mcap(Recording(format="mcap", integrity="full", motions=(motion,)))
+    motions = [Motion("PSM2", "/PSM2/local/measured_cp", "PSM2_base", stamps_ns, tip, turned)]
+    if other is not None:
+        there = np.linspace(AWAY_MM, BESIDE_MM, len(tip)) + np.array([shift_mm, 0.0, 0.0])
+        since = stamps_ns >= stamps_ns[0] + round(1e9 * other_s)
+        seen = stamps_ns[since], there[since] + BASE_MM, np.tile([0.0, 1.0, 0.0, 0.0], (int(since.sum()), 1))
+        motions.append(Motion("PSM2", "/PSM2/measured_cp", "ECM", stamps_ns, tip + BASE_MM, turned))
+        motions.append(Motion(other, f"/{other}/measured_cp", "ECM", *seen))
+    return write_mcap(Recording(format="mcap", integrity="full", motions=tuple(motions)))
 
 
-def add(database: Database, data: bytes) -> Demonstration:
-    return cases.store(database, cases.upload(data, MCAP))
+def add(database: Database, data: bytes, **cut: Any) -> Demonstration:
+    return cases.store(database, cases.upload(data, MCAP), **cut)
+
+
+def both_arms(shift_mm: float = 0.0) -> bytes:
+    """Return a hand-off of PSM2 to PSM1, which was recorded all along."""
+    return turning(shift_mm, other="PSM1")
+
+
+def add_both(database: Database, shift_mm: float = 0.0) -> Demonstration:
+    """Store a demonstration of PSM2 whose recording has the other arm too."""
+    return add(database, both_arms(shift_mm), arm="PSM2", segment="whole")
+
+
+def beside(database: Database, version: PolicyVersion) -> PartnerMotion | None:
+    """Return the other arm's motion in the pose style of a version."""
+    with database.reading() as session:
+        return poses_of(session.get_one(PolicyVersion, version.row)).path.partner
 
 
 def stored(database: Database) -> int:
     with database.reading() as session:
         return session.scalar(select(func.count()).select_from(StoredPoses)) or 0
+
+
+def rows_of(database: Database) -> list[Any]:
+    with database.reading() as session:
+        return [tuple(row) for row in session.execute(text("SELECT sha256, policy_row, poses FROM pose_styles"))]
 
 
 def wrong(database: Database) -> list[tuple[str, str]]:
@@ -127,7 +180,7 @@ def test_an_older_version_gets_its_pose_style_by_an_equal_training(database: Dat
     add(database, turning())
     with monkeypatch.context() as older:
         older.setattr(training, "POSES_VERSION", 0)
-        older.setattr(training, "certified_poses", lambda *_: None)
+        older.setattr(training, "certified_poses", lambda *_, **__: None)
         version = cases.train(database, release=True)
     with database.reading() as session, pytest.raises(NotFound, match="before there were any") as refused:
         poses_of(session.get_one(PolicyVersion, version.row))
@@ -156,6 +209,129 @@ def test_a_pose_style_is_erased_with_its_demonstration(database: Database):
     with database.writing() as session:
         erase_demo(session, demo.sha256, "test")
     assert stored(database) == 0
+
+
+# ---- the other arm -----------------------------------------------------------------------------------------------
+
+
+def test_the_other_arm_is_stored_as_it_was_demonstrated(database: Database):
+    """By hand: phase k of 100 is k hundredths of the straight way from 45 to 17 mm along x."""
+    cases.add_surgeon(database)
+    add_both(database)
+    other = beside(database, cases.train(database))
+    assert other is not None and other.arm == "PSM1"
+    assert np.abs(other.tip_mm - np.linspace(AWAY_MM, BESIDE_MM, PHASES)).max() < 1e-6
+    assert other.tip_mm[50] == pytest.approx((31.0, 55.0, -125.0), abs=1e-6)
+    assert np.abs(np.abs(other.rotation_xyzw) - (0.0, 1.0, 0.0, 0.0)).max() < 1e-6
+    assert wrong(database) == []
+
+
+def test_a_demonstration_moved_as_a_whole_moves_the_other_arm(database: Database):
+    cases.add_surgeon(database)
+    demos = [add_both(database, shift) for shift in (0.0, 3.5)]
+    here, there = (beside(database, cases.train(database, demos=[demo.sha256])) for demo in demos)
+    assert here is not None and there is not None
+    assert np.abs(there.tip_mm - here.tip_mm - (3.5, 0.0, 0.0)).max() < 1e-6
+    assert np.abs(there.rotation_xyzw - here.rotation_xyzw).max() < 1e-6
+
+
+@pytest.mark.parametrize("without", [{"other": None}, {"other_s": 0.5}, {"other": "PSM3"}])
+def test_the_other_arm_is_learnt_if_every_recording_has_it_all_along(database: Database, without: dict[str, Any]):
+    cases.add_surgeon(database)
+    has = [add_both(database, shift) for shift in (0.0, 2.5)]
+    has_not = add(database, turning(1.0, **{"other": "PSM1"} | without), arm="PSM2", segment="whole")
+    both = cases.train(database, demos=[one.sha256 for one in has], combine=Corridor())
+    other = beside(database, both)
+    assert other is not None and other.arm == "PSM1"
+    mixed = cases.train(database, demos=[one.sha256 for one in (*has, has_not)], combine=Corridor())
+    assert beside(database, mixed) is None
+    assert wrong(database) == []
+
+
+def test_a_batch_learns_the_other_arm_too(database: Database):
+    cases.add_surgeon(database)
+    add_both(database)
+    assert retrain(database, release=True).state == "succeeded"
+    with database.reading() as session:
+        version = session.scalars(select(PolicyVersion)).one()
+    assert beside(database, version) is not None
+
+
+def test_a_batch_tries_a_style_again_whose_recording_cannot_be_read_now(
+    database: Database, monkeypatch: pytest.MonkeyPatch
+):
+    cases.add_surgeon(database)
+    add_both(database)
+    job = ask_retraining(database)
+    (part,) = parts_of(database, job)
+    with monkeypatch.context() as now:
+        now.setattr(training, "stored_recording", busy)
+        with pytest.raises(Busy):
+            retrain_part(database, part.request, Settings(database_url=database.url))
+    assert states_of(database, job) == ["queued"]
+    cases.work(database, part)
+    assert states_of(database, job) == ["done"]
+
+
+def busy(*_: Any) -> None:
+    raise Busy("Too many recordings are being read; try again.")
+
+
+def test_a_recording_that_is_not_cached_is_read_again(database: Database):
+    cases.add_surgeon(database)
+    add_both(database)
+    cached = beside(database, cases.train(database))
+    with database.writing() as session:
+        session.execute(delete(ParsedChunk))
+        session.execute(delete(ParsedRecording))
+    again = beside(database, cases.train(database, seed=2))
+    assert cached is not None and again is not None
+    assert again.tip_mm.tobytes() == cached.tip_mm.tobytes()
+
+
+def test_no_recording_is_read_where_the_other_arm_is_not_known(database: Database, monkeypatch: pytest.MonkeyPatch):
+    cases.add_surgeon(database)
+    add(database, turning())
+    monkeypatch.setattr(training, "stored_recording", lambda *_: pytest.fail("it was read"))
+    assert beside(database, cases.train(database)) is None
+
+
+def test_no_recording_is_read_without_consent(database: Database, monkeypatch: pytest.MonkeyPatch):
+    cases.add_surgeon(database)
+    add_both(database)
+    job = cases.ask_training(database)
+    with database.writing() as session:
+        put_surgeon(session, "kestrel", NO_CONSENT, "test")
+    monkeypatch.setattr(training, "stored_recording", lambda *_: pytest.fail("it was read"))
+    ended = cases.work(database, job)
+    assert ended.state == "failed" and "consent" in (ended.error or "")
+
+
+def test_a_recording_that_was_erased_meanwhile_is_named(database: Database):
+    cases.add_surgeon(database)
+    demo = add_both(database)
+    with database.reading() as session:
+        read = training.lessons(session, [demo.row])
+    with database.writing() as session:
+        erase_demo(session, demo.sha256, "test")
+    with pytest.raises(NotFound, match=r"A demonstration was erased while the training used it\."):
+        training.with_partners(database, read, read_told)
+
+
+def test_a_pose_style_of_before_keeps_its_bytes_at_an_equal_training(
+    database: Database, monkeypatch: pytest.MonkeyPatch
+):
+    cases.add_surgeon(database)
+    add_both(database)
+    with monkeypatch.context() as older:
+        older.setattr(training, "POSES_VERSION", 2)
+        older.setattr(training, "with_partners", lambda _database, lessons, _tell: [*lessons])
+        version = cases.train(database, release=True)
+    before = rows_of(database)
+    assert beside(database, version) is None
+    assert cases.train(database, release=True).row == version.row
+    assert (rows_of(database), wrong(database)) == (before, [])
+    assert beside(database, cases.train(database, seed=2)) is not None  # another version has it
 
 
 @pytest.mark.nightly  # by day tests/library/test_backup.py counts every table

@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from sqlalchemy import text, update
+from sqlalchemy import select, text, update
 
 from skills.cli.installation import state_of
 from skills.comparison.combining import Corridor
-from skills.db.models import Demonstration, PolicyVersion
+from skills.db.models import Demonstration, PolicyVersion, StoredPoses
+from skills.db.packed import digest
 from skills.db.session import Database
 from skills.errors import NotFound
 from skills.formats.reader_process import read_told
@@ -23,13 +24,14 @@ from skills.library import inspection
 from skills.library.catalogue import put_surgeon
 from skills.library.demos import mark_demo
 from skills.library.inspection import Checked, inspect_policies
-from skills.library.integrity import demo_identity, policy_identity
+from skills.library.integrity import demo_identity, policy_identity, poses_identity_of
 from skills.library.relearning import compute_again, decoded
 from skills.library.training import GATE_VERSION, certified, lessons
 from skills.settings import Settings
 from tests import backends
 from tests.library import cases
 from tests.library.attacks import tampering
+from tests.library.test_pose_styles import add_both
 from tests.library.test_scenes import SCENE, SLIPPING
 
 CERTIFICATES, RELEARNT = "certificates", "policies learnt again"
@@ -140,6 +142,34 @@ def test_other_actions_with_certificate_and_digests_are_named(database):
     ((name, why),) = parts(database)[RELEARNT].wrong
     assert name == "policy_versions 1"
     assert why.startswith("computed again, it has other results: its values")
+
+
+def test_another_motion_of_the_other_arm_with_its_digest_is_named(tmp_path: Path):
+    """It was rewritten with the digest of its row, so only reading the recording again can find it."""
+    database = Database(backends.fresh("sqlite", tmp_path))
+    cases.add_surgeon(database)
+    for shift_mm in (0.0, 2.5):
+        add_both(database, shift_mm)
+    with database.reading() as session:
+        demos = [one.sha256 for one in session.scalars(select(Demonstration).order_by(Demonstration.row))]
+    cases.train(database, demos=demos, combine=Corridor())
+    cases.train(database, demos=demos[:1])
+    assert [part.wrong for part in parts(database).values()] == [[], []]
+    with database.reading() as session:
+        row = session.get_one(StoredPoses, 1)
+        poses, policy = row.poses, row.policy.sha256
+    other = poses.path.partner
+    assert other is not None
+    moved = replace(other, tip_mm=other.tip_mm + 1e-3)
+    changed = replace(poses, path=replace(poses.path, partner=moved))
+    with tampering(database) as connection:
+        value = {"poses": changed, "sha256": poses_identity_of(policy, digest(changed))}
+        connection.execute(update(StoredPoses).where(StoredPoses.row == 1).values(**value))
+        connection.commit()
+    assert parts(database, relearn=None)[CERTIFICATES].wrong == []
+    ((name, why),) = parts(database)[RELEARNT].wrong
+    assert name == "policy_versions 1" and why.endswith("the other arm's motion in its pose style")
+    database.close()
 
 
 def _request(manifest: dict[str, Any]) -> dict[str, Any]:
