@@ -445,7 +445,15 @@ def recognise(
 
 
 def vote(probability: Floats) -> Floats:
-    """Return the sum of the logarithms of several demonstrations' probabilities, (M, S): shape (S,)."""
+    """Return the sum of the logarithms of several demonstrations' probabilities.
+
+    Args:
+        probability: The probability of each of S surgeons for each of M demonstrations, shape (M, S); one below
+            `LEAST_VOTE` counts as that.
+
+    Returns:
+        The sum for each surgeon, shape (S,); the largest wins.
+    """
     return np.asarray(np.log(probability.clip(LEAST_VOTE)).sum(axis=0))
 
 

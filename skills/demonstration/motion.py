@@ -358,6 +358,14 @@ def recorded_motion(
 def recorded_signal(stamps_ns: Ints, values: Floats, topic: str) -> Signal:
     """Make a signal of a continuous value, such as a jaw's angle; samples whose stamps go back are dropped and counted.
 
+    Args:
+        stamps_ns: Integer nanoseconds, shape (T,), in the order of the recording.
+        values: Values, shape (T,); the angle of a jaw in rad.
+        topic: The source: the topic, or a table and its column.
+
+    Returns:
+        The signal, with the number of dropped samples in `backward_stamps`; samples with equal stamps are kept.
+
     Raises:
         BackwardStamps: As in `forward_samples`.
         NotFinite: A value is NaN or infinite.
@@ -371,6 +379,15 @@ def recorded_signal(stamps_ns: Ints, values: Floats, topic: str) -> Signal:
 
 def recorded_joints(arm: str, topic: str, stamps_ns: Ints, positions: Floats) -> Joints:
     """Make joints from samples as recorded; those whose stamps go back are dropped and counted.
+
+    Args:
+        arm: The arm's name.
+        topic: The source: the topic, or "table" with what it holds.
+        stamps_ns: Integer nanoseconds, shape (T,), in the order of the recording.
+        positions: Shape (T, J), in rad; the third joint of a PSM, its insertion, in mm.
+
+    Returns:
+        The joints, with the number of dropped samples in `backward_stamps`; samples with equal stamps are kept.
 
     Raises:
         BackwardStamps: As in `forward_samples`.

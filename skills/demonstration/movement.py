@@ -334,7 +334,11 @@ def press_times(clutch: Signal) -> list[tuple[int, int | None]]:
 
 
 def clutched(recording: Recording) -> list[Nanoseconds]:
-    """Return the intervals in which the clutch was down, in ns; the end is `FOREVER_NS` if it never went up again."""
+    """Return the intervals in which the clutch was down, in ns; the end is `FOREVER_NS` if it never went up again.
+
+    Args:
+        recording: The recording; without a clutch there is no interval.
+    """
     if recording.clutch is None:
         return []
     return [(down_ns, FOREVER_NS if up_ns is None else up_ns) for down_ns, up_ns in press_times(recording.clutch)]

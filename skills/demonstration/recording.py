@@ -148,7 +148,12 @@ def _joints_at(joints: Joints, stamps_ns: Ints) -> tuple[Ints, Floats, Floats]:
 
 
 def shown_bases(identifications: Sequence[ArmIdentification], motions: Sequence[Motion]) -> Iterator[BaseFrame]:
-    """Yield the bases that joints show in the frame of poses which are not stated to be in the base."""
+    """Yield the bases that joints show in the frame of poses which are not stated to be in the base.
+
+    Args:
+        identifications: Arms that joints and poses show together; those that are not "identified" are left out.
+        motions: The recorded poses, for which of them are stated to be in the base.
+    """
     stated = {(motion.arm, motion.topic) for motion in motions if motion.states_base}
     for one in identifications:
         if one.found.verdict == "identified" and (one.arm, one.topic) not in stated:
@@ -170,6 +175,9 @@ def paired_bases(motions: Sequence[Motion]) -> tuple[BaseFrame, ...]:
     nearest within `PAIR_NS`. The result is the median over all pairs of samples, component by component. If the
     orientations do not agree with the tips, the rotation is fitted to the tips, and `spread_rad` is the deviation of
     the orientations from it. Of more than `BASES_LIMIT` pairs of motions only the first are compared.
+
+    Args:
+        motions: The recorded poses; those without orientation are left out.
 
     Returns:
         One frame for each pair of motions of an arm, in mm; none for pairs with fewer than `PAIRS_LEAST` common
@@ -495,12 +503,22 @@ def base_frames(recording: Recording) -> tuple[BaseFrame, ...]:
     """Return the poses of the bases of arms in other frames, in mm.
 
     They are found from poses of an arm in both frames (`paired_bases`), and otherwise from its joints (`shown_bases`).
+
+    Args:
+        recording: The recording; they are computed once for each.
     """
     return recording.bases
 
 
 def preference(motion: Motion) -> tuple[int, str]:
-    """Prefer the pose relative to the arm's own remote centre: camera and set-up joints do not move it."""
+    """Prefer the pose relative to the arm's own remote centre: camera and set-up joints do not move it.
+
+    Args:
+        motion: The poses of one topic.
+
+    Returns:
+        A key to sort by, the preferred one first: rank of the topic, and its name.
+    """
     known = [f"/{motion.arm}/local/measured_cp", f"/{motion.arm}/measured_cp"]
     return (known.index(motion.topic) if motion.topic in known else len(known), motion.topic)
 

@@ -437,7 +437,17 @@ def refuse_unfit(scene: Scene, path: GridPath, frame: str) -> None:
 
 
 def touching(scene: Scene, grid: GridWorld, states: Ints, actions: Ints) -> Flags:
-    """Return for each state and action, both (N,), whether the move touches a scene, (N,); off the grid it stays."""
+    """Return for each state and action whether the move touches a scene; off the grid it stays.
+
+    Args:
+        scene: The scene, in the frame of the grid.
+        grid: The grid world.
+        states: States, shape (N,).
+        actions: The action in each, 0 to 26, shape (N,).
+
+    Returns:
+        Whether the straight line between the centres of the two cells comes within the scene's margin, shape (N,).
+    """
     cells = grid.cells_of(states)
     after = cells + MOVES[actions]
     after = np.where(grid.holds(after)[:, None], after, cells)

@@ -55,25 +55,41 @@ def any_action(bits: Any) -> Any:
 
 
 def run_episodes(
-    q: Any,  # (n_states * 27,) float64, learnt in place
-    value: Any,  # (n_states,) float64: the largest Q value of each state, kept up to date
-    best: Any,  # (n_states,) int8: the action of that Q value, the first of equals
-    rewards: Any,  # (n_states,) float64: Algorithm 1
-    shape: Any,  # (3,) uint64
-    starts: Any,  # (E,) uint64: the state that each episode starts in
-    epsilons: Any,  # (E,) float64: the probability of exploring in each episode
-    off_grid: float,  # the reward of a move off the grid
+    q: Any,
+    value: Any,
+    best: Any,
+    rewards: Any,
+    shape: Any,
+    starts: Any,
+    epsilons: Any,
+    off_grid: float,
     alpha: float,
     gamma: float,
     max_steps: int,
-    goal: Any,  # uint64
+    goal: Any,
     rng: Any,
-    tally: Any,  # (3,) int64: counts of steps, of finished episodes, and of episodes that ran out of steps; added to
+    tally: Any,
 ) -> None:
     """Learn Q values in the paper's cell state by Eq. 1, one episode for each start.
 
     Integers are unsigned, so that numba does not test each index for being negative; x, y and z count from 1, so that a
     move to -1 is 0 and not a wrapped number.
+
+    Args:
+        q: Q values, shape (n_states * 27,), float64, learnt in place.
+        value: The largest Q value of each state, shape (n_states,), float64, kept up to date.
+        best: The action of that Q value, the first of equals, shape (n_states,), int8, kept up to date.
+        rewards: Algorithm 1: the reward for entering each state, shape (n_states,), float64.
+        shape: Number of cells along each axis, shape (3,), uint64.
+        starts: The state that each episode starts in, shape (E,), uint64.
+        epsilons: The probability of exploring in each episode, shape (E,), float64.
+        off_grid: The reward of a move off the grid.
+        alpha: Learning rate.
+        gamma: Discount.
+        max_steps: The number of moves after which an episode ends.
+        goal: The state that finishes an episode, uint64.
+        rng: State of the random bits, shape (1,), uint64, advanced in place.
+        tally: Counts of steps, of finished episodes, and of those that ran out of steps, shape (3,), int64; added to.
     """
     nx, ny, nz = shape[0], shape[1], shape[2]
     before_first = (ny + ONE) * nz + ONE
@@ -132,17 +148,31 @@ def run_episodes(
 
 
 def explore(
-    model: Any,  # (n_states, 27) int32: the state that each action led to, `OFF_GRID`, `TOUCHED` or `UNKNOWN`
-    shape: Any,  # (3,) int64
-    first: int,  # start state of the first episode times 27, plus its first action; the others follow in order
-    slip: float,  # probability that one of the 27 moves, drawn uniformly, is made instead
+    model: Any,
+    shape: Any,
+    first: int,
+    slip: float,
     max_steps: int,
     goal: int,
     rng: Any,
-    tally: Any,  # as for `run_episodes`
-    touches: Any,  # (n_states, 27) bool: moves that touch the scene and end the episode; (0, 27) without a scene
+    tally: Any,
+    touches: Any,
 ) -> None:
-    """Move in the grid and record the result of each action: one episode for every pair of state and action."""
+    """Move in the grid and record the result of each action: one episode for every pair of state and action.
+
+    Args:
+        model: The state that each action led to, `OFF_GRID`, `TOUCHED` or `UNKNOWN`, shape (n_states, 27), int32,
+            changed in place.
+        shape: Number of cells along each axis, shape (3,), int64.
+        first: Start state of the first episode times 27, plus its first action; the others follow in order.
+        slip: Probability that one of the 27 moves, drawn uniformly, is made instead.
+        max_steps: The number of moves after which an episode ends.
+        goal: The state that finishes an episode.
+        rng: State of the random bits, shape (1,), uint64, advanced in place.
+        tally: Counts of steps, of finished episodes, and of episodes that ran out of steps or touched the scene, shape
+            (3,), int64; added to.
+        touches: Moves that touch the scene and end the episode, shape (n_states, 27), bool; (0, 27) without a scene.
+    """
     nx, ny, nz = shape[0], shape[1], shape[2]
     slips = np.uint64(slip * 4294967296.0)
     random = rng[0]
@@ -183,24 +213,42 @@ def explore(
 
 
 def sweep(
-    q: Any,  # (rows, 27) float64, learnt in place
-    value: Any,  # (rows,) float64: the largest Q value of each row
-    model: Any,  # as for `explore`
-    states: Any,  # (rows,) int64: the state of each row
-    live: Any,  # (rows,) bool: whether Q values are learnt in this row
-    stays: Any,  # (rows,) bool: whether the phase stays the same on entering this state
-    worth: Any,  # (n_states,) float64: reward and discounted value of entering each state in the phase, updated
-    first: int,  # row of the phase
-    last: int,  # row of the phase, exclusive
-    backwards: bool,  # whether rows are processed from the last to the first
-    entering: Any,  # (n_states,) float64: the reward for entering each state without a change of phase
+    q: Any,
+    value: Any,
+    model: Any,
+    states: Any,
+    live: Any,
+    stays: Any,
+    worth: Any,
+    first: int,
+    last: int,
+    backwards: bool,
+    entering: Any,
     off_grid: float,
-    touched: float,  # the reward of touching the scene
+    touched: float,
     alpha: float,
     gamma: float,
     tolerance: float,
 ) -> Any:
     """Apply Eq. 1 once to every action of a phase that was tried.
+
+    Args:
+        q: Q values, shape (rows, 27), float64, learnt in place.
+        value: The largest Q value of each row, shape (rows,), float64, kept up to date.
+        model: The state that each action led to, as `explore` records it, shape (n_states, 27), int32.
+        states: The state of each row, shape (rows,), int64.
+        live: Whether Q values are learnt in each row, shape (rows,), bool.
+        stays: Whether the phase stays the same on entering the row's state, shape (rows,), bool.
+        worth: Reward and discounted value of entering each state in the phase, shape (n_states,), float64, updated.
+        first: First row of the phase.
+        last: Last row of the phase, exclusive.
+        backwards: Whether rows are processed from the last to the first.
+        entering: The reward for entering each state without a change of phase, shape (n_states,), float64.
+        off_grid: The reward of a move off the grid.
+        touched: The reward of touching the scene.
+        alpha: Learning rate.
+        gamma: Discount.
+        tolerance: Relative change up to which a Q value counts as unchanged.
 
     Returns:
         The number of Q values whose relative change was greater than the tolerance.
@@ -235,11 +283,11 @@ def sweep(
 
 
 def settle(
-    best: Any,  # (n_states,) float64: the value of the best move in each state, iterated in place
-    worth: Any,  # (n_states,) float64: reward and discounted value of entering each state, updated
-    rewards: Any,  # (n_states,) float64: Algorithm 1
-    stays: Any,  # (n_states,) bool: whether entering it neither changes the phase nor finishes
-    shape: Any,  # (3,) int64
+    best: Any,
+    worth: Any,
+    rewards: Any,
+    stays: Any,
+    shape: Any,
     goal: int,
     off_grid: float,
     gamma: float,
@@ -247,6 +295,18 @@ def settle(
     max_sweeps: int,
 ) -> Any:
     """Iterate values over the grid, forwards and backwards in turn, until no relative change is above the tolerance.
+
+    Args:
+        best: The value of the best move in each state, shape (n_states,), float64, iterated in place.
+        worth: Reward and discounted value of entering each state, shape (n_states,), float64, updated.
+        rewards: The reward for entering each state, shape (n_states,), float64.
+        stays: Whether entering a state neither changes the phase nor finishes, shape (n_states,), bool.
+        shape: Number of cells along each axis, shape (3,), int64.
+        goal: The state that finishes, whose value is not iterated; -1 if there is none.
+        off_grid: The reward of a move off the grid.
+        gamma: Discount.
+        tolerance: Relative change up to which a value counts as unchanged.
+        max_sweeps: Most sweeps; forwards and backwards count as two.
 
     Returns:
         True if the values settled within `max_sweeps`.
@@ -281,13 +341,13 @@ def settle(
 
 
 def spread_distances(
-    distance: Any,  # (nx, ny, nz) int64: 0 at the places to measure from, elsewhere more than any; filled in place
+    distance: Any,
 ) -> None:
     """Count the fewest moves from each cell (Chebyshev), in one pass forwards and one back (Rosenfeld and Pfaltz 1966).
 
     Args:
-        distance: Shape (nx, ny, nz): 0 at the cells to measure from, elsewhere at least the longest distance; changed
-            in place.
+        distance: Shape (nx, ny, nz), int64: 0 at the cells to measure from, elsewhere at least the longest distance;
+            changed in place.
     """
     nx, ny, nz = distance.shape
     for way in range(2):
@@ -306,15 +366,23 @@ def spread_distances(
 
 
 def spread_worth(
-    best: Any,  # (nx, ny, nz) int64: the worth of the best move in each cell, at first less than any; filled in place
-    worth: Any,  # (nx, ny, nz) int64: that of entering each cell, at first less than any but at the given cells; filled
-    given: Any,  # (nx, ny, nz) bool: cells whose worth is given and does not change
-    step: int,  # change of the worth with each move
+    best: Any,
+    worth: Any,
+    given: Any,
+    step: int,
 ) -> None:
     """Spread the worth of given cells over a grid, forwards and backwards in turn, until nothing changes.
 
     Each move adds `step`, which is negative, so that every cell ends with the best way to a given cell; a way ends at
     the first given cell that it enters. Integers, so that equally good ways are equal.
+
+    Args:
+        best: The worth of the best move in each cell, at first less than any, shape (nx, ny, nz), int64; changed in
+            place.
+        worth: That of entering each cell, at first less than any but at the given cells, shape (nx, ny, nz), int64;
+            changed in place.
+        given: Cells whose worth is given and does not change, shape (nx, ny, nz), bool.
+        step: Change of the worth with each move, below 0.
     """
     nx, ny, nz = best.shape
     changed = True
@@ -340,12 +408,19 @@ def spread_worth(
 
 
 def find_equal(
-    q: Any,  # (rows, 27) float64
-    tie: float,  # relative difference up to which two actions are equally good
-    value: Any,  # (rows,) float64: the largest Q value of each row, filled
-    equal: Any,  # (rows,) int32: the actions that are as good as that one, a bit for each, filled
+    q: Any,
+    tie: float,
+    value: Any,
+    equal: Any,
 ) -> None:
-    """Find the best actions of each row."""
+    """Find the best actions of each row.
+
+    Args:
+        q: Q values, shape (rows, 27), float64.
+        tie: Relative difference up to which two actions are equally good.
+        value: The largest Q value of each row, shape (rows,), float64, filled.
+        equal: The actions that are as good as that one, a bit for each, shape (rows,), int32, filled.
+    """
     for row in range(len(q)):
         top = -np.inf
         for action in range(27):
@@ -362,26 +437,48 @@ def find_equal(
 
 @inner
 def place_in_box(at: Any, size_y: Any, size_z: Any) -> Any:
-    """Return the place x, y, z of a row in the box of its phase, counted from the box's first row."""
+    """Return the place x, y, z of a row in the box of its phase, counted from the box's first row.
+
+    Args:
+        at: Index of the row, counted from the box's first one.
+        size_y: Number of the box's cells along y.
+        size_z: Number of its cells along z.
+    """
     rest = at // size_z
     x = rest // size_y
     return x, rest - x * size_y, at - rest * size_z
 
 
 def choose_ways(
-    actions: Any,  # (rows,) int64: the action of each row, filled
-    length: Any,  # (rows,) int64: the way left on entering each row, in `STEPS`: 0 at ends, else `NEVER`; filled
-    deepest: Any,  # (rows,) int64: the greatest depth on that way, with that of the row: at first that alone; filled
-    joined: Any,  # (rows,) int64: the waypoint at which that way ends, filled
-    ends: Any,  # (rows,) bool: whether a way ends on entering this row
-    order: Any,  # (N,) int64: the rows that have an action; one pass is enough if every way goes backwards in it
-    equal: Any,  # as for `find_equal`
-    depth: Any,  # (rows,) int64: the depth of each row's cell
-    phase_of: Any,  # (rows,) int64
-    offset: Any,  # (P + 1,) int64: the first row of each phase, and the number of rows
-    size: Any,  # (P, 3) int64: the cells of each phase's box along each axis
+    actions: Any,
+    length: Any,
+    deepest: Any,
+    joined: Any,
+    ends: Any,
+    order: Any,
+    equal: Any,
+    depth: Any,
+    phase_of: Any,
+    offset: Any,
+    size: Any,
 ) -> None:
-    """Choose of each row's best actions the one with the shortest, then shallowest, then earliest joining way."""
+    """Choose of each row's best actions the one with the shortest, then shallowest, then earliest joining way.
+
+    Args:
+        actions: The action of each row, 0 to 26, shape (rows,), int64, filled.
+        length: The way left on entering each row, in units of `STEPS`, shape (rows,), int64: at first 0 at ends, else
+            `NEVER`; filled.
+        deepest: The greatest depth on that way, with that of the row, shape (rows,), int64: at first that alone;
+            filled.
+        joined: The waypoint at which that way ends, shape (rows,), int64: at first that of ends; filled.
+        ends: Whether a way ends on entering each row, shape (rows,), bool.
+        order: The rows that have an action, shape (N,), int64; one pass is enough if every way goes backwards in it.
+        equal: The best actions of each row, a bit for each, shape (rows,), int32, as `find_equal` fills them.
+        depth: The depth of each row's cell, shape (rows,), int64.
+        phase_of: The phase of each row, shape (rows,), int64.
+        offset: The first row of each phase, and the number of rows, shape (P + 1,), int64.
+        size: The cells of each phase's box along each axis, shape (P, 3), int64.
+    """
     number, changed, waits = 0, 1, 0
     while changed > 0 and (number != 1 or waits > 0):
         changed = 0
@@ -427,19 +524,33 @@ def choose_ways(
 
 
 def count_off_rule(
-    rows: Any,  # (N,) int64: the rows to check
-    actions: Any,  # (rows,) int64: the action of each row
-    worth: Any,  # (rows,) float64: reward and discounted value of entering each row from its phase
-    tie: Any,  # (rows,) float64: the difference up to which two actions of each row are equally good
-    length: Any,  # (rows,) int64: as for `choose_ways`, of the walks by these actions
+    rows: Any,
+    actions: Any,
+    worth: Any,
+    tie: Any,
+    length: Any,
     deepest: Any,
     joined: Any,
     ends: Any,
-    phase_of: Any,  # this and the following as for `choose_ways`
+    phase_of: Any,
     offset: Any,
     size: Any,
 ) -> Any:
     """Count the rows in which an action that is as good leads to a better way, or to an equal one at a lower index.
+
+    Args:
+        rows: The rows to check, shape (N,), int64.
+        actions: The action of each row, shape (rows,), int64.
+        worth: Reward and discounted value of entering each row from its phase, shape (rows,), float64.
+        tie: The difference up to which two actions of each row are equally good, shape (rows,), float64.
+        length: The way left on entering each row by these actions, in units of `STEPS`, shape (rows,), int64; `NEVER`
+            if it does not end.
+        deepest: The greatest depth on that way, with that of the row, shape (rows,), int64.
+        joined: The waypoint at which that way ends, shape (rows,), int64.
+        ends: Whether a way ends on entering each row, shape (rows,), bool.
+        phase_of: The phase of each row, shape (rows,), int64.
+        offset: The first row of each phase, and the number of rows, shape (P + 1,), int64.
+        size: The cells of each phase's box along each axis, shape (P, 3), int64.
 
     Returns:
         The number of rows, with those whose own way never ends.
@@ -494,13 +605,21 @@ def warp(distance: Any, cost: Any) -> None:
 
 
 def tell_apart(
-    bits: Any,  # (N,) uint64: the bits of the numbers
-    found: Any,  # (F,) uint64: the distinct numbers in order of first appearance, filled
-    places: Any,  # (N,) uint8: index of each number in `found`, filled
-    slots: Any,  # (2^k,) int16, more than F and all -1: hash table of indices in `found`, with linear probing
-    shift: Any,  # uint64: 64 - k
+    bits: Any,
+    found: Any,
+    places: Any,
+    slots: Any,
+    shift: Any,
 ) -> Any:
     """Find the distinct numbers of an array, compared bit by bit, and the index of each element among them.
+
+    Args:
+        bits: The bits of the numbers, shape (N,), uint64.
+        found: The distinct numbers in order of first appearance, shape (F,), uint64, filled.
+        places: Index of each number in `found`, shape (N,), uint8, filled.
+        slots: Hash table of indices in `found`, with linear probing: shape (2^k,), int16, more than F and all -1;
+            changed in place.
+        shift: 64 - k, uint64.
 
     Returns:
         The number of distinct numbers; -1 if they are more than `found` has room for.
@@ -531,7 +650,17 @@ def tell_apart(
 
 @inner
 def angle_between(a: Any, i: Any, b: Any, j: Any) -> Any:
-    """Return the angle between the orientations of row i of `a` and row j of `b`, unit quaternions, in rad."""
+    """Return the angle between the orientations of row i of `a` and row j of `b`, unit quaternions, in rad.
+
+    Args:
+        a: Quaternions x, y, z, w, shape (N, 4).
+        i: Index of a row of `a`.
+        b: Quaternions x, y, z, w, shape (M, 4).
+        j: Index of a row of `b`.
+
+    Returns:
+        The angle, 0 to pi; q and -q are the same orientation.
+    """
     w = a[i, 0] * b[j, 0] + a[i, 1] * b[j, 1] + a[i, 2] * b[j, 2] + a[i, 3] * b[j, 3]
     x = a[i, 3] * b[j, 0] - a[i, 0] * b[j, 3] - a[i, 1] * b[j, 2] + a[i, 2] * b[j, 1]
     y = a[i, 3] * b[j, 1] + a[i, 0] * b[j, 2] - a[i, 1] * b[j, 3] - a[i, 2] * b[j, 0]
@@ -541,23 +670,42 @@ def angle_between(a: Any, i: Any, b: Any, j: Any) -> Any:
 
 @inner
 def distance_between(a: Any, i: Any, b: Any, j: Any) -> Any:
-    """Return the distance between the positions of row i of `a` and row j of `b`, in mm."""
+    """Return the distance between the positions of row i of `a` and row j of `b`, in mm.
+
+    Args:
+        a: Positions in mm, shape (N, 3).
+        i: Index of a row of `a`.
+        b: Positions in mm in the same frame, shape (M, 3).
+        j: Index of a row of `b`.
+    """
     x, y, z = b[j, 0] - a[i, 0], b[j, 1] - a[i, 1], b[j, 2] - a[i, 2]
     return sqrt(x * x + y * y + z * z)
 
 
 def step_along(
-    path_mm: Any,  # (N, 3)
-    path_xyzw: Any,  # (N, 4) unit quaternions
-    tip_mm: Any,  # (R, 3): the positions reached, replaced by the commanded ones
-    rotation_xyzw: Any,  # (R, 4): the orientations reached, unit quaternions, replaced likewise
-    phases: Any,  # (R,) int64: replaced by the phases after the tick
-    off: Any,  # (R, 2): distance in mm and angle in rad from the pose of the phase before the tick, filled
+    path_mm: Any,
+    path_xyzw: Any,
+    tip_mm: Any,
+    rotation_xyzw: Any,
+    phases: Any,
+    off: Any,
     step_mm: float,
     step_rad: float,
     ahead: int,
 ) -> None:
-    """Make one tick of runs along a path, as `skills.learning.tube` describes it."""
+    """Make one tick of runs along a path, as `skills.learning.tube` describes it.
+
+    Args:
+        path_mm: Positions of the path, shape (N, 3), float64.
+        path_xyzw: Its orientations, unit quaternions, shape (N, 4), float64.
+        tip_mm: The positions reached, in the same frame, shape (R, 3), float64, replaced by the commanded ones.
+        rotation_xyzw: The orientations reached, unit quaternions, shape (R, 4), float64, replaced likewise.
+        phases: The phases before the tick, shape (R,), int64, replaced by those after it.
+        off: Distance in mm and angle in rad from the pose of the phase before the tick, shape (R, 2), float64, filled.
+        step_mm: Longest step of the position in a tick.
+        step_rad: Largest turn in a tick.
+        ahead: Phases that one tick may advance.
+    """
     last = len(path_mm) - 1
     for run in range(len(phases)):
         phase = phases[run]
@@ -602,14 +750,26 @@ def step_along(
 
 
 def nearest_pose(
-    path_mm: Any,  # (N, 3)
-    path_xyzw: Any,  # (N, 4) unit quaternions
-    tip_mm: Any,  # (1, 3)
-    rotation_xyzw: Any,  # (1, 4), a unit quaternion
+    path_mm: Any,
+    path_xyzw: Any,
+    tip_mm: Any,
+    rotation_xyzw: Any,
     start_mm: float,
     start_rad: float,
 ) -> Any:
-    """Return the index of the nearest pose, by the larger of distance over `start_mm` and angle over `start_rad`."""
+    """Return the index of the nearest pose, by the larger of distance over `start_mm` and angle over `start_rad`.
+
+    Args:
+        path_mm: Positions of the path, shape (N, 3), float64.
+        path_xyzw: Its orientations, unit quaternions, shape (N, 4), float64.
+        tip_mm: A position in the same frame, shape (1, 3), float64.
+        rotation_xyzw: An orientation, a unit quaternion, shape (1, 4), float64.
+        start_mm: The distance that counts as much as an angle of `start_rad`, above 0.
+        start_rad: That angle, above 0.
+
+    Returns:
+        The index, the first of equally near ones.
+    """
     nearest, best = 0, -1.0
     for phase in range(len(path_mm)):
         off_mm = distance_between(tip_mm, 0, path_mm, phase) / start_mm

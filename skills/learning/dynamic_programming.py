@@ -428,6 +428,13 @@ def rule_in(frame: str, depth_along: Sequence[float] | None = None) -> ShortestW
 
     In the base of an arm, depth is the distance from the remote centre. In another frame it is measured along the given
     direction, and not compared without one.
+
+    Args:
+        frame: Name of the frame; that of an arm's base ends with "_base".
+        depth_along: The direction in which depth increases in that frame, three numbers; not used in an arm's base.
+
+    Raises:
+        BadSettings: The direction is not finite, or has the length 0.
     """
     if frame.endswith("_base"):
         return REMOTE_CENTRE

@@ -115,6 +115,12 @@ def learn_in_scene(
 def scene_learner(learner: Learner) -> PhaseQLearning | ValueIteration:
     """Return a learner that learns in a scene.
 
+    Args:
+        learner: Any learner.
+
+    Returns:
+        The same learner.
+
     Raises:
         BadSettings: It does not: it has no phases, or a network.
     """

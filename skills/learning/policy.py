@@ -44,7 +44,11 @@ GUIDED_MM = 50.0  # ours: greatest distance of a start outside the grid; metres 
 
 
 def describe_learner(learner: Learner) -> dict[str, Any]:
-    """Return a learner as JSON: its kind and its settings."""
+    """Return a learner as JSON: its kind and its settings.
+
+    Args:
+        learner: The learner; `learner_of` returns it again.
+    """
     return {"kind": learner.kind, **describe_settings(learner)}
 
 
@@ -52,6 +56,9 @@ def describe_settings(learner: Learner) -> dict[str, Any]:
     """Return the settings of a learner as JSON; the joining rule is left out where it is the nearest waypoint.
 
     So a training by that rule has the identity that it had before there was another one.
+
+    Args:
+        learner: The learner.
     """
     settings = {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(learner).items()}
     if not learner.join_share:
@@ -60,7 +67,15 @@ def describe_settings(learner: Learner) -> dict[str, Any]:
 
 
 def learner_of(described: dict[str, Any]) -> Learner:
-    """Return a learner from its JSON."""
+    """Return a learner from its JSON.
+
+    Args:
+        described: Its kind and its settings, as `describe_learner` returns them; settings that are missing have their
+            defaults.
+
+    Raises:
+        BadSettings: There is no learner of this kind, or a setting is impossible.
+    """
     settings = dict(described)
     kind = settings.pop("kind", None)
     if kind not in LEARNERS:

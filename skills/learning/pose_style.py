@@ -343,8 +343,15 @@ def _apart(base: Rotation, rotation_xyzw: Floats) -> Floats:
 def unit_quaternion(values: ArrayLike, name: str) -> Floats:
     """Return a unit quaternion x, y, z, w, shape (4,).
 
+    Args:
+        values: The four numbers.
+        name: Their name, for the message.
+
+    Returns:
+        The same numbers, read-only; a length within `UNIT_TOLERANCE` of 1 is not corrected.
+
     Raises:
-        BadInput: It has another shape, or its length is not 1.
+        BadInput: It has another shape, a number is NaN or infinite, or its length is not 1.
     """
     quaternion = frozen(values, np.float64, (4,), name)
     if not abs(float(np.linalg.norm(quaternion)) - 1.0) <= UNIT_TOLERANCE:
@@ -359,13 +366,33 @@ def _blend(count: int) -> Floats:
 
 
 def laid_tip(tip_mm: Floats, ends_mm: Floats) -> Floats:
-    """Return positions laid between two ends."""
+    """Return positions laid between two ends.
+
+    The corrections of both ends are blended along the phases with a smoothstep.
+
+    Args:
+        tip_mm: Positions of one motion, shape (P, 3).
+        ends_mm: The new first and last position in the same frame, shape (2, 3).
+
+    Returns:
+        The positions, shape (P, 3); the first and the last are the ends.
+    """
     share = _blend(len(tip_mm))[:, None]
     return np.asarray(tip_mm + (1.0 - share) * (ends_mm[0] - tip_mm[0]) + share * (ends_mm[1] - tip_mm[-1]))
 
 
 def laid_rotations(rotation_xyzw: Floats, ends: Rotation) -> Floats:
-    """Return the orientations of each demonstration, (K, P, 4), laid between two ends."""
+    """Return the orientations of each demonstration laid between two ends.
+
+    As for `laid_tip`, the corrections of both ends are blended along the phases.
+
+    Args:
+        rotation_xyzw: Orientations of K demonstrations, unit quaternions, shape (K, P, 4).
+        ends: The new first and last orientation in the same frame.
+
+    Returns:
+        Unit quaternions, shape (K, P, 4); the first and the last orientation of each demonstration are the ends.
+    """
     demos, phases, _ = rotation_xyzw.shape
     shown = [Rotation.from_quat(rotation_xyzw[:, k]) for k in (0, -1)]
     first, last = (ends[k] * shown[k].inv() for k in (0, 1))
@@ -398,6 +425,16 @@ def _turn_at(rotation_xyzw: Floats, places: Floats) -> Floats:
 
 
 def mean_rotation(rotation_xyzw: Floats, weights: Floats) -> Floats:
-    """Return the weighted mean orientation at each phase, (PHASES, 4), from (K, PHASES, 4)."""
+    """Return the weighted mean orientation at each phase.
+
+    It is the eigenvector of the largest eigenvalue of the weighted sum of outer products, so q and -q are the same.
+
+    Args:
+        rotation_xyzw: Orientations of K demonstrations, unit quaternions, shape (K, P, 4).
+        weights: The weight of each demonstration, shape (K,).
+
+    Returns:
+        Unit quaternions of either sign, shape (P, 4).
+    """
     outer = np.einsum("k,kpi,kpj->pij", weights, rotation_xyzw, rotation_xyzw)
     return np.asarray(np.linalg.eigh(outer)[1][:, :, -1])

@@ -486,14 +486,23 @@ def moved(hand: Hand, rotation: Floats, about_mm: Floats, to_mm: Floats) -> Hand
 
 
 def jaw_recorded(hand: Hand | None) -> bool:
-    """Return whether a pass has the angles of the surgeon's jaw."""
+    """Return whether a pass has the angles of the surgeon's jaw.
+
+    Args:
+        hand: The hand along the pass; None in plans of older versions.
+    """
     return hand is not None and hand.jaw_rad is not None
 
 
 def jaw_within(demo: Demo) -> Floats | None:
     """Return the demonstrated angles of the jaw, shape (T,), within the range of the instrument.
 
-    None if there are none, or if their median is outside of the range: JIGSAWS has another zero.
+    Args:
+        demo: The demonstration.
+
+    Returns:
+        Angles in rad, clipped to the range; None if there are none, or if their median is outside of the range: JIGSAWS
+        has another zero.
     """
     if demo.jaw_rad is None:
         return None

@@ -464,7 +464,11 @@ def rotation_of(rotation_xyzw: Floats | None) -> Floats | None:
 
 
 def turn_deg(one: Pass) -> float:
-    """Return the greatest angle between the jaw's rotation in A1 and that at its start, degrees."""
+    """Return the greatest angle between the jaw's rotation in A1 and that at its start, degrees.
+
+    Args:
+        one: The pass; the result is 0 if its jaw is held.
+    """
     if one.hand is None or one.hand.rotation_xyzw is None:
         return 0.0
     turned = matrix_of(one.hand.rotation_xyzw)

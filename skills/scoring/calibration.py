@@ -123,7 +123,12 @@ class Design:
 
 
 def designs_of(cohort: Cohort) -> tuple[Design, ...]:
-    """Return the designs among which is chosen, the simplest first: of equally good ones the first is taken."""
+    """Return the designs among which is chosen, the simplest first: of equally good ones the first is taken.
+
+    Args:
+        cohort: The rated trials. Without figures of the masters there is no mean with theirs; of a single task there is
+            one sum.
+    """
     masters, together = (False, True)[: cohort.values.shape[1]], (True, False)[: len(cohort.names)]
     return tuple(Design(*chosen) for chosen in product(masters, together, STRENGTHS[::-1]))
 
@@ -450,12 +455,19 @@ def _shares(said: Ints, true: Ints) -> Floats:
 
 
 def as_numbers(model: SkillModel) -> dict[str, Any]:
-    """Return a model as plain numbers for JSON, without loss."""
+    """Return a model as plain numbers for JSON, without loss.
+
+    Args:
+        model: The fitted model.
+    """
     return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in vars(model).items()}
 
 
 def from_numbers(numbers: Mapping[str, Any]) -> SkillModel:
     """Return the model that `as_numbers` wrote.
+
+    Args:
+        numbers: The model's attributes by their names; arrays as lists.
 
     Raises:
         BadInput: An array has the wrong shape, or a number is NaN or infinite.
@@ -465,5 +477,12 @@ def from_numbers(numbers: Mapping[str, Any]) -> SkillModel:
 
 
 def of_durations(cohort: Cohort) -> Cohort:
-    """Return the cohort with the duration alone as its figure."""
+    """Return the cohort with the duration alone as its figure.
+
+    Args:
+        cohort: The rated trials, with the duration as their first figure.
+
+    Returns:
+        The same trials with one side and one figure: `values` of shape (N, 1, 1), `thirds` of shape (N, 1, 3, 1).
+    """
     return replace(cohort, values=cohort.values[:, :1, :1], thirds=cohort.thirds[:, :1, :, :1])

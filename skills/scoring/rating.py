@@ -77,7 +77,11 @@ class Skill:
 
 
 def unrated(why: str) -> Skill:
-    """Return the result for a trial that no model rates, with the reason."""
+    """Return the result for a trial that no model rates, with the reason.
+
+    Args:
+        why: The reason, one sentence or more.
+    """
     return Skill(calibrated=False, calibration=None, words=(why,))
 
 

@@ -331,6 +331,9 @@ def shuffled(cohort: Cohort, rng: np.random.Generator) -> Ints:
 def check_permutations(permutations: int) -> None:
     """Refuse a number of permutations with which no model could be accepted.
 
+    Args:
+        permutations: Number of random orders with which a model is compared.
+
     Raises:
         BadInput: There are fewer than `LEAST_PERMUTATIONS`.
     """
@@ -404,7 +407,14 @@ def level_refusals(judged: Mapping[str, Any]) -> list[str]:
 
 
 def known_parts(judged: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the parts of a rated task's rating that are predicted better than by chance."""
+    """Return the parts of a rated task's rating that are predicted better than by chance.
+
+    Args:
+        judged: As for `refusals`, of a task and not of the mean.
+
+    Returns:
+        The names of the parts.
+    """
     by_chance, lows = judged["chance"]["rho"], {name: part["rho_interval"][0] for name, part in judged["parts"].items()}
     return tuple(name for name, low in lows.items() if low > 0 and low > by_chance)
 

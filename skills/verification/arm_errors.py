@@ -180,6 +180,12 @@ NAMED = MappingProxyType({one.name: one for one in (CALIBRATED, UNCALIBRATED)})
 def checked_own(own: ArmErrors) -> ArmErrors:
     """Return a laboratory's own errors.
 
+    Args:
+        own: The errors.
+
+    Returns:
+        The same errors.
+
     Raises:
         BadSettings: They have the name of a default, and differ from it.
     """
@@ -299,7 +305,14 @@ def _stream(seed: int, error: str, number: int) -> np.random.Generator:
 
 
 def rotation_of(vectors: Floats) -> Floats:
-    """Return the rotations about axes, by their lengths in rad: vectors of shape (N, 3) to (N, 3, 3)."""
+    """Return the rotations about axes, by their lengths in rad.
+
+    Args:
+        vectors: Rotation vectors, shape (N, 3).
+
+    Returns:
+        Rotation matrices, shape (N, 3, 3).
+    """
     half = np.linalg.norm(vectors, axis=1, keepdims=True) / 2
     # sin(x) / x, which numpy has for pi x, is 1 where nothing turns
     return matrix_of(np.concatenate([np.sinc(half / pi) * vectors / 2, np.cos(half)], axis=1))
@@ -464,10 +477,18 @@ def calibrate_arm(measured: MeasuredArm, *, name: str, blocks: int = BLOCKS) -> 
 
 
 def encoder_errors_mm(measured: MeasuredArm, blocks: int = BLOCKS) -> Floats:
-    """Return the errors of the tip in the base frame by the encoders, (N, 3).
+    """Return the errors of the tip in the base frame by the encoders: measured position minus setpoint.
+
+    Args:
+        measured: Setpoints and measured poses of N moments.
+        blocks: Number of blocks of the cross-validation; at least four samples are needed for each.
+
+    Returns:
+        Errors in mm, shape (N, 3).
 
     Raises:
-        BadInput: The samples hold too few independent ones.
+        BadInput: The samples hold too few independent ones, or measured positions and setpoints differ by the same
+            number throughout.
     """
     errors_mm = np.asarray(measured.measured_mm - measured.setpoint_mm)
     _check_number(errors_mm, blocks)
@@ -475,10 +496,17 @@ def encoder_errors_mm(measured: MeasuredArm, blocks: int = BLOCKS) -> Floats:
 
 
 def tracked_errors_mm(measured: MeasuredArm, blocks: int = BLOCKS) -> Floats:
-    """Return the errors of the tip in the base frame by the tracker, (N, 3).
+    """Return the errors of the tip in the base frame by the tracker, beyond what a registration removes.
+
+    Args:
+        measured: Setpoints of N moments, and the marker's positions.
+        blocks: Number of blocks of the cross-validation; at least four samples are needed for each.
+
+    Returns:
+        Errors in mm, shape (N, 3).
 
     Raises:
-        BadInput: There is no tracker, or the samples hold too few independent ones.
+        BadInput: There is no tracker, the samples hold too few independent ones, or the errors are the same throughout.
     """
     if measured.marker_mm is None:
         raise BadInput("The recording has no tracker.")
@@ -583,7 +611,14 @@ def _spread(values: Floats) -> float:
 
 
 def effective_number(values: Floats) -> float:
-    """Return the effective number of independent samples among errors along an axis, shape (N,); at least 2."""
+    """Return the effective number of independent samples among errors along an axis.
+
+    Args:
+        values: The errors in the order of time, shape (N,), in any unit.
+
+    Returns:
+        The number, at least 2.
+    """
     rho = _autocorrelation(_autocovariance(values))
     return max(2.0, len(values) / _lasting(rho))
 

@@ -121,12 +121,23 @@ ABOVE_TISSUE = ("insertion axis", "carriage", "cannula mount", "cannula")
 
 
 def names_of(instrument: str) -> tuple[str, ...]:
-    """Return the names of an arm's parts: its bodies, then its shaft and hand."""
+    """Return the names of an arm's parts: its bodies, then its shaft and hand.
+
+    Args:
+        instrument: Number of the instrument.
+    """
     return tuple(body.name for body in _of(instrument)) + TOOL
 
 
 def radii_of(instrument: str) -> Floats:
-    """Return the radii of an arm's parts in mm, shape (B,)."""
+    """Return the radii of an arm's parts in mm, shape (B,).
+
+    Args:
+        instrument: Number of the instrument.
+
+    Returns:
+        The radii, in the order of `names_of`.
+    """
     return np.array([body.radius_mm for body in _of(instrument)] + [SHAFT_RADIUS_MM, FINGER_REACH_MM])
 
 
@@ -209,6 +220,12 @@ def _reach(body: ArmCapsule, insertion_mm: float) -> Row:
 def between(arm: Parts, radii: Floats, other: Parts, other_radii: Floats) -> Floats:
     """Return the distances of all parts of one arm from all of another in as many poses, in one frame.
 
+    Args:
+        arm: The parts of one arm, B in T poses.
+        radii: Their radii in mm, shape (B,).
+        other: The parts of the other arm, C in T poses, in the same frame.
+        other_radii: Their radii in mm, shape (C,).
+
     Returns:
         Distances in mm, negative where they overlap, shape (T, B, C); infinite between the two tools.
     """
@@ -224,11 +241,20 @@ def between(arm: Parts, radii: Floats, other: Parts, other_radii: Floats) -> Flo
 
 
 def segments_apart(p: Floats, u: Floats, q: Floats, v: Floats) -> Floats:
-    """Return the distances of segments p + s u from segments q + t v, s and t in 0..1, (..., 3) to (...,).
+    """Return the distances of segments p + s u from segments q + t v, with s and t in 0..1.
 
     The least distance is between the lines if they are nearest within both segments, and otherwise at an end of one of
     them: the s that is best for the lines is brought within the segment, then the t that is best for it, then s again.
     Where the segments are nearly parallel this is exact too, because every s is then nearly as good. NaN stays NaN.
+
+    Args:
+        p: Beginnings of the first segments, shape (..., 3).
+        u: From their beginnings to their ends, same unit, shape (..., 3).
+        q: Beginnings of the other segments, same frame, shape (..., 3).
+        v: From their beginnings to their ends, shape (..., 3).
+
+    Returns:
+        Distances of the axes in the same unit, shape (...,); shapes are broadcast.
     """
     r = p - q
     uu, vv, uv, ur, vr = ((a * b).sum(axis=-1) for a, b in ((u, u), (v, v), (u, v), (u, r), (v, r)))

@@ -316,13 +316,24 @@ def needle_poses(trajectory: Trajectory, at: Ints) -> tuple[Floats, Floats]:
 
 
 def needle_arc_mm(trajectory: Trajectory, at: Ints) -> Floats:
-    """Return points along the needle's wire in PSM_A's jaws at some samples, mm, shape (F, 49, 3)."""
+    """Return points along the needle's wire in PSM_A's jaws at some samples.
+
+    Args:
+        trajectory: The trajectory.
+        at: The samples, shape (F,).
+
+    Returns:
+        Points in mm in the PSM_A base frame, shape (F, 49, 3).
+    """
     place, rotation = _in_jaws_of_psm_a(trajectory, at)
     return np.asarray(place[:, None] + np.einsum("fij,kj->fki", rotation, _ARC_MM))
 
 
 def needle_travel_mm(trajectory: Trajectory) -> Floats:
     """Return upper bounds on the distance that any point of the needle in PSM_A's jaws moves to the next sample.
+
+    Args:
+        trajectory: The trajectory, of T samples.
 
     Returns:
         Millimetres, shape (T - 1,).

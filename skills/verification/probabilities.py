@@ -195,7 +195,11 @@ def _pass(found: dict[str, Flags]) -> PassDoubt:
 
 
 def share(wrong: Flags) -> Probability:
-    """Count the variations without a fault."""
+    """Count the variations without a fault.
+
+    Args:
+        wrong: Whether each variation has a fault, shape (N,), at least one.
+    """
     count, of = int(np.count_nonzero(~wrong)), len(wrong)
     lower, upper = wilson(count, of)
     return Probability(count, of, count / of, lower, upper)

@@ -181,7 +181,11 @@ def clearance_of(trajectory: Trajectory, scene: Scene) -> SceneClearance:
 
 
 def limit_of(scene: Scene) -> float:
-    """Return the distance, mm, that both arms must keep from a scene."""
+    """Return the distance, mm, that both arms must keep from a scene.
+
+    Args:
+        scene: The scene, whose margin counts if it is larger than `LEAST_MM`.
+    """
     return max(LEAST_MM, scene.margin_mm)
 
 
@@ -207,7 +211,11 @@ class Group:
 
 
 def groups_of(trajectory: Trajectory) -> list[tuple[str, Group]]:
-    """Return the name of each arm of a motion with its tool, and with its outer bodies."""
+    """Return the name of each arm of a motion with its tool, and with its outer bodies.
+
+    Args:
+        trajectory: The motion of PSM_A, and of PSM_M if it moves.
+    """
     arms = (PSM_A, PSM_M) if trajectory.psm_m is not None else (PSM_A,)
     return [(body, group(trajectory, body)) for body in arms for group in (_tool, _bodies)]
 
@@ -240,7 +248,16 @@ def _bodies(trajectory: Trajectory, body: str) -> Group:
 
 
 def links_at(trajectory: Trajectory, body: str, at: Ints) -> tuple[Links, ...]:
-    """Return an arm's links at some samples, in the frame of PSM_A's base; PSM_M's with each opening of its jaw."""
+    """Return an arm's links at some samples, in the frame of PSM_A's base; PSM_M's with each opening of its jaw.
+
+    Args:
+        trajectory: The motion of PSM_A, and of PSM_M if it moves.
+        body: `PSM_A` or `PSM_M`; without a motion of PSM_M always PSM_A's links are returned.
+        at: The samples, shape (C,).
+
+    Returns:
+        The links in C poses, once for PSM_A, and for each of `JAWS_RAD` for PSM_M.
+    """
     m = trajectory.psm_m
     if body == PSM_A or m is None:
         return (links_of(trajectory.joints[at], trajectory.instrument, openings(trajectory)[at]),)
@@ -318,7 +335,18 @@ def _until_next(seen_mm: Floats, way_mm: Floats) -> Floats:
 
 
 def from_parts(group: Group, scene: Scene, body: str, at: Ints) -> dict[str, Floats]:
-    """Return the distances of an arm's capsules from each part of a scene, by its name, at C samples, (C, L)."""
+    """Return the distances of an arm's capsules from each part of a scene, by its name, at some samples.
+
+    Args:
+        group: The arm's L capsules.
+        scene: The scene, in the frame of PSM_A's base; its margin is not taken off.
+        body: `PSM_A` or `PSM_M`, which is not compared with the scene's capsules.
+        at: The samples, shape (C,).
+
+    Returns:
+        Distances in mm, negative where they overlap, shape (C, L); the least of all openings of the jaw. Those from a
+        height map are lower bounds; those of capsules that are not compared with tissue are infinite.
+    """
     axes, found = group.axes(at), {}
     parts: list[tuple[str, Callable[[Floats, Floats], Floats]]] = []
     if scene.tissue is not None:
@@ -336,7 +364,16 @@ def from_parts(group: Group, scene: Scene, body: str, at: Ints) -> dict[str, Flo
 
 
 def needle_from_tissue(trajectory: Trajectory, tissue: Tissue, at: Ints) -> dict[str, Floats]:
-    """Return lower bounds on the distances of the needle in PSM_A's jaws from tissue, (C, 1)."""
+    """Return lower bounds on the distances of the needle in PSM_A's jaws from tissue.
+
+    Args:
+        trajectory: The motion.
+        tissue: The tissue, in the frame of PSM_A's base.
+        at: The samples, shape (C,).
+
+    Returns:
+        Bounds in mm, negative inside, shape (C, 1), by the name `TISSUE`.
+    """
     above = tissue.above_mm(needle_arc_mm(trajectory, at)).min(axis=1)[:, None]
     return {TISSUE: np.where(above > 0, above / tissue.steep, above) - NEEDLE_THICK_MM / 2}
 
@@ -356,6 +393,15 @@ def flat_tissue(trajectory: Trajectory, report: SceneReport, tissue: Tissue) -> 
     """Return flat tissue, above which the estimate of success varies a motion: its height and its normal, of length 1.
 
     Of a height map it is as far below the lowest place of both tools, along the map's normal, as the map is from them.
+
+    Args:
+        trajectory: The motion of PSM_A, and of PSM_M if it moves.
+        report: The comparison of that motion with the scene of the tissue.
+        tissue: The tissue, in the frame of PSM_A's base.
+
+    Returns:
+        The height in mm along the normal, from the origin of PSM_A's base, and the normal. The height is NaN where a
+        distance of a tool from the tissue is not known.
     """
     up = np.array(tissue.normal) / np.linalg.norm(tissue.normal)
     if tissue.flat:

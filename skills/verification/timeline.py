@@ -280,6 +280,9 @@ def timeline_of_recording(recording: Recording) -> Timeline:
 
     Arms are shown in one frame if each was recorded in it. Outer bodies are shown where joints were recorded and the
     place of the base in that frame is known and stood still.
+
+    Args:
+        recording: The recording.
     """
     motions, together = _motions(recording)
     clock = _Clock.of(0.0, recording.duration_s, _rate_hz(motions))
@@ -373,7 +376,13 @@ def _session(recording: Recording, start_s: float, end_s: float) -> dict[str, An
 
 
 def timeline_of_path(path: "PosePath", *, arm: str, frame: str) -> Timeline:
-    """Return the motion that a pose style gives at its own place, in the tempo of its demonstrations."""
+    """Return the motion that a pose style gives at its own place, in the tempo of its demonstrations.
+
+    Args:
+        path: The motion, and that of the other arm if the style has one.
+        arm: Name of the arm that was demonstrated.
+        frame: Name of the frame of all poses.
+    """
     clock = _Clock.of(0.0, float(path.elapsed_s[-1]), RATE_HZ)
     jaw = None if path.jaw_rad is None else (path.elapsed_s, path.jaw_rad)
     arms = [clock.track(arm, frame, (path.elapsed_s, path.tip_mm, path.rotation_xyzw), jaw)]
