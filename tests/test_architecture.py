@@ -126,6 +126,17 @@ def test_one_name_stands_for_one_thing():
     assert found.two_things() == []
 
 
+def test_no_name_of_a_test_is_longer_than_the_limit():
+    """The limit is that of CONTRIBUTING.md; `python -m tests.house` counts the names that are longer."""
+    names = {
+        (name, file.relative_to(PROJECT).as_posix())
+        for file in house.sources(PROJECT / "tests")
+        for name in re.findall(r"^ *(?:async )?def (test_\w+)", source(file), re.MULTILINE)
+    }
+    assert len(names) > 1000
+    assert sorted(one for one in names if len(one[0]) > house.LONGEST_TEST_NAME) == []
+
+
 @pytest.mark.parametrize("library", ["pickle", "cPickle", "dill", "cloudpickle", "joblib", "shelve", "marshal"])
 def test_nothing_is_pickled(library):
     assert importers(library) == []

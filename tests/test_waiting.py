@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from tests.waiting import children
 
 
-def test_a_child_is_found_once_before_and_after_the_thread_that_started_it_has_ended():
+def test_a_child_is_found_once_also_after_its_thread_has_ended():
     with ThreadPoolExecutor(1) as thread:
         child = thread.submit(subprocess.Popen, ["cat"], stdin=subprocess.PIPE).result()
         assert children(os.getpid()).count(child.pid) == 1

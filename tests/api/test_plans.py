@@ -148,7 +148,7 @@ def test_a_headline_is_good_only_if_the_stated_arm_error_allows_it(tmp_path: Pat
     assert levels == {one.name: expected[one.name] for one in arms}
 
 
-def test_a_playback_states_errors_of_its_own_or_takes_those_of_the_installation(still: Service):
+def test_a_playback_states_its_own_errors_or_takes_the_installations(still: Service):
     asked = {"plan": plan(still, [5.0, 56.0, -125.0])["id"]}
     own, calibrated, installed = asked | {"errors": asdict(ARMS)}, asked | {"errors": "calibrated"}, asked
     jobs = [still.http.post("/playbacks", json=body).json()["id"] for body in (own, calibrated, installed, own)]

@@ -45,7 +45,7 @@ def test_the_served_policy_carries_its_scene_and_a_client_verifies_it(trained: S
         rebuilt(about | {"scene": thinner}, arrays, demo)
 
 
-def test_a_client_of_before_that_runs_the_actions_as_they_are_never_touches(trained: Service):
+def test_an_older_client_that_runs_the_actions_as_they_are_never_touches(trained: Service):
     about = in_scene(trained)
     assert not {"format", "actions_joining"} & set(about)
     actions, shape = np.array(about["actions"]), tuple(about["grid"]["shape"])

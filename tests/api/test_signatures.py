@@ -63,7 +63,7 @@ def test_a_signature_is_made_once_and_again_after_a_release(trained: Service, mo
     assert files["policy.json"] == digest(trained, POLICY)
 
 
-def test_new_rows_are_signed_first_and_keep_the_first_head_that_covers_them(
+def test_new_rows_are_signed_first_and_keep_the_first_head_covering_them(
     trained: Service, monkeypatch: pytest.MonkeyPatch
 ):
     def added(slug: str) -> tuple[str, int]:

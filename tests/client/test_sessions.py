@@ -248,7 +248,7 @@ def test_a_redirect_is_not_followed(follow: Follow) -> None:
     assert refused.value.status == 307
 
 
-def test_after_a_call_that_was_cancelled_no_answer_is_taken_for_the_next_pose() -> None:
+def test_after_a_cancelled_call_no_answer_is_taken_for_the_next_pose() -> None:
     async def cancelled(url: str) -> None:
         async with AsyncClient(url) as client, client.session(**KESTREL, timeout_s=END_S) as session:
             with pytest.raises(TimeoutError):

@@ -169,7 +169,7 @@ def test_a_path_without_hysteresis_is_stored_as_before_there_was_any():
     assert_same(unpack(forged({"value": "GridPath", "of": older}, a0=PATH.states)), PATH)
 
 
-def test_a_policy_without_a_rule_among_ties_is_stored_as_before_there_was_one():
+def test_a_policy_without_a_rule_among_ties_is_stored_as_it_was_before():
     tree, arrays = parts_of(replace(PHASED, ties=None))
     assert "ties" not in tree["of"]
     assert unpack(forged(tree, **arrays)).ties is None

@@ -135,7 +135,7 @@ def test_a_recording_that_starts_before_1970_cannot_be_written():
         messages_of(Recording(format="csv", integrity="none", motions=(early,)))
 
 
-def test_a_viewers_file_has_the_poses_in_metres_and_says_that_it_is_to_look_at():
+def test_a_viewers_file_has_poses_in_metres_and_says_it_is_to_look_at():
     timeline = timeline_of_recording(two_arms(3.0))
     data = timeline_mcap(timeline, "recordings/abc")
     reader = make_reader(io.BytesIO(data), decoder_factories=[DecoderFactory()])

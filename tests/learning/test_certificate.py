@@ -232,7 +232,7 @@ def test_on_a_long_grid_an_action_is_optimal_where_it_comes_nearer(learner):
         assert (further == 0) == certificate.every_action_optimal == optimal
 
 
-def test_the_advised_gamma_is_the_least_hundredth_that_keeps_the_furthest_value():
+def test_the_advised_gamma_is_the_least_that_keeps_the_furthest_value():
     """The furthest cell is 448 moves away; each multiplies a value by gamma, and by 0.8 where a fifth of them slips."""
     policy = learn_tabular(sparse_reward(long_path()), PhaseQLearning())
     for slip in (0.0, 0.2):

@@ -168,7 +168,7 @@ def test_one_worse_action_is_found(worse):
     assert certify_in_scene(replace(policy, q=q), hazards)[0].suboptimal == 1
 
 
-def test_a_gamma_whose_values_vanish_beside_the_cost_of_touching_is_refused():
+def test_a_gamma_too_small_beside_the_cost_of_touching_is_refused():
     path, hazards = room(touch=1e6)
     policy = learn_in_scene(sparse_reward(path), ValueIteration(gamma=0.001), hazards)
     with pytest.raises(BadSettings, match=r"With gamma 0.001 the values of \d+ states are too small"):

@@ -58,7 +58,7 @@ def test_the_shares_of_five_waypoints_in_a_row_by_hand(join_share, by_hand):
     assert share_in(ROW, join_share=join_share) == by_hand
 
 
-def test_by_the_rule_start_a_pass_beyond_the_goal_goes_back_and_shows_all_of_it():
+def test_by_the_rule_start_a_pass_beyond_the_goal_goes_back_to_the_start():
     policy = learn_tabular(sparse_reward(ROW), PhaseQLearning(join_share=1.0))
     followed = rollout_from(policy, 6)
     assert followed.states.tolist() == [6, 5, 4, 3, 2, 1, 2, 3, 4, 5]
@@ -282,7 +282,7 @@ def test_the_limits_of_a_release_are_the_stated_ones_or_all_or_nothing():
         assert OddsLimits(extreme, 1.0 - extreme).least_finishing == extreme
 
 
-def test_a_path_that_comes_back_beside_its_start_fails_and_the_remedy_mends_it():
+def test_a_path_that_ends_beside_its_start_fails_and_the_remedy_mends_it():
     for join_share, within in ((0.0, False), (0.5, True)):
         policy = learnt("closed", join_share=join_share)
         assert near_starts(policy, coverage(policy).share, NearLimits()).within == within
@@ -291,7 +291,7 @@ def test_a_path_that_comes_back_beside_its_start_fails_and_the_remedy_mends_it()
 # ---- storage -------------------------------------------------------------------------------------------------------
 
 
-def test_the_json_of_a_learner_by_the_rule_nearest_is_as_before_there_were_rules():
+def test_the_json_of_a_learner_states_the_joining_rule_unless_nearest():
     assert "join_share" not in describe_learner(PhaseQLearning())
     assert "join_share" not in describe_learner(ValueIteration())
     described = describe_learner(ValueIteration(join_share=0.5))

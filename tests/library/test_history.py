@@ -415,7 +415,7 @@ def test_a_cache_may_be_emptied_by_hand_and_is_logged_again(database: Database):
     assert wrong_in(database) == []
 
 
-def test_uploads_in_pieces_erasures_in_steps_and_retentions_keep_the_history_whole(
+def test_uploads_erasures_and_retentions_in_steps_keep_the_history_whole(
     database: Database, monkeypatch: pytest.MonkeyPatch
 ):
     for room in (recordings, sweep, erasure):

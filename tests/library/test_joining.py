@@ -72,7 +72,7 @@ def test_the_gates_limit_is_a_setting_and_part_of_a_trainings_identity(database)
     assert (result["policy_version"], result["releasable"]) == (refused.version + 1, True)
 
 
-def test_a_batch_of_stale_styles_takes_those_checked_with_other_near_limits(database):
+def test_a_batch_of_stale_styles_takes_those_checked_by_other_near_limits(database):
     cases.add_surgeon(database)
     cases.add_demo(database, loop())
     cases.train(database)
@@ -86,7 +86,7 @@ def test_the_default_of_the_settings_is_that_of_the_gate():
     assert near_limits(Settings()) == NearLimits()
 
 
-def test_the_manifest_states_the_shares_and_by_another_rule_the_format_and_table(database):
+def test_a_manifest_states_shares_and_by_another_rule_format_and_table(database):
     cases.add_surgeon(database)
     cases.add_demo(database)
     nearest, half = cases.train(database), cases.train(database, learner=HALF)

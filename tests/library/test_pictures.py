@@ -146,7 +146,7 @@ def test_they_are_erased_with_what_they_show(database: Database, playback: Store
     assert drawn(database) == asked(database) == []
 
 
-def test_the_plot_of_distances_shows_both_arms_bodies_and_the_line_between_the_nearest():
+def test_the_plot_shows_both_arms_bodies_and_the_line_between_the_nearest():
     """The line's length is the least distance, by the planned joints, and it is drawn from the side and from above."""
     motion = time_parametrise([hand_off()], rate_hz=60.0, psm_m=BESIDE)
     outer = bodies_clearance(motion, 2.0)

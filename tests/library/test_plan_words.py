@@ -152,7 +152,7 @@ def test_without_a_hand_off_no_error_is_said_to_cost_success():
         (15, 15, 0.0, "it is not more: the rest is lost by several errors together."),
     ],
 )
-def test_what_lowers_a_probability_is_named_also_if_it_is_no_error_of_the_arms(count, without, shift_mm, words):
+def test_what_lowers_a_probability_is_named_also_if_it_is_no_arm_error(count, without, shift_mm, words):
     def some(count: int) -> dict[str, Any]:
         return {"count": count, "of": 20, "probability": count / 20, "lower": 0.5, "upper": 1.0}
 

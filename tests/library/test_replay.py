@@ -298,7 +298,7 @@ def test_the_bag_is_complete_deterministic_and_holds_the_plans_samples(database:
         replay_bag(database, plan.sha256, **OF_A1_ALONE)
 
 
-def test_the_bag_is_signed_under_the_first_checkpoint_that_covers_its_verdict(database: Database, plan: Plan):
+def test_the_bag_is_signed_under_the_first_checkpoint_with_its_verdict(database: Database, plan: Plan):
     judged(database, plan)
     data = replay_bag(database, plan.sha256, **OF_A1_ALONE)
     with database.reading() as session:

@@ -288,7 +288,7 @@ def test_what_ended_again_while_the_clock_was_wrong_ends_again(
         assert find_surgeon(session, surgeon).consent["uses"] == ["training"]
 
 
-def test_a_release_superseded_while_the_clock_was_wrong_is_not_served_again(
+def test_a_release_superseded_while_the_clock_was_wrong_stays_superseded(
     database: Database, restored: Callable[[], Database], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     cases.add_surgeon(database)

@@ -160,7 +160,7 @@ def test_a_deleted_recording_is_gone_at_once_and_swept_later(database: Database,
         assert session.scalars(select(RecordingChunk.recording).distinct()).all() == [again.row]
 
 
-def test_a_cached_content_is_dropped_in_steps_and_not_used_from_the_first_on(
+def test_cached_content_is_dropped_in_steps_and_unused_from_the_first_on(
     database: Database, small: None, monkeypatch: pytest.MonkeyPatch
 ):
     data = cases.hand_off()

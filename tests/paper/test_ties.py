@@ -29,7 +29,7 @@ def test_no_approach_goes_deeper_than_its_ends_and_all_are_shorter(now, later, d
     assert np.array_equal(before.rows, after.rows)
 
 
-def test_the_demonstration_is_reproduced_as_before_and_no_action_is_off_the_rule(now, user_path):
+def test_the_demonstration_is_reproduced_and_no_action_is_off_the_rule(now, user_path):
     certificate, _ = certify(now)
     assert (certificate.off_rule, certificate.suboptimal) == (0, 0)
     assert certificate.starts_joining_nearest == 1331

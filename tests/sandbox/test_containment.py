@@ -67,7 +67,7 @@ def test_missing_layers_are_refused_by_name_if_all_are_required(some_layers):
     confined_reader(Settings())
 
 
-def test_no_service_and_no_worker_starts_without_all_layers_if_they_are_required(some_layers, tmp_path, monkeypatch):
+def test_no_service_and_no_worker_starts_without_a_required_layer(some_layers, tmp_path, monkeypatch):
     wanted = Settings(containment="required", database_url=f"sqlite:///{tmp_path}/skills.sqlite", port=0)
     monkeypatch.setattr(serving.logs, "configure", lambda *how, **more: None)
     for start in (serving.serve, run_worker):
@@ -76,7 +76,7 @@ def test_no_service_and_no_worker_starts_without_all_layers_if_they_are_required
     assert not list(tmp_path.iterdir())
 
 
-def test_the_doctor_names_what_a_missing_layer_needs_and_fails_if_it_is_required(some_layers, monkeypatch):
+def test_the_doctor_names_a_missing_layers_need_and_fails_if_required(some_layers, monkeypatch):
     for mode, state in (("available", "missing"), ("required", "failed")):
         monkeypatch.setenv("SKILLS_CONTAINMENT", mode)
         settings.cache_clear()

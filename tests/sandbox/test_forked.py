@@ -284,7 +284,7 @@ def test_it_ends_with_its_asker(tmp_path):
     until(lambda: not list(tmp_path.glob("suture-skills-*")))
 
 
-def test_an_asker_that_goes_without_reading_what_it_was_told_ends_it_without_a_word():
+def test_an_asker_that_leaves_without_reading_ends_the_server_silently():
     asker, control = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     with control, selectors.DefaultSelector() as events:
         control.send(b"ready")
@@ -292,7 +292,7 @@ def test_an_asker_that_goes_without_reading_what_it_was_told_ends_it_without_a_w
         fork_server._serve(control, events, {}, fork_server._Inherited(Allowance("", ()), (), 0))
 
 
-def test_an_asker_that_has_ended_before_it_was_ready_ends_it_without_a_word(tmp_path: Path):
+def test_an_asker_gone_before_the_server_is_ready_ends_it_silently(tmp_path: Path):
     asker, control = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     asker.close()
     folder = tempfile.mkdtemp(dir=tmp_path)

@@ -64,7 +64,7 @@ def test_the_figures_of_a_circle_are_those_by_hand() -> None:
     assert found["stops"] == pytest.approx(0.0, abs=1e-9)
 
 
-def test_the_mean_over_the_arms_is_geometric_and_their_order_does_not_matter() -> None:
+def test_the_mean_over_the_arms_is_geometric_and_ignores_their_order() -> None:
     small, large = circle("PSM1", radius_mm=10.0), circle("PSM2", radius_mm=40.0)
     found = readable(measure_trial(recording(small, large)))
     assert found["path_length_mm"] == pytest.approx(

@@ -74,7 +74,7 @@ def test_jaws_hold_where_friction_exceeds_the_wedge_between_them():
 
 
 @pytest.mark.nightly  # of the referee, which is no gate
-def test_the_same_seed_gives_the_same_trials_and_a_half_step_the_same_outcomes():
+def test_a_seed_gives_the_same_trials_and_half_the_step_the_same_outcomes():
     need("mujoco")
     trajectory, errors, _ = some_plan(4)
     once, again = (referee(trajectory, errors=errors, trials=2, seed=7) for _ in range(2))
@@ -113,7 +113,7 @@ def test_the_trial_begins_where_no_finger_can_have_touched_the_needle():
     assert np.linalg.norm(needle_poses(ONE, watched[:1])[0] - hinge) > 16
 
 
-def test_the_arms_are_followed_until_they_stand_and_the_jaws_then_move_as_planned():
+def test_arms_are_followed_until_they_stand_and_jaws_then_move_as_planned():
     end, last = refereeing._watched(ONE, 0)[-1], ONE.last_samples[0]
     for planned in (ONE.joints, ONE.psm_m.joints):
         np.testing.assert_allclose(planned[end : last + 1] - planned[last], 0, atol=1e-9)
@@ -130,7 +130,7 @@ def test_the_arms_are_followed_until_they_stand_and_the_jaws_then_move_as_planne
     assert strokes["back_s"] == pytest.approx(1.875 * 18 / ONE.speed_mm_s)
 
 
-def test_a_jaw_that_holds_less_than_closed_grips_with_all_its_torque_until_it_opens():
+def test_a_jaw_that_holds_less_than_closed_grips_with_all_its_torque():
     held = np.where(ONE.jaw_rad == JAW_CLOSED_RAD, 0.1, ONE.jaw_rad)
     end = int(refereeing._watched(ONE, 0)[-1])
     (mine, _) = refereeing._strokes(replace(ONE, jaw_rad=held), 0, end)["jaws_rad"]
@@ -226,7 +226,7 @@ def test_a_plan_is_not_called_likelier_than_the_referee_finds_it():
 
 
 @pytest.mark.nightly
-def test_of_50_plans_45_are_not_called_likelier_than_the_referee_finds_them():
+def test_45_of_50_plans_are_called_no_likelier_than_the_referee_finds_them():
     found = refereed(plans=(12, 12, 13, 13), trials=100, varied=12)
     closed = [one.closed_form.probability for one in found]
     print(f"{sum(not one.too_hopeful for one in found)} of 50 plans, {min(closed):.2f} to {max(closed):.2f}")

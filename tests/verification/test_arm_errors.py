@@ -33,14 +33,14 @@ from tests.arms import ARMS
 PLAN = "0" * 64
 
 
-def test_every_size_of_a_default_has_a_source_and_a_calibrated_arm_has_no_greater_one():
+def test_every_default_has_sources_and_a_calibrated_arm_no_greater_error():
     for errors in NAMED.values():
         assert set(errors.sources) == set(SIZES)
     assert all(getattr(CALIBRATED, size) <= getattr(UNCALIBRATED, size) for size in SIZES)
     assert set(CALLED) == set(SIZES) - {"tip_correlation_s"}
 
 
-def test_errors_are_stated_by_name_or_by_json_and_else_by_the_uncalibrated_default(tmp_path, monkeypatch):
+def test_errors_are_stated_by_name_or_json_and_are_else_uncalibrated(tmp_path, monkeypatch):
     assert stated_errors("calibrated") == CALIBRATED
     assert stated_errors(json.dumps(asdict(ARMS))) == ARMS
     monkeypatch.delenv("SKILLS_ARM_ERRORS", raising=False)
@@ -108,7 +108,7 @@ def recorded(count: int = 3000, keeps: float = 0.9, seed: int = 0) -> MeasuredAr
     return MeasuredArm(tip, jaw, tip + 0.2 * lasting(rng, count, keeps), turned, np.arange(count) * 0.01)
 
 
-def test_the_effective_number_is_that_of_a_noise_whose_autocorrelation_is_known():
+def test_the_effective_number_is_that_of_noise_of_known_autocorrelation():
     rng = np.random.default_rng(1)
     for keeps in (0.0, 0.5, 0.9):
         values = lasting(rng, 20_000, keeps, axes=1)[:, 0]

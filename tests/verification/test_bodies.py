@@ -214,7 +214,7 @@ def test_the_bodies_of_both_generations_have_names_of_their_own():
 # ---- in inexact worlds ---------------------------------------------------------------------------------------------
 
 
-def test_a_plan_whose_bodies_meet_never_succeeds_though_every_needle_is_caught():
+def test_a_plan_whose_bodies_meet_fails_though_every_needle_is_caught():
     few = DoubtSettings(variations=40, suture_point_mm=0.0, needle_rad=0.0)
     asked = {"approach_m": PSM_M, "pad_top_mm": -170.0, "settings": few, "errors": EXACT}
     only = doubt(JAMMED, **asked).under[0]

@@ -53,7 +53,7 @@ def test_a_pass_without_its_a2_is_named_at_its_first_sample_alone():
     assert np.flatnonzero(~(values == 0)).tolist() == [int(np.argmax(changed.passes == 1))]
 
 
-def test_a_pass_that_ends_with_a_place_beyond_the_hinge_at_its_point_deviates_nowhere():
+def test_a_pass_that_ends_with_a_place_beyond_the_hinge_does_not_deviate():
     demo, policy = turning()
     point, psm_m = SuturePoint(tuple((demo.tip_mm[-1] - [0.0, 0.0, 10.2]).tolist())), PsmM(PSM_M, BASE_MM, BASE_XYZW)
     plan = stack(policy, [point], demo=demo, psm_m=psm_m, rate_hz=RATE_HZ, speed_mm_s=20.0, tip_offset_mm=10.2)

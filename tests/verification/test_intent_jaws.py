@@ -155,7 +155,7 @@ def test_a_jaw_that_was_not_recorded_stays_closed_in_a1():
     assert broken(compare(asked, motion.built())) == (A_LETS_GO, rows[0])
 
 
-def test_an_arm_that_slips_at_the_last_moment_was_not_standing_while_the_jaws_moved():
+def test_an_arm_that_slips_at_the_last_moment_was_not_standing_still():
     asked, motion = sound()
     changed = poses(motion)
     closing = changes(changed)
@@ -164,7 +164,7 @@ def test_an_arm_that_slips_at_the_last_moment_was_not_standing_while_the_jaws_mo
     assert broken(compare(asked, changed.built())) == ("PSM_M's jaw not open as it comes in", closing[0])
 
 
-def test_a_jaw_without_psm_m_keeps_between_its_angles_at_the_ends_of_a_transfer():
+def test_a_jaw_without_psm_m_stays_between_its_angles_around_a_transfer():
     asked, psm_m = replace(sound()[0], psm_m=PsmM(PSM_M)), PsmM(PSM_M)
     motion = timed(planned().pass_paths, psm_m)
     assert broken(compare(asked, motion)) is None

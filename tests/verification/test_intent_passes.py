@@ -227,7 +227,7 @@ def test_the_recorded_hand_off_missed_by_a_third_of_a_degree_is_named():
     assert broken(compare(asked, changed.built())) == ("A2 off the recorded hand-off", rows[-1])
 
 
-def test_a_stall_makes_the_clock_late_by_the_time_that_it_takes_of_the_recording():
+def test_a_stall_makes_the_clock_late_by_the_recorded_time_that_it_takes():
     asked, motion = sound()
     changed = poses(motion)
     stall(A1, 0, 0.2)(changed)
@@ -235,7 +235,7 @@ def test_a_stall_makes_the_clock_late_by_the_time_that_it_takes_of_the_recording
     assert late_s[changed.rows(A1, 0)[-1]] == pytest.approx(0.5 * motion.tempo, abs=0.02)
 
 
-def test_a_rollout_that_joins_the_recording_later_goes_by_the_clock_of_its_end(monkeypatch):
+def test_a_rollout_that_joins_later_goes_by_the_clock_of_its_end(monkeypatch):
     """As where a policy of several demonstrations leaves the start of this one on another's way."""
     asked, motion = sound()
     changed = poses(motion)
@@ -244,7 +244,7 @@ def test_a_rollout_that_joins_the_recording_later_goes_by_the_clock_of_its_end(m
     assert not compare(asked, changed.built()).values["clock of A1 off the recording's"].any()
 
 
-def test_nobody_stands_still_from_the_moment_at_which_the_needle_changes_hands():
+def test_standing_still_while_the_needle_changes_hands_is_not_counted():
     asked, motion = sound()
     changed = poses(motion)
     stood = compare(asked, motion).values["standing still"]

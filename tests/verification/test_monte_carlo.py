@@ -404,7 +404,7 @@ def test_what_is_drawn_is_even_about_nothing_and_within_its_bounds():
     np.testing.assert_allclose(np.cov(all_of_them.T), np.eye(27), atol=0.03)
 
 
-def test_a_base_stays_where_it_is_from_pass_to_pass_and_all_else_is_drawn_anew():
+def test_a_base_stays_from_pass_to_pass_and_all_else_is_drawn_anew():
     one, other, third = (
         draw(seed, k, 5, 3, suture_point_mm=5.0, needle_rad=0.1) for seed, k in ((0, 0), (0, 1), (1, 0))
     )

@@ -188,7 +188,7 @@ def test_a_needle_that_dips_into_the_tissue_while_it_is_carried_is_refused():
     assert (report.failure.limit, report.failure.value < 0) == (0.0, True)
 
 
-def test_at_the_beginning_of_a_pass_the_needle_may_be_where_the_hand_left_it():
+def test_as_a_pass_begins_the_needle_may_be_where_the_hand_left_it():
     heights = needle_arc_mm(TRAJECTORY, np.arange(len(TRAJECTORY)))[..., 2].min(axis=1) - RADIUS_MM
     a1 = np.flatnonzero((TRAJECTORY.phase == A1) & (TRAJECTORY.pass_index == 0))
     top = float(heights[a1[0]]) + 2.0

@@ -61,7 +61,7 @@ def test_the_outer_bodies_stand_where_joints_and_base_put_them():
         assert np.abs(track.bodies_mm[:, :, 3:] - parts.end_mm[:, :-1]).max() < 0.05
 
 
-def test_a_demonstration_is_in_its_own_frame_with_the_times_of_its_recording():
+def test_a_demonstration_is_in_its_own_frame_with_its_recordings_times():
     recording = short()
     demo = cut_demo(recording, arm="PSM1", start_s=1.0, end_s=5.0)
     timeline = timeline_of_demo(recording, demo)
