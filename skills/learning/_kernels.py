@@ -22,7 +22,7 @@ SMALLEST_SINE = 1e-6  # of half an angle: below it, a share of the chord equals 
 SCATTER = np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio (Knuth 6.4): spreads similar bits over the table
 ACTIONS, HALF, LOW_HALF = np.uint64(27), np.uint64(32), np.uint64(0xFFFFFFFF)
 STEPS = (0, 4294967296, 6074001000, 7439101574)  # lengths of moves along 0 to 3 axes, in 2^-32 of a cell
-NEVER, SHALLOWEST = 2**62, -(2**62)  # length of an approach that never enters a waypoint; less than any depth
+NEVER = 2**62  # length of an approach that never enters a waypoint
 
 
 @inner

@@ -46,7 +46,7 @@ sqrt(2) and sqrt(3) of any two approaches differ, and depths in nanometres.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import hypot, isfinite
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -434,11 +434,11 @@ def rule_in(frame: str, depth_along: Sequence[float] | None = None) -> ShortestW
         depth_along: The direction in which depth increases in that frame, three numbers; not used in an arm's base.
 
     Raises:
-        BadSettings: The direction is not finite, or has the length 0.
+        BadSettings: The direction is not three finite numbers, or has the length 0.
     """
     if frame.endswith("_base"):
         return REMOTE_CENTRE
-    return ShortestWay(depth_along=None if depth_along is None else (depth_along[0], depth_along[1], depth_along[2]))
+    return ShortestWay(depth_along=None if depth_along is None else cast(Point, tuple(depth_along)))
 
 
 def choose(domain: Domain, q: Floats, rule: ShortestWay) -> Ints:

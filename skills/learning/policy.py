@@ -8,7 +8,7 @@ the shortest way (`skills.learning.dynamic_programming`); the others, whose valu
 lowest index.
 """
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from functools import cached_property
 from math import dist, inf
 from typing import Any, get_args
@@ -74,12 +74,14 @@ def learner_of(described: dict[str, Any]) -> Learner:
             defaults.
 
     Raises:
-        BadSettings: There is no learner of this kind, or a setting is impossible.
+        BadSettings: There is no learner of this kind, it has no such setting, or a setting is impossible.
     """
     settings = dict(described)
     kind = settings.pop("kind", None)
     if kind not in LEARNERS:
         raise BadSettings(f"There is no learner of this kind; the learners are {', '.join(LEARNERS)}.")
+    if unknown := sorted(settings.keys() - {one.name for one in fields(LEARNERS[kind])}):
+        raise BadSettings(f"The learner {kind} has no setting {', '.join(unknown)}; a newer version may have it.")
     return LEARNERS[kind](**settings)
 
 

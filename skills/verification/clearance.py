@@ -55,6 +55,7 @@ STANDS = 1e-6  # ours, rad and mm: joints that differ by no more are those of on
 RADIUS_MM = 0.33  # of the needle's wire
 # The arc from the place where it is held, two thirds from the tip: x along the needle, y towards the arc's centre.
 _TURN = np.linspace(-pi / 3, 2 * pi / 3, 49)
+ARC_BULGE_MM = NEEDLE_RADIUS_MM * (1 - cos((_TURN[1] - _TURN[0]) / 2))  # of the wire beyond the chord of two points
 _ARC_MM: Floats = NEEDLE_RADIUS_MM * np.stack([np.sin(_TURN), 1 - np.cos(_TURN), np.zeros_like(_TURN)], axis=1)
 
 

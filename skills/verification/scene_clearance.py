@@ -35,6 +35,7 @@ from skills.planning.motion_laws import A2, PHASES, TRANSFER
 from skills.planning.trajectory import Trajectory
 from skills.verification.bodies import ABOVE_TISSUE, TOOL, moved_mm, names_of, parts_of, radii_of
 from skills.verification.clearance import (
+    ARC_BULGE_MM,
     FINGER_REACH_MM,
     FINGERS,
     NEEDLE_THICK_MM,
@@ -164,7 +165,7 @@ def clearance_of(trajectory: Trajectory, scene: Scene) -> SceneClearance:
         needle[_by_hand(trajectory, needle)] = np.inf
         nearest.append(_nearest(trajectory, (NEEDLE, (ARC,)), TISSUE, looks, apart))
     nearest.sort(key=lambda pair: float(np.nan_to_num(pair[0], nan=-np.inf)))
-    least, leastneedle_from_tissue = float(at_least.min()), float(needle.min())
+    least, least_needle = float(at_least.min()), float(needle.min())
     return SceneClearance(
         SceneReport(
             limit_mm=limit_mm,
@@ -173,7 +174,7 @@ def clearance_of(trajectory: Trajectory, scene: Scene) -> SceneClearance:
             looks=int(np.count_nonzero(looked)),
             nearest=tuple(one for apart, one in nearest if not apart >= CLEARANCE_SEEN_MM),
             bodies=True,
-            needle_at_least_mm=None if leastneedle_from_tissue >= CLEARANCE_SEEN_MM else leastneedle_from_tissue,
+            needle_at_least_mm=None if least_needle >= CLEARANCE_SEEN_MM else least_needle,
         ),
         at_least,
         needle,
@@ -374,8 +375,10 @@ def needle_from_tissue(trajectory: Trajectory, tissue: Tissue, at: Ints) -> dict
     Returns:
         Bounds in mm, negative inside, shape (C, 1), by the name `TISSUE`.
     """
-    above = tissue.above_mm(needle_arc_mm(trajectory, at)).min(axis=1)[:, None]
-    return {TISSUE: np.where(above > 0, above / tissue.steep, above) - NEEDLE_THICK_MM / 2}
+    arc_mm, thick_mm = needle_arc_mm(trajectory, at), NEEDLE_THICK_MM / 2 + ARC_BULGE_MM
+    # The chords from point to point, because a ridge may be between two of them.
+    apart = tissue.from_lines_mm(arc_mm[:, :-1], arc_mm[:, 1:], within_mm=CLEARANCE_SEEN_MM + thick_mm)
+    return {TISSUE: apart.min(axis=1)[:, None] - thick_mm}
 
 
 def _by_hand(trajectory: Trajectory, needle_mm: Floats) -> Flags:
@@ -414,7 +417,8 @@ def flat_tissue(trajectory: Trajectory, report: SceneReport, tissue: Tissue) -> 
         for one in links_at(trajectory, body, every)
     )
     apart = [one.least_mm for one in report.nearest if one.part == TISSUE and one.link in LINKS]
-    return lowest - min((nan if one is None else one for one in apart), default=CLEARANCE_SEEN_MM), xyz(up)
+    least = np.min([nan if one is None else one for one in apart], initial=CLEARANCE_SEEN_MM)  # NaN stays NaN
+    return lowest - float(least), xyz(up)
 
 
 def _nearest(

@@ -237,7 +237,7 @@ def test_a_rule_that_is_no_share_is_refused(learner, share):
 @pytest.mark.parametrize("kind", ["cell-q-learning", "max-ent-irl", "dqn", "ddpg", "trpo"])
 def test_learners_without_phases_have_the_rule_nearest_alone(kind):
     assert learner_of({"kind": kind}).join_share == 0
-    with pytest.raises(TypeError, match="join_share"):
+    with pytest.raises(BadSettings, match=f"{kind} has no setting join_share"):
         learner_of({"kind": kind, "join_share": 0.5})
 
 

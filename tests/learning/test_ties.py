@@ -209,6 +209,9 @@ def test_the_frame_decides_how_depth_is_measured():
     assert rule_in("PSM1_base") == rule_in("PSM2_base", [0, 0, 1]) == REMOTE_CENTRE
     assert rule_in("camera") == FLAT
     assert rule_in("camera", [0, 0, 2]) == ShortestWay(depth_along=(0.0, 0.0, 2.0))
+    for wrong in ([0, 0], [0, 0, 1, 5]):
+        with pytest.raises(BadSettings, match="three finite numbers"):
+            rule_in("camera", wrong)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import pytest
 
 from skills.gridworld.scene import Box, Capsule, Scene, Tissue
 from skills.kinematics import matrix_of
-from skills.planning.handoff import HOLDING_RAD, OPEN_RAD
+from skills.planning.handoff import HOLDING_RAD, NEEDLE_RADIUS_MM, OPEN_RAD
 from skills.planning.trajectory import A1, A2
 from skills.verification.bodies import parts_of, radii_of
 from skills.verification.clearance import (
@@ -15,13 +15,14 @@ from skills.verification.clearance import (
     RADIUS_MM,
     links_of,
     needle_arc_mm,
+    needle_poses,
     needle_travel_mm,
     openings,
     travel_mm,
 )
 from skills.verification.gates import SCENE
-from skills.verification.playback import PSM_A, PSM_M
-from skills.verification.scene_clearance import LOOK_BODIES_MM, LOOK_MM, clearance_of, flat_tissue
+from skills.verification.playback import CLEARANCE_SEEN_MM, PSM_A, PSM_M
+from skills.verification.scene_clearance import LOOK_BODIES_MM, LOOK_MM, clearance_of, flat_tissue, needle_from_tissue
 from skills.verification.verdict import judge
 from tests.planning.motions import ideal_playback
 from tests.verification.test_playback import TRAJECTORY, beside, with_psm_m
@@ -175,6 +176,31 @@ def test_no_sample_of_the_needle_is_lower_than_the_bound_says():
     steps = np.linalg.norm(np.diff(needle_arc_mm(TRAJECTORY, np.arange(len(TRAJECTORY))), axis=0), axis=2).max(axis=1)
     same = np.diff(TRAJECTORY.pass_index) == 0
     assert (steps[same] <= needle_travel_mm(TRAJECTORY)[same] + 1e-9).all()
+
+
+def test_between_two_points_of_the_arc_nothing_is_nearer_than_the_bound():
+    """Ridges 2 mm apart with slopes of 4: half a millimetre along the wire is up to 1 mm of height."""
+    at = np.arange(0, len(TRAJECTORY), 7)
+    at = at[np.isin(TRAJECTORY.phase[at], (A1, A2))]
+    place, rotation = needle_poses(TRAJECTORY, at)
+    turn = np.linspace(-np.pi / 3, 2 * np.pi / 3, 5001)
+    arc = NEEDLE_RADIUS_MM * np.stack([np.sin(turn), 1 - np.cos(turn), np.zeros_like(turn)], axis=1)
+    wire = place[:, None] + np.einsum("fij,kj->fki", rotation, arc)
+    ridges = tuple((0.0, 4.0) * 60 for _ in range(2))
+    for shift_mm in np.linspace(0.0, 2.0, 5):
+        for normal in ((0.0, 0.0, 1.0), (0.3, 0.2, 1.0)):
+            tissue = Tissue((-60.0 + shift_mm, -50.0, -170.0), normal, (1.0, -0.0, -normal[0]), 1.0, ridges)
+            nearest = tissue.above_mm(wire).min(axis=1)
+            assert (nearest > 0).any()
+            exact = np.where(nearest > 0, nearest / tissue.steep, nearest) - RADIUS_MM
+            bound = needle_from_tissue(TRAJECTORY, tissue, at)["tissue"][:, 0]
+            seen = bound < CLEARANCE_SEEN_MM
+            assert (bound[seen] <= exact[seen]).all()
+            assert (bound[seen] >= exact[seen] - 0.7).all()
+    level = Tissue.plane((0.0, 0.0, -170.0), (0.1, 0.0, 1.0))
+    apart = level.above_mm(wire).min(axis=1) - RADIUS_MM
+    bound = needle_from_tissue(TRAJECTORY, level, at)["tissue"][:, 0]
+    assert (bound <= apart).all() and (bound >= apart - 0.01).all()
 
 
 def test_a_needle_that_dips_into_the_tissue_while_it_is_carried_is_refused():
