@@ -221,8 +221,9 @@ def _advice(report: MotionReport, *, has_jaw: bool) -> tuple[str, ...]:
     elif not report.a1_turn_negligible:
         degrees = np.degrees(report.a1_orientation_change_rad)
         said.append(
-            f"The needle turns by {degrees:.0f} degrees before the tip arrives, and a plan keeps its orientation "
-            "until then (20 degrees move its tip by one cell of 5 mm): bring it there first, then turn it."
+            f"The needle turns by {degrees:.0f} degrees before the tip arrives (20 degrees move its tip by one cell of "
+            "5 mm). A plan turns it as you did, unless it is to keep its orientation; the grid's policy knows no turn: if "
+            "this one is not your style, bring the needle there first, then turn it."
         )
     if not has_jaw:
         said.append("The jaw was not recorded: grasp and release are not known.")

@@ -34,6 +34,7 @@ def test_a_quarter_turn_is_measured_for_either_sign_of_the_quaternion():
     turn[50:] = [-np.sqrt(0.5), 0.0, 0.0, -np.sqrt(0.5)]
     report = describe(cut_demo(recording(motion(line(1, 20), rotation=turn))))
     assert report.orientation_change_rad == pytest.approx(np.pi / 2)
+    assert "turns by 90 degrees" in report.advice[-2] and "A plan turns it as you did" in report.advice[-2]
 
 
 def test_advice_names_rest_clutch_gap_and_what_is_missing():
