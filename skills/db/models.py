@@ -69,6 +69,7 @@ added_later(Partner, "base_xyzw")
 added_later(Partner, "instrument")
 added_later(PosePath, "turn_share")
 added_later(PosePath, "partner")
+added_later(PartnerMotion, "jaw_rad")
 added_later(CertifiedPoses, "scene")  # never stored: the policy has the scene
 added_later(CertifiedPoses, "partner_scene")  # likewise
 added_later(PhaseQLearning, "slip")

@@ -211,11 +211,12 @@ def partner_motion(recording: Recording, demo: Demo) -> PartnerMotion | None:
         return None
     seconds, bases = demo.start_s + demo.stamps_s, base_frames(recording)
     found = partner_along(recording, motion, seconds, bases, demo.partner.arm)
-    return (
-        found
-        if found is None or base is None
-        else PartnerMotion(found.arm, *base.seen_from(found.tip_mm, found.rotation_xyzw))
-    )
+    if found is None:
+        return None
+    tip_mm, rotation_xyzw = found.tip_mm, found.rotation_xyzw
+    if base is not None:
+        tip_mm, rotation_xyzw = base.seen_from(tip_mm, rotation_xyzw)
+    return PartnerMotion(found.arm, tip_mm, rotation_xyzw, _jaw_at(recording, found.arm, seconds))
 
 
 def _check_joints(recording: Recording, motion: Motion) -> None:

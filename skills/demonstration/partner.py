@@ -79,16 +79,20 @@ class PartnerMotion:
         arm: The other arm's name.
         tip_mm: Positions of its tip at each stamp or phase, shape (T, 3).
         rotation_xyzw: Its orientations there, unit quaternions, shape (T, 4).
+        jaw_rad: Angles of its jaw there, shape (T,); None if they were not recorded.
     """
 
     arm: str
     tip_mm: Floats
     rotation_xyzw: Floats
+    jaw_rad: Floats | None = None
 
     def __post_init__(self) -> None:
         count = len(self.tip_mm)
         object.__setattr__(self, "tip_mm", frozen(self.tip_mm, np.float64, (count, 3), "tip_mm"))
         object.__setattr__(self, "rotation_xyzw", frozen(self.rotation_xyzw, np.float64, (count, 4), "rotation_xyzw"))
+        if self.jaw_rad is not None:
+            object.__setattr__(self, "jaw_rad", frozen(self.jaw_rad, np.float64, (count,), "jaw_rad"))
 
 
 def partner_at(

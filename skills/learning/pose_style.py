@@ -187,7 +187,11 @@ class PoseStyle:
         turns = np.stack([_turn_at(one.rotation_xyzw, warp) for one, warp in zip(self.partners, warps, strict=True)])
         seen = Rotation.from_quat(_turn_at(mean_rotation(turns, weights), again))
         tip_mm = goal_mm + goal.apply(_at(np.einsum("k,kpi->pi", weights, tips), again))
-        return PartnerMotion(self.partners[0].arm, tip_mm, same_signs((goal * seen).as_quat()))
+        jaws = [one.jaw_rad for one in self.partners if one.jaw_rad is not None]
+        jaw_rad = None
+        if len(jaws) == len(self.partners):
+            jaw_rad = _at(weights @ np.stack([_at(jaw, warp) for jaw, warp in zip(jaws, warps, strict=True)]), again)
+        return PartnerMotion(self.partners[0].arm, tip_mm, same_signs((goal * seen).as_quat()), jaw_rad)
 
     def _weights(self, ends: Floats, turns: Rotation) -> Floats:
         """Return the weight of each demonstration between two poses, (K,), with sum 1.
@@ -297,9 +301,9 @@ def _partners(demos: Sequence[Demo], partners: Sequence[PartnerMotion | None]) -
         last = Rotation.from_quat(demo.rotation_xyzw[-1]).inv()
         at = np.interp(np.linspace(0.0, demo.stamps_s[-1], PHASES), demo.stamps_s, np.arange(len(demo.stamps_s)))
         turned = Rotation.from_quat(_turn_at(other.rotation_xyzw, at))
-        found.append(
-            PartnerMotion(other.arm, last.apply(_at(other.tip_mm, at) - demo.tip_mm[-1]), (last * turned).as_quat())
-        )
+        seen_mm, jaw_rad = last.apply(_at(other.tip_mm, at) - demo.tip_mm[-1]), other.jaw_rad
+        jaw_rad = None if jaw_rad is None else _at(jaw_rad, at)
+        found.append(PartnerMotion(other.arm, seen_mm, (last * turned).as_quat(), jaw_rad))
     return tuple(found)
 
 

@@ -623,8 +623,9 @@ def _beside(poses: CertifiedPoses) -> dict[str, Any]:
     other, near = poses.path.partner, poses.partner_scene
     if other is None:
         return {}
+    jaw_rad = None if other.jaw_rad is None else other.jaw_rad.tolist()
     moved = {"arm": other.arm, "position_mm": other.tip_mm.tolist(), "rotation_xyzw": other.rotation_xyzw.tolist()}
-    return {"partner_motion": {**moved, "scene": None if near is None else as_json(near)}}
+    return {"partner_motion": {**moved, "jaw_rad": jaw_rad, "scene": None if near is None else as_json(near)}}
 
 
 def next_json(poses: CertifiedPoses, step: PoseStep) -> dict[str, Any]:
@@ -639,7 +640,7 @@ def _partner_pose(poses: CertifiedPoses, phase: int) -> dict[str, Any] | None:
     if other is None:
         return None
     pose = {"position_mm": other.tip_mm[phase].tolist(), "rotation_xyzw": other.rotation_xyzw[phase].tolist()}
-    return {"arm": other.arm, **pose}
+    return {"arm": other.arm, **pose, "jaw_rad": None if other.jaw_rad is None else float(other.jaw_rad[phase])}
 
 
 def about_next(

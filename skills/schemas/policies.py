@@ -432,6 +432,7 @@ class PartnerPose(Given):
     arm: str
     position_mm: Point = Field(description="Of its tip, in the frame of the pose style.")
     rotation_xyzw: Quaternion
+    jaw_rad: float | None = Field(description="null where its jaw was not recorded.")
 
 
 class PartnerPath(Given):
@@ -444,6 +445,7 @@ class PartnerPath(Given):
     arm: str
     position_mm: list[Point] = Field(description="Of its tip, in the frame of the pose style.")
     rotation_xyzw: list[Quaternion]
+    jaw_rad: list[float] | None = Field(description="null where its jaw was not recorded.")
     scene: TubeClearance | None = Field(
         default=None,
         description="How near it comes to the scene that the version was learnt in, of which a part may be this arm "

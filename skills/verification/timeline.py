@@ -388,7 +388,8 @@ def timeline_of_path(path: "PosePath", *, arm: str, frame: str) -> Timeline:
     arms = [clock.track(arm, frame, (path.elapsed_s, path.tip_mm, path.rotation_xyzw), jaw)]
     if path.partner is not None:
         other = path.partner
-        arms.append(clock.track(other.arm, frame, (path.elapsed_s, other.tip_mm, other.rotation_xyzw)))
+        jaw = None if other.jaw_rad is None else (path.elapsed_s, other.jaw_rad)
+        arms.append(clock.track(other.arm, frame, (path.elapsed_s, other.tip_mm, other.rotation_xyzw), jaw))
     return clock.timeline("learnt path", arms, in_one_frame=True, clutch_s=(), stages=())
 
 

@@ -17,7 +17,7 @@ from tests import backends
 from tests.api.posed import of_both_arms, of_pose_style
 from tests.api.service import KESTREL, POLICY, Service, assert_problem, serving
 from tests.library import cases
-from tests.library.test_pose_styles import AWAY_MM, BESIDE_MM
+from tests.library.test_pose_styles import AWAY_MM, BESIDE_MM, OPEN_RAD
 
 POSES, NEXT = f"{POLICY}/pose-style", f"{POLICY}/next"
 
@@ -86,6 +86,7 @@ def test_the_other_arm_is_served_at_the_same_phases(both: Service):
     assert (other["arm"], style["partner"]["arm"], style["frame"], other["scene"]) == (*2 * ["PSM1"], "PSM2_base", None)
     assert len(other["position_mm"]) == len(other["rotation_xyzw"]) == len(style["position_mm"])
     assert np.abs(other["position_mm"] - np.linspace(AWAY_MM, BESIDE_MM, PHASES)).max() < 1e-6  # by hand
+    assert np.abs(other["jaw_rad"] - np.linspace(OPEN_RAD, 0.0, PHASES)).max() < 1e-6
     assert other["position_mm"][-1] == pytest.approx(style["partner"]["position_mm"], abs=1e-6)
     played = both.http.get(f"/timelines/policy-versions/{style['sha256']}").json()["timeline"]
     assert [arm["arm"] for arm in played["arms"]] == ["PSM2", "PSM1"]
@@ -98,7 +99,7 @@ def test_next_has_the_other_arm_at_the_phase_that_it_answers(both: Service):
     for _ in range(3):
         step = both.client.next_pose(**KESTREL, **pose, phase=phase)
         phase = step["phase"]
-        at = {name: other[name][phase] for name in ("position_mm", "rotation_xyzw")}
+        at = {name: other[name][phase] for name in ("position_mm", "rotation_xyzw", "jaw_rad")}
         assert step["partner_pose"] == {"arm": "PSM1", **at}
         pose = {name: step[name] for name in pose}
     assert phase == 33

@@ -120,7 +120,7 @@ def test_a_session_has_the_other_arm_as_next_does(backend: str, tmp_path: Path):
                 answer = socket.receive_json()
                 asked = service.http.post(f"{POLICY}/next", json=hand | {"phase": phase}).json()
                 hand, phase = {name: answer[name] for name in hand}, answer["phase"]
-                other = {"arm": "PSM1", **{name: there[name][phase] for name in hand}}
+                other = {"arm": "PSM1", **{name: there[name][phase] for name in (*hand, "jaw_rad")}}
                 assert answer["partner_pose"] == asked["partner_pose"] == other
         until(lambda: service.app.state.sessions.count == 0)
     backends.drop(url)

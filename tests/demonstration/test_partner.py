@@ -82,6 +82,10 @@ def test_its_motion_is_the_recorded_one_at_the_stamps_of_this_arm(recorded):
     nearest = np.abs(value.seconds(other.stamps_ns)[None] - seconds[:, None]).argmin(axis=1)
     off = angle_between(matrix_of(found.rotation_xyzw), matrix_of(other.rotation_xyzw[nearest]))
     assert off.max() < 0.02
+    jaw = value.jaw_of(M)
+    np.testing.assert_array_equal(found.jaw_rad, np.interp(seconds, value.seconds(jaw.stamps_ns), jaw.values))
+    without = replace(value, jaws=tuple((arm, one) for arm, one in value.jaws if arm != M))
+    assert partner_motion(without, demo).jaw_rad is None
 
 
 def test_its_motion_in_this_arms_own_frame_is_found_through_the_camera(recorded):

@@ -242,6 +242,20 @@ def test_the_other_arm_is_served_only_if_all_demonstrations_have_the_same() -> N
         assert found is not None and (found.path.partner is not None) == there
 
 
+def test_the_other_arms_jaw_is_in_step_and_needs_every_demonstration() -> None:
+    demo = a_demo(samples=400)
+    assert demo.rotation_xyzw is not None
+    later = replace(demo, stamps_s=demo.stamps_s[-1] * (demo.stamps_s / demo.stamps_s[-1]) ** 1.6)
+    ends = (demo.tip_mm[0], demo.rotation_xyzw[0], demo.tip_mm[-1], demo.rotation_xyzw[-1])
+    # It closes in proportion to this arm's way along x, whatever the tempo.
+    jawed = [replace(beside(one), jaw_rad=0.01 * one.tip_mm[:, 0]) for one in (demo, later)]
+    path = learn_pose_style([demo, later], jawed).between(*ends)
+    assert path.partner is not None and path.partner.jaw_rad is not None
+    assert np.abs(path.partner.jaw_rad - 0.01 * path.tip_mm[:, 0]).max() < 1e-9
+    partly = learn_pose_style([demo, later], [jawed[0], beside(later)]).between(*ends).partner
+    assert partly is not None and partly.jaw_rad is None
+
+
 def test_another_arm_of_fewer_poses_is_none_of_the_path() -> None:
     path = learn_pose_style([a_demo()]).between(*poses(1), *poses(2))
     with pytest.raises(BadInput, match="The other arm has 10 poses, and the path 101"):

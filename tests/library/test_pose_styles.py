@@ -12,7 +12,7 @@ from sqlalchemy import delete, func, select, text
 from skills.comparison.combining import Corridor
 from skills.db.models import Demonstration, ParsedChunk, ParsedRecording, PolicyVersion, StoredPoses
 from skills.db.session import Database
-from skills.demonstration.motion import Motion
+from skills.demonstration.motion import Motion, Signal
 from skills.demonstration.partner import PartnerMotion
 from skills.demonstration.recording import Recording
 from skills.errors import Busy, Corrupt, NotFound
@@ -39,6 +39,7 @@ MCAP = "application/vnd.mcap"
 
 # PSM_M goes straight to 12 mm beside where PSM_A ends; PSM_A's base stands at BASE_MM in the camera's frame.
 AWAY_MM, BESIDE_MM, BASE_MM = (45.0, 55.0, -125.0), (17.0, 55.0, -125.0), np.array([30.0, -40.0, 180.0])
+OPEN_RAD = 0.8  # of the jaw of the other arm as it begins
 
 
 def turning(
@@ -64,13 +65,16 @@ def turning(
     aside = Rotation.from_rotvec(np.radians(detour_deg) * np.sin(np.linspace(0, np.pi, len(tip)))[:, None] * [1, 0, 0])
     turned = (Rotation.from_quat([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0]) * spin * aside).as_quat()
     motions = [Motion("PSM2", "/PSM2/local/measured_cp", "PSM2_base", stamps_ns, tip, turned)]
+    jaws: tuple[tuple[str, Signal], ...] = ()
     if other is not None:
         there = np.linspace(AWAY_MM, BESIDE_MM, len(tip)) + np.array([shift_mm, 0.0, 0.0])
         since = stamps_ns >= stamps_ns[0] + round(1e9 * other_s)
         seen = stamps_ns[since], there[since] + BASE_MM, np.tile([0.0, 1.0, 0.0, 0.0], (int(since.sum()), 1))
         motions.append(Motion("PSM2", "/PSM2/measured_cp", "ECM", stamps_ns, tip + BASE_MM, turned))
         motions.append(Motion(other, f"/{other}/measured_cp", "ECM", *seen))
-    return write_mcap(Recording(format="mcap", integrity="full", motions=tuple(motions)))
+        angles = np.linspace(OPEN_RAD, 0.0, len(tip))  # of its jaw, which closes
+        jaws = ((other, Signal(stamps_ns, angles, f"/{other}/jaw/measured_js")),)
+    return write_mcap(Recording(format="mcap", integrity="full", motions=tuple(motions), jaws=jaws))
 
 
 def add(database: Database, data: bytes, **cut: Any) -> Demonstration:
