@@ -222,8 +222,8 @@ def _advice(report: MotionReport, *, has_jaw: bool) -> tuple[str, ...]:
         degrees = np.degrees(report.a1_orientation_change_rad)
         said.append(
             f"The needle turns by {degrees:.0f} degrees before the tip arrives (20 degrees move its tip by one cell of "
-            "5 mm). A plan turns it as you did, unless it is to keep its orientation; the grid's policy knows no turn. If "
-            "it is not your style, bring the needle there first, then turn it."
+            "5 mm). A plan turns it as you did, unless it is to keep its orientation; the grid's policy knows no turn. "
+            "If it is not your style, bring the needle there first, then turn it."
         )
     if not has_jaw:
         said.append("The jaw was not recorded: grasp and release are not known.")
