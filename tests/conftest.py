@@ -69,6 +69,15 @@ def compile_tests() -> None:
         subprocess.run(command, cwd=tests.parent, stdout=subprocess.DEVNULL)
 
 
+@pytest.fixture(autouse=True)
+def no_setting_stays() -> Iterator[None]:
+    """Fail a test that leaves a setting in the environment, which another test would then find."""
+    before = {name: value for name, value in os.environ.items() if name.startswith("SKILLS_")}
+    yield
+    after = {name: value for name, value in os.environ.items() if name.startswith("SKILLS_")}
+    assert after == before
+
+
 @pytest.fixture(scope="session")
 def reading_server() -> Iterator["ForkServer"]:
     """Yield one fork server for all readers of a process: each takes a second to start, and 500 tests need one."""

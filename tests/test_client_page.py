@@ -61,7 +61,7 @@ def test_every_block_of_the_page_runs_in_the_order_of_the_page(url: str, capsys:
         "http://127.0.0.1:9 gave no answer",
         "over plain HTTP, where others can read it",
         "[('kestrel', 'simple-running', 1)]",
-        "['kestrel'] Recognition needs at least two surgeons",
+        "['kestrel'] PSM2: Recognition needs at least two surgeons",
     ):
         assert said in printed, printed
     assert names["path"].finished

@@ -11,7 +11,7 @@ import pytest
 from tests.needs import NEEDS, need, required
 
 ROOT = Path(__file__).parents[1]
-OF_THE_PAGE = "tests/e2e/test_page.py::test_light_or_dark_is_chosen_and_stays"
+OF_THE_PAGE = "tests/e2e/test_page.py::test_everything_is_reached_with_the_keyboard_and_the_focus_is_seen"
 
 
 @pytest.mark.parametrize("name", NEEDS)

@@ -58,6 +58,12 @@ if TYPE_CHECKING:
     from alembic.config import Config
 
 BUSY_TIMEOUT_MS = 10_000
+# With wal_level=minimal PostgreSQL does not log what a transaction does to a sequence that it makes, nor the next 32
+# numbers: after a crash they would be given again. Setting a sequence to where it stands is always logged.
+LOG_SEQUENCES = (
+    "SELECT setval(format('%I.%I', schemaname, sequencename)::regclass, last_value) FROM pg_sequences "
+    "WHERE schemaname = current_schema() AND last_value IS NOT NULL"
+)
 WRITE_LOCK = 0x5C111  # ours: the number of the advisory lock of everything, an arbitrary unused one
 WAL_LIMIT_BYTES = 64 << 20  # without a limit the write-ahead log stays as large as the largest upload
 KEPT_OPEN, AT_ONCE = 10, 40  # connections; 40 threads handle requests (Starlette's default), and each needs one
@@ -166,6 +172,9 @@ class Database:
                 self.history.log_schema(connection)
                 fill_tiles(connection)
             connection.commit()
+        if before != revisions()[0] and self.engine.dialect.name == "postgresql":
+            with self.writing() as session:
+                session.execute(text(LOG_SEQUENCES))
 
     def forget(self) -> None:
         """Remove deleted data from SQLite's write-ahead log; call it after the commit.

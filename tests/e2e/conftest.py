@@ -49,6 +49,7 @@ class Service:
             **{k: v for k, v in os.environ.items() if not k.startswith("SKILLS_")},
             "SKILLS_DATABASE_URL": f"sqlite:///{self.database}",
             "SKILLS_WORKERS": "1",
+            "SKILLS_PORT": str(self.port),  # for those that start it by another command
             **{f"SKILLS_{name.upper()}": str(value) for name, value in settings.items()},
         }
         self.command = [sys.executable, "-m", "skills", "serve", "--port", str(self.port)]

@@ -5,11 +5,10 @@ import signal
 import sqlite3
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
-from datetime import datetime
+from datetime import datetime, timedelta
 from pathlib import Path
 
 import pytest
@@ -27,7 +26,7 @@ from tests.jobs.house import ROOT
 from tests.library.styles import add_styles, ask_retraining, damage, look, parts_of, states_of, styles_of
 from tests.waiting import until
 
-SLOW = CellQLearning(episodes=60_000)  # some 50 ms of learning, so that a test can act midway
+SLOW = CellQLearning(episodes=1_500_000)  # a second or two of learning, so that a test can act midway
 STYLES = 16
 STOPPED_S = 2.0  # the other workers' transactions end within that time, or the stop is tried again
 
@@ -59,16 +58,18 @@ def workers(database: Database, number: int) -> Iterator[list[subprocess.Popen[b
 def stop_between_transactions(database: Database, worker: subprocess.Popen[bytes]) -> None:
     """Stop a worker outside of transactions, ours or the engine's: otherwise others would wait until it continues."""
     with closing(Database(Settings(database_url=database.url).engine_url)) as engine:
-        worker.send_signal(signal.SIGSTOP)
-        while not others_can_go_on(database, engine):
-            worker.send_signal(signal.SIGCONT)
-            time.sleep(0.05)
+        while True:
+            is_quiet(database, engine, until_s=1e9)  # on a busy machine a transaction is open most of the time
             worker.send_signal(signal.SIGSTOP)
+            if is_quiet(database, engine):
+                return
+            worker.send_signal(signal.SIGCONT)
 
 
-def others_can_go_on(*databases: Database) -> bool:
+def is_quiet(*databases: Database, until_s: float = 0.0) -> bool:
+    """Return whether all transactions from before a moment, so many seconds from now, end within `STOPPED_S`."""
     with databases[0].reading() as session:
-        moment = session.scalar(select(func.now()))
+        moment = session.scalar(select(func.now())) + timedelta(seconds=until_s)
     try:
         until(lambda: all(nothing_is_open(database, moment) for database in databases), STOPPED_S)
     except AssertionError:

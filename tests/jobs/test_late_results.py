@@ -24,7 +24,7 @@ from tests.jobs.test_batches import stop_between_transactions
 from tests.library import cases
 from tests.waiting import END_S, crowded, until
 
-SLOW = CellQLearning(episodes=800_000)  # about a second of learning, so that a test can act midway
+SLOW = CellQLearning(episodes=4_000_000)  # some seconds of learning, so that a test can act midway
 PATIENCE_S = END_S
 
 

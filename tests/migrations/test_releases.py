@@ -213,7 +213,7 @@ def run(words: list[str], environment: dict[str, str]) -> tuple[int, str]:
         process = subprocess.run(command, env=os.environ | environment, capture_output=True, text=True, timeout=END_S)
         return process.returncode, process.stderr
     settings.cache_clear()
-    result = CliRunner().invoke(app, words, env=environment)
+    result = CliRunner().invoke(app, words, env={"SKILLS_SERVER": None, **environment})
     settings.cache_clear()
     return result.exit_code, result.stderr
 
