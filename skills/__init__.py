@@ -53,6 +53,8 @@ _CONTENTS = {
     "play": "simulation.player",
     "PlaybackReport": "verification.verdict",
     "judge": "verification.verdict",
+    "PlanVerdict": "verification.verdict",
+    "judge_plan": "verification.verdict",
     "Refereed": "simulation.referee",
     "referee": "simulation.referee",
 }

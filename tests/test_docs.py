@@ -181,7 +181,8 @@ def test_the_python_of_the_library_ends_with_a_feasible_playback(capsys: pytest.
     printed = capsys.readouterr().out.splitlines()
     assert "suboptimal=0" in printed[0]
     assert "starts_reaching=1331" in printed[0]
-    assert printed[-1] == "True"
+    assert printed[1] == "True None"
+    assert "count=1000, of=1000" in printed[2]
 
 
 # ---- the blocks without a test of their own, on a real service ---------------------------------------------------

@@ -2,11 +2,13 @@
 
     python -m tests.walks        bytes to demonstration, request to served policy, suture point to replay bag
 
-A station is a public function that is called from another room, at its first call. Methods, the client, the start of
-the service, its periodic work and the modules that every room uses (`COMMON`) are left out.
+A station is a public function that is called from another room, at its first call. Methods, private modules such as
+`_kernels`, the client, the start of the service, its periodic work and the modules that every room uses (`COMMON`) are
+left out.
 """
 
 import io
+import re
 import sys
 import tempfile
 import threading
@@ -51,6 +53,7 @@ class Trace:
             "." in code.co_qualname
             or code.co_name.startswith(("_", "<", *PERIODIC, *STARTING))
             or file.startswith(COMMON)
+            or re.search(r"/_[a-z]", file)
         ):
             return
         caller = frame.f_back

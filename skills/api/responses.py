@@ -39,7 +39,6 @@ from skills.db.session import Database
 from skills.errors import PreconditionFailed, SkillsError, TooMany, UnknownFormat
 from skills.formats import BYTES
 from skills.library import policies
-from skills.library.integrity import covered, learnt
 from skills.library.jobs import ACTIVE, find_job, find_jobs, job_json
 from skills.library.policies import Served, has_poses, pose_style_json, poses_of
 from skills.library.proofs import sign_files
@@ -232,14 +231,8 @@ def _encode(policy: PolicyVersion, release: Release | None, media_type: str) -> 
     if media_type == NPZ:
         content = policies.arrays_of(policy)
     else:
-        about = policies.about_policy(policy, release)
-        about[policies.table_name(about, "actions")] = policies.actions_of(learnt(policy))
-        # An older version is served as it was, and a smaller one too: a client of before verifies every field.
-        live = None if covered(policy).share is None else policies.live_actions_of(learnt(policy))
-        if live is not None:
-            about[policies.table_name(about, "live_actions")] = live
-        about["arrays"] = f"/policy-versions/{policy.sha256} with Accept: {NPZ}"
-        content = orjson.dumps(about)
+        arrays = f"/policy-versions/{policy.sha256} with Accept: {NPZ}"
+        content = orjson.dumps(policies.policy_json(policy, release) | {"arrays": arrays})
     # A header and no field: the bytes, and so the ETag and what older clients verify, stay those of the policy.
     linked = release is not None and policy.poses is not None
     link = f'<{policy.suture}/pose-style>; rel="related"; title="pose style"' if linked else None

@@ -224,6 +224,7 @@ State = Literal["released", "trained", "stored", "empty"]
 STATES: tuple[State, ...] = ("released", "trained", "stored", "empty")
 MOST = 50  # rows of a list on a page
 MOST_VERSIONS = 200
+MOST_CHOICES = 200  # in a selection of a form; of more nobody chooses by eye
 MOST_COUNTED = 1000  # of a kind, for the figures of the first page
 
 _Row = tuple[int, str]  # a style: the surgeon's row and the suture type's slug
@@ -440,14 +441,15 @@ def whole_style(session: Session, surgeon: str, suture: str) -> WholeStyle:
     )
 
 
-def all_surgeons(session: Session, limit: int = 1000) -> Sequence[Surgeon]:
-    """List the surgeons, for a selection in a form."""
-    return session.scalars(select(Surgeon).order_by(Surgeon.slug).limit(limit)).all()
+def surgeons_to_choose(session: Session) -> Sequence[Surgeon] | None:
+    """List the surgeons, for a selection in a form; None where they are too many, so that the pseudonym is typed."""
+    found = session.scalars(select(Surgeon).order_by(Surgeon.slug).limit(MOST_CHOICES + 1)).all()
+    return found if len(found) <= MOST_CHOICES else None
 
 
-def all_suture_types(session: Session, limit: int = 1000) -> Sequence[SutureType]:
-    """List the suture types, for a selection in a form."""
-    return session.scalars(select(SutureType).order_by(SutureType.slug).limit(limit)).all()
+def all_suture_types(session: Session) -> Sequence[SutureType]:
+    """List the suture types."""
+    return session.scalars(select(SutureType).order_by(SutureType.slug)).all()
 
 
 class ReleasedStyle(NamedTuple):
@@ -459,12 +461,12 @@ class ReleasedStyle(NamedTuple):
     policy_row: int
 
 
-def released_styles(session: Session, limit: int = 1000) -> list[ReleasedStyle]:
-    """List the styles that serve a version, by surgeon and suture type, for a selection in a form."""
+def released_styles(session: Session) -> list[ReleasedStyle]:
+    """List the first `MOST_CHOICES` styles that serve a version, by surgeon and suture type, for a selection."""
     by = PolicyVersion
     found = select(Surgeon.slug, Release.suture, by.version, by.row).join(Release, Release.surgeon_row == Surgeon.row)
     found = found.join(by, by.row == Release.policy_row).where(is_served()).order_by(Surgeon.slug, Release.suture)
-    return [ReleasedStyle(*one) for one in session.execute(found.limit(limit))]
+    return [ReleasedStyle(*one) for one in session.execute(found.limit(MOST_CHOICES))]
 
 
 def newest_recordings(

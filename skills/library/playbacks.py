@@ -37,15 +37,10 @@ from skills.planning.trajectory import Trajectory
 from skills.remedies import Action, Remedy
 from skills.settings import Settings
 from skills.verification.arm_errors import CALLED, NAMED, ArmErrors
-from skills.verification.asked import asked_of
-from skills.verification.gates import SCENE, Failure
-from skills.verification.intent import compare
-from skills.verification.monte_carlo import doubt
 from skills.verification.playback import Pictures
-from skills.verification.probabilities import JUDGE_VERSION, UPWARDS
+from skills.verification.probabilities import JUDGE_VERSION
 from skills.verification.probabilities import NEEDLE as NEEDLE_ERROR
-from skills.verification.scene_clearance import NEEDLE, SceneClearance, clearance_of, flat_tissue
-from skills.verification.verdict import judge
+from skills.verification.verdict import judge_plan
 
 Level = Literal["good", "caution", "bad"]
 Counts = Literal["hand-over", "clearance"]
@@ -244,25 +239,18 @@ def check_playback(
     with database.reading() as session:
         stored = find_plan(session, request["plan"])
         plan, policy = planned(stored), {"version": stored.policy.version, "sha256": stored.policy.sha256}
-        asked = asked_of(plan, learnt(stored.policy), None if plan.path == "cell centres" else hand_of(stored.policy))
+        followed, demo = learnt(stored.policy), None if plan.path == "cell centres" else hand_of(stored.policy)
     check_frame(plan.frame)
     trajectory = trajectory_of(plan)
     measured = play(trajectory, timeout_s=settings.playback_timeout_s, memory_bytes=settings.playback_memory_bytes)
-    approach_m = None if plan.psm_m is None else plan.psm_m.approach
-    beside = None if plan.scene is None else clearance_of(trajectory, plan.scene)
-    intent = compare(asked, trajectory, measured.joints)
-    # The simulator's pad lies below the motion wherever that goes, so it is no tissue and no gate.
-    verdict = judge(measured, trajectory, approach_m=approach_m, beside=beside, pad_is_tissue=False, intent=intent)
-    tissue = None if plan.scene is None else plan.scene.tissue
-    pad = (None, UPWARDS) if tissue is None or beside is None else flat_tissue(trajectory, beside.report, tissue)
     errors = ArmErrors(**request["errors"]) if "errors" in request else stated_errors(settings.arm_errors)
-    doubted = doubt(trajectory, approach_m=approach_m, pad_top_mm=pad[0], pad_normal=pad[1], errors=errors)
-    report = _finite(asdict(verdict)) | {
-        "doubt": _finite(asdict(doubted)),
+    verdict = judge_plan(plan, trajectory, measured, policy=followed, demo=demo, errors=errors)
+    report = _finite(asdict(verdict.report)) | {
+        "doubt": _finite(asdict(verdict.doubt)),
         "stated_by": request.get("stated_by", "installation"),
-        "failure_in_words": failure_in_words(verdict.failure, beside),
-        "scene": None if beside is None else _finite(asdict(beside.report)),
-        "tissue": "not given" if tissue is None else "judged",
+        "failure_in_words": verdict.failure_in_words,
+        "scene": None if verdict.scene is None else _finite(asdict(verdict.scene)),
+        "tissue": "not given" if plan.scene is None or plan.scene.tissue is None else "judged",
         "plan": request["plan"],
         "trajectory": trajectory_digest(trajectory),
         "policy": policy,
@@ -276,7 +264,7 @@ def check_playback(
         if known is None:
             plan = find_plan(session, request["plan"])
             known = StoredPlayback(
-                sha256=identity, plan=plan, feasible=verdict.feasible, report=report, measured=measured
+                sha256=identity, plan=plan, feasible=verdict.report.feasible, report=report, measured=measured
             )
             session.add(known)
             record_event(session, actor, "play", "playback", identity, plan.policy.surgeon)
@@ -285,14 +273,6 @@ def check_playback(
         return {"playback": known.sha256, "feasible": known.feasible}
 
     return store
-
-
-def failure_in_words(failure: Failure | None, beside: SceneClearance | None) -> str | None:
-    """Return a verdict's failure as a sentence; one beside a scene also names the nearest parts."""
-    near = [] if beside is None else [one for one in beside.report.nearest if one.body != NEEDLE]
-    if failure is None or failure.quantity != SCENE or not near:
-        return None if failure is None else str(failure)
-    return f"{failure} Nearest: {near[0]}."
 
 
 def find_playback(session: Session, playback_sha256: str) -> StoredPlayback:
@@ -309,12 +289,7 @@ def headline_of(playback: StoredPlayback, settings: Settings) -> dict[str, Any]:
 def standing_of(session: Session, playback: StoredPlayback) -> dict[str, Any]:
     """Return the policy version that a playback's plan follows, and whether its style serves it now."""
     policy = playback.plan.policy
-    served = releases.served(session, policy.surgeon, policy.suture)
-    return {
-        "version": policy.version,
-        "sha256": policy.sha256,
-        "released": served is not None and served.policy_row == policy.row,
-    }
+    return {"version": policy.version, "sha256": policy.sha256, "released": releases.serves(session, policy)}
 
 
 def trajectory_digest(trajectory: Trajectory) -> str:

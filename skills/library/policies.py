@@ -170,8 +170,21 @@ def followable(policy: PolicyVersion) -> PolicyVersion:
     return policy
 
 
-def about_policy(policy: PolicyVersion, release: Release | None) -> dict[str, Any]:
-    """Return the JSON of a policy (`schemas.policies.Policy`) without its actions."""
+def policy_json(policy: PolicyVersion, release: Release | None) -> dict[str, Any]:
+    """Return the JSON of a policy version (`schemas.policies.Policy`), with its actions but without a link to arrays.
+
+    An older version is described as it was, and a smaller one too: a client of before verifies every field.
+
+    Args:
+        policy: The version.
+        release: Its release; None: as a version of the style's history.
+
+    Raises:
+        Corrupt: The stored values do not match the version's digest.
+    """
+    actions, live = actions_of(learnt(policy)), None
+    if covered(policy).share is not None:
+        live = live_actions_of(learnt(policy))
     return {
         "version": policy.version,
         "sha256": policy.sha256,
@@ -179,6 +192,8 @@ def about_policy(policy: PolicyVersion, release: Release | None) -> dict[str, An
         "created_at": rfc3339(policy.created_at),
         "released_at": rfc3339(release.released_at) if release else None,
         "released_by": release.released_by if release else None,
+        table_name(policy.manifest, "actions"): actions,
+        **({} if live is None else {table_name(policy.manifest, "live_actions"): live}),
     }
 
 

@@ -219,6 +219,12 @@ def served(session: Session, surgeon: Surgeon, suture: str) -> Release | None:
     return releases[0] if releases and consent.may(surgeon, "training") else None
 
 
+def serves(session: Session, policy: PolicyVersion) -> bool:
+    """Return whether a policy version is the one that its style serves."""
+    now = served(session, policy.surgeon, policy.suture)
+    return now is not None and now.policy_row == policy.row
+
+
 def shares_served(session: Session, suture: str) -> dict[str, float]:
     """Return the mean share of the demonstration that the starts of each served policy follow, by surgeon.
 

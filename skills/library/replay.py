@@ -21,7 +21,6 @@ from skills.db.session import Database
 from skills.errors import BadPlan, Conflict, Corrupt
 from skills.formats.replay_bag import (
     ArmMotion,
-    arm_names,
     arms_of,
     folder_of,
     held_jaw_rad,
@@ -422,8 +421,8 @@ def _arm_lines(arm: ArmMotion, planned_arm: str, *, hands: bool) -> list[str]:
         jaw = "closed, with a holding force" if least == JAW_CLOSED_RAD else "as demonstrated"
         jaw += " (median)" if least == most != JAW_CLOSED_RAD else ""
         jaw += "; opens once PSM_M's is closed" if hands else ""
-        known = planned_arm.upper() == arm_names(planned_arm)[0]
-        assumed = "" if known else f" ASSUMED: the demonstration calls its arm {planned_arm!r}."
+        named_so = planned_arm.upper() == arm.name
+        assumed = "" if named_so else f" ASSUMED: the demonstration calls its arm {planned_arm!r}."
         named = f"{arm.name}, PSM_A: it brings the needle.{assumed}"
     return [
         named,

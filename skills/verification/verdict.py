@@ -1,6 +1,7 @@
 """The verdict on a playback: feasible or not, with its figures as plain numbers.
 
     Playback, Trajectory --judge--> PlaybackReport
+    SuturePlan, its policy and demonstration, Playback --judge_plan--> PlanVerdict, with the probability of success
 
 `judge` compares the simulator's measurements (`Playback`) with the intended motion (`Trajectory`), and with what was
 asked if its deviations from that are given (`skills.verification.intent`), by the gates of `skills.verification.gates`.
@@ -19,6 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from skills.arrays import Floats, frozen
+from skills.demonstration.demonstration import Demo
 from skills.errors import BadInput
 from skills.fields import Count, Figure, Sha256, schema
 from skills.kinematics import (
@@ -29,17 +31,21 @@ from skills.kinematics import (
     angle_between,
     matrix_of,
 )
+from skills.learning.policy import Policy
 from skills.notebook import card
 from skills.planning.motion_laws import A2, PHASES
+from skills.planning.plan import SuturePlan
 from skills.planning.trajectory import Trajectory
+from skills.verification.arm_errors import UNCALIBRATED, ArmErrors
+from skills.verification.asked import asked_of
 from skills.verification.bodies import BodiesReport, bodies_clearance
-from skills.verification.clearance import (
-    psm_m_poses,
-)
-from skills.verification.gates import ArmSamples, Failure, Figures, Limits, figures_of, first_failure
-from skills.verification.intent import IntentComparison, Mismatch
+from skills.verification.clearance import psm_m_poses
+from skills.verification.gates import SCENE, ArmSamples, Failure, Figures, Limits, figures_of, first_failure
+from skills.verification.intent import IntentComparison, Mismatch, compare
+from skills.verification.monte_carlo import doubt
 from skills.verification.playback import CLEARANCE_SEEN_MM, MEANS, PAD, PSM_M, Playback
-from skills.verification.scene_clearance import SceneClearance
+from skills.verification.probabilities import UPWARDS, Doubt
+from skills.verification.scene_clearance import NEEDLE, SceneClearance, SceneReport, clearance_of, flat_tissue
 
 
 @schema
@@ -282,6 +288,68 @@ def judge(
         intent=None if intent is None else intent.deviations,
         means=dict(MEANS),
     )
+
+
+@dataclass(frozen=True)
+class PlanVerdict:
+    """The verdict on a plan that was played: all that can be judged without a robot.
+
+    Attributes:
+        report: The motion as it was played, compared with the limits, with the scene, and with what was asked.
+        scene: Its distances from the plan's scene; None if the plan has none.
+        doubt: The probability of success when arms and world differ from the plan.
+    """
+
+    report: PlaybackReport
+    scene: SceneReport | None
+    doubt: Doubt
+
+    @property
+    def failure_in_words(self) -> str | None:
+        """The reason why it is not feasible; one beside a scene also names the nearest parts."""
+        failure = self.report.failure
+        near = [] if self.scene is None else [one for one in self.scene.nearest if one.body != NEEDLE]
+        if failure is None or failure.quantity != SCENE or not near:
+            return None if failure is None else str(failure)
+        return f"{failure} Nearest: {near[0]}."
+
+
+def judge_plan(
+    plan: SuturePlan,
+    trajectory: Trajectory,
+    playback: Playback,
+    *,
+    policy: Policy,
+    demo: Demo | None,
+    errors: ArmErrors = UNCALIBRATED,
+) -> PlanVerdict:
+    """Compare a plan as it was played with what was asked, its scene and the limits, and count how often it succeeds.
+
+    Args:
+        plan: The plan.
+        trajectory: Its trajectory, with PSM_M's motion if the plan has PSM_M.
+        playback: The measurements of that trajectory.
+        policy: The policy that the plan follows.
+        demo: The demonstration whose hand it follows, as `stack` was given it; None for a plan along cell centres.
+        errors: The stated errors of the arms.
+
+    Returns:
+        The verdict, its distances from the scene, and the probability of success.
+
+    Raises:
+        BadInput: The playback is not of this trajectory.
+    """
+    approach_m = None if plan.psm_m is None else plan.psm_m.approach
+    beside = None if plan.scene is None else clearance_of(trajectory, plan.scene)
+    intent = compare(asked_of(plan, policy, demo), trajectory, playback.joints)
+    # The simulator's pad lies below the motion wherever that goes, so it is no tissue and no gate.
+    report = judge(playback, trajectory, approach_m=approach_m, beside=beside, pad_is_tissue=False, intent=intent)
+    tissue = None if plan.scene is None else plan.scene.tissue
+    top_mm, normal = (None, UPWARDS)
+    if tissue is not None and beside is not None:
+        top_mm, normal = flat_tissue(trajectory, beside.report, tissue)
+    doubted = doubt(trajectory, approach_m=approach_m, pad_top_mm=top_mm, pad_normal=normal, errors=errors)
+    return PlanVerdict(report, None if beside is None else beside.report, doubted)
 
 
 def _check_same(playback: Playback, trajectory: Trajectory) -> None:

@@ -16,13 +16,15 @@ from skills.api.pages import BORROWED, assets, build, number, share, size
 from skills.db.models import Demonstration, Plan, PolicyVersion, StoredRecording
 from skills.db.service_tables import Job
 from skills.learning.policy import rollout_from
+from skills.library.catalogue import put_surgeon
 from skills.library.consent import may
 from skills.library.integrity import covered, learnt
-from skills.library.overview import matrix, moves_to_goal
+from skills.library.overview import MOST, matrix, moves_to_goal
 from skills.library.policies import find_version
+from tests import backends
 from tests.api.keyed import As, copy_of_told, key
 from tests.api.service import CSV, KESTREL, Service, assert_problem, serving
-from tests.library import cases
+from tests.library import cases, hospital
 from tests.migrations.make_fixture import RELEASES
 
 STYLE = f"/pages/styles/kestrel/{cases.SUTURE}"
@@ -305,3 +307,51 @@ def test_numbers_are_written_with_their_units_and_never_rounded_up_to_all() -> N
 def test_a_problem_of_a_call_is_no_page(told: Service) -> None:
     assert_problem(told.http.get("/policies/nobody/simple-running"), 404)
     assert told.http.post("/recordings", content=b"", headers={"Content-Type": CSV}).status_code == 422
+
+
+# ---- more surgeons and styles than a form can list ---------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def crowded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
+    """Yield a service with 220 surgeons, and 240 released styles of the first twenty."""
+    with serving(backends.fresh("sqlite", tmp_path_factory.mktemp("crowded"))) as service:
+        hospital.fill(service.database, 20)
+        with service.database.writing() as session:
+            for number in range(200):
+                put_surgeon(session, f"wren-{number:03}", {}, "test")
+        yield service
+
+
+def test_the_catalogue_reaches_every_surgeon_page_by_page_and_by_search(crowded: Service) -> None:
+    path, shown = "/pages/catalogue", []
+    while path:
+        page = page_of(crowded, path)
+        here = [at.rpartition("/")[2] for at in page.addresses() if at.startswith("/pages/surgeons/")]
+        assert len(here) <= MOST
+        shown += here
+        path = next((at for at in page.addresses() if "cursor=" in at), "")
+    assert len(shown) == 220 and shown == sorted(set(shown))
+    found = page_of(crowded, "/pages/catalogue?q=N-19")
+    assert [at for at in found.addresses() if at.startswith("/pages/surgeons/")] == [
+        f"/pages/surgeons/wren-19{digit}" for digit in range(10)
+    ]
+    assert "No pseudonym contains nobody." in page_of(crowded, "/pages/catalogue?q=nobody").text
+
+
+def test_forms_take_a_typed_pseudonym_where_surgeons_are_too_many_to_list(crowded: Service, told: Service) -> None:
+    with crowded.database.reading() as session:
+        recording = session.scalars(select(StoredRecording.sha256).limit(1)).one()
+    paths = ("/pages/jobs", "/pages/proposals", "/pages/recordings/new?surgeon=wren-199")
+    for path in (*paths, f"/pages/recordings/{recording}?surgeon=wren-199"):
+        fields = [(tag, about) for tag, about in page_of(crowded, path).tags if about.get("name") == "surgeon"]
+        assert fields and all(tag == "input" and "pattern" in about for tag, about in fields), path
+        assert "surgeon=" not in path or fields[0][1]["value"] == "wren-199"
+    few = [tag for tag, about in page_of(told, "/pages/jobs").tags if about.get("name") == "surgeon"]
+    assert few == ["select"]
+
+
+def test_a_released_style_beyond_the_list_is_not_called_unreleased(crowded: Service) -> None:
+    page = page_of(crowded, f"/pages/plans/new?surgeon=surgeon-0019&suture={cases.SUTURE}").text
+    assert "surgeon-0019" in page and "(not released)" not in page
+    assert "Only the first 200 released styles are listed." in page

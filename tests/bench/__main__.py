@@ -29,6 +29,7 @@ from tests.bench.serving import serving
 from tests.bench.session import session
 from tests.bench.ties import ties
 from tests.bench.tissue import tissue
+from tests.bench.upkeep import upkeep
 from tests.bench.writers import writers
 
 PARTS = {
@@ -45,6 +46,7 @@ PARTS = {
     "batches": batches,
     "scaling": scaling,
     "million": million,
+    "upkeep": upkeep,
     "writers": writers,
     "history": history,
     "serving": serving,

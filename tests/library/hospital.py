@@ -149,6 +149,28 @@ def _add_jobs(session: Session, styles: list[Style]) -> None:
     _add(session, StyleToRetrain, rows)
 
 
+def add_trainings(database: Database, styles: list[Style], each: int) -> None:
+    """Add more finished trainings of each style, with an event for each, in transactions of some thousands."""
+    with database.reading() as session:
+        training, event, surgeons = _first(session, Job), _first(session, Event), _rows(session, Surgeon, "slug")
+    asked = (
+        training["request"] | {"surgeon": surgeon, "suture": suture, "seed": seed}
+        for seed in range(WAITING + 1, WAITING + 1 + each)
+        for surgeon, suture in styles
+    )
+    while some := list(islice(asked, 5 * ROWS_AT_ONCE)):
+        jobs = [
+            training
+            | {"id": secrets.token_hex(8), "request": request, "identity": identity_of("training", request)}
+            | {"surgeon_row": surgeons[(request["surgeon"],)]}
+            for request in some
+        ]
+        events = [event | {"object_id": job["id"], "sha256": sha256(job["id"].encode())} for job in jobs]
+        with database.writing() as session:
+            _add(session, Job, jobs)
+            _add(session, Event, events)
+
+
 def _add_events(session: Session, count: int) -> None:
     first = _first(session, Event)
     _add(session, Event, (first | {"sha256": sha256(str(number).encode())} for number in range(count)))

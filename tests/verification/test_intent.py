@@ -12,6 +12,7 @@ from scipy.interpolate import CubicSpline
 
 from skills.gridworld.grid import discretize
 from skills.gridworld.reward import sparse_reward
+from skills.gridworld.scene import Box, Scene, Tissue
 from skills.kinematics import forward, instrument_of, joint_margins, matrix_of, quaternion_of
 from skills.learning.policy import learn_tabular
 from skills.learning.q_learning import PhaseQLearning
@@ -21,10 +22,12 @@ from skills.planning.handoff import PsmM
 from skills.planning.plan import SuturePoint, stack
 from skills.planning.trajectory import A1, A2, TRANSFER, PassPath, Trajectory
 from skills.verification import intent
+from skills.verification.arm_errors import UNCALIBRATED
 from skills.verification.asked import asked_of
 from skills.verification.intent import LIMITS, compare
 from skills.verification.playback import Playback
-from skills.verification.verdict import judge
+from skills.verification.scene_clearance import clearance_of
+from skills.verification.verdict import judge, judge_plan
 from tests.planning.motions import PSM_M, ideal_playback
 from tests.planning.test_hand import turning
 from tests.verification.faults import BASE, RATE_HZ, X, Z, broken, bump, planned, poses, rising, shift, sound, timed
@@ -249,6 +252,25 @@ def test_a_sound_motion_is_feasible_with_its_intent_and_without():
     asked, motion = sound()
     assert judge(ideal(motion), motion, intent=compare(asked, motion)).feasible
     assert judge(ideal(motion), motion).intent is None
+
+
+def test_the_verdict_on_a_plan_has_its_request_scene_and_inexact_worlds():
+    demo, policy = turning()
+    point, psm_m = SuturePoint(tuple(demo.tip_mm[-1].tolist())), PsmM(PSM_M, BASE_MM, BASE_XYZW)
+    plan = stack(policy, [point], demo=demo, psm_m=psm_m, rate_hz=RATE_HZ, speed_mm_s=20.0)
+    motion = timed(plan.pass_paths, psm_m)
+    low_mm = float(motion.tip_mm[:, 2].min()) - 30.0
+    plan = replace(plan, scene=Scene(plan.frame, tissue=Tissue.plane((0.0, 0.0, low_mm), (0.0, 0.0, 1.0))))
+    verdict = judge_plan(plan, motion, ideal(motion), policy=policy, demo=demo)
+    beside, apart = clearance_of(motion, plan.scene), compare(asked_of(plan, policy, demo), motion)
+    assert verdict.report == judge(ideal(motion), motion, beside=beside, pad_is_tissue=False, intent=apart)
+    assert verdict.report.feasible and verdict.failure_in_words is None
+    assert verdict.scene == beside.report
+    assert (verdict.doubt.pad_top_mm, verdict.doubt.under[0].errors) == (low_mm, UNCALIBRATED)
+    x, y, z = motion.tip_mm[len(motion) // 2].tolist()
+    box = Box((x - 5.0, y - 5.0, z - 5.0), (x + 5.0, y + 5.0, z + 5.0))
+    inside = replace(plan, scene=replace(plan.scene, boxes=(box,)))
+    assert "Nearest: " in judge_plan(inside, motion, ideal(motion), policy=policy, demo=demo).failure_in_words
 
 
 # ---- sound plans ---------------------------------------------------------------------------------------------------

@@ -530,7 +530,7 @@ def show_proposals(
             found=found,
             following=following,
             asked=asked | {"state": state},
-            surgeons=overview.all_surgeons(session),
+            surgeons=overview.surgeons_to_choose(session),
             sutures=overview.all_suture_types(session),
         )
 

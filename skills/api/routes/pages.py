@@ -17,7 +17,8 @@ from skills.api.responses import JSON
 from skills.api.routes.policies import JobId, Version
 from skills.formats import MEDIA_TYPES, SUFFIXES
 from skills.kinematics import INSTRUMENTS
-from skills.library import jobs, overview, policies, retraining, scores
+from skills.library import jobs, overview, policies, releases, retraining, scores
+from skills.library.catalogue import list_surgeons
 from skills.library.demos import find_demo
 from skills.library.plans import find_plan, hands_over, plan_in_words
 from skills.library.playbacks import headline_of
@@ -187,7 +188,7 @@ def show_upload(request: Request, caller: Asking, db: Db, surgeon: Picked = None
             kinds=MEDIA_TYPES,
             suffixes=SUFFIXES,
             instruments=list(INSTRUMENTS),
-            surgeons=overview.all_surgeons(session),
+            surgeons=overview.surgeons_to_choose(session),
             surgeon=surgeon,
             suture=suture,
         )
@@ -208,7 +209,7 @@ def show_recording(
             found=found,
             demos=demos,
             taken=[[demo.start_s, demo.end_s] for demo in demos if demo.withdrawn_at is None],
-            surgeons=overview.all_surgeons(session),
+            surgeons=overview.surgeons_to_choose(session),
             sutures=overview.all_suture_types(session),
             surgeon=surgeon,
             suture=suture,
@@ -259,6 +260,8 @@ def show_plan_editor(
             "plan_editor.html",
             caller,
             released=released,
+            most=overview.MOST_CHOICES,
+            is_served=policy is not None and releases.serves(session, policy),
             policy=policy,
             partner=None if policy is None else policy.demonstration.demo.partner,
             before=before,
@@ -310,7 +313,7 @@ def show_jobs(
             found=jobs.list_jobs(session, overview.MOST, cursor, state or None),
             state=state,
             most=overview.MOST,
-            surgeons=overview.all_surgeons(session),
+            surgeons=overview.surgeons_to_choose(session),
             sutures=overview.all_suture_types(session),
         )
 
@@ -336,14 +339,16 @@ def show_job(
 
 
 @router.get("/pages/catalogue", dependencies=[needs("reader")])
-def show_people(request: Request, caller: Asking, db: Db) -> Response:
+def show_people(request: Request, caller: Asking, db: Db, q: Words = "", cursor: SlugCursor = None) -> Response:
     """Show surgeons and suture types, with forms that add and change them."""
     with db.reading() as session:
         return render(
             request,
             "people.html",
             caller,
-            surgeons=overview.all_surgeons(session),
+            q=q,
+            surgeons=list_surgeons(session, overview.MOST, cursor, q or None),
+            most=overview.MOST,
             sutures=overview.all_suture_types(session),
         )
 

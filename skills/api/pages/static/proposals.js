@@ -24,6 +24,7 @@ if (chosen) {
 async function surgeonOf(item) {
   const { surgeon, pseudonym } = chosen.elements;
   const named = item.dataset.surgeon;
+  if (!surgeon.reportValidity()) throw new Error("Give the surgeon's pseudonym at the top of the list.");
   if (!surgeon.value && !named) throw new Error("The recording names no surgeon; choose one at the top of the list.");
   if (!surgeon.value) return named;
   if (surgeon.value === "+" && (!pseudonym.value || !pseudonym.reportValidity())) throw new Error("Give the new surgeon's pseudonym at the top of the list.");
