@@ -223,8 +223,7 @@ def _rounded(values: NDArray[Any]) -> list[Any]:
 State = Literal["released", "trained", "stored", "empty"]
 STATES: tuple[State, ...] = ("released", "trained", "stored", "empty")
 MOST = 50  # rows of a list on a page
-MOST_VERSIONS = 200
-MOST_CHOICES = 200  # in a selection of a form; of more nobody chooses by eye
+MOST_LISTED = 200  # of a style's versions and demonstrations, or in a selection, where of more nobody chooses by eye
 MOST_COUNTED = 1000  # of a kind, for the figures of the first page
 
 _Row = tuple[int, str]  # a style: the surgeon's row and the suture type's slug
@@ -416,7 +415,7 @@ class WholeStyle:
 
 
 def whole_style(session: Session, surgeon: str, suture: str) -> WholeStyle:
-    """Return one style with all its demonstrations, versions and releases.
+    """Return one style with its newest demonstrations, versions and releases, `MOST_LISTED` of each.
 
     Raises:
         NotFound: The surgeon or the suture type is unknown.
@@ -426,7 +425,7 @@ def whole_style(session: Session, surgeon: str, suture: str) -> WholeStyle:
 
     def newest(of: Any) -> Any:
         mine = select(of).where(of.surgeon_row == who.row, of.suture == what.slug)
-        return session.scalars(mine.order_by(of.row.desc()).limit(MOST_VERSIONS)).all()
+        return session.scalars(mine.order_by(of.row.desc()).limit(MOST_LISTED)).all()
 
     releases: Sequence[Release] = newest(Release)
     style = _styles(session, [who.row], what.slug).get((who.row, what.slug), StyleState(what.slug, "empty"))
@@ -443,8 +442,8 @@ def whole_style(session: Session, surgeon: str, suture: str) -> WholeStyle:
 
 def surgeons_to_choose(session: Session) -> Sequence[Surgeon] | None:
     """List the surgeons, for a selection in a form; None where they are too many, so that the pseudonym is typed."""
-    found = session.scalars(select(Surgeon).order_by(Surgeon.slug).limit(MOST_CHOICES + 1)).all()
-    return found if len(found) <= MOST_CHOICES else None
+    found = session.scalars(select(Surgeon).order_by(Surgeon.slug).limit(MOST_LISTED + 1)).all()
+    return found if len(found) <= MOST_LISTED else None
 
 
 def all_suture_types(session: Session) -> Sequence[SutureType]:
@@ -461,12 +460,12 @@ class ReleasedStyle(NamedTuple):
     policy_row: int
 
 
-def released_styles(session: Session) -> list[ReleasedStyle]:
-    """List the first `MOST_CHOICES` styles that serve a version, by surgeon and suture type, for a selection."""
+def released_styles(session: Session, limit: int = MOST_LISTED) -> list[ReleasedStyle]:
+    """List the first styles that serve a version, by surgeon and suture type, for a selection in a form."""
     by = PolicyVersion
     found = select(Surgeon.slug, Release.suture, by.version, by.row).join(Release, Release.surgeon_row == Surgeon.row)
     found = found.join(by, by.row == Release.policy_row).where(is_served()).order_by(Surgeon.slug, Release.suture)
-    return [ReleasedStyle(*one) for one in session.execute(found.limit(MOST_CHOICES))]
+    return [ReleasedStyle(*one) for one in session.execute(found.limit(limit))]
 
 
 def newest_recordings(

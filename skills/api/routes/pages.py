@@ -115,7 +115,8 @@ def show_style(
         whole = overview.whole_style(session, surgeon, suture)
         shown = _chosen(session, whole, version)
         other = None if beside is None else policies.find_version(session, surgeon, suture, beside)
-        return render(request, "style.html", caller, whole=whole, shown=shown, other=other)
+        most = overview.MOST_LISTED
+        return render(request, "style.html", caller, whole=whole, shown=shown, other=other, most=most)
 
 
 def _chosen(session: Session, whole: overview.WholeStyle, version: int | None) -> Any:
@@ -260,7 +261,7 @@ def show_plan_editor(
             "plan_editor.html",
             caller,
             released=released,
-            most=overview.MOST_CHOICES,
+            most=overview.MOST_LISTED,
             is_served=policy is not None and releases.serves(session, policy),
             policy=policy,
             partner=None if policy is None else policy.demonstration.demo.partner,
