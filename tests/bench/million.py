@@ -75,6 +75,7 @@ def installation(backend: str, surgeons: int) -> Iterator[Service]:
         with service.http:
             fill(service.database, surgeons)
             gc.freeze()  # as the server does: later collections skip all that was imported
+            gc.collect()  # the server collects nothing before; otherwise a first collection would wait for a long time
             yield service
         service.database.close()
         backends.drop(url)
