@@ -50,6 +50,7 @@ ROUNDS = 2
 WORKERS = (1, 2, 4)
 FIRST = "warm-up"  # a surgeon whose style is trained before the measurement
 MOST_S = 600.0
+LIMITS = Settings(database_url="sqlite://")  # made once, as by a worker: reading the environment takes 4 ms
 T = TypeVar("T")
 
 
@@ -168,7 +169,7 @@ def returned(reward: RewardMap) -> tuple[np.ndarray, Certificate, Coverage]:
 
 def worked_out(lesson: Lesson) -> None:
     """Learn, certify, check, measure, describe and pack: everything that does not need the database."""
-    learn_style(lesson, training_of(lesson), Settings(database_url="sqlite://"))
+    learn_style(lesson, training_of(lesson), LIMITS)
 
 
 def training_of(lesson: Lesson) -> dict[str, object]:
