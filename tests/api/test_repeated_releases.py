@@ -7,6 +7,8 @@ import pytest
 
 from skills.client import Client, Retrying
 from skills.client.connection import NotReached
+from skills.library import releases
+from skills.library.policies import list_versions
 from tests.api.service import CSV, KESTREL, POLICY, Service, assert_problem
 from tests.library import cases
 from tests.library.styles import add_styles
@@ -35,6 +37,18 @@ def test_asked_again_for_what_is_served_nothing_is_done_and_that_is_said(trained
     assert again["did"] == "Nothing: the style serves version 1 already."
     assert told(again) == (True, 1)
     assert trained.counts()["events"] == events
+
+
+def test_one_version_of_a_style_serves_or_none_does(trained: Service):
+    def serving() -> list[bool]:
+        with trained.database.reading() as session:
+            return [releases.serves(session, one) for one in list_versions(session, **KESTREL, limit=9)]
+
+    assert serving() == [True]
+    trained.train(seed=7, release=True)
+    assert serving() == [True, False]
+    trained.client.withdraw(**KESTREL)
+    assert serving() == [False, False]
 
 
 def test_a_withdrawn_release_is_reported_and_a_new_request_releases_it(trained: Service):
