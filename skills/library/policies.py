@@ -182,9 +182,8 @@ def policy_json(policy: PolicyVersion, release: Release | None) -> dict[str, Any
     Raises:
         Corrupt: The stored values do not match the version's digest.
     """
-    actions, live = actions_of(learnt(policy)), None
-    if covered(policy).share is not None:
-        live = live_actions_of(learnt(policy))
+    actions = actions_of(learnt(policy))
+    live = None if covered(policy).share is None else live_actions_of(learnt(policy))
     return {
         "version": policy.version,
         "sha256": policy.sha256,

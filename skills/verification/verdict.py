@@ -345,10 +345,8 @@ def judge_plan(
     # The simulator's pad lies below the motion wherever that goes, so it is no tissue and no gate.
     report = judge(playback, trajectory, approach_m=approach_m, beside=beside, pad_is_tissue=False, intent=intent)
     tissue = None if plan.scene is None else plan.scene.tissue
-    top_mm, normal = (None, UPWARDS)
-    if tissue is not None and beside is not None:
-        top_mm, normal = flat_tissue(trajectory, beside.report, tissue)
-    doubted = doubt(trajectory, approach_m=approach_m, pad_top_mm=top_mm, pad_normal=normal, errors=errors)
+    top = (None, UPWARDS) if tissue is None or beside is None else flat_tissue(trajectory, beside.report, tissue)
+    doubted = doubt(trajectory, approach_m=approach_m, pad_top_mm=top[0], pad_normal=top[1], errors=errors)
     return PlanVerdict(report, None if beside is None else beside.report, doubted)
 
 
