@@ -250,6 +250,11 @@ class Action(Enum):
         command="Calibrate on rated trials: skills calibrate FOLDER",
         python="Ask the operator of the service to calibrate it on rated trials.",
     )
+    ACCEPT_ROLLBACK = Words(
+        http="Or ask the operator of the service to accept it: skills accept-rollback",
+        command="Or go on with this one: skills accept-rollback",
+        python="Or ask the operator of the service to accept it: skills accept-rollback",
+    )
     VERIFY = Words(
         http="Ask the operator of the service to verify its database and to restore the row from a backup.",
         command="Find the row with skills verify, then restore it from a backup.",

@@ -206,7 +206,7 @@ def environment(settings: Settings) -> dict[str, str]:
 
 def prepare(settings: Settings) -> None:
     """Migrate the database and seed its catalogue."""
-    with closing(Database(settings.database_url, signing_key=settings.signing_key)) as database:
+    with closing(Database.of(settings)) as database:
         prepare_database(database, settings)
 
 
@@ -218,7 +218,7 @@ def refuse_keyless(settings: Settings) -> None:
     """
     if settings.beyond_loopback and settings.proxy_header is None:
         with (
-            closing(Database(settings.database_url, signing_key=settings.signing_key)) as database,
+            closing(Database.of(settings)) as database,
             database.reading() as session,
         ):
             refuse_without_keys(session)
@@ -361,7 +361,7 @@ def keeping_erasures(settings: Settings) -> Iterator[None]:
                 )
             pause_s = max(ERASURES_EVERY_S, 10 * (time.monotonic() - began_s))  # a long list costs a tenth of a core
 
-    with closing(Database(settings.database_url, signing_key=settings.signing_key)) as database:
+    with closing(Database.of(settings)) as database:
         try:
             known = keep_up_erasures(database, file)
             # there are no erasures yet; write the file anyway, to find out now whether that is possible

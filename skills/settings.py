@@ -54,7 +54,10 @@ class Settings(BaseSettings):
     erasures_file: Path | None = None  # list of erasures to apply after a restore; kept up to date if it is named
     # secret key that signs the history, made at the first start; kept apart from the database and its backups
     signing_key: Path = Field(default_factory=lambda: _state_folder() / "signing.key")
-    checkpoints: Path | None = None  # file to which each signed head of the history is appended
+    # file to which each signed head of the history is appended, and with which the database is compared; by default a
+    # file beside the signing key
+    checkpoints: Path | None = None
+    verify_every_s: float = Field(default=3600.0, ge=1)  # between two verifications of the history by a worker
     sample_recordings: Path | None = None
     paper_data: Path | None = None
 

@@ -1,7 +1,8 @@
 """The FastAPI application: routes, middleware, one database, one job engine, and errors as problem documents."""
 
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
+from math import inf
 from typing import Any
 
 from anyio import CapacityLimiter, to_thread
@@ -21,6 +22,7 @@ from skills.api.responses import DOWNLOADS_READ, Encoded, Watching
 from skills.api.routes import catalogue, demos, operating, pages, plans, policies
 from skills.api.sessions import Sessions
 from skills.db.session import Database
+from skills.errors import SkillsError
 from skills.jobs import Engine
 from skills.library.arm_errors import stated_errors
 from skills.library.catalogue import seed_catalogue
@@ -57,6 +59,8 @@ def create_app(settings: Settings) -> FastAPI:
                     yield
         finally:
             await to_thread.run_sync(app.state.engine.close)
+            with suppress(SkillsError):  # what was written after the last signature; the next start signs it otherwise
+                await to_thread.run_sync(keep_signed, app.state.database, inf)
             app.state.access.close()
             app.state.database.close()
 
@@ -71,7 +75,7 @@ def create_app(settings: Settings) -> FastAPI:
         max_body_size=settings.max_upload_bytes,
     )
     app.state.settings = settings
-    app.state.database = Database(settings.database_url, signing_key=settings.signing_key)
+    app.state.database = Database.of(settings)
     app.state.engine = Engine(settings)
     app.state.encoded = Encoded()
     app.state.served = PolicyCache(app.state.database, app.state.encoded)
@@ -112,11 +116,15 @@ def create_app(settings: Settings) -> FastAPI:
 
 
 def prepare_database(database: Database, settings: Settings) -> None:
-    """Migrate a database, seed its catalogue if it is empty, and sign its history."""
+    """Migrate a database, seed its catalogue if it is empty, and sign its history.
+
+    If it is not the database that was signed last, nothing is changed, and `History.refused` says why.
+    """
     database.migrate()
-    with database.writing() as session:
-        seed_catalogue(session)
-    keep_signed(database, settings.checkpoints)
+    if keep_signed(database):
+        with database.writing() as session:
+            seed_catalogue(session)
+        keep_signed(database)
 
 
 class Service(FastAPI):
@@ -138,7 +146,7 @@ class Service(FastAPI):
         failing = super().build_middleware_stack()
         assert isinstance(failing, ServerErrorMiddleware)  # the handler of status 500 is outermost, and stays so
         at_hand = AtHand(failing.app, state.served, policies.get_policy, policies.router)
-        failing.app = Gate(at_hand, state.access, state.settings)
+        failing.app = Gate(at_hand, state.access, state.settings, state.database.history)
         return Observed(Headers(HeadAsGet(failing)), state.metrics)
 
 

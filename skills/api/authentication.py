@@ -37,6 +37,7 @@ from skills.api.authorisation import LOCAL, Caller
 from skills.api.problems import answer_to
 from skills.db import now
 from skills.db.changes import WeightedCache
+from skills.db.history import History
 from skills.db.session import Database
 from skills.errors import Busy, NotAllowed, NotSignedIn, SkillsError, TooMany, WrongHost
 from skills.library.keys import (
@@ -104,7 +105,7 @@ class Access:
         self._own_digest = digest_of(self.own_key)
         self._database = database
         # a separate pool, which slow requests cannot exhaust
-        self._asked = Database(database.url, patience_ms=PATIENCE_MS)
+        self._asked = Database.of(settings, patience_ms=PATIENCE_MS)
         self._settings = settings
         self._known: WeightedCache[str, _Remembered] = WeightedCache(KEPT)
         # wrong keys, with the time until which each is refused without a query
@@ -306,9 +307,10 @@ class _Together(Generic[T]):
 class Gate:
     """ASGI middleware that refuses unauthenticated requests, and sets `scope["caller"]` for the routes."""
 
-    def __init__(self, app: ASGIApp, access: Access, settings: Settings) -> None:
+    def __init__(self, app: ASGIApp, access: Access, settings: Settings, history: History) -> None:
         self.app = app
         self._access = access
+        self._history = history
         self._names = settings.host_names
         self._person = None if settings.proxy_header is None else settings.proxy_header.lower().encode()
         self._once = ONCE if self._person is None else ONCE | {self._person}
@@ -323,7 +325,9 @@ class Gate:
             _refuse_wrong_host(headers, self._names)
             # No same-origin policy holds for WebSockets, so the origin of one is checked as that of a change.
             _refuse_foreign(scope.get("method", WEB_SOCKET), headers)
-            if not is_open(_path(scope)):
+            if not is_open(path := _path(scope)):
+                if self._history.refused is not None and path not in SAYS_WHAT_IS_WRONG:
+                    raise self._history.refused  # before a key is looked up, among those of another database
                 scope["caller"] = await self._caller(scope, headers)
                 # a stream repeats the check while it is open; without the scope, which would be a reference cycle
                 scope["ask_again"] = self.ask_again

@@ -34,7 +34,9 @@ SIGNATURE = "signature"  # the response is the signature of the others
 USUAL = frozenset({b"accept", b"if-none-match"})
 READ = USUAL | {b"if-match"}
 LONGEST = 500  # a longer header is left to the route
-SWEEP_S = 2.0  # an erased policy leaves memory within this time; it is not served from the erasure on
+# An erased policy leaves memory within this time; it is not served from the erasure on. A database that was put back to
+# an older copy under the running service is noticed within this time; no policy is read from it before.
+SWEEP_S = 2.0
 
 
 @dataclass
@@ -119,13 +121,15 @@ class PolicyCache:
         for _ in range(2):
             if (known := self._seen(key)) is not None:
                 return known
-            sign_history(self._database, None)
+            sign_history(self._database)
         raise Busy("The history is not signed up to this release yet; try again in a second.")
 
     def _seen(self, key: Style) -> Known | None:
         """Read the tables, all within one transaction; None where the release is under no signed checkpoint yet."""
         surgeon, suture, media_type = key
+        kept = self._database.history.kept_head()
         with self._database.reading() as session:
+            self._database.history.compare(session.connection(), kept)
             release = session.execute(STANDS, {"surgeon": surgeon, "suture": suture}).first()
             known = self._known.get(key)
             if known is not None and release is not None and known.release == tuple(release) and not known.over:
@@ -145,9 +149,11 @@ class PolicyCache:
             return Known(body, tuple(release), consent.last_day(served.policy.surgeon.consent), None)
 
     async def _sweep(self) -> None:
-        """Remove erased policies from memory periodically, also those that are not requested any more."""
+        """Compare the database with its kept head, and remove erased policies from memory, periodically."""
         while True:
             await asyncio.sleep(SWEEP_S)
+            with suppress(SkillsError, SQLAlchemyError):  # `History.refused` says what is wrong
+                await asyncio.to_thread(self._database.compare_history)
             with suppress(SkillsError, SQLAlchemyError):  # the database may be readable again at the next sweep
                 await asyncio.to_thread(self.forget_erased)
                 await asyncio.to_thread(neighbours.forget_gone, self._database)

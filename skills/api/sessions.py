@@ -299,7 +299,7 @@ class Sessions:
                     self._version, self._known_s, self._rows_seen = version, began_s, rows
                     _tell(looking, found)
             for one in looking:
-                if monotonic() - self._known_s > UNKNOWN_S:
+                if monotonic() - self._known_s > UNKNOWN_S or self._database.history.refused is not None:
                     one.end(BUSY, UNREADABLE)
                 elif one.pinned.last_day is not None and not consent.today() <= one.pinned.last_day:
                     one.end(FORBIDDEN, "The surgeon's consent has ended.")

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from skills.cli.shell import KEY, AsJson, err, files, out, print_json, read_key, refusing, service, show
-from skills.errors import SkillsError
+from skills.errors import NotReady, SkillsError
 
 commands = typer.Typer()
 _ENDED = {
@@ -31,6 +31,22 @@ _LISTED = {
     "keys": "keys revoked",
     "failed": "demonstrations marked recovery or failure",
 }
+
+
+_NO_LIST = (
+    "NO LIST OF ERASURES: surgeons who were erased after {since} ARE BACK, policies that were withdrawn or superseded "
+    "since ARE SERVED, demonstrations that were marked failure since ARE LEARNT FROM, revoked keys ARE VALID and "
+    "withdrawn consent IS IN FORCE. Use --erasures, or erase, withdraw, mark and revoke all of this again before you "
+    "use this database."
+)
+Lists = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--erasures",
+        help="A list that `skills erasures` wrote, or the URL of the database that is replaced; repeatable. By default "
+        "the file of SKILLS_ERASURES_FILE.",
+    ),
+]
 
 
 @commands.command()
@@ -118,13 +134,7 @@ def backup(to: Annotated[Path, typer.Argument(help="A new file.", dir_okay=False
 @refusing
 def restore(
     source: Annotated[Path, typer.Argument(help="A file that `skills backup` wrote.", dir_okay=False)],
-    erasures: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="A list that `skills erasures` wrote, or the URL of the database that is replaced; repeatable. By "
-            "default the file of SKILLS_ERASURES_FILE."
-        ),
-    ] = None,
+    erasures: Lists = None,
     check: Annotated[bool, typer.Option("--check", help="Only check the backup; write nothing.")] = False,
     as_json: AsJson = False,
 ) -> None:
@@ -144,30 +154,69 @@ def restore(
             _say(f"{source} is whole: {rows} rows of {taken}.", as_json, whole=True, rows=rows, created_at=taken)
             return
         refuse_left_over(settings())
-        kept = settings().erasures_file
-        sources = erasures or ([str(kept)] if kept is not None and kept.exists() else [])
-        listed = library.NOTHING
-        for one in sources:
-            listed |= library.read_erasures(one)
+        sources, listed = _listed_in(erasures)
         with closing(Database(settings().database_url)) as database, _telling("restoring") as told:
             done = library.restore(database, source, listed, told)
     rows, taken = sum(table.rows for table in done.manifest.tables), done.manifest.created_at
     ended = {name: count for name, count in vars(done).items() if name != "manifest"}
-    sentence = f"Restored {rows} rows, the state of {taken}."
-    if sources:
-        counts = ", ".join(f"{count} {_ENDED[name]}" for name, count in ended.items())
-        sentence += f"\nApplied again, from {', '.join(map(_without_password, sources))}: {counts}."
-        if done.styles_stopped:
-            sentence += "\nRelease a version of each style that is to be served: `skills policy release`."
-    _say(sentence, as_json, rows=rows, created_at=taken, **ended)
+    _say(
+        f"Restored {rows} rows, the state of {taken}.{_again(sources, ended)}",
+        as_json,
+        rows=rows,
+        created_at=taken,
+        **ended,
+    )
     if not sources:
-        err.print(
-            f"NO LIST OF ERASURES: surgeons who were erased after {taken} ARE BACK, policies that were withdrawn "
-            "or superseded since ARE SERVED, demonstrations that were marked failure since ARE LEARNT FROM, revoked "
-            "keys ARE VALID and withdrawn consent IS IN FORCE. Restore into an empty database with --erasures, or "
-            "erase, withdraw, mark and revoke all of this again before you use this database.",
-            style="red",
-        )
+        err.print(_NO_LIST.format(since=taken), style="red")
+
+
+@commands.command("accept-rollback")
+@refusing
+def accept_rollback(erasures: Lists = None, as_json: AsJson = False) -> None:
+    """Go on with a database that was put back to an older copy of itself, and repeat what was ended since.
+
+    A service refuses such a database until this command is given; the event is logged, and the kept heads of its
+    history are set aside. Restore the right copy instead where there is one.
+    """
+    from skills.db.session import Database
+    from skills.jobs.readiness import refuse_left_over
+    from skills.library import backup as library
+    from skills.settings import settings
+
+    with files():
+        sources, listed = _listed_in(erasures)
+        with closing(Database(settings().database_url)) as database, _telling("accepting"):
+            try:
+                database.compare_history()
+            except NotReady:  # otherwise there is nothing to accept, as the next call says
+                refuse_left_over(settings())
+            ended = library.accept_rollback(database, listed)
+    _say(f"The database is accepted as it is.{_again(sources, ended)}", as_json, **ended)
+    if not sources:
+        err.print(_NO_LIST.format(since="it was copied"), style="red")
+
+
+def _listed_in(given: list[str] | None) -> tuple[list[str], "Erasures"]:
+    """Return the lists of erasures to apply, by default the file of the settings, and their union."""
+    from skills.library import backup as library
+    from skills.settings import settings
+
+    kept, listed = settings().erasures_file, library.NOTHING
+    sources = given or ([str(kept)] if kept is not None and kept.exists() else [])
+    for one in sources:
+        listed |= library.read_erasures(one)
+    return sources, listed
+
+
+def _again(sources: list[str], ended: dict[str, int]) -> str:
+    """Return sentences on what the lists of erasures have ended again."""
+    if not sources:
+        return ""
+    counts = ", ".join(f"{count} {_ENDED[name]}" for name, count in ended.items())
+    sentence = f"\nApplied again, from {', '.join(map(_without_password, sources))}: {counts}."
+    if ended["styles_stopped"]:
+        sentence += "\nRelease a version of each style that is to be served: `skills policy release`."
+    return sentence
 
 
 @commands.command()
@@ -203,8 +252,8 @@ def verify(
     head: Annotated[
         Path | None,
         typer.Option(
-            help="A file of signed checkpoints that was kept elsewhere, by default of SKILLS_CHECKPOINTS: the history "
-            "must continue each of them.",
+            help="A file of signed checkpoints that was kept elsewhere, by default the file of SKILLS_CHECKPOINTS or "
+            "beside the signing key: the history must continue each of them.",
             dir_okay=False,
         ),
     ] = None,
@@ -245,10 +294,8 @@ def verify(
         _telling("verifying") as told,
     ):
         with files():
-            kept = settings().checkpoints
-            head = head or (kept if kept is not None and kept.exists() else None)
-            heads = [] if head is None else read_notes(head.read_text())
-        keep_signed(database, settings().checkpoints)
+            heads = None if head is None else read_notes(head.read_text())
+        keep_signed(database)
         for part in inspect_installation(
             database,
             reader.tell,
@@ -372,6 +419,7 @@ def _telling(doing: str) -> Iterator[Callable[[str], None]]:
 
 if TYPE_CHECKING:
     from skills.db.session import Database
+    from skills.library.backup import Erasures
     from skills.library.inspection import Checked
 
 key_commands = typer.Typer()

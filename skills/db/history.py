@@ -15,6 +15,7 @@ guessed, so all proofs stay valid. `skills.library.history` numbers the leaves, 
 
 import hmac
 import json
+import logging
 import os
 import secrets
 import tempfile
@@ -44,6 +45,7 @@ from sqlalchemy import (
 from sqlalchemy.orm import Mapped, mapped_column
 
 from skills.db import Base, RowId, now, rfc3339
+from skills.db.kept_heads import heads_beside, last_head, set_aside
 from skills.db.logged_rows import (
     CACHES,
     OF_LEAF,
@@ -57,9 +59,9 @@ from skills.db.logged_rows import (
     united,
     united_rows,
 )
-from skills.errors import BadSettings, Corrupt
+from skills.errors import BadSettings, Corrupt, NotReady
 from skills.remedies import Action, Remedy
-from skills.transparency import HASH_BYTES, Checkpoint, Seal, SigningKey, Tree, leaf_hash, read_notes
+from skills.transparency import HASH_BYTES, Checkpoint, Note, Seal, SigningKey, Tree, leaf_hash, read_notes
 
 ADD, CHANGE, REMOVE, FOUND = "add", "change", "remove", "found"
 SCHEMA = "schema"  # the name under which triggers, indexes and constraints are logged as if they were rows
@@ -102,12 +104,13 @@ class StoredCheckpoint(Base):
     __tablename__ = "history_checkpoints"
 
     row: Mapped[RowId]
-    size: Mapped[int] = mapped_column(BigInteger)
+    size: Mapped[int] = mapped_column(BigInteger, index=True)
     note: Mapped[str] = mapped_column(String(1000))
     subtrees: Mapped[bytes] = mapped_column(LargeBinary)
     signed_at: Mapped[datetime] = mapped_column(default=now)
 
 
+log = logging.getLogger(__name__)
 LEAVES = cast(Table, Leaf.__table__)
 CHECKPOINTS = cast(Table, StoredCheckpoint.__table__)
 
@@ -129,6 +132,7 @@ _FURTHER = (
     "SELECT current_setting('skills.notes' || n, true), set_config('skills.notes' || n, '', true), "
     "set_config('skills.noting', '0', true) FROM generate_series(1, %s) n"
 )
+HISTORY = "history"  # in a session's `info`: the `History` of its database
 NOTING = "noting"  # in a connection's `info`: whether its transactions note changes
 
 
@@ -173,10 +177,13 @@ def take_notes(connection: Connection) -> list[Any]:
 class History:
     """The history of one database, written with the signing key of this installation."""
 
-    def __init__(self, engine: Engine, key_file: Path) -> None:
-        """Name the database and the file of the key; both are read at the first use."""
+    def __init__(self, engine: Engine, key_file: Path, heads_file: Path | None) -> None:
+        """Name the database, the file of the key, and that of the kept heads; they are read at the first use."""
         self._engine = engine
         self.key_file = key_file
+        self.heads_file = heads_file or heads_beside(key_file, engine.url)
+        self.refused: NotReady | None = None  # why nothing of the database is served or written, see `compare`
+        self._agreed: tuple[str, Note | None] | None = None  # the newest checkpoint, and the kept head
         self._seal: Seal | None = None
         self._origin: str | None = None
 
@@ -204,11 +211,84 @@ class History:
             self._origin = None if first is None else first.partition("\n")[0]
         return self._origin
 
+    def kept_head(self) -> Note | None:
+        """Return the head that was kept last; None if none was.
+
+        Raises:
+            NotReady: It cannot be read.
+        """
+        try:
+            return last_head(self.heads_file)
+        except NotReady as refused:
+            self.refused = refused
+            raise
+
+    def kept_heads(self, origin: str) -> list[Note]:
+        """Return all kept heads of one log.
+
+        Raises:
+            Corrupt: The file has anything else.
+        """
+        if not self.heads_file.exists():
+            return []
+        return [note for note in read_notes(self.heads_file.read_text()) if note.checkpoint.origin == origin]
+
+    def compare(self, connection: Connection, kept: Note | None) -> None:
+        """Compare the database with the signing key and with the head that was kept last; the result is `refused`.
+
+        Args:
+            connection: In a transaction.
+            kept: The head, read before the transaction began, as it must not be newer than what that sees.
+
+        Raises:
+            NotReady: The database is not the one that was signed last: older, another one, or signed with another key.
+        """
+        newest = newest_checkpoint(connection)
+        if newest is None or (newest, kept) == self._agreed:
+            return
+        try:
+            self._refuse_another(connection, newest, kept)
+        except NotReady as refused:
+            if self.refused is None:
+                log.critical("Nothing is served or written. %s", refused)
+            self.refused, self._agreed = refused, None
+            raise
+        self.refused, self._agreed = None, (newest, kept)
+
+    def _refuse_another(self, connection: Connection, newest: str, kept: Note | None) -> None:
+        (note,) = read_notes(newest)
+        try:
+            key = self.key
+        except (BadSettings, Corrupt) as error:
+            raise NotReady(error.message, *error.remedies) from error
+        if not note.signed_by(key.public):
+            raise NotReady(
+                f"The history of this database was signed with another key than that in {self.key_file}, and what is "
+                "written with this one could not be verified.",
+                "Put the right key there, or name its file in SKILLS_SIGNING_KEY. If it is lost, restore a backup into "
+                "an empty database, whose history then goes on with this key.",
+            )
+        if kept is None or kept == note:
+            return
+        head, here = kept.checkpoint, note.checkpoint
+        if head.origin != here.origin and here.size == 0:
+            return  # a history that has just begun takes the place of another
+        known = select(CHECKPOINTS.c.row).where(CHECKPOINTS.c.size == head.size, CHECKPOINTS.c.note == kept.text)
+        if connection.scalar(known) is None:
+            how = "older than" if (head.origin, here.size < head.size) == (here.origin, True) else "another than"
+            raise NotReady(
+                f"This database is {how} the one whose history was kept last: that one has "
+                f"{head.size} leaves, and this {here.size} without that head. Releases that were withdrawn, keys "
+                "that were revoked, consent that was withdrawn and erased surgeons may be back in it.",
+                "Put the right copy of the database back.",
+                Remedy(Action.ACCEPT_ROLLBACK),
+            )
+
     def settle(self, connection: Connection) -> None:
         """Add a leaf for each logged row that the transaction has changed; call it before the commit.
 
         Raises:
-            BadSettings: The signing key cannot be read.
+            NotReady: The database is not the one that was signed last, see `compare`.
         """
         if not connection.info.get(NOTING):
             return  # the job engine's database, or one that is not migrated yet
@@ -231,7 +311,10 @@ class History:
         if self._seal is None:
             origin = self.origin(connection)
             assert origin is not None, "no history was begun: migrate first"
+            self.compare(connection, self.kept_head())
             self._seal = self.key.seal_of(origin)
+        if self.refused is not None:
+            raise self.refused
         for leaf in leaves:
             leaf["seal"] = self._seal.of(leaf["entry"].encode())
         add_leaves(connection, leaves)
@@ -379,14 +462,20 @@ class History:
         take_notes(connection)
         connection.info[NOTING] = True
         self._origin = self._seal = None
+        set_aside(self.heads_file)  # of a database that was here before
         if self.origin(connection) is None:
             self.begin(connection)
             return
         self.make_key()
-        last = connection.scalar(select(CHECKPOINTS.c.note).order_by(CHECKPOINTS.c.row.desc()).limit(1))
-        if not read_notes(last or "")[0].signed_by(self.key.public):
+        if not read_notes(newest_checkpoint(connection) or "")[0].signed_by(self.key.public):
             self.sign(connection, adopt=True)
         self.log_schema(connection)
+
+
+def newest_checkpoint(connection: Connection) -> str | None:
+    """Return the newest signed checkpoint as a note; None where no history was begun."""
+    note: str | None = connection.scalar(select(CHECKPOINTS.c.note).order_by(CHECKPOINTS.c.row.desc()).limit(1))
+    return note
 
 
 def _number_leaves(connection: Connection, numbered: Sequence[tuple[int, int]]) -> None:
@@ -434,6 +523,8 @@ class Latest:
     entry: str
     salt: bytes
     digests: Mapping[str, str]
+    number: int | None = None
+    seal: bytes = b""
 
     @property
     def hash(self) -> str:
@@ -460,7 +551,8 @@ def latest_leaves(connection: Connection, table: str, keys: Sequence[str] | None
     if keys is not None and not keys:
         return {}
     columns = (LEAVES.c.key, LEAVES.c.row, LEAVES.c.entry, LEAVES.c.salt, LEAVES.c.digests)
-    query = select(*columns).where(LEAVES.c.table_name == table, LEAVES.c.key.is_not(None)).order_by(LEAVES.c.row)
+    of_rows = (LEAVES.c.table_name == table, LEAVES.c.key.is_not(None))
+    query = select(*columns, LEAVES.c.number, LEAVES.c.seal).where(*of_rows).order_by(LEAVES.c.row)
     if keys is None:
         return {key: Latest(*about) for key, *about in connection.execute(query)}
     found = {}

@@ -49,7 +49,6 @@ IN_PIECES = "the row that the pieces belong to has their digest, which `skills v
 SWEPT = "what the sweep has yet to delete, and nobody sees; `skills verify` finds one that names an existing row"
 NOT_LOGGED = {
     "executors": OF_A_RUN,
-    "sign_ins": "browser sessions, which end within a day; what is done in one is an event",
     "retraining_styles": "the progress of a batch; the versions and releases that it made are logged",
     "loose_chunks": SWEPT,
     "erased_surgeons": SWEPT,
@@ -60,12 +59,14 @@ NOT_LOGGED = {
     "history_checkpoints": "the history itself",
     "history_tiles": "hashes of the history, which `skills verify` computes again",
 }
-CACHES = ("measured_shapes", "parsed_recordings")  # logged, but anybody may delete their rows at any time
+# Logged, but anybody may delete their rows at any time; a sign-in that is gone lets nobody in.
+CACHES = ("measured_shapes", "parsed_recordings", "sign_ins")
 COLUMNS_NOT_LOGGED = {
     ("jobs", "progress"): OF_A_RUN,
     ("jobs", "attempt"): OF_A_RUN,
     ("jobs", "told_at"): OF_A_RUN,
     ("jobs", "started_at"): OF_A_RUN,
+    ("sign_ins", "used_at"): OF_A_RUN,
 }
 
 # ---- rows as they are stored -----------------------------------------------------------------------------------------

@@ -163,12 +163,17 @@ class DatasetChunk(Base):
 
 
 class Executor(Base):
-    """A worker process and its last heartbeat; an `id` is never reused."""
+    """A worker process and its last heartbeat; an `id` is never reused.
+
+    `found` is the number of faults that its last verification of the history found, which ended at `verified_at`.
+    """
 
     __tablename__ = "executors"
 
     id: Mapped[str] = mapped_column(String(64), primary_key=True)
     beat_at: Mapped[datetime] = mapped_column(default=now)
+    verified_at: Mapped[datetime | None]
+    found: Mapped[int | None]
 
 
 class Key(Base):

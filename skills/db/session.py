@@ -38,7 +38,7 @@ from functools import cache
 from importlib import resources
 from pathlib import Path
 from time import monotonic, sleep
-from typing import TYPE_CHECKING, Any, Literal, NoReturn
+from typing import TYPE_CHECKING, Any, Literal, NoReturn, Self
 
 from sqlalchemy import URL, Connection, Dialect, Engine, create_engine, event, inspect, text
 from sqlalchemy.engine import ExceptionContext, make_url
@@ -47,12 +47,12 @@ from sqlalchemy.exc import ArgumentError, DatabaseError, DBAPIError, Operational
 from sqlalchemy.orm import Session, sessionmaker
 from sqlalchemy.pool import ConnectionPoolEntry
 
-from skills.db.history import FORGET_NOTES, NOTING, NOTING_CONNECTION, History
+from skills.db.history import CHECKPOINTS, FORGET_NOTES, HISTORY, NOTING, NOTING_CONNECTION, History
 from skills.db.row_visibility import ONLY, Only
 from skills.db.tiles import fill_tiles
 from skills.errors import BadSettings, Busy, Conflict, Corrupt, DatabaseUnusable, SkillsError, StorageFull
 from skills.remedies import Action, Remedy
-from skills.settings import settings
+from skills.settings import Settings, settings
 
 if TYPE_CHECKING:
     from alembic.config import Config
@@ -106,13 +106,21 @@ log = logging.getLogger(__name__)
 class Database:
     """Sessions on one database; thread-safe."""
 
-    def __init__(self, url: str, *, patience_ms: int | None = None, signing_key: Path | None = None) -> None:
+    def __init__(
+        self,
+        url: str,
+        *,
+        patience_ms: int | None = None,
+        signing_key: Path | None = None,
+        checkpoints: Path | None = None,
+    ) -> None:
         """Open a database; it connects on first use.
 
         Args:
             url: SQLAlchemy URL of a SQLite file or a PostgreSQL database.
             patience_ms: Timeout for locks and for connections, `BUSY_TIMEOUT_MS` by default.
             signing_key: The file of the key that its history is written with, by default of `SKILLS_SIGNING_KEY`.
+            checkpoints: The file of its kept heads, by default of `SKILLS_CHECKPOINTS`, or else beside the key.
 
         Raises:
             BadSettings: The URL is not one of these, or the folder of the file cannot be created.
@@ -120,8 +128,16 @@ class Database:
         """
         self.url = url
         self.engine = _open(url, patience_ms or BUSY_TIMEOUT_MS)
-        self.history = History(self.engine, signing_key or settings().signing_key)
-        self._sessions = sessionmaker(self.engine, expire_on_commit=False)
+        self.history = History(
+            self.engine, signing_key or settings().signing_key, checkpoints or settings().checkpoints
+        )
+        self._sessions = sessionmaker(self.engine, expire_on_commit=False, info={HISTORY: self.history})
+
+    @classmethod
+    def of(cls, settings: Settings, *, patience_ms: int | None = None) -> Self:
+        """Open the database of an installation."""
+        files = {"signing_key": settings.signing_key, "checkpoints": settings.checkpoints}
+        return cls(settings.database_url, patience_ms=patience_ms, **files)
 
     @contextmanager
     def reading(self) -> Iterator[Session]:
@@ -152,19 +168,32 @@ class Database:
         if only is None:
             return self
         narrowed = copy(self)
-        narrowed._sessions = sessionmaker(self.engine, expire_on_commit=False, info={ONLY: only})
+        narrowed._sessions = sessionmaker(self.engine, expire_on_commit=False, info={HISTORY: self.history, ONLY: only})
         return narrowed
+
+    def compare_history(self) -> None:
+        """Compare the database with its signing key and its kept head; see `History.compare`.
+
+        Raises:
+            NotReady: It is not the database that was signed last.
+        """
+        kept = self.history.kept_head()
+        with self.reading() as session:
+            self.history.compare(session.connection(), kept)
 
     def migrate(self) -> None:
         """Migrate the tables to this version, from an empty database or any older version.
 
         Raises:
+            NotReady: They would be changed, and it is not the database that was signed last.
             Conflict: The database was written by a newer version of the code.
             Busy: It cannot be reached or written.
             BadSettings: The signing key of its history is missing, or cannot be made.
         """
         with self._in_words(), self.engine.execution_options(writes=True).connect() as connection:
             before = revision_of(connection)
+            if before != revisions()[0] and inspect(connection).has_table(CHECKPOINTS.name):
+                self.history.compare(connection, self.history.kept_head())
             upgrade(connection)
             self.history.begin(connection)
             if before != revisions()[0]:

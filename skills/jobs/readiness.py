@@ -1,8 +1,8 @@
 """Readiness of an installation: checks of its databases and workers, and the warm-up of the compiled loops.
 
-There must be a usable database, the signing key of its history, a usable database of the job engine, and at least one
-live worker. Each check uses new connections with a short timeout, so that the result is current and arrives in time.
-After the warm-up, the first job or request does not wait for compilation.
+There must be a usable database, the one that was signed last with this signing key, a usable database of the job
+engine, and at least one live worker. Each check uses new connections with a short timeout, so that the result is
+current and arrives in time. After the warm-up, the first job or request does not wait for compilation.
 """
 
 import time
@@ -23,7 +23,7 @@ from skills.db import now
 from skills.db.models import SutureType
 from skills.db.service_tables import Executor
 from skills.db.session import Database, revision_of, revisions
-from skills.errors import BadSettings, Corrupt, NotReady, SkillsError
+from skills.errors import NotReady, SkillsError
 from skills.formats.mcap._kernels import follow_compiled
 from skills.gridworld.grid import GridPath, GridWorld
 from skills.gridworld.reward import sparse_reward
@@ -55,12 +55,12 @@ def refuse_unready(settings: Settings) -> int:
     """
     _refuse_missing(settings.database_url, "The database")
     try:
-        opened = Database(settings.database_url, patience_ms=PATIENCE_MS, signing_key=settings.signing_key)
+        opened = Database.of(settings, patience_ms=PATIENCE_MS)
     except SkillsError as error:
         raise NotReady(UNUSABLE) from error
     with closing(opened) as database:
         _try_database(database)
-        _try_key(database)
+        database.compare_history()
         _try_engine(settings)
         return _workers(database, settings.lease_s)
 
@@ -106,14 +106,6 @@ def _try_database(database: Database) -> None:
         raise NotReady("The database has a newer version; update the code of this process.")
     if revision != revisions()[0]:
         raise NotReady("The database has an older version.", Remedy(Action.MIGRATE))
-
-
-def _try_key(database: Database) -> None:
-    """Read the signing key of the history, which a running process may have read before it was lost."""
-    try:
-        database.history.key  # noqa: B018 - reads the file
-    except (BadSettings, Corrupt) as error:
-        raise NotReady(error.message, *error.remedies) from error
 
 
 def _try_engine(settings: Settings) -> None:

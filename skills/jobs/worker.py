@@ -88,6 +88,7 @@ SWEEPING_S = 0.2  # in a round, which must stay much shorter than a lease
 MISSED_ROUNDS = 20  # in a row; while the database is unavailable the engine's retry pauses grow up to 90 s
 DRAIN_S = 8  # jobs that run longer are aborted and run again elsewhere; container runtimes kill after 10 s
 NICENESS = 10
+VERIFY_FIRST_S = 30.0  # after the start of a worker, which has more urgent work then
 
 log = logging.getLogger(__name__)
 
@@ -112,7 +113,7 @@ def run_worker(settings: Settings, *, parent: int | None = None, perform: Perfor
     stop = _stopped_by_signals()
     perform = logged(perform or _library())
     executor = f"{os.getpid()}-{uuid.uuid4().hex}"  # unique: with a reused id the engine would run its work twice
-    database = Database(settings.database_url, signing_key=settings.signing_key)
+    database = Database.of(settings)
     with database.reading() as session:
         refuse_other_tables(session.connection())
     client = connect(settings)
@@ -122,9 +123,10 @@ def run_worker(settings: Settings, *, parent: int | None = None, perform: Perfor
     def sweeping() -> bool:
         return sweep(database, settings, SWEEPING_S, by_age=clock.is_steady())
 
-    watch = Watch(database, client, executor, leases, recover, work.doing, sweeping, settings.checkpoints)
+    watch = Watch(database, client, executor, leases, recover, work.doing, sweeping)
     try:
         watch.beat()  # registered before it can hold any job, so that others can take over
+        Thread(target=_keep_verified, args=(watch, settings.verify_every_s), daemon=True, name="verify").start()
         with _engine(work, executor, watch):
             gc.freeze()  # everything imported so far stays, so later collections skip it
             gc.enable()  # the callers disable it while they import
@@ -157,6 +159,16 @@ def _go_round(watch: Watch, over: Callable[[], bool]) -> None:
             os._exit(1)
         if over():
             return
+
+
+def _keep_verified(watch: Watch, every_s: float) -> None:
+    """Verify the history, and again each time; a large one less often, so that it takes a tenth of a core at most."""
+    pause_s = min(VERIFY_FIRST_S, every_s)
+    while True:
+        time.sleep(pause_s)
+        began_s = time.monotonic()
+        _survive(watch.verify)
+        pause_s = max(every_s, 9 * (time.monotonic() - began_s))
 
 
 def _library() -> Perform:

@@ -15,7 +15,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import timedelta
-from pathlib import Path
+from math import inf
 
 from dbos import DBOS, DBOSClient, WorkflowStatus
 from sqlalchemy import delete, func, select, update
@@ -26,7 +26,7 @@ from skills.db.session import Database
 from skills.errors import Busy, SkillsError
 from skills.jobs import JOBS, QUEUES, STEPS, WORKFLOW, drop, tell, workflow_id
 from skills.library import locks
-from skills.library.history import keep_signed
+from skills.library.history import NAMED, Verified, keep_signed, verify_history
 from skills.library.jobs import ACTIVE, BATCH, PART, UNSYNCHRONISED, end_part, names_of
 from skills.settings import Settings
 
@@ -240,7 +240,6 @@ class Watch:
         recover: Callable[[list[str]], object],
         doing: Collection[str] = frozenset(),
         sweep: Callable[[], bool] = lambda: True,
-        checkpoints: Path | None = None,
     ) -> None:
         """Create the watch of one executor.
 
@@ -253,7 +252,6 @@ class Watch:
                 are still pending and still assigned to those executors.
             doing: Ids of the workflows that this worker is running; a live view, not a copy.
             sweep: Deletes what nobody needs any more in our database for a moment; returns whether nothing is left.
-            checkpoints: File to which the signed heads of the history are appended.
         """
         self._database = database
         self._client = client
@@ -263,7 +261,6 @@ class Watch:
         self._doing = doing
         self._sweep = sweep
         self._swept_s: float | None = None
-        self._checkpoints = checkpoints
         self._unheard = Leases(leases.lease_s, leases.clock)
 
     def beat(self) -> None:
@@ -276,7 +273,8 @@ class Watch:
     def round(self) -> None:
         """Write a heartbeat, sign the history, take over from dead workers, enqueue new jobs, read back outcomes."""
         self.beat()
-        keep_signed(self._database, self._checkpoints)
+        if not keep_signed(self._database):
+            return  # of another database than was signed last nothing is done
         self._take_over()
         live = self._live()
         known = {w.workflow_id: w for w in self._workflows(live)}
@@ -295,9 +293,24 @@ class Watch:
             if self._sweep():
                 self._swept_s = time.monotonic()
 
+    def verify(self) -> None:
+        """Verify the history and all logged rows, if this is the first of the workers; log and count the faults."""
+        with self._database.reading() as session:
+            if session.scalar(select(func.min(Executor.id))) != self._executor:
+                return
+        kept = self._database.history.kept_head()
+        with self._database.reading() as session:
+            self._database.history.compare(session.connection(), kept)
+            found = list(verify_history(session.connection(), self._database.history, None, Verified()))
+        for name, why in found[:NAMED]:
+            log.error("The history is not whole: %s: %s; run `skills verify`.", name, why)
+        with self._database.writing(()) as session:
+            mine = update(Executor).where(Executor.id == self._executor)
+            session.execute(mine.values(verified_at=now(), found=len(found)))
+
     def leave(self) -> None:
         """Sign the last leaves of the history, and remove this worker from the table of executors."""
-        keep_signed(self._database, self._checkpoints)
+        keep_signed(self._database, inf)
         with self._database.writing(()) as session:
             session.execute(delete(Executor).where(Executor.id == self._executor))
 

@@ -13,7 +13,7 @@ import json
 import os
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -25,14 +25,16 @@ from sqlalchemy.orm import Session
 from skills import __version__
 from skills.db import Base, dump, rfc3339
 from skills.db.dump import Manifest
+from skills.db.kept_heads import set_aside
 from skills.db.models import SUCCESS, Demonstration, Erasure, PolicyVersion, Release, StoredRecording, Surgeon
 from skills.db.service_tables import Event, Job, Key, record_event
 from skills.db.session import Database
 from skills.db.tiles import fill_tiles
-from skills.errors import Conflict, Corrupt
+from skills.errors import Conflict, Corrupt, NotReady
 from skills.library.catalogue import put_surgeon, salted
 from skills.library.demos import MARKS, mark_demo, withdraw_demo
 from skills.library.erasure import delete_recording, erase_demo, erase_surgeon
+from skills.library.history import sign_history
 from skills.library.jobs import ACTIVE, BATCH
 from skills.library.keys import revoke_key
 from skills.library.releases import withdraw_policies
@@ -200,12 +202,43 @@ def restore(database: Database, source: Path, erasures: Erasures = NOTHING, told
             database.history.go_on_after_restore(session.connection())
             fill_tiles(session.connection())
             told("erasures")
-            restored = _end_again(session, manifest, erasures)
+            restored = Restored(manifest, **_end_again(session, erasures))
             session.execute(update(Job).where(Job.state.in_(ACTIVE), Job.kind != BATCH).values(told_at=None))
             record_event(session, "local", "restore", "installation", manifest.created_at)
     sweep_erased(database)
     database.forget()
     return restored
+
+
+def accept_rollback(database: Database, erasures: Erasures = NOTHING) -> dict[str, int]:
+    """Go on with a database that is not the one whose history was kept last, and apply a list of erasures.
+
+    An event says so, with the size of the head that was given up; the file of kept heads is set aside.
+
+    Returns:
+        The numbers of what the list ended again, by name as in `Restored`.
+
+    Raises:
+        Conflict: It is the database that was kept last.
+        NotReady: It was signed with another key.
+        BadSettings: The file of kept heads cannot be set aside.
+    """
+    history = database.history
+    kept = history.kept_head()
+    with database.writing() as session:
+        connection = session.connection()
+        with suppress(NotReady):
+            history.compare(connection, kept)
+            raise Conflict("The database is the one whose history was kept last: there is nothing to accept.")
+        history.compare(connection, None)
+        set_aside(history.heads_file)
+        ended = _end_again(session, erasures)
+        session.execute(update(Job).where(Job.state.in_(ACTIVE), Job.kind != BATCH).values(told_at=None))
+        size = 0 if kept is None else kept.checkpoint.size
+        record_event(session, "local", "accept", "rollback", f"{size} leaves")
+    sign_history(database)
+    sweep_erased(database)
+    return ended
 
 
 def erasures_of(database: Database) -> Erasures:
@@ -336,7 +369,7 @@ def _in_order(session: Session) -> Iterator[tuple[Any, datetime]]:
 # ---- applying the list -------------------------------------------------------------------------------------------
 
 
-def _end_again(session: Session, manifest: Manifest, erasures: Erasures) -> Restored:
+def _end_again(session: Session, erasures: Erasures) -> dict[str, int]:
     """Apply the entries of a list that the backup does not know; an entry that it knows may have been added anew since.
 
     An erased surgeon that is not in the backup stays listed, so that nobody can take the pseudonym.
@@ -368,8 +401,16 @@ def _end_again(session: Session, manifest: Manifest, erasures: Erasures) -> Rest
         revoke_key(session, key, "restore")
     narrowed = _narrow(session, later.consents)
     stopped = len(served - _served(session))
-    ended = (len(surgeons), len(demos), len(deleted), len(withdrawn), stopped, len(keys), narrowed)
-    return Restored(manifest, *ended, demos_marked=marked)
+    return {
+        "surgeons_erased": len(surgeons),
+        "demos_erased": len(demos),
+        "recordings_deleted": len(deleted),
+        "demos_withdrawn": len(withdrawn),
+        "styles_stopped": stopped,
+        "keys_revoked": len(keys),
+        "consents_narrowed": narrowed,
+        "demos_marked": marked,
+    }
 
 
 def _mark_again(session: Session, outcomes: Mapping[str, tuple[datetime, DemoOutcome]]) -> int:

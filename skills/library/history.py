@@ -1,6 +1,6 @@
 """The history, signed and verified: every logged row against its newest leaf, every leaf against the signed tree.
 
-    leaves --sign_history--> checkpoints, in the database and in the file of `SKILLS_CHECKPOINTS`
+    leaves --sign_history--> checkpoints, in the database and in the file of its kept heads
     database, key, heads --verify_history--> findings, each named by table, key and column
 
 What verification finds depends on what the attacker lacks. With the database alone nobody can write a leaf that the
@@ -11,12 +11,10 @@ its older checkpoint, is found by a later head that was kept elsewhere.
 import hmac
 import json
 import logging
-import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 from math import inf
-from pathlib import Path
 from time import monotonic
 from typing import Any
 
@@ -30,7 +28,10 @@ from skills.db.history import (
     SCHEMA,
     History,
     Latest,
+    latest_leaves,
+    newest_checkpoint,
 )
+from skills.db.kept_heads import keep_head
 from skills.db.logged_rows import (
     CACHES,
     ROWS_AT_ONCE,
@@ -40,9 +41,21 @@ from skills.db.logged_rows import (
     schema_of,
 )
 from skills.db.session import Database
-from skills.db.tiles import TILES, fill_tiles, full_tiles
-from skills.errors import BadSettings, Corrupt, SkillsError
-from skills.transparency import TILE_WIDTH, Note, Tree, leaf_hash, read_notes, root_of
+from skills.db.tiles import TILES, fill_tiles, full_tiles, stored_tiles
+from skills.errors import BadSettings, Corrupt, NotReady, SkillsError
+from skills.remedies import Action, Remedy
+from skills.transparency import (
+    TILE_WIDTH,
+    Checkpoint,
+    Note,
+    Tree,
+    inclusion_proof,
+    leaf_hash,
+    node_from,
+    proven_root,
+    read_notes,
+    root_of,
+)
 
 SIGNING_LOCK = 0x5C112  # ours: the number of the advisory lock under which one process at a time signs
 SIGNING_S = 0.5  # ours: a worker must write its heartbeat meanwhile
@@ -53,42 +66,44 @@ Finding = tuple[str, str]
 _Read = tuple[str, Sequence[Any] | Exception]  # a row's key, and its columns or the error of reading them
 
 
-def sign_history(database: Database, checkpoints: Path | None, at_most_s: float = inf) -> str | None:
-    """Sign all leaves that no checkpoint covers yet, and append the checkpoint to a file.
+def sign_history(database: Database, at_most_s: float = inf) -> str | None:
+    """Sign all leaves that no checkpoint covers yet, and keep the head outside the database.
 
     Several processes may call it; one at a time signs.
 
     Args:
         database: The database, without restriction.
-        checkpoints: The file, if any. If it cannot be written now, a later checkpoint covers the same leaves.
         at_most_s: Stop after the transaction during which this time has passed.
 
     Returns:
         The last checkpoint; None where there was nothing to sign.
 
     Raises:
-        BadSettings: The signing key cannot be read.
+        NotReady: The database is not the one that was signed last.
         Corrupt: The stored tree is not the one that was signed last.
     """
+    database.compare_history()
     note, began_s = None, monotonic()
     while (signed := _sign_some(database)) is not None:
         note = signed
         if monotonic() - began_s > at_most_s:
             break
-    if checkpoints is not None and (note is not None or not checkpoints.exists()):
-        with database.reading() as session:
-            newest = note or newest_checkpoint(session.connection())
-        if newest is not None:
-            append_checkpoint(checkpoints, newest)
+    with database.reading() as session:  # also what others signed, or this process before it was killed
+        newest = newest_checkpoint(session.connection())
+    if newest is not None:
+        keep_head(database.history.heads_file, newest)
     return note
 
 
-def keep_signed(database: Database, checkpoints: Path | None) -> None:
-    """Sign some of the history; log why where it cannot be signed, because work goes on without."""
+def keep_signed(database: Database, at_most_s: float = SIGNING_S) -> bool:
+    """Sign some of the history; return whether it is the database that was signed last, and log why where it is not."""
     try:
-        sign_history(database, checkpoints, SIGNING_S)
+        sign_history(database, at_most_s)
+    except NotReady:
+        return False  # logged when it was found
     except (BadSettings, Corrupt) as error:
         log.error("The history is not signed: %s", error)
+    return True
 
 
 def _sign_some(database: Database) -> str | None:
@@ -107,23 +122,70 @@ def _sign_some(database: Database) -> str | None:
         return note
 
 
-def append_checkpoint(file: Path, note: str) -> None:
-    """Append a signed checkpoint to a file, durably; a failure is logged, because the next one will do as well."""
+# ---- single rows -----------------------------------------------------------------------------------------------------
+
+
+def logged_leaf(connection: Connection, history: History, table: str, key: str) -> Latest:
+    """Return the newest leaf of a row that the service wrote, and that nobody else has changed since.
+
+    Raises:
+        Corrupt: The row is missing, or not as its leaf says, or the service did not write the leaf.
+    """
+    refuse_edited(connection, history, table, [key])
+    return latest_leaves(connection, table, [key])[key]
+
+
+def refuse_edited(connection: Connection, history: History, table: str, keys: Sequence[str]) -> None:
+    """Refuse rows that somebody else than the service has written, see `edited_rows`.
+
+    Raises:
+        Corrupt: There is one.
+    """
+    if edited_rows(connection, history, table, keys):
+        raise Corrupt(f"A row of {table} is not as the history has it, so it is not used.", Remedy(Action.VERIFY))
+
+
+def edited_rows(connection: Connection, history: History, table: str, keys: Sequence[str]) -> list[str]:
+    """Return the keys of rows that are missing, that are not as their newest leaves say, or whose leaves are forged.
+
+    Rows that were put back together with their older leaf, and rows that are gone, are found by `verify_history`.
+    """
+    known, latest = logged()[table], latest_leaves(connection, table, keys)
+    rows = {known.key_of(row): row for row in known.rows_of(connection, keys)}
+    origin = history.origin(connection)
+    edited = []
+    for key in keys:
+        leaf, row = latest.get(key), rows.get(key)
+        if leaf is None or row is None or origin is None or not leaf.matches(known.columns, row):
+            edited.append(key)
+        elif not hmac.compare_digest(leaf.seal, history.key.seal_of(origin).of(leaf.entry.encode())):
+            edited += [] if _is_signed(connection, leaf) else [key]
+    for key in edited:
+        log.error("%s %s is not as the history has it, and is not used; run `skills verify`.", table, key)
+    return edited
+
+
+def _is_signed(connection: Connection, leaf: Latest) -> bool:
+    """Return whether a leaf is under the newest checkpoint, such as one of an installation that a backup came from."""
+    (note,) = read_notes(newest_checkpoint(connection) or "")
     try:
-        handle = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
-        try:
-            os.write(handle, f"{note}\n".encode())
-            os.fsync(handle)
-        finally:
-            os.close(handle)
-    except OSError as error:
-        log.error("The checkpoint could not be appended to SKILLS_CHECKPOINTS (%s).", error.strerror)
+        covered_leaf(connection, leaf, note.checkpoint)
+    except Corrupt:
+        return False
+    return True
 
 
-def newest_checkpoint(connection: Connection) -> str | None:
-    """Return the newest signed checkpoint as a note; None where no history was begun."""
-    note: str | None = connection.scalar(select(CHECKPOINTS.c.note).order_by(CHECKPOINTS.c.row.desc()).limit(1))
-    return note
+def covered_leaf(connection: Connection, leaf: Latest, signed: Checkpoint) -> list[bytes]:
+    """Return the hashes that prove a leaf under a checkpoint (RFC 6962).
+
+    Raises:
+        Corrupt: They do not lead to its root.
+    """
+    if leaf.number is not None and leaf.number < signed.size:
+        hashes = inclusion_proof(signed.size, leaf.number, node_from(stored_tiles(connection)))
+        if proven_root(leaf_hash(leaf.entry.encode()), leaf.number, signed.size, hashes) == signed.root:
+            return hashes
+    raise Corrupt("The history is not as it was signed, so it proves nothing.", Remedy(Action.VERIFY))
 
 
 # ---- verification ----------------------------------------------------------------------------------------------------
@@ -147,14 +209,14 @@ class _Log:
 
 
 def verify_history(
-    connection: Connection, history: History, heads: Sequence[Note], done: Verified
+    connection: Connection, history: History, heads: Sequence[Note] | None, done: Verified
 ) -> Iterator[Finding]:
     """Verify the history and every logged row, in one consistent state.
 
     Args:
         connection: In a transaction that reads one state.
         history: The history, with its key.
-        heads: Checkpoints that were kept elsewhere; the history must continue each of them.
+        heads: Checkpoints that were kept elsewhere; the history must continue each of them. None: those of its file.
         done: Counts what was compared.
 
     Yields:
@@ -169,9 +231,10 @@ def verify_history(
     except SkillsError as error:
         yield "history", error.words()
         return
-    signed, since = [], None
+    signed, since, here = [], None, set()
     for row, stored, note in _checkpoints(connection):
         name = f"history_checkpoints {row}"
+        here.add(note)
         if note is None or note.checkpoint.size != stored or note.checkpoint.origin != origin:
             yield name, "it is not a checkpoint of this history"
         elif note.signed_by(public):
@@ -181,7 +244,7 @@ def verify_history(
             yield name, "it is not signed with the key of this installation"
     if since is None:
         yield "history", "no checkpoint is signed with the key of this installation"
-    for note in heads:
+    for note in history.kept_heads(origin) if heads is None else heads:
         name = f"head of {note.checkpoint.size} leaves"
         if note.checkpoint.origin != origin:
             yield name, f"it is of the history {note.checkpoint.origin}, and this one is {origin}"
@@ -189,6 +252,8 @@ def verify_history(
             yield name, "it is not signed with the key of this installation"
         else:
             signed.append((name, note))
+            if note not in here and any(one is not None and one.checkpoint.size > note.checkpoint.size for one in here):
+                yield name, "its checkpoint was removed from the database, which has later ones"
     read = _Log()
     for leaf in _leaves(connection):
         name = f"{leaf.table_name} {leaf.key or '(erased)'}"

@@ -78,7 +78,7 @@ def inspect_installation(
     tell: Teller = read_told,
     *,
     decode_all: bool = False,
-    heads: Sequence[Note] = (),
+    heads: Sequence[Note] | None = None,
     relearn: Settings | None = None,
     limit: int | None = None,
 ) -> Iterator[Checked]:
@@ -88,7 +88,7 @@ def inspect_installation(
         database: The database, without restriction.
         tell: The reader of recordings, possibly in another process.
         decode_all: Decode every recording whose content is cached, and not only the newest.
-        heads: Signed heads of the history that were kept elsewhere.
+        heads: Signed heads of the history that were kept elsewhere; None: those of the database's own file.
         relearn: The limits of time and memory with which every policy is learnt again; None: none is.
         limit: Learn at most this number of policies again, drawn at random each time; None: all.
 
@@ -174,7 +174,7 @@ def _has_parent(key: ForeignKey) -> ColumnElement[bool]:
     return exists().where(other.c[key.column.name] == key.parent)
 
 
-def _history(heads: Sequence[Note], database: Database, session: Session, checked: Checked) -> None:
+def _history(heads: Sequence[Note] | None, database: Database, session: Session, checked: Checked) -> None:
     """Verify the history in one transaction: its leaves and the rows must be of the same state."""
     done = Verified()
     checked.wrong += verify_history(session.connection(), database.history, heads, done)

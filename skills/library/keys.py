@@ -22,14 +22,16 @@ from datetime import datetime, timedelta
 from functools import lru_cache
 from typing import Any
 
-from sqlalchemy import delete, or_, select, update
+from sqlalchemy import delete, exists, or_, select, update
 from sqlalchemy.orm import Session
 
 from skills.db import now, rfc3339
+from skills.db.history import HISTORY, LEAVES
 from skills.db.row_visibility import Only
-from skills.db.service_tables import Key, SignIn, record_event
+from skills.db.service_tables import Key, KeySurgeon, SignIn, record_event
 from skills.errors import BadInput, Conflict, NotFound
 from skills.library.catalogue import find_surgeon
+from skills.library.history import edited_rows
 from skills.remedies import Action, Remedy
 from skills.schemas.requests import OWNER
 from skills.settings import Role
@@ -131,8 +133,9 @@ def list_keys(session: Session, limit: int | None = None, after: int | None = No
 
 
 def is_keyless(session: Session) -> bool:
-    """Return whether no key was ever created: expired and revoked ones must not open the installation to everyone."""
-    return session.scalar(select(Key.row).limit(1)) is None
+    """Return whether no key was ever created: expired, revoked and deleted ones must not open it to everyone."""
+    logged = exists().where(LEAVES.c.table_name == Key.__tablename__)
+    return session.scalar(select(Key.row).limit(1)) is None and not session.scalar(select(logged))
 
 
 def refuse_without_keys(session: Session) -> None:
@@ -148,7 +151,7 @@ def refuse_without_keys(session: Session) -> None:
 
 
 def holders_of(session: Session, texts: Iterable[str]) -> dict[str, Holder]:
-    """Return the holders of those keys that are not revoked, with one query for each `KEYS_AT_ONCE` of them.
+    """Return the holders of those keys that are not revoked and that the service wrote, some at a time.
 
     The caller checks whether a key has expired.
     """
@@ -157,13 +160,23 @@ def holders_of(session: Session, texts: Iterable[str]) -> dict[str, Holder]:
     for at in range(0, len(shapes), KEYS_AT_ONCE):
         some = shapes[at : at + KEYS_AT_ONCE]
         rows = session.scalars(select(Key).where(Key.id.in_({shape[1] for shape in some})))
-        keys = {key.id: key for key in rows if key.revoked_at is None}
+        keys = {key.id: key for key in _ours(session, [key for key in rows if key.revoked_at is None])}
         for shape in some:
             key = keys.get(shape[1])
             # Compared in constant time, so that timing does not reveal the digest.
             if key is not None and hmac.compare_digest(key.digest, digest_of(shape[0])):
                 found[shape[0]] = held(key)
     return found
+
+
+def _ours(session: Session, keys: Sequence[Key]) -> list[Key]:
+    """Return the keys that nobody else than the service has written; each edited one is logged."""
+    seen = {f"{key.row}/{surgeon.row}": key for key in keys for surgeon in key.surgeons if key.restricted}
+    history, connection = session.info[HISTORY], session.connection()
+    wrong = edited_rows(connection, history, Key.__tablename__, [str(key.row) for key in keys])
+    wrong += edited_rows(connection, history, KeySurgeon.__tablename__, [*seen])
+    rows = {int(key.partition("/")[0]) for key in wrong}
+    return [key for key in keys if key.row not in rows]
 
 
 def held(key: Key) -> Holder:
@@ -228,15 +241,21 @@ def sign_in(session: Session, key_id: str, lasts: Lasts) -> str:
 
 
 def signed_in(session: Session, cookies: Iterable[str], lasts: Lasts) -> dict[str, tuple[Holder, bool]]:
-    """Return the holders signed in with several cookies, and whether `note_use` is due, without sign-ins that ended.
+    """Return the holders signed in with several cookies, and whether `note_use` is due.
 
-    There is one query for each `KEYS_AT_ONCE` cookies.
+    Sign-ins that ended, and those that the service did not write, or whose key it did not, are left out.
     """
     standing: dict[str, tuple[Holder, bool]] = {}
     by_digest = {digest_of(cookie): cookie for cookie in cookies}
     digests, at = list(by_digest), now()
     for first in range(0, len(digests), KEYS_AT_ONCE):
-        for found in session.scalars(select(SignIn).where(SignIn.digest.in_(digests[first : first + KEYS_AT_ONCE]))):
+        rows = session.scalars(select(SignIn).where(SignIn.digest.in_(digests[first : first + KEYS_AT_ONCE]))).all()
+        names = [found.digest for found in rows]
+        edited = edited_rows(session.connection(), session.info[HISTORY], SignIn.__tablename__, names)
+        keys = {key.row for key in _ours(session, list({found.key.row: found.key for found in rows}.values()))}
+        for found in rows:
+            if found.digest in edited or found.key_row not in keys:
+                continue
             idle_s, age_s = (at - found.used_at).total_seconds(), (at - found.created_at).total_seconds()
             # The key's own expiry is left to the caller, as in `holders_of`.
             if found.key.revoked_at is None and idle_s < lasts.idle_s and age_s < lasts.most_s:

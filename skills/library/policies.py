@@ -60,10 +60,12 @@ def policy_of(session: Session, surgeon: str, suture: str) -> Served:
 
     Raises:
         NotFound: The surgeon or suture type is unknown, or nothing is served; the error then lists the candidates.
+        Corrupt: Its release, its version or its surgeon was changed by others than the service.
     """
     who, what = find_surgeon(session, surgeon), find_suture_type(session, suture)
     served = releases.served(session, who, what.slug)
     if served is not None:
+        releases.refuse_edited_release(session, served)
         return Served(served.policy, served)
     # Without candidates: no version of this surgeon may be released.
     refused = consent.refusal(who, "training")

@@ -20,16 +20,14 @@ from sqlalchemy import Connection, or_, select
 from sqlalchemy.orm import Session
 
 from skills.db import rfc3339
-from skills.db.history import CHECKPOINTS, LEAVES, History, Latest, latest_leaves
+from skills.db.history import CHECKPOINTS, History, newest_checkpoint
 from skills.db.logged_rows import as_bytes, logged
 from skills.db.models import PolicyVersion, Release
 from skills.db.session import Database
-from skills.db.tiles import stored_tiles
-from skills.errors import Busy, Corrupt, NotFound
+from skills.errors import Busy, NotFound
 from skills.library.catalogue import find_surgeon
-from skills.library.history import newest_checkpoint, sign_history
-from skills.remedies import Action, Remedy
-from skills.transparency import Checkpoint, Note, attest, inclusion_proof, leaf_hash, node_from, proven_root, read_notes
+from skills.library.history import covered_leaf, logged_leaf, sign_history
+from skills.transparency import Note, attest, read_notes
 
 DISCLOSED = {  # of the rows that a proof is about; the digests of their other columns reveal nothing without a guess
     "releases": ("row", "policy_row", "surgeon_row", "suture", "released_at", "released_by", "withdrawn_at"),
@@ -83,65 +81,29 @@ def served_json(session: Session, history: History, surgeon: str, suture: str, a
         "policy": sha256,
         "released_at": rfc3339(release.released_at),
         "withdrawn_at": rfc3339(release.withdrawn_at),
-        "proofs": _proofs(connection, keys, checkpoint["note"]),
+        "proofs": _proofs(connection, history, keys, checkpoint["note"]),
         "checkpoint": checkpoint,
     }
 
 
-def logged_leaf(connection: Connection, table: str, key: str) -> tuple[Latest, int | None]:
-    """Return the newest leaf of a row and its number, None if no checkpoint covers it.
-
-    Raises:
-        Corrupt: The row is not as the leaf says, or has none.
-    """
-    latest = latest_leaves(connection, table, [key]).get(key)
-    rows = list(logged()[table].rows_of(connection, [key]))
-    if latest is None or len(rows) != 1 or not latest.matches(logged()[table].columns, rows[0]):
-        raise Corrupt(f"A row of {table} is not as the history has it, so nothing is signed.", Remedy(Action.VERIFY))
-    number: int | None = connection.scalar(select(LEAVES.c.number).where(LEAVES.c.row == latest.row))
-    return latest, number
-
-
-def covered_leaf(connection: Connection, latest: Latest, number: int, signed: Checkpoint) -> list[bytes]:
-    """Return the hashes that prove a leaf under a checkpoint (RFC 6962).
-
-    Raises:
-        Corrupt: They do not lead to its root.
-    """
-    hashes = inclusion_proof(signed.size, number, node_from(stored_tiles(connection)))
-    if proven_root(leaf_hash(latest.entry.encode()), number, signed.size, hashes) != signed.root:
-        raise Corrupt("The history is not as it was signed, so it proves nothing.", Remedy(Action.VERIFY))
-    return hashes
-
-
-def _proofs(connection: Connection, keys: dict[str, str], note: str) -> list[dict[str, Any]]:
+def _proofs(connection: Connection, history: History, keys: dict[str, str], note: str) -> list[dict[str, Any]]:
     """Return the proofs of the newest leaves of some rows, given by table and key."""
-    leaves = {}
-    for table, key in keys.items():
-        latest = latest_leaves(connection, table, [key]).get(key)
-        if latest is None:
-            raise Corrupt("The history has no leaf of this release.", Remedy(Action.VERIFY))
-        leaves[table] = latest
-    query = select(LEAVES.c.row, LEAVES.c.number).where(LEAVES.c.row.in_([one.row for one in leaves.values()]))
-    of_row = {row: number for row, number in connection.execute(query)}  # noqa: C416 - mypy
+    leaves = {table: logged_leaf(connection, history, table, key) for table, key in keys.items()}
     signed = read_notes(note)[0].checkpoint
-    if any(number is None or number >= signed.size for number in of_row.values()):
-        raise Busy("The history is not signed up to this release yet; try again in a second.")
     proofs = []
     for table, latest in leaves.items():
+        if latest.number is None or latest.number >= signed.size:
+            raise Busy("The history is not signed up to this release yet; try again in a second.")
         (row,) = logged()[table].rows_of(connection, [keys[table]])
-        number = of_row[latest.row]
-        assert number is not None
-        hashes = covered_leaf(connection, latest, number, signed)
         proofs.append(
             {
                 "table": table,
-                "number": number,
+                "number": latest.number,
                 "entry": latest.entry,
                 "salt": latest.salt.hex(),
                 "disclosed": {name: as_bytes(getattr(row, name))[1:].decode() for name in DISCLOSED[table]},
                 "digests": dict(latest.digests),
-                "hashes": [one.hex() for one in hashes],
+                "hashes": [one.hex() for one in covered_leaf(connection, latest, signed)],
             }
         )
     return proofs
@@ -163,7 +125,7 @@ def head_over(database: Database, rows: Rows) -> Note:
             head = first_head(session.connection(), database.history, rows)
         if head is not None:
             return head
-        sign_history(database, None)
+        sign_history(database)
     raise Busy("The history is not signed up to these rows yet; try again in a second.")
 
 
@@ -174,16 +136,16 @@ def first_head(connection: Connection, history: History, rows: Rows) -> Note | N
         Corrupt: A row is not as the history has it, or the history is not as it was signed.
         BadSettings: The signing key cannot be read.
     """
-    leaves = [logged_leaf(connection, table, str(row)) for table, row in rows]
-    numbers = [number for _, number in leaves if number is not None]
+    leaves = [logged_leaf(connection, history, table, str(row)) for table, row in rows]
+    numbers = [leaf.number for leaf in leaves if leaf.number is not None]
     if len(numbers) < len(leaves):
         return None
     query = select(CHECKPOINTS.c.note).where(CHECKPOINTS.c.size > max(numbers)).order_by(CHECKPOINTS.c.size)
     for note in connection.scalars(query):
         (head,) = read_notes(note)
         if head.signed_by(history.key.public):  # those of an installation that a backup came from are not
-            for leaf, number in zip(leaves, numbers, strict=True):
-                covered_leaf(connection, leaf[0], number, head.checkpoint)
+            for leaf in leaves:
+                covered_leaf(connection, leaf, head.checkpoint)
             return head
     return None
 

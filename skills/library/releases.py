@@ -27,10 +27,13 @@ from typing import Any
 import numpy as np
 from sqlalchemy import (
     ColumnElement,
+    ScalarSelect,
     String,
     and_,
     bindparam,
+    cast,
     exists,
+    func,
     select,
     type_coerce,
 )
@@ -39,6 +42,7 @@ from sqlalchemy.orm import Session, aliased
 from skills.arrays import Floats
 from skills.db import now, rfc3339
 from skills.db.changes import announce
+from skills.db.history import HISTORY, LEAVES
 from skills.db.models import (
     Demonstration,
     PolicyVersion,
@@ -62,6 +66,7 @@ from skills.learning.evaluation import dtw
 from skills.learning.policy import Policy
 from skills.library import consent
 from skills.library.consent import refusal
+from skills.library.history import refuse_edited
 from skills.library.integrity import learnt
 from skills.planning.plan import CONSTANT_TURN_DEG, DrivenPass, departure_of, driven_pass
 from skills.schemas.policies import FitOnTheSame
@@ -149,15 +154,22 @@ def fit_of_versions(session: Session, released: PolicyVersion, trained: PolicyVe
     return fit_of(before, after, list(taught(session, rows).values()))
 
 
+def _newest_leaf(table: type[Release | Surgeon]) -> ScalarSelect[Any]:
+    of_row = (LEAVES.c.table_name == table.__tablename__, LEAVES.c.key == cast(table.row, String))
+    return select(func.max(LEAVES.c.row)).where(*of_row).scalar_subquery()
+
+
 # The newest release of a style that is not withdrawn, with columns that identify it for ever: row numbers are reused
 # after an erasure. It is served if the surgeon's consent, returned as text, covers training. A pose style may be added
-# to its version later.
+# to its version later. The newest leaves show that the service changed a row, although somebody changed it back.
 STANDS = (
     select(
         Release.row,
         type_coerce(Release.released_at, String).label("released_at"),
         consent.AS_TEXT.label("consent"),
         StoredPoses.sha256.label("poses"),
+        _newest_leaf(Release),
+        _newest_leaf(Surgeon),
         PolicyVersion.sha256,
     )
     .join(Surgeon, Surgeon.row == Release.surgeon_row)
@@ -217,6 +229,19 @@ def served(session: Session, surgeon: Surgeon, suture: str) -> Release | None:
     """Return the release that a style serves today; None if there is none or consent does not cover training."""
     releases = standing(session, surgeon.row, suture)
     return releases[0] if releases and consent.may(surgeon, "training") else None
+
+
+def refuse_edited_release(session: Session, release: Release) -> None:
+    """Refuse to serve a release if it, a later one of its style, its policy or its surgeon was not written by us.
+
+    Raises:
+        Corrupt: One of these rows is not as the history has it.
+    """
+    of_style = (Release.surgeon_row == release.surgeon_row, Release.suture == release.suture)
+    releases = session.scalars(select(Release.row).where(*of_style, Release.row >= release.row)).all()
+    decide = {"releases": releases, "policy_versions": [release.policy_row], "surgeons": [release.surgeon_row]}
+    for table, rows in decide.items():
+        refuse_edited(session.connection(), session.info[HISTORY], table, [str(row) for row in rows])
 
 
 def serves(session: Session, policy: PolicyVersion) -> bool:

@@ -222,7 +222,7 @@ def cleared(
             demonstration was withdrawn; another policy than the plan's is released, or none; the plan was not played,
             its verdict is of an older version, which did not judge the arms' outer bodies or did not compare the motion
             with what was asked; it is not feasible, or not certain enough.
-        Corrupt: The stored verdict does not match its digest.
+        Corrupt: The stored verdict does not match its digest, or the release is not as the history has it.
     """
     policy = plan.policy
     consent.require(policies.followable(policy).surgeon, "export")
@@ -244,6 +244,7 @@ def cleared(
             f"This plan follows version {policy.version} of the policy, and {now} released; release that version, or "
             "plan again with the released one."
         )
+    releases.refuse_edited_release(session, served[0])
     played = session.scalar(
         select(StoredPlayback).where(StoredPlayback.plan_row == plan.row).order_by(StoredPlayback.row.desc()).limit(1)
     )

@@ -438,9 +438,9 @@ def test_a_request_is_freed_without_the_garbage_collector(service: Service):
     async def request() -> "ref[Mark]":
         mark = Mark()
         scope = {"type": "http", "method": "GET", "path": "/surgeons", "headers": [(b"host", b"localhost")]}
-        await Gate(application, service.app.state.access, service.app.state.settings)(
-            scope | {"mark": mark}, None, None
-        )  # type: ignore[arg-type]
+        state = service.app.state
+        gate = Gate(application, state.access, state.settings, state.database.history)
+        await gate(scope | {"mark": mark}, None, None)  # type: ignore[arg-type]
         return ref(mark)
 
     gc.disable()

@@ -34,7 +34,7 @@ def served(service: Service, at: str) -> tuple[dict[str, Any], dict[str, Any], d
 
 def test_who_was_served_which_version_at_a_time_is_proven(trained: Service):
     database = trained.app.state.database
-    sign_history(database, None)
+    sign_history(database)
     with database.reading() as session:
         released_at = session.scalars(select(Release.released_at).order_by(Release.row)).all()[-1]
     assert_problem(asked(trained, at="2020-01-01T00:00:00Z"), 404)
@@ -45,7 +45,7 @@ def test_who_was_served_which_version_at_a_time_is_proven(trained: Service):
     with database.writing() as session:
         withdraw(session, find_surgeon(session, "kestrel"), "simple-running", "test")
     assert_problem(asked(trained, at=rfc3339(released_at) or ""), 503, "busy")  # its new leaf is not signed yet
-    sign_history(database, None)
+    sign_history(database)
     again, withdrawn, _ = served(trained, rfc3339(released_at) or "")
     assert again["policy"] == said["policy"]
     assert withdrawn["withdrawn_at"] is not None
@@ -53,7 +53,7 @@ def test_who_was_served_which_version_at_a_time_is_proven(trained: Service):
 
 
 def test_a_proof_that_was_changed_anywhere_is_refused(trained: Service):
-    sign_history(trained.app.state.database, None)
+    sign_history(trained.app.state.database)
     said, _, _ = served(trained, rfc3339(now()) or "")
     head, proof = said["checkpoint"], said["proofs"][0]
     changed = [
@@ -74,7 +74,7 @@ def test_a_proof_that_was_changed_anywhere_is_refused(trained: Service):
 
 
 def test_the_newest_checkpoint_is_signed_by_the_key_that_is_named(trained: Service):
-    sign_history(trained.app.state.database, None)
+    sign_history(trained.app.state.database)
     head = trained.http.get("/history/checkpoint").json()
     assert trained.client.checkpoint() == head
     served_now = trained.client.served_at("kestrel", "simple-running", now())

@@ -60,7 +60,7 @@ def fill(url: str, styles: int) -> str:
     database = Database(url)
     filled = hospital.fill(database, styles // hospital.SUTURES)
     hospital.add_trainings(database, filled, JOBS_OF_STYLE - 1)
-    sign_history(database, None)
+    sign_history(database)
     with database.engine.execution_options(isolation_level="AUTOCOMMIT").connect() as connection:
         connection.execute(text("VACUUM ANALYZE" if connection.dialect.name == "postgresql" else "ANALYZE"))
         counts = {name: connection.scalar(text(f"SELECT count(*) FROM {name}")) for name in COUNTED}

@@ -15,23 +15,24 @@ from sqlalchemy import Connection, func, insert, select, text, update
 from sqlalchemy.orm import Session
 
 from skills.db import Base, now
-from skills.db.history import CHECKPOINTS, LEAVES, take_notes
+from skills.db.history import CHECKPOINTS, LEAVES, newest_checkpoint, take_notes
+from skills.db.kept_heads import keep_head
 from skills.db.logged_rows import COLUMNS_NOT_LOGGED, NOT_LOGGED, logged
 from skills.db.models import Release, Surgeon
 from skills.db.service_tables import Job
 from skills.db.session import Database
 from skills.db.tiles import TILES, stored_tiles
-from skills.errors import BadSettings, Corrupt
+from skills.errors import BadSettings, Corrupt, NotReady
 from skills.library import erasure, locks, recordings, sweep
 from skills.library.catalogue import find_surgeon, put_surgeon
 from skills.library.erasure import erase_surgeon
-from skills.library.history import Verified, append_checkpoint, newest_checkpoint, sign_history, verify_history
+from skills.library.history import Verified, sign_history, verify_history
 from skills.library.inspection import inspect_installation
 from skills.library.proofs import served_json
 from skills.library.recordings import stored_recording
 from skills.library.releases import withdraw
 from skills.settings import Settings
-from skills.transparency import SigningKey, inclusion_proof, leaf_hash, node_from, read_notes
+from skills.transparency import Checkpoint, SigningKey, Tree, inclusion_proof, leaf_hash, node_from, read_notes
 from tests import backends
 from tests.db.test_tables import FROZEN, WITHDRAWABLE, fill
 from tests.independent_history import check_disclosed, check_inclusion
@@ -47,9 +48,9 @@ def full(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
     """Yield a signed database with rows in every logged table; its tests undo their changes."""
     url = backends.fresh(request.param, tmp_path_factory.mktemp("full"))
     database = Database(url)
-    sign_history(database, None)
+    sign_history(database)
     fill(database)
-    sign_history(database, None)
+    sign_history(database)
     yield database
     database.close()
     backends.drop(url)
@@ -256,16 +257,16 @@ def _all_found(connection: Connection, database: Database) -> list[tuple[str, st
 
 
 def test_a_head_kept_elsewhere_finds_an_older_state_put_back(tmp_path: Path):
-    database = Database(backends.fresh("sqlite", tmp_path))
+    database = Database(backends.fresh("sqlite", tmp_path), checkpoints=tmp_path / "heads")
     cases.add_surgeon(database)
-    sign_history(database, tmp_path / "heads")
+    sign_history(database)
     database.close()
     older, file = tmp_path / "older.sqlite", Path(database.url.removeprefix("sqlite:///"))
-    with closing(Database(database.url)) as database:
+    with closing(Database(database.url, checkpoints=tmp_path / "heads")) as database:
         database.forget()
         shutil.copy(file, older)
         cases.add_surgeon(database, "heron")
-        sign_history(database, tmp_path / "heads")
+        sign_history(database)
         heads = tuple(read_notes((tmp_path / "heads").read_text()))
         assert len(heads) == 2
         with database.reading() as session:
@@ -278,12 +279,12 @@ def test_a_head_kept_elsewhere_finds_an_older_state_put_back(tmp_path: Path):
 
 
 def test_a_row_written_past_the_service_is_not_logged_for_its_author(database: Database):
-    sign_history(database, None)
+    sign_history(database)
     with database.engine.connect() as connection:  # with triggers, without the service's `writing`
         connection.exec_driver_sql("UPDATE surgeons SET skill_level = 'expert'")
         connection.commit()
     cases.add_surgeon(database, "heron")  # a transaction of the service after it
-    sign_history(database, None)
+    sign_history(database)
     assert wrong_in(database) == [("surgeons 1", "not as the history has it: skill_level")]
 
 
@@ -315,7 +316,9 @@ def test_a_change_by_the_service_does_not_cover_another_column_of_the_row(full: 
 
 def test_the_notes_name_every_logged_column_that_may_change():
     """The others are of rows that only somebody past the service can change, which no leaf covers."""
-    changing = runpy.run_path(str(Path("migrations") / "versions" / "0016_history.py"))["CHANGING"]
+    versions = Path("migrations") / "versions"
+    changing = runpy.run_path(str(versions / "0016_history.py"))["CHANGING"]
+    changing["sign_ins"] = " ".join(runpy.run_path(str(versions / "0019_history_compared.py"))["CHANGED"])
     for table, names in changing.items():
         if table not in WITHDRAWABLE:
             assert names.split() == [*logged()[table].columns], table
@@ -372,7 +375,7 @@ def test_a_row_that_was_erased_and_is_put_back_with_its_old_leaf_is_found(databa
         old = session.execute(leaf).one()._mapping
     with database.writing() as session:
         erase_surgeon(session, "heron", "test")
-    sign_history(database, None)
+    sign_history(database)
     with tampering(database) as connection:
         connection.execute(SURGEONS.insert(), [dict(row)])
         connection.execute(LEAVES.insert(), [{**old, "row": old["row"] + 1000, "number": None}])
@@ -457,14 +460,14 @@ def test_signing_and_writing_do_not_wait_for_each_other(database: Database):
         database.history.settle(session.connection())  # its leaves have their rows
         with impatient.writing([locks.surgeon("egret")]) as other:
             put_surgeon(other, "egret", {}, "test")
-        assert sign_history(impatient, None) is not None
+        assert sign_history(impatient) is not None
     signing = database.engine.execution_options(writes=()).connect()
     with closing(impatient), closing(signing):
         assert database.history.sign(signing) is not None  # and not committed yet
         with impatient.writing([locks.surgeon("swift")]) as other:
             put_surgeon(other, "swift", {}, "test")
         signing.commit()
-    sign_history(database, None)
+    sign_history(database)
     with database.reading() as session:
         of_surgeons = select(LEAVES.c.number, LEAVES.c.row).where(LEAVES.c.table_name == "surgeons")
         numbers = session.execute(of_surgeons.order_by(LEAVES.c.row)).all()
@@ -478,7 +481,7 @@ def test_signing_and_writing_do_not_wait_for_each_other(database: Database):
 def test_proofs_are_checked_offline_and_stay_valid_after_an_erasure(database: Database):
     cases.add_demo(database)
     cases.train(database, release=True)
-    sign_history(database, None)
+    sign_history(database)
     with database.reading() as session:
         connection = session.connection()
         note = newest_checkpoint(connection) or ""
@@ -488,7 +491,7 @@ def test_proofs_are_checked_offline_and_stay_valid_after_an_erasure(database: Da
         verifier = database.history.key.verifier(note.partition("\n")[0])
     with database.writing() as session:
         erase_surgeon(session, "kestrel", "test")
-    sign_history(database, None)
+    sign_history(database)
     with database.reading() as session:
         after = dict(session.execute(select(LEAVES.c.number, LEAVES.c.entry)).all())
         of_erased = LEAVES.c.table_name.in_(("demonstrations", "surgeons", "releases"))
@@ -521,7 +524,7 @@ def add_cranes(database: Database, count: int, name: str = "crane") -> None:
 def test_tiles_are_written_as_they_fill_and_every_change_of_one_is_found(database: Database):
     for name in ("crane", "egret", "swift"):
         add_cranes(database, 300, name)
-        sign_history(database, None)
+        sign_history(database)
         with database.reading() as session:
             tiles = session.execute(TILES_IN_ORDER).all()
             leaves = session.scalars(select(LEAVES.c.entry).order_by(LEAVES.c.number)).all()
@@ -541,7 +544,7 @@ def test_no_proof_is_given_from_tiles_or_leaves_that_were_changed(database: Data
     cases.add_demo(database)
     add_cranes(database, 350)  # the newest leaves stand behind the last whole tile
     cases.train(database, release=True)
-    sign_history(database, None)
+    sign_history(database)
     asked = ("kestrel", cases.SUTURE, now())
     with database.reading() as session:
         given = served_json(session, database.history, *asked)
@@ -560,7 +563,7 @@ def test_no_proof_is_given_from_tiles_or_leaves_that_were_changed(database: Data
 
 def test_tiles_of_an_older_database_are_written_by_its_migration(database: Database):
     add_cranes(database, 300)
-    sign_history(database, None)
+    sign_history(database)
     with database.reading() as session:
         before = session.execute(TILES_IN_ORDER).all()
     go(database, command.downgrade, "0016")
@@ -594,7 +597,7 @@ def test_without_its_key_the_history_is_neither_written_nor_verified(tmp_path: P
     key.rename(tmp_path / "away")
     with closing(Database(url, signing_key=key)) as database:
         database.migrate()
-        with pytest.raises(BadSettings, match="is missing"), database.writing() as session:
+        with pytest.raises(NotReady, match="is missing"), database.writing() as session:
             put_surgeon(session, "heron", {}, "test")
         assert "is missing" in wrong_in(database)[0][1]
     key.write_text(str(SigningKey(b"another" * 4 + b"key!")))
@@ -632,7 +635,9 @@ def test_a_tree_that_was_changed_is_not_signed_on(full: Database):
         connection.rollback()
 
 
-def test_checkpoints_that_cannot_be_appended_are_no_reason_to_stop(tmp_path: Path, caplog: pytest.LogCaptureFixture):
-    append_checkpoint(tmp_path / "none" / "heads", "note")
-    assert "could not be appended to SKILLS_CHECKPOINTS" in caplog.text
+def test_a_head_that_cannot_be_kept_is_no_reason_to_stop(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    note = SigningKey(b"k" * 32).sign(Checkpoint("suture-skills/0", 0, Tree().root))
+    keep_head(tmp_path / "none" / "heads", note)
+    assert "could not be appended" in caplog.text
+    assert "SKILLS_CHECKPOINTS" in caplog.text
     assert os.listdir(tmp_path) == []

@@ -287,6 +287,7 @@ def test_what_value_iteration_finds_may_be_released(database: Database):
     assert version.manifest["metrics"]["dtw_total_mm"] == 0
     with database.writing() as session:
         releases.release(session, session.get_one(PolicyVersion, version.row), "test")
+    with database.reading() as session:
         assert policy_of(session, "kestrel", cases.SUTURE).policy.row == version.row
 
 

@@ -311,7 +311,7 @@ def test_the_bag_is_signed_under_the_first_checkpoint_with_its_verdict(database:
         assert f"{head.size} leaves, root {head.root.hex()}" in archive.read("README.txt").decode()
         assert check_envelope(archive.read("signature.dsse"), str(key))["predicate"]["checkpoint"] == note
     cases.add_surgeon(database, "heron")
-    sign_history(database, None)
+    sign_history(database)
     assert replay_bag(database, plan.sha256, **OF_A1_ALONE) == data
 
 
