@@ -67,6 +67,9 @@ COLUMNS_NOT_LOGGED = {
     ("jobs", "told_at"): OF_A_RUN,
     ("jobs", "started_at"): OF_A_RUN,
 }
+# By table, the columns that a migration has added to it, each with its value in the rows that there were. The leaves of
+# these rows lack the columns; every later leaf has them.
+ADDED: dict[str, dict[str, Any]] = {}
 
 # ---- rows as they are stored -----------------------------------------------------------------------------------------
 

@@ -130,6 +130,7 @@ def _proofs(connection: Connection, keys: dict[str, str], note: str) -> list[dic
     proofs = []
     for table, latest in leaves.items():
         (row,) = logged()[table].rows_of(connection, [keys[table]])
+        disclosed = [name for name in DISCLOSED[table] if name in latest.digests]  # a leaf of before an added column
         number = of_row[latest.row]
         assert number is not None
         hashes = covered_leaf(connection, latest, number, signed)
@@ -139,7 +140,7 @@ def _proofs(connection: Connection, keys: dict[str, str], note: str) -> list[dic
                 "number": number,
                 "entry": latest.entry,
                 "salt": latest.salt.hex(),
-                "disclosed": {name: as_bytes(getattr(row, name))[1:].decode() for name in DISCLOSED[table]},
+                "disclosed": {name: as_bytes(getattr(row, name))[1:].decode() for name in disclosed},
                 "digests": dict(latest.digests),
                 "hashes": [one.hex() for one in hashes],
             }
