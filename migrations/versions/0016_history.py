@@ -7,6 +7,8 @@ connections of the service, which have the setting "skills.noting"; on others, a
 import sqlalchemy as sa
 from alembic import op
 
+from skills.migrations.noting import CHANGES, note_changes
+
 revision = "0016"
 down_revision = "0015"
 branch_labels = None
@@ -55,7 +57,6 @@ CHANGING = {
     "recording_surgeons": "recording_row surgeon_row",
     "key_surgeons": "key_row surgeon_row",
 }
-CHANGES = (("add", "INSERT"), ("change", "UPDATE"), ("remove", "DELETE"))
 UNCHANGEABLE = "row, table_name, entry, seal"
 
 
@@ -91,20 +92,13 @@ def upgrade() -> None:
         _on_sqlite()
     else:
         _on_postgresql()
+    for table, keys in LOGGED.items():
+        changing = CHANGING.get(table, "")
+        note_changes(table, keys, changing, changing if table == "jobs" else "")  # the progress of jobs is not logged
 
 
 def _on_sqlite() -> None:
     op.execute("CREATE TABLE history_notes (table_name TEXT, change TEXT, key TEXT, changed TEXT)")
-    for table, keys in LOGGED.items():
-        for change, statement in CHANGES:
-            row = "NEW" if change == "add" else "OLD"
-            key = " || '/' || ".join(f"{row}.{name}" for name in keys)
-            names = CHANGING.get(table, "").split() if change == "change" else ()
-            changed = " || ".join(f"iif(NEW.{name} IS NOT OLD.{name}, '{name} ', '')" for name in names) or "NULL"
-            op.execute(
-                f"CREATE TRIGGER {table}_noted_{change} AFTER {_of(table, statement)} ON {table} "  # noqa: S608 - ours
-                f"BEGIN INSERT INTO history_notes VALUES ('{table}', '{change}', {key}, {changed}); END"
-            )
     for table, what in (("history", f"UPDATE OF {UNCHANGEABLE}"), ("history_checkpoints", "UPDATE")):
         for name, statement in (("append_only", what), ("kept", "DELETE")):
             op.execute(
@@ -123,38 +117,12 @@ def _on_postgresql() -> None:
         "END IF; "
         "PERFORM set_config('skills.notes' || part, concat(so_far, noted, chr(10)), true); END $$"
     )
-    for table, keys in LOGGED.items():
-        new, old = (", ".join(f"{row}.{name}" for name in keys) for row in ("NEW", "OLD"))
-        differs = "CASE WHEN NEW.{0}::text IS DISTINCT FROM OLD.{0}::text THEN '{0} ' END"
-        changed = ", ".join(differs.format(name) for name in CHANGING.get(table, "").split()) or "NULL"
-        op.execute(
-            f"CREATE FUNCTION skills_note_{table}() RETURNS trigger LANGUAGE plpgsql AS $$ BEGIN "
-            "IF coalesce(current_setting('skills.noting', true), '') = '' THEN NULL; "
-            "ELSIF TG_OP = 'INSERT' THEN "
-            f"PERFORM skills_note(json_build_array(TG_TABLE_NAME, 'add', concat_ws('/', {new}), NULL)); "
-            "ELSIF TG_OP = 'DELETE' THEN "
-            f"PERFORM skills_note(json_build_array(TG_TABLE_NAME, 'remove', concat_ws('/', {old}), NULL)); "
-            "ELSE "
-            f"PERFORM skills_note(json_build_array(TG_TABLE_NAME, 'change', concat_ws('/', {old}), "
-            f"concat({changed}))); "
-            "END IF; RETURN NULL; END $$"
-        )
-        for change, statement in CHANGES:
-            op.execute(
-                f"CREATE TRIGGER {table}_noted_{change} AFTER {_of(table, statement)} ON {table} "
-                f"FOR EACH ROW EXECUTE FUNCTION skills_note_{table}()"
-            )
     for table, what in (("history", f"UPDATE OF {UNCHANGEABLE}"), ("history_checkpoints", "UPDATE")):
         for name, statement in (("append_only", what), ("kept", "DELETE")):
             op.execute(
                 f"CREATE TRIGGER {table}_{name} BEFORE {statement} ON {table} "
                 "FOR EACH ROW EXECUTE FUNCTION skills_append_only()"
             )
-
-
-def _of(table: str, statement: str) -> str:
-    # not of the progress of a job, which is not logged
-    return f"UPDATE OF {', '.join(CHANGING[table].split())}" if (table, statement) == ("jobs", "UPDATE") else statement
 
 
 def downgrade() -> None:

@@ -47,6 +47,7 @@ from sqlalchemy.orm import Mapped, mapped_column
 from skills.db import Base, RowId, now, rfc3339
 from skills.db.kept_heads import heads_beside, last_head, set_aside
 from skills.db.logged_rows import (
+    ADDED,
     CACHES,
     OF_LEAF,
     ROWS_AT_ONCE,
@@ -506,11 +507,11 @@ def _leaves_of(
             yield new_leaf(name, ADD, at, key, digested(table.columns, row), latest.get(key))
         elif key in latest and effects[key].written:  # removed, and added again
             yield new_leaf(name, CHANGE, at, key, digested(table.columns, row), latest[key])
-        elif key in latest and (changed := effects[key].changed):
+        elif key in latest and (changed := effects[key].changed) and latest[key].is_committed:
             # the other columns keep their digests: if somebody else has changed one, that stays to be found
-            digests = {**latest[key].digests, **latest[key].digests_of(changed, row)}
+            digests = {**latest[key].of_row, **latest[key].digests_of(changed, row)}
             yield new_leaf(name, CHANGE, at, key, (latest[key].salt, digests), latest[key])
-        # a row without a leaf was not written by the service: `skills verify` goes on naming it
+        # a row without a leaf, or with one that was changed, is not the service's: `skills verify` goes on naming it
     gone = [key for key, effect in effects.items() if effect.before and not effect.after]
     yield from removals(connection, name, gone, latest, at)
 
@@ -531,6 +532,17 @@ class Latest:
         """The hash of its entry, by which the row's next leaf names it."""
         return leaf_hash(self.entry.encode()).hex()
 
+    @property
+    def is_committed(self) -> bool:
+        """Whether its digests are those that were logged, and of the same columns."""
+        return bool(orjson.loads(self.entry)["commitment"] == commitment_to(self.digests))
+
+    @cached_property
+    def of_row(self) -> Mapping[str, str]:
+        """The digests of all columns: one that was added after the leaf has the value that its migration gave it."""
+        added = ADDED.get(orjson.loads(self.entry)["table"], {})
+        return {**digests_of(tuple(added), tuple(added.values()), self.salt), **self.digests}
+
     def digests_of(self, names: Iterable[str], row: Any) -> dict[str, str]:
         """Return the digests of some columns of a row with the salt of this leaf."""
         some = sorted(names)
@@ -539,11 +551,11 @@ class Latest:
     def differing(self, names: Sequence[str], values: Sequence[Any]) -> list[str]:
         """Return the names of the columns that differ from a row."""
         here = digests_of(names, values, self.salt)
-        return sorted(name for name in {*here, *self.digests} if here.get(name) != self.digests.get(name))
+        return sorted(name for name in {*here, *self.of_row} if here.get(name) != self.of_row.get(name))
 
     def matches(self, names: Sequence[str], values: Sequence[Any]) -> bool:
         """Return whether a row is as it was logged."""
-        return not self.differing(names, values)
+        return self.is_committed and not self.differing(names, values)
 
 
 def latest_leaves(connection: Connection, table: str, keys: Sequence[str] | None = None) -> dict[str, Latest]:
@@ -595,7 +607,7 @@ def changed_rows(
         if (effect := effects[known.raw.name].get(known.key_of(row))) and effect.after:
             rows[known.raw.name].append(row)
     for table, key, row, entry, salt, digests in sorted(found, key=itemgetter(2)):
-        if dialect.name == "sqlite":
+        if dialect.name == "sqlite" and digests is not None:
             digests = json.loads(digests)
         latest[table][key] = Latest(row, entry, salt, digests)
     return rows, latest

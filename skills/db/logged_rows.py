@@ -68,6 +68,9 @@ COLUMNS_NOT_LOGGED = {
     ("jobs", "started_at"): OF_A_RUN,
     ("sign_ins", "used_at"): OF_A_RUN,
 }
+# By table, the columns that a migration has added to it, each with its value in the rows that there were. The leaves of
+# these rows lack the columns; every later leaf has them.
+ADDED: dict[str, dict[str, Any]] = {}
 
 # ---- rows as they are stored -----------------------------------------------------------------------------------------
 
@@ -297,22 +300,29 @@ _OBJECTS = {
         UNION ALL
         SELECT 'constraint ' || c.relname || ' ' || n.conname, pg_get_constraintdef(n.oid)
           FROM pg_constraint n JOIN pg_class c ON c.oid = n.conrelid
-         WHERE n.connamespace = current_schema()::regnamespace AND c.relname = ANY(:tables)
+         WHERE n.connamespace = current_schema()::regnamespace AND c.relname = ANY(:tables) AND n.contype <> 'n'
+        UNION ALL
+        SELECT 'table ' || c.relname, string_agg(concat_ws(' ', a.attname, format_type(a.atttypid, a.atttypmod),
+               CASE WHEN a.attnotnull THEN 'NOT NULL' END, pg_get_expr(d.adbin, c.oid)), ', ' ORDER BY a.attname)
+          FROM pg_class c JOIN pg_attribute a ON a.attrelid = c.oid AND a.attnum > 0 AND NOT a.attisdropped
+          LEFT JOIN pg_attrdef d ON d.adrelid = c.oid AND d.adnum = a.attnum
+         WHERE c.relnamespace = current_schema()::regnamespace AND c.relname = ANY(:tables) GROUP BY c.relname
         UNION ALL
         SELECT 'index ' || indexname, indexdef FROM pg_indexes
          WHERE schemaname = current_schema() AND tablename = ANY(:tables)""",
 }
 
 
+# Columns that are not null are constraints since PostgreSQL 18, and were none before: their table's columns say it.
 # PostgreSQL writes `IN ('a', 'b')` in one form where a migration made it, in another once `pg_dump` has copied it.
 _COPIED = re.compile(r"ANY \(ARRAY\[((?:\('(?:[^']|'')*'::character varying\)::text(?:, )?)+)\]\)")
 _ONE = re.compile(r"\(('(?:[^']|'')*'::character varying)\)::text")
 
 
 def schema_of(connection: Connection) -> dict[str, str]:
-    """Return the definitions of triggers, functions, constraints, indexes and (on SQLite) tables, by kind and name.
+    """Return the definitions of triggers, functions, constraints, indexes and tables, by kind and name.
 
-    They are the same for a database that was copied by `pg_dump`.
+    They are the same for a database that was copied by `pg_dump`, also to another major version of PostgreSQL.
     """
     kind = connection.dialect.name
     given = {"tables": list(Base.metadata.tables)} if kind == "postgresql" else {}

@@ -95,13 +95,14 @@ def _proofs(connection: Connection, history: History, keys: dict[str, str], note
         if latest.number is None or latest.number >= signed.size:
             raise Busy("The history is not signed up to this release yet; try again in a second.")
         (row,) = logged()[table].rows_of(connection, [keys[table]])
+        disclosed = [name for name in DISCLOSED[table] if name in latest.digests]  # a leaf of before an added column
         proofs.append(
             {
                 "table": table,
                 "number": latest.number,
                 "entry": latest.entry,
                 "salt": latest.salt.hex(),
-                "disclosed": {name: as_bytes(getattr(row, name))[1:].decode() for name in DISCLOSED[table]},
+                "disclosed": {name: as_bytes(getattr(row, name))[1:].decode() for name in disclosed},
                 "digests": dict(latest.digests),
                 "hashes": [one.hex() for one in covered_leaf(connection, latest, signed)],
             }
