@@ -31,7 +31,7 @@ import logging
 import os
 import sqlite3
 import stat
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, closing, contextmanager, suppress
 from copy import copy
 from functools import cache
@@ -122,6 +122,7 @@ class Database:
         self.engine = _open(url, patience_ms or BUSY_TIMEOUT_MS)
         self.history = History(self.engine, signing_key or settings().signing_key)
         self._sessions = sessionmaker(self.engine, expire_on_commit=False)
+        self._condition: tuple[Callable[[Session], None], Sequence[str]] = (lambda _: None), ()
 
     @contextmanager
     def reading(self) -> Iterator[Session]:
@@ -139,9 +140,11 @@ class Database:
             names: What it changes or relies on, see `skills.library.locks`: transactions with a common name run one
                 after the other. None: everything. No names: changes that are decided by a single statement each.
         """
-        locks = True if names is None else tuple(sorted({_number(name) for name in names}))
+        check, further = self._condition
+        locks = True if names is None else tuple(sorted({_number(name) for name in (*names, *further)}))
         bind = self.engine.execution_options(writes=locks)
         with self._in_words(), self._sessions(bind=bind) as session, session.begin():
+            check(session)
             yield session
             if session.in_transaction():  # otherwise the block has undone its changes
                 session.flush()
@@ -154,6 +157,17 @@ class Database:
         narrowed = copy(self)
         narrowed._sessions = sessionmaker(self.engine, expire_on_commit=False, info={ONLY: only})
         return narrowed
+
+    def on_condition(self, check: Callable[[Session], None], names: Sequence[str]) -> "Database":
+        """Return this database with a check at the beginning of each writing transaction, which may refuse it.
+
+        Args:
+            check: It raises an error where the transaction must not take place.
+            names: What the check relies on, in addition to the names of each transaction.
+        """
+        checked = copy(self)
+        checked._condition = check, names
+        return checked
 
     def migrate(self) -> None:
         """Migrate the tables to this version, from an empty database or any older version.
