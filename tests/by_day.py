@@ -17,6 +17,7 @@ ON_BOTH = {
     "test_the_same_upload_eight_times_at_once_is_one_demonstration",
     "test_the_same_training_eight_times_at_once_is_one_job",
     "test_a_job_performed_twice_makes_one_version",
+    "test_a_try_that_was_ended_stores_nothing_more",
     "test_erasure_leaves_no_row_and_events_without_a_name",
     "test_an_upload_that_dies_anywhere_leaves_nothing_to_see_and_is_swept",
     "test_an_erased_surgeons_jobs_are_gone_at_once_and_swept_later",

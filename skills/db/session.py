@@ -31,7 +31,7 @@ import logging
 import os
 import sqlite3
 import stat
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, closing, contextmanager, suppress
 from copy import copy
 from functools import cache
@@ -132,6 +132,7 @@ class Database:
             self.engine, signing_key or settings().signing_key, checkpoints or settings().checkpoints
         )
         self._sessions = sessionmaker(self.engine, expire_on_commit=False, info={HISTORY: self.history})
+        self._condition: tuple[Callable[[Session], None], Sequence[str]] = (lambda _: None), ()
 
     @classmethod
     def of(cls, settings: Settings, *, patience_ms: int | None = None) -> Self:
@@ -155,9 +156,11 @@ class Database:
             names: What it changes or relies on, see `skills.library.locks`: transactions with a common name run one
                 after the other. None: everything. No names: changes that are decided by a single statement each.
         """
-        locks = True if names is None else tuple(sorted({_number(name) for name in names}))
+        check, further = self._condition
+        locks = True if names is None else tuple(sorted({_number(name) for name in (*names, *further)}))
         bind = self.engine.execution_options(writes=locks)
         with self._in_words(), self._sessions(bind=bind) as session, session.begin():
+            check(session)
             yield session
             if session.in_transaction():  # otherwise the block has undone its changes
                 session.flush()
@@ -180,6 +183,17 @@ class Database:
         kept = self.history.kept_head()
         with self.reading() as session:
             self.history.compare(session.connection(), kept)
+
+    def on_condition(self, check: Callable[[Session], None], names: Sequence[str]) -> "Database":
+        """Return this database with a check at the beginning of each writing transaction, which may refuse it.
+
+        Args:
+            check: It raises an error where the transaction must not take place.
+            names: What the check relies on, in addition to the names of each transaction.
+        """
+        checked = copy(self)
+        checked._condition = check, names
+        return checked
 
     def migrate(self) -> None:
         """Migrate the tables to this version, from an empty database or any older version.

@@ -17,7 +17,7 @@ from skills.db.service_tables import Job, record_event
 from skills.db.session import Database
 from skills.library.batch_work import retrain_part
 from skills.library.datasets import export_dataset
-from skills.library.jobs import PART, Store, names_of
+from skills.library.jobs import PART, Store, names_of, while_running
 from skills.library.playbacks import check_playback, draw_pictures
 from skills.library.training import train_style
 from skills.library.tries import TRY, perform_try
@@ -54,7 +54,7 @@ def perform_job(database: Database, row: int, attempt: int, settings: Settings) 
         if job is None or job.state != "running" or job.attempt != attempt:
             return  # erased, cancelled, or taken by another attempt
         kind, request, names = job.kind, job.request, names_of(session, row)
-    store = MAKERS[kind](database, request, settings)
+    store = MAKERS[kind](while_running(database, row, attempt), request, settings)
     with database.writing(names) as session:
         ended = {"state": "succeeded", "progress": 1.0, "ended_at": now()}
         mine = (Job.row == row, Job.state == "running", Job.attempt == attempt)

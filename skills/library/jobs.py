@@ -278,15 +278,29 @@ def find_live(session: Session, kind: str, request: Mapping[str, object]) -> Job
     return session.scalar(alike.execution_options(**EVERYBODYS))
 
 
+def while_running(database: Database, row: int, attempt: int) -> Database:
+    """Return a database that a job writes to: each transaction is refused once the job does not run at this attempt.
+
+    Erasing deletes the jobs whose result would bring back what was erased, so they end here too.
+    """
+    mine = (Job.row == row, Job.attempt == attempt, Job.state == "running")
+
+    def check(session: Session) -> None:
+        if session.scalar(select(Job.row).where(*mine)) is None:
+            raise Conflict("The job was cancelled while it ran, or something that it uses was erased.")
+
+    with database.reading() as session:
+        names = names_of(session, row)
+    return database.on_condition(check, [locks.job(row)] if names is None else names)
+
+
 def telling(database: Database, kind: str, request: Mapping[str, object]) -> Callable[[float], None]:
-    """Return a callback that stores the progress of a job; it raises `Conflict` once the job is no longer running."""
+    """Return a callback that stores the progress of a running job, in the database of `while_running`."""
     mine = (Job.identity == identity_of(kind, request), Job.state == "running")
 
     def tell(share: float) -> None:
         with database.writing(()) as session:
-            running = update(Job).where(*mine).values(progress=share).returning(Job.row)
-            if session.execute(running).first() is None:
-                raise Conflict("The job was cancelled while it ran.")
+            session.execute(update(Job).where(*mine).values(progress=share), **UNSYNCHRONISED)
 
     return tell
 

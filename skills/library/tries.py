@@ -104,8 +104,7 @@ def perform_try(database: Database, request: dict[str, Any], settings: Settings)
             told.append(step.model_dump(mode="json"))
             with database.writing(()) as session:
                 so_far = {"result": {"steps": told}, "progress": min(len(told) / STEPS, 0.95)}
-                if session.execute(update(Job).where(*mine).values(**so_far).returning(Job.row)).first() is None:
-                    raise Conflict("The job was cancelled while it ran.")
+                session.execute(update(Job).where(*mine).values(**so_far))
 
     def store(_session: Session, _actor: str) -> dict[str, Any]:
         return {"steps": told}

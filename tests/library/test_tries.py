@@ -1,27 +1,38 @@
 """Tries: each step on a synthetic bag, every question with its answers, every refusal with its remedy."""
 
+from collections.abc import Callable
+from copy import copy
 from io import BytesIO
+from itertools import count as counted
 from typing import Any
 
 import numpy as np
 import pytest
-from sqlalchemy import func, select, update
+from sqlalchemy import delete, func, select, update
+from sqlalchemy.orm import Session
 
-from skills.db.models import Demonstration, Plan, PolicyVersion, Release, StoredPlayback
-from skills.db.service_tables import Job
+from skills.db.models import Demonstration, ParsedRecording, Plan, PolicyVersion, Release, StoredPlayback, Surgeon
+from skills.db.service_tables import Event, Job
 from skills.db.session import Database
 from skills.demonstration.demonstration import cut_demo
 from skills.demonstration.recording import Motion, Recording
 from skills.errors import BadSettings, Conflict, NotFound
 from skills.formats import read_recording, write_mcap
 from skills.gridworld.grid import GridWorld, choose_grid
+from skills.jobs.workflows import Work
+from skills.library import jobs, perform_job
 from skills.library.catalogue import put_surgeon
-from skills.library.erasure import erase_demo
+from skills.library.demos import add_demo
+from skills.library.erasure import erase_demo, erase_surgeon
 from skills.library.recordings import store_recording
 from skills.library.tries import CELLS_MM, choose_cells, request_try
+from skills.schemas.requests import DemoIn
 from skills.schemas.tries import LOSS_MM, TryIn
 from skills.seeds.recordings import sample_recordings
+from skills.settings import Settings
+from tests.by_day import some
 from tests.library import cases
+from tests.model.replaced import Interruptible
 
 MCAP = "application/vnd.mcap"
 ANSWERS: dict[str, Any] = {"tissue_mm": -170.0, "errors": "calibrated", "release": True}
@@ -207,6 +218,77 @@ def test_an_erased_demonstration_takes_its_tries_along(database: Database) -> No
     with database.writing() as session:
         erase_demo(session, digest, "test")
     assert count(database, Job) == 0
+
+
+def erase_its_demo(session: Session, job: Job) -> None:
+    mine = select(Demonstration.sha256).where(Demonstration.surgeon_row == job.surgeon_row)
+    for digest in session.scalars(mine).all():
+        erase_demo(session, digest, "test")
+
+
+def erase_its_surgeon(session: Session, job: Job) -> None:
+    erase_surgeon(session, session.get_one(Surgeon, job.surgeon_row).slug, "test")
+
+
+def cancel_it(session: Session, job: Job) -> None:
+    jobs.cancel(session, job.id, "test")
+
+
+def start_it_over(session: Session, job: Job) -> None:
+    session.execute(update(Job).where(Job.row == job.row).values(attempt=job.attempt + 1))
+
+
+STORED = (Demonstration, ParsedRecording, PolicyVersion, Release, Plan, StoredPlayback, Event)
+ENDINGS = (erase_its_demo, erase_its_surgeon, cancel_it, start_it_over)
+
+
+def ended_before(last: int, database: Database, job: Job, ending: Callable[[Session, Job], None]) -> bool:
+    """Perform a try that ends before a transaction of it; return whether it had so many."""
+    worker, at = copy(database), 0
+    worker.__class__ = Interruptible
+    there: list[int] = []
+
+    def pause() -> None:
+        nonlocal at
+        at += 1
+        if at == last:
+            with database.writing() as session:
+                ending(session, session.get_one(Job, job.row))
+            there[:] = [count(database, one) for one in STORED]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Interruptible, "pause", staticmethod(pause))
+        Work(worker, Settings(database_url=database.url), perform_job).try_once(job.row, job.attempt, 0)
+    if there:
+        assert [count(database, one) for one in STORED] == there, f"stored after its end before transaction {last}"
+    return bool(there)
+
+
+def end_before_each_transaction(database: Database, ending: Callable[[Session, Job], None], **asked: Any) -> int:
+    """End a try, each time of another surgeon, before each of its transactions; return the number of those."""
+    recording = cases.store(database, cases.upload(cases.bag(), MCAP)).recording.sha256  # kestrel's, so that it stays
+    for last in counted(1):
+        cases.add_surgeon(database, surgeon := f"heron-{last}")
+        said = TryIn(recording=recording, surgeon=surgeon, suture=cases.SUTURE, **asked)
+        add_demo(database, recording, DemoIn(surgeon=surgeon, suture=cases.SUTURE, cell_mm=asked["cell_mm"]), "test")
+        with database.writing() as session:
+            job = request_try(session, said, "test").job
+            session.execute(delete(ParsedRecording))
+        if not ended_before(last, database, job, ending):
+            return last - 1
+    raise AssertionError("it never ends")
+
+
+@pytest.mark.parametrize("ending", some(ENDINGS, of=len(ENDINGS)))
+def test_a_try_that_was_ended_stores_nothing_more(database: Database, ending: Callable[[Session, Job], None]) -> None:
+    assert end_before_each_transaction(database, ending, cell_mm=5.0) > 10
+
+
+@pytest.mark.nightly  # each of some thirty tries is played; by day a try ends with its questions
+@pytest.mark.needs("simulator")
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_nor_does_one_that_is_played(database: Database, ending: Callable[[Session, Job], None]) -> None:
+    assert end_before_each_transaction(database, ending, cell_mm=5.0, **ANSWERS) > 20
 
 
 def test_cells_without_a_path_are_passed_over() -> None:
