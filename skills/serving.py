@@ -30,7 +30,7 @@ import uvicorn
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 from skills import logs
-from skills.api.app import create_app, prepare_database
+from skills.api.app import create_app, prepare_database, prepare_to_serve
 from skills.api.sessions import MESSAGE_BYTES
 from skills.client import Client
 from skills.compiled import check_wanted
@@ -268,7 +268,8 @@ def serve(settings: Settings, *, samples: bool = False) -> None:
     check_wanted()
     if settings.containment == "required":
         refuse_uncontained()
-    prepare(settings)
+    with closing(Database.of(settings)) as database:
+        prepare_to_serve(database, settings)
     refuse_keyless(settings)
     app = create_app(settings)
 

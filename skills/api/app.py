@@ -22,7 +22,7 @@ from skills.api.responses import DOWNLOADS_READ, Encoded, Watching
 from skills.api.routes import catalogue, demos, operating, pages, plans, policies
 from skills.api.sessions import Sessions
 from skills.db.session import Database
-from skills.errors import SkillsError
+from skills.errors import NotReady, SkillsError
 from skills.jobs import Engine
 from skills.library.arm_errors import stated_errors
 from skills.library.catalogue import seed_catalogue
@@ -53,14 +53,14 @@ def create_app(settings: Settings) -> FastAPI:
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         try:
-            await to_thread.run_sync(prepare_database, app.state.database, settings)
+            await to_thread.run_sync(prepare_to_serve, app.state.database, settings)
             async with app.state.served.watching():
                 with confined_reader(settings) as app.state.reader:
                     yield
-        finally:
-            await to_thread.run_sync(app.state.engine.close)
             with suppress(SkillsError):  # what was written after the last signature; the next start signs it otherwise
                 await to_thread.run_sync(keep_signed, app.state.database, inf)
+        finally:
+            await to_thread.run_sync(app.state.engine.close)
             app.state.access.close()
             app.state.database.close()
 
@@ -118,13 +118,23 @@ def create_app(settings: Settings) -> FastAPI:
 def prepare_database(database: Database, settings: Settings) -> None:
     """Migrate a database, seed its catalogue if it is empty, and sign its history.
 
-    If it is not the database that was signed last, nothing is changed, and `History.refused` says why.
+    Raises:
+        NotReady: It is not the database that was signed last; nothing was changed.
     """
     database.migrate()
-    if keep_signed(database):
-        with database.writing() as session:
-            seed_catalogue(session)
-        keep_signed(database)
+    database.compare_history()
+    with database.writing() as session:
+        seed_catalogue(session)
+    keep_signed(database)
+
+
+def prepare_to_serve(database: Database, settings: Settings) -> None:
+    """Prepare a database; if it is not the one that was signed last, serve only the reason, `History.refused`."""
+    try:
+        prepare_database(database, settings)
+    except NotReady:
+        if database.history.refused is None:
+            raise
 
 
 class Service(FastAPI):

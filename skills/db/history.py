@@ -133,6 +133,10 @@ _FURTHER = (
     "SELECT current_setting('skills.notes' || n, true), set_config('skills.notes' || n, '', true), "
     "set_config('skills.noting', '0', true) FROM generate_series(1, %s) n"
 )
+REMOVED = (
+    "The history of this database was removed, so nobody can tell what was changed in it.",
+    "Put the right copy of the database back, or restore a backup into an empty one.",
+)
 HISTORY = "history"  # in a session's `info`: the `History` of its database
 NOTING = "noting"  # in a connection's `info`: whether its transactions note changes
 
@@ -184,7 +188,7 @@ class History:
         self.key_file = key_file
         self.heads_file = heads_file or heads_beside(key_file, engine.url)
         self.refused: NotReady | None = None  # why nothing of the database is served or written, see `compare`
-        self._agreed: tuple[str, Note | None] | None = None  # the newest checkpoint, and the kept head
+        self._agreed: tuple[str | None, Note | None] | None = None  # the newest checkpoint, and the kept head
         self._seal: Seal | None = None
         self._origin: str | None = None
 
@@ -201,8 +205,8 @@ class History:
         except (OSError, UnicodeDecodeError) as error:
             why = "is missing" if isinstance(error, FileNotFoundError) else "cannot be read"
             raise BadSettings(
-                f"The signing key {self.key_file} {why}, and this database has a history that was begun with one.",
-                "Put the file back, or name it in SKILLS_SIGNING_KEY.",
+                f"The signing key {why}, and this database has a history that was begun with one.",
+                "Put its file back, or name it in SKILLS_SIGNING_KEY.",
             ) from error
 
     def origin(self, connection: Connection) -> str | None:
@@ -221,6 +225,8 @@ class History:
         try:
             return last_head(self.heads_file)
         except NotReady as refused:
+            if self.refused is None:
+                log.critical("Nothing is served or written (%s). %s", self.heads_file, refused)
             self.refused = refused
             raise
 
@@ -245,29 +251,33 @@ class History:
             NotReady: The database is not the one that was signed last: older, another one, or signed with another key.
         """
         newest = newest_checkpoint(connection)
-        if newest is None or (newest, kept) == self._agreed:
+        if (newest, kept) == self._agreed:
             return
         try:
             self._refuse_another(connection, newest, kept)
         except NotReady as refused:
             if self.refused is None:
-                log.critical("Nothing is served or written. %s", refused)
+                log.critical("Nothing is served or written (%s, %s). %s", self.key_file, self.heads_file, refused)
             self.refused, self._agreed = refused, None
             raise
         self.refused, self._agreed = None, (newest, kept)
 
-    def _refuse_another(self, connection: Connection, newest: str, kept: Note | None) -> None:
-        (note,) = read_notes(newest)
+    def _refuse_another(self, connection: Connection, newest: str | None, kept: Note | None) -> None:
+        """Refuse the database; the message names no path, for it is also given to callers without a key."""
+        if newest is None:
+            if kept is not None:
+                raise NotReady(*REMOVED)
+            return  # no history was begun
         try:
-            key = self.key
+            (note,), key = read_notes(newest), self.key
         except (BadSettings, Corrupt) as error:
             raise NotReady(error.message, *error.remedies) from error
         if not note.signed_by(key.public):
             raise NotReady(
-                f"The history of this database was signed with another key than that in {self.key_file}, and what is "
-                "written with this one could not be verified.",
-                "Put the right key there, or name its file in SKILLS_SIGNING_KEY. If it is lost, restore a backup into "
-                "an empty database, whose history then goes on with this key.",
+                "The history of this database was signed with another key, and what is written with this one could not "
+                "be verified.",
+                "Name the file of the right key in SKILLS_SIGNING_KEY. If it is lost, restore a backup into an empty "
+                "database, whose history then goes on with this key.",
             )
         if kept is None or kept == note:
             return
@@ -276,11 +286,11 @@ class History:
             return  # a history that has just begun takes the place of another
         known = select(CHECKPOINTS.c.row).where(CHECKPOINTS.c.size == head.size, CHECKPOINTS.c.note == kept.text)
         if connection.scalar(known) is None:
-            how = "older than" if (head.origin, here.size < head.size) == (here.origin, True) else "another than"
+            is_older = head.origin == here.origin and here.size < head.size
             raise NotReady(
-                f"This database is {how} the one whose history was kept last: that one has "
-                f"{head.size} leaves, and this {here.size} without that head. Releases that were withdrawn, keys "
-                "that were revoked, consent that was withdrawn and erased surgeons may be back in it.",
+                f"This database is {'older' if is_older else 'another'} than the one whose history was kept last: that "
+                f"one has {head.size} leaves, and this {here.size} without that head. Withdrawn releases and consents, "
+                "revoked keys and erased surgeons may be back in it.",
                 "Put the right copy of the database back.",
                 Remedy(Action.ACCEPT_ROLLBACK),
             )
@@ -311,8 +321,9 @@ class History:
             return
         if self._seal is None:
             origin = self.origin(connection)
-            assert origin is not None, "no history was begun: migrate first"
             self.compare(connection, self.kept_head())
+            if origin is None:
+                raise NotReady(*REMOVED)
             self._seal = self.key.seal_of(origin)
         if self.refused is not None:
             raise self.refused
@@ -323,11 +334,19 @@ class History:
     # ---- beginning, migrations and restorations
 
     def begin(self, connection: Connection) -> None:
-        """Begin a history, if there is none: make a key, and log every row and the schema as they are found."""
+        """Begin a history, if there is none: make a key, and log every row and the schema as they are found.
+
+        Raises:
+            NotReady: There are rows, and there was a history: to log them as found would vouch for them.
+        """
         self._origin = self._seal = None  # of a history that a downgrade may have dropped
         connection.info[NOTING] = True
         if not inspect(connection).has_table(LEAVES.name) or self.origin(connection) is not None:
             return
+        had_one = self.kept_head() is not None or connection.scalar(select(LEAVES.c.row).limit(1)) is not None
+        if had_one and any(True for table in logged().values() for _ in table.pages(connection)):
+            self.refused = NotReady(*REMOVED)
+            raise self.refused
         self.sign_empty(connection)
         at = rfc3339(now())
         for table in logged().values():

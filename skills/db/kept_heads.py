@@ -47,13 +47,13 @@ def last_head(file: Path) -> Note | None:
             tail = kept.read().decode(errors="replace")
         # a note has two paragraphs, and a blank line follows it
         return read_notes("\n\n".join(tail.split("\n\n")[-3:-1]) + "\n")[0] if size else None
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         return None
     except (OSError, Corrupt) as error:
         why = error.strerror if isinstance(error, OSError) else "it does not end in a signed checkpoint"
         raise NotReady(
-            f"The kept heads of the history, {file}, cannot be read ({why}), so an older copy of the database would "
-            "not be noticed.",
+            f"The kept heads of the history cannot be read ({why}), so an older copy of the database would not be "
+            "noticed.",
             "Put the file back as the service wrote it.",
             ANOTHER,
         ) from error

@@ -90,7 +90,8 @@ def test_a_signing_key_that_is_missing_or_unreadable_is_named(installation: Sett
     with serving(installation.database_url, signing_key=key) as service:
         key.unlink()
         problem = assert_problem(service.http.get("/readyz"), 503, "not-ready")
-    assert "signing.key is missing" in problem["detail"]
+    assert "The signing key is missing" in problem["detail"]
+    assert str(tmp_path) not in problem["detail"]
     assert "SKILLS_SIGNING_KEY" in problem["detail"]
 
 
