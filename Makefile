@@ -13,7 +13,7 @@ export SKILLS_PAPER_DATA ?= $(abspath $(wildcard ../shared/paper/data))
 export SKILLS_TEST_JIGSAWS ?= $(abspath $(wildcard ../shared/jigsaws))
 export SKILLS_TEST_BENCHMARKS ?= $(abspath $(wildcard ../shared/benchmarks))
 
-.PHONY: demo test serve docs bench faults nightly mutants deep lint lock wheelhouse wheel-check fixture clean
+.PHONY: demo test serve docs bench faults nightly mutants deep lint lock wheelhouse wheel-check clean
 
 # uv where it is present, venv and pip otherwise; either way the same versions, checked by their hashes. One package,
 # movement-primitives, comes as source: setuptools is there first, and it is built before Cython, a need of python-fcl, is
@@ -128,10 +128,6 @@ wheelhouse:
 PYTHONS ?= $(PYTHON)
 wheel-check:
 	@sh tests/wheel.sh $(PYTHONS)
-
-# A populated installation of this version, which later ones must take over: once at each release (CONTRIBUTING.md).
-fixture: $(READY)
-	@$(BIN)/python -m tests.migrations.make_fixture
 
 clean:
 	rm -rf $(VENV) build .cache

@@ -43,7 +43,6 @@ ON_BOTH = {
     "test_up_makes_exactly_the_tables_of_the_models",
     "test_a_migration_that_fails_half_way_leaves_nothing",
     "test_two_services_that_start_together_migrate_once",
-    "test_a_release_is_taken_over_and_serves_the_same_bytes",
     # the history
     "test_the_triggers_note_every_logged_table",
     "test_what_the_service_wrote_is_whole_and_signed",

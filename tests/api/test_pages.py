@@ -1,7 +1,6 @@
 """The pages without a browser: their content, the markup that they escape, and the data of their views."""
 
 import re
-import shutil
 from collections.abc import Iterator
 from functools import cache
 from html.parser import HTMLParser
@@ -25,7 +24,6 @@ from tests import backends
 from tests.api.keyed import As, copy_of_told, key
 from tests.api.service import CSV, KESTREL, Service, assert_problem, serving
 from tests.library import cases, hospital
-from tests.migrations.make_fixture import RELEASES
 
 STYLE = f"/pages/styles/kestrel/{cases.SUTURE}"
 NASTY = """<script>alert(1)</script>'"><img src=x onerror=alert(2)>{{ 7 * 7 }}"""
@@ -135,14 +133,6 @@ def test_behind_a_prefix_every_address_has_it(tmp_path: Path) -> None:
             page = page_of(service, path)
             assert all(address.startswith(("/lab/skills/", "#")) for address in page.addresses()), path
             assert ("meta", {"name": "root", "content": "/lab/skills"}) in page.tags
-
-
-def test_an_installation_of_an_older_version_has_all_its_pages(tmp_path: Path) -> None:
-    for release in sorted(RELEASES.iterdir()):
-        shutil.copy(release / "skills.sqlite", tmp_path / f"{release.name}.sqlite")
-        with serving(f"sqlite:///{tmp_path / release.name}.sqlite") as service:
-            for path in every_page(service):
-                page_of(service, path)
 
 
 def test_an_empty_service_says_how_to_begin(service: Service) -> None:
