@@ -22,6 +22,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from skills.arithmetic import arcsin, arctan2, cos, product, sin
 from skills.arrays import Flags, Floats, Ints, frozen
 from skills.errors import BadInput, ImproperRotation, UnknownInstrument, Unreachable
 from skills.fields import Point, Six, schema
@@ -198,8 +199,8 @@ def forward(joints: ArrayLike, instrument: str = DEFAULT_INSTRUMENT) -> tuple[Fl
         (-pi / 2, 0.0, q[:, 4] - pi / 2, 0.0),
         (-pi / 2, WRIST_MM, q[:, 5] - pi / 2, 0.0),
     ):
-        pose = pose @ _link(alpha, a, theta, d, len(q))
-    return pose[:, :3, 3].copy(), pose[:, :3, :3] @ _TIP_IN_HINGE
+        pose = product(pose, _link(alpha, a, theta, d, len(q)))
+    return pose[:, :3, 3].copy(), product(pose[:, :3, :3], _TIP_IN_HINGE)
 
 
 def axes_of(joints: Floats) -> tuple[Floats, Floats, Floats]:
@@ -215,7 +216,7 @@ def axes_of(joints: Floats) -> tuple[Floats, Floats, Floats]:
         The direction of the shaft and that from the wrist's pitch axis to the hinge of the jaws, in the PSM base frame,
         each of shape (T, 3); and the rotation of the tip [n o a], shape (T, 3, 3).
     """
-    (s1, s2, s4, s5, s6), (c1, c2, c4, c5, c6) = (f(joints[:, (0, 1, 3, 4, 5)]).T[:, :, None] for f in (np.sin, np.cos))
+    (s1, s2, s4, s5, s6), (c1, c2, c4, c5, c6) = (f(joints[:, (0, 1, 3, 4, 5)]).T[:, :, None] for f in (sin, cos))
     shaft = np.concatenate([c2 * s1, -s2, -c2 * c1], axis=1)
     x3 = np.concatenate([-s1 * s2, -c2, c1 * s2], axis=1)
     y3 = _cross(shaft, x3)
@@ -228,9 +229,9 @@ def axes_of(joints: Floats) -> tuple[Floats, Floats, Floats]:
 
 def _link(alpha: float, a: float, theta: Floats | float, d: Floats | float, count: int) -> Floats:
     """Return one row of the modified DH table as a homogeneous transform per sample, shape (T, 4, 4)."""
-    # Exact for the table's multiples of a right angle, where np.cos(pi / 2) would leave 6e-17.
-    ca, sa = float(np.round(np.cos(alpha), 12)), float(np.round(np.sin(alpha), 12))
-    ct, st = np.cos(theta), np.sin(theta)
+    # Exact for the table's multiples of a right angle, where cos(pi / 2) would leave 6e-17.
+    ca, sa = float(np.round(cos(alpha), 12)), float(np.round(sin(alpha), 12))
+    ct, st = cos(theta), sin(theta)
     link = np.zeros((count, 4, 4))
     link[:, 0, 0], link[:, 0, 1], link[:, 0, 3] = ct, -st, a
     link[:, 1, 0], link[:, 1, 1], link[:, 1, 2], link[:, 1, 3] = st * ca, ct * ca, -sa, -sa * d
@@ -385,7 +386,7 @@ def solutions_of(tip: Floats, rotation: Floats, tool: InstrumentConstants) -> Fl
     Returns:
         Joints, rad and mm, shape (T, 6, 6): solutions, then joints; NaN where the wrist is in the remote centre.
     """
-    hinge = rotation @ _TIP_IN_HINGE.T
+    hinge = product(rotation, _TIP_IN_HINGE.T)
     x6, z6 = hinge[:, :, 0], hinge[:, :, 2]
     normal = _cross(tip, z6)
     length = np.linalg.norm(normal, axis=1, keepdims=True)
@@ -405,15 +406,15 @@ def _wrists(tip: Floats, x6: Floats, z6: Floats, z5: Floats, tool: InstrumentCon
     depth = np.linalg.norm(wrist, axis=-1)
     # With the wrist in the remote centre the shaft's direction is undetermined; the wrist is inside the cannula there.
     shaft = wrist / np.where(depth > 1e-6, depth, np.nan)[..., None]
-    yaw = np.arctan2(shaft[..., 0], -shaft[..., 2])
-    pitch = -np.arcsin(np.clip(shaft[..., 1], -1.0, 1.0))
-    s1, c1, s2, c2 = np.sin(yaw), np.cos(yaw), np.sin(pitch), np.cos(pitch)
+    yaw = arctan2(shaft[..., 0], -shaft[..., 2])
+    pitch = -arcsin(np.clip(shaft[..., 1], -1.0, 1.0))
+    s1, c1, s2, c2 = sin(yaw), cos(yaw), sin(pitch), cos(pitch)
     x3 = np.stack([-s1 * s2, -c2, c1 * s2], axis=-1)
     y3 = _cross(shaft, x3)
-    roll = np.arctan2(-_dot(z5, x3), _dot(z5, y3))
-    x4 = np.cos(roll)[..., None] * x3 + np.sin(roll)[..., None] * y3
-    wrist_pitch = _wrapped(np.arctan2(-_dot(x5, shaft), _dot(x5, x4)) + pi / 2)
-    wrist_yaw = _wrapped(np.arctan2(-_dot(x6, z5), _dot(x6, x5)) + pi / 2)
+    roll = arctan2(-_dot(z5, x3), _dot(z5, y3))
+    x4 = cos(roll)[..., None] * x3 + sin(roll)[..., None] * y3
+    wrist_pitch = _wrapped(arctan2(-_dot(x5, shaft), _dot(x5, x4)) + pi / 2)
+    wrist_yaw = _wrapped(arctan2(-_dot(x6, z5), _dot(x6, x5)) + pi / 2)
     return np.stack([yaw, pitch, depth + tool.wrist_offset_mm, roll, wrist_pitch, wrist_yaw], axis=-1)
 
 
@@ -504,7 +505,7 @@ def check_rotation(rotation: Floats) -> None:
     Raises:
         ImproperRotation: A matrix is not orthonormal with determinant 1; `sample` is the index of the first.
     """
-    skew = np.abs(np.swapaxes(rotation, -1, -2) @ rotation - np.eye(3)).max(axis=(-1, -2), initial=0.0)
+    skew = np.abs(product(np.swapaxes(rotation, -1, -2), rotation) - np.eye(3)).max(axis=(-1, -2), initial=0.0)
     good = (skew < 1e-6) & (np.linalg.det(rotation) > 0)
     if not good.all():
         sample = int(np.argmin(good))
@@ -584,5 +585,5 @@ def angle_between(rotation: Floats, other: Floats) -> Floats:
     Returns:
         Angles in rad, 0 to pi, shape (T,).
     """
-    q = quaternion_of(np.swapaxes(rotation, -1, -2) @ other)
-    return np.asarray(2 * np.arctan2(np.linalg.norm(q[:, :3], axis=1), np.abs(q[:, 3])))
+    q = quaternion_of(product(np.swapaxes(rotation, -1, -2), other))
+    return np.asarray(2 * arctan2(np.linalg.norm(q[:, :3], axis=1), np.abs(q[:, 3])))

@@ -39,6 +39,7 @@ from typing import ClassVar, Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
+from skills.arithmetic import product
 from skills.arrays import Floats, frozen
 from skills.comparison.distances import TREMOR_S, distances, medoid, placed, resampled
 from skills.demonstration.demonstration import Demo
@@ -67,7 +68,8 @@ def moved(demo: Demo, start_mm: ArrayLike, goal_mm: ArrayLike) -> Demo:
             is outside `SCALES`.
     """
     start, goal = (frozen(one, np.float64, (3,), name) for one, name in ((start_mm, "start_mm"), (goal_mm, "goal_mm")))
-    scale = np.linalg.norm(goal - start) / max(np.linalg.norm(demo.tip_mm[-1] - demo.tip_mm[0]), np.finfo(float).tiny)
+    lengths = np.linalg.norm([goal - start, demo.tip_mm[-1] - demo.tip_mm[0]], axis=1)
+    scale = lengths[0] / max(lengths[1], np.finfo(float).tiny)
     if not SCALES[0] <= scale <= SCALES[1]:
         raise BadPath(
             f"From its start to its goal the new path is {scale:.3g} times as long as the demonstrated one; a "
@@ -75,9 +77,9 @@ def moved(demo: Demo, start_mm: ArrayLike, goal_mm: ArrayLike) -> Demo:
             scale=float(scale),
         )
     tip_mm = laid(placed(demo.tip_mm, scaled=True), start, goal)
-    turn = axes(start, goal).T @ axes(demo.tip_mm[0], demo.tip_mm[-1])
+    turn = product(axes(start, goal).T, axes(demo.tip_mm[0], demo.tip_mm[-1]))
     seen = demo.rotation_xyzw
-    rotation = None if seen is None else quaternion_of(turn @ matrix_of(seen))
+    rotation = None if seen is None else quaternion_of(product(turn, matrix_of(seen)))
     return replace(demo, tip_mm=tip_mm, rotation_xyzw=rotation, partner=None)
 
 
@@ -92,8 +94,8 @@ def laid(shape: Floats, start_mm: Floats, goal_mm: Floats) -> Floats:
     Raises:
         BadPath: They lie within a millimetre of each other.
     """
-    length_mm = np.linalg.norm(goal_mm - start_mm)
-    return np.asarray(start_mm + length_mm * shape @ axes(start_mm, goal_mm))
+    length_mm = np.linalg.norm(goal_mm - start_mm, axis=-1)
+    return np.asarray(start_mm + product(length_mm * shape, axes(start_mm, goal_mm)))
 
 
 def axes(start_mm: Floats, goal_mm: Floats) -> Floats:

@@ -32,6 +32,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from skills.arithmetic import product
 from skills.arrays import Floats, Ints, frozen
 from skills.comparison import _kernels
 from skills.demonstration.demonstration import Demo
@@ -100,8 +101,8 @@ def placed(tip_mm: Floats, *, scaled: bool = False) -> Floats:
     Raises:
         BadPath: It ends within `LEAST_MM` of its start.
     """
-    length_mm = float(np.linalg.norm(tip_mm[-1] - tip_mm[0]))
-    there = (tip_mm - tip_mm[0]) @ own_axes(tip_mm).T / (length_mm if scaled else 1.0)
+    length_mm = float(np.linalg.norm(tip_mm[-1] - tip_mm[0], axis=-1))
+    there = product(tip_mm - tip_mm[0], own_axes(tip_mm).T) / (length_mm if scaled else 1.0)
     return frozen(there, np.float64, (None, 3), "tip_mm")
 
 
@@ -115,7 +116,7 @@ def own_axes(tip_mm: Floats) -> Floats:
         BadPath: It ends within `LEAST_MM` of its start.
     """
     way_mm = tip_mm[-1] - tip_mm[0]
-    length_mm = float(np.linalg.norm(way_mm))
+    length_mm = float(np.linalg.norm(way_mm, axis=-1))
     if not length_mm >= LEAST_MM:
         raise BadPath(
             f"It ends {length_mm:.2f} mm from where it began, so it has no direction and cannot be compared; cut "
@@ -124,8 +125,8 @@ def own_axes(tip_mm: Floats) -> Floats:
         )
     x = way_mm / length_mm
     up = np.array([0.0, 0.0, 1.0] if abs(x[2]) < STEEPEST else [0.0, 1.0, 0.0])
-    z = up - (up @ x) * x
-    z /= np.linalg.norm(z)
+    z = up - product(up, x) * x
+    z /= np.linalg.norm(z, axis=-1)
     return np.stack([x, np.cross(z, x), z])
 
 

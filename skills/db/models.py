@@ -46,15 +46,17 @@ from skills.learning.q_learning import PhaseQLearning, Training
 from skills.learning.tube import CertifiedPoses
 from skills.learning.tube_certificate import TubeCertificate, TubeLimits
 from skills.packing import added_later, few_numbers
-from skills.planning.handoff import PsmM
-from skills.planning.motion_laws import Pose
+from skills.planning.handoff import OtherArm, PsmM
+from skills.planning.motion_laws import Pose, Poses
 from skills.planning.path_fit import Hand
 from skills.planning.plan import Departure, Pass, SuturePlan, SuturePoint
+from skills.planning.trajectory import Trajectory
 from skills.verification.playback import Pictures, Playback
 
 stored(GridWorld, GridPath, RewardLevels, *LEARNERS.values(), Training, Network, ShortestWay)
 stored(SuturePoint, Pass, Pause, Partner, PsmM, Hand, Pose, Departure)
 stored(PosePath, PartnerMotion, TubeLimits, TubeCertificate)
+stored(Trajectory, OtherArm, Poses)
 stored(Surroundings, Scene, SceneCosts, Box, Capsule, Tissue)
 # Left out of the serialised value while they hold their default, so that the digests of older values stay the same.
 added_later(GridPath, "hysteresis")

@@ -41,9 +41,21 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from skills.arithmetic import arccos, arcsin, product
 from skills.arrays import Floats, frozen, xyz
 from skills.fields import Count, Point, Quaternion, schema
-from skills.kinematics import CLASSIC, INSERTION, JAW_TIP_MM, SI, ArmConstants, axes_of, check_rotation, quaternion_of
+from skills.kinematics import (
+    CLASSIC,
+    INSERTION,
+    JAW_TIP_MM,
+    SI,
+    ArmConstants,
+    axes_of,
+    check_rotation,
+    matrix_of,
+    quaternion_of,
+)
+from skills.quaternions import best_turn
 
 FIT_MM = 1.0  # a recorder that writes the last joints it has at 30 Hz is off by 0.5 mm at 50 mm/s
 FIT_RAD = 0.03  # the same of a wrist that turns at 3 rad/s
@@ -341,7 +353,7 @@ def _without_delay(poses: _Poses, one: _Hypothesis) -> _Poses:
     for _ in range(3):
         fit, tip = _fit(now, one), now.tips_of(one)
         shift = (poses.moved(now.joints + step_s * poses.speeds).tips_of(one) - tip) / step_s
-        off = (now.tip_mm - fit.position_mm) @ fit.rotation - tip
+        off = product(now.tip_mm - fit.position_mm, fit.rotation) - tip
         way = float((shift**2).sum())
         if not way > 0.0:
             return poses
@@ -365,14 +377,13 @@ def _fit(poses: _Poses, one: _Hypothesis) -> _Fit:
     if poses.in_base:
         return _Fit(one, np.zeros(3), np.eye(3), np.linalg.norm(poses.tip_mm - tip, axis=1), _turn(poses, np.eye(3)))
     middle, recorded = tip.mean(axis=0), poses.tip_mm.mean(axis=0)
-    covariance = (poses.tip_mm - recorded).T @ (tip - middle) / len(tip)
+    covariance = np.einsum("ni,nj->ij", poses.tip_mm - recorded, tip - middle) / len(tip)
     if poses.rotation is not None:
         # The sum of R_recorded R_predicted^T; both sums are largest for the same rotation if the hypothesis is right.
-        covariance += LEVER_MM**2 * np.tensordot(poses.rotation, poses.turned, axes=([0, 2], [0, 2])) / len(tip)
-    left, _, right = np.linalg.svd(covariance)
-    rotation = left @ np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))]) @ right
-    position = recorded - rotation @ middle
-    away = np.linalg.norm(poses.tip_mm - position - tip @ rotation.T, axis=1)
+        covariance += LEVER_MM**2 * np.einsum("nik,njk->ij", poses.rotation, poses.turned) / len(tip)
+    rotation = matrix_of(best_turn(covariance)[None])[0]
+    position = recorded - product(rotation, middle)
+    away = np.linalg.norm(poses.tip_mm - position - product(tip, rotation.T), axis=1)
     return _Fit(one, position, rotation, away, _turn(poses, rotation))
 
 
@@ -380,8 +391,8 @@ def _turn(poses: _Poses, rotation: Floats) -> float:
     """Return the root mean square of the angles between recorded and predicted orientations; 0 if none are recorded."""
     if poses.rotation is None:
         return 0.0
-    chord = np.sqrt(((poses.rotation - rotation @ poses.turned) ** 2).sum(axis=(1, 2)) / 8.0)
-    return float(np.sqrt(((2.0 * np.arcsin(np.minimum(1.0, chord))) ** 2).mean()))
+    chord = np.sqrt(((poses.rotation - product(rotation, poses.turned)) ** 2).sum(axis=(1, 2)) / 8.0)
+    return float(np.sqrt(((2.0 * arcsin(np.minimum(1.0, chord))) ** 2).mean()))
 
 
 # ---- the decision -----------------------------------------------------------------------------------------------
@@ -448,7 +459,7 @@ def _beside_the_base(poses: _Poses, best: _Fit) -> Identification | None:
 
 def _wrong_frame(poses: _Poses, free: _Fit) -> Identification:
     x, y, z = free.position_mm.tolist()
-    turn = np.degrees(np.arccos(np.clip((np.trace(free.rotation) - 1.0) / 2.0, -1.0, 1.0)))
+    turn = np.degrees(arccos(np.clip((np.trace(free.rotation) - 1.0) / 2.0, -1.0, 1.0)))
     reason = (
         f"the poses are stated to be relative to the arm's base, but the joints put the base at ({x:.1f}, {y:.1f}, "
         f"{z:.1f}) mm in their frame, turned by {turn:.1f} degrees"
@@ -485,7 +496,7 @@ def _told(
 
 def _is_identity(fit: _Fit) -> bool:
     """Return whether the fitted transform is none, within the residual."""
-    away = np.linalg.norm(fit.position_mm) + 200.0 * np.abs(fit.rotation - np.eye(3)).max()
+    away = np.linalg.norm(fit.position_mm, axis=-1) + 200.0 * np.abs(fit.rotation - np.eye(3)).max()
     return bool(away <= max(MARGIN * fit.residual_mm, 0.1))
 
 

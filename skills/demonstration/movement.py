@@ -26,13 +26,16 @@ tap of the pedal is a command to the console and no pause.
 
 from bisect import bisect_left
 from dataclasses import dataclass
+from math import pi
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from skills.arithmetic import cos
 from skills.arrays import Flags, Floats, Ints
 from skills.demonstration.recording import Recording, Signal
+from skills.quaternions import INVERSE, angle_of, multiplied
 
 MOVING_MM_S = 2.0  # above the drift of a held hand, far below the 20-90 mm/s of a hand-off
 TURNING_RAD_S = 0.15  # 9 degrees/s: above an unsteady wrist, below the 45 degrees/s of an intended turn
@@ -139,10 +142,12 @@ def smoothed_tip(seconds: Floats, tip_mm: Floats, window_s: float) -> tuple[Floa
     step_s = duration / (count - 1)
     # The bound in grid steps keeps the window small: with samples nanoseconds apart it would take gigabytes.
     half = 0 if duration == 0 else int(min(window_s / step_s / 2, window_s / GRID_STEP_S))
-    window = np.hanning(2 * half + 3)[1:-1]
+    window = 0.5 - 0.5 * cos(np.arange(1, 2 * half + 2) * (pi / (half + 1)))
     even = [np.interp(grid_s, seconds, axis) for axis in tip_mm.T]
-    smooth = [np.convolve(np.pad(axis, half, mode="edge"), window / window.sum(), mode="valid") for axis in even]
-    return grid_s, np.stack(smooth, axis=1)
+    rested = np.pad(np.stack(even, axis=1), ((half, half), (0, 0)), mode="edge")
+    window = window / window.sum()
+    smooth = sum(weight * rested[at : at + count] for at, weight in enumerate(window.tolist()))
+    return grid_s, np.asarray(smooth)
 
 
 def spans_of(seconds: Floats, on: Flags) -> list[Span]:
@@ -256,7 +261,7 @@ def angle_between(one_xyzw: Floats, other_xyzw: Floats) -> float:
     Returns:
         The angle in rad, 0 to pi.
     """
-    return float(2.0 * np.arccos(min(1.0, abs(float(one_xyzw @ other_xyzw)))))
+    return float(angle_of(multiplied(one_xyzw * INVERSE, other_xyzw)))
 
 
 def _rate(grid_s: Floats, values: Floats) -> Floats:

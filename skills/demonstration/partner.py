@@ -125,7 +125,7 @@ def partner_at(
         if seen is None:
             continue
         (position,), (rotation,) = seen
-        apart_mm = float(np.linalg.norm(position - motion.tip_mm[here]))
+        apart_mm = float(np.linalg.norm(position - motion.tip_mm[here], axis=-1))
         if apart_mm <= NEAR_MM:
             base_mm, base_xyzw = (None, None) if base is None else _other_base(base, other.arm, bases)
             tool = _instrument_of(recording, other.arm)
@@ -380,7 +380,8 @@ class _Observed:
         one = self.overlap
         deviation_mm = 0.0 if self.apart_mm is None or usual_mm is None else abs(self.apart_mm - usual_mm)
         seen = (1.0, self.slip_mm, min(self.parted_mm, PARTED_MM), deviation_mm)
-        odds = float(np.dot(WITHOUT_FRAME if self.apart_mm is None else WEIGHTS, seen))
+        weights = WITHOUT_FRAME if self.apart_mm is None else WEIGHTS
+        odds = sum(weight * value for weight, value in zip(weights, seen, strict=True))
         confidence = 1.0 / (1.0 + exp(-max(odds, -ODDS)))
         return NeedleTransfer(one.giver, one.taker, one.held_s, one.taken_s, one.released_s, self.slip_mm, confidence)
 

@@ -34,6 +34,7 @@ from skills.demonstration.movement import (
 )
 from skills.demonstration.segments import arrival
 from skills.fields import Count, Fraction, Point, stored_schema
+from skills.quaternions import INVERSE, angle_of, multiplied, unit
 
 IDLE_MM_S = 1.0
 SHORTEST_S = 0.1  # of a stretch between two pauses: from a shorter one no meaningful speed can be computed
@@ -193,9 +194,8 @@ def _orientation_change(demo: Demo, until_s: float) -> float | None:
     if demo.rotation_xyzw is None:
         return None
     rotation: Floats = demo.rotation_xyzw[demo.stamps_s <= until_s]
-    unit = rotation / np.linalg.norm(rotation, axis=1, keepdims=True)
-    cosine = np.abs(unit @ unit[0]).min()
-    return float(2.0 * np.arccos(min(1.0, cosine)))
+    turned = unit(rotation)
+    return float(angle_of(multiplied(turned[0] * INVERSE, turned)).max())
 
 
 def _advice(report: MotionReport, *, has_jaw: bool) -> tuple[str, ...]:

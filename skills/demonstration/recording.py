@@ -21,6 +21,7 @@ from typing import Literal
 
 import numpy as np
 
+from skills.arithmetic import product
 from skills.arrays import Floats, Ints
 from skills.demonstration.identification import (
     MOST_SAMPLES,
@@ -41,6 +42,7 @@ from skills.demonstration.motion import (
 from skills.errors import NoUsableTopic, UnreadableRecording
 from skills.fields import Count, Point, Quaternion, schema
 from skills.kinematics import matrix_of, quaternion_of
+from skills.quaternions import INVERSE, angle_of, best_turn, multiplied, turned, unit
 from skills.remedies import did_you_mean
 
 BASES_LIMIT = 64  # ours: pairs of motions of one arm in two frames; a dVRK's recording has one or two per arm
@@ -49,8 +51,6 @@ PAIRS_LEAST = 10  # ours: from fewer pairs it cannot be concluded that a base st
 IDENTIFIED_LIMIT = 16  # ours: pairs of joints and poses that are compared, each for 0.1 s; a dVRK has two per arm
 JOINT_GAP_NS = 50_000_000  # ours: joints further apart in time are not interpolated
 WIDE_MM = 2.0  # ours: a rotation cannot be fitted to tips that move less than this in a second direction
-
-_INVERSE = np.array([-1.0, -1.0, -1.0, 1.0])  # a unit quaternion x, y, z, w times this is its inverse
 
 
 @schema
@@ -92,8 +92,8 @@ class BaseFrame:
             The same in `local_frame`.
         """
         turn = matrix_of(np.array([self.rotation_xyzw]))[0]
-        rotation = quaternion_of(turn.T @ matrix_of(rotation_xyzw))
-        return (position_mm - np.asarray(self.position_mm)) @ turn, rotation
+        rotation = quaternion_of(product(turn.T, matrix_of(rotation_xyzw)))
+        return product(position_mm - np.asarray(self.position_mm), turn), rotation
 
 
 def identified_arms(
@@ -202,13 +202,13 @@ def _base_frame(local: Motion, other: Motion) -> BaseFrame | None:
     if len(here) < PAIRS_LEAST:
         return None
     assert local.rotation_xyzw is not None and other.rotation_xyzw is not None
-    turns = _unit(_product(other.rotation_xyzw[there], local.rotation_xyzw[here] * _INVERSE))
-    turns *= np.where(turns @ turns[0] < 0, -1.0, 1.0)[:, None]  # q and -q are the same turn
+    turns = unit(multiplied(other.rotation_xyzw[there], local.rotation_xyzw[here] * INVERSE))
+    turns *= np.where(product(turns, turns[0]) < 0, -1.0, 1.0)[:, None]  # q and -q are the same turn
     # The smaller misfit of the tips decides, because recorded orientations may disagree with the tips.
     turn = min(_candidates(turns, local.tip_mm[here], other.tip_mm[there]), key=lambda one: one[0])[1]
-    places = other.tip_mm[there] - _turned(turn, local.tip_mm[here])
+    places = other.tip_mm[there] - turned(turn, local.tip_mm[here])
     place = np.median(places, axis=0)
-    sine = np.linalg.norm(_product(turns, turn * _INVERSE)[:, :3], axis=1).max()
+    spread_rad = float(angle_of(multiplied(turns, turn * INVERSE)).max())
     x, y, z = place.tolist()
     qx, qy, qz, qw = turn.tolist()
     return BaseFrame(
@@ -218,7 +218,7 @@ def _base_frame(local: Motion, other: Motion) -> BaseFrame | None:
         position_mm=(x, y, z),
         rotation_xyzw=(qx, qy, qz, qw),
         spread_mm=float(np.linalg.norm(places - place, axis=1).max()),
-        spread_rad=float(2.0 * np.arcsin(min(1.0, sine))),
+        spread_rad=spread_rad,
     )
 
 
@@ -227,15 +227,15 @@ def _candidates(turns: Floats, here_mm: Floats, there_mm: Floats) -> Iterator[tu
 
     The fit (Kabsch) is determined only if the tips move in more than one direction.
     """
-    found = [_unit(np.median(turns, axis=0))]
+    found = [unit(np.median(turns, axis=0))]
     one, other = here_mm - here_mm.mean(axis=0), there_mm - there_mm.mean(axis=0)
-    left, size, right = np.linalg.svd(other.T @ one)
-    if size[1] > len(one) * WIDE_MM**2:
-        # The last sign makes it a rotation: the best fit of flat or noisy points may be a reflection.
-        proper = np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
-        found.append(quaternion_of((left @ proper @ right)[None])[0])
+    spread = np.einsum("ni,nj->ij", one, one)
+    size = np.trace(spread)
+    # The sum of products of two principal spreads, over that of the spreads: nearly the second one.
+    if size * size - (spread * spread).sum() > 2 * size * len(one) * WIDE_MM**2:
+        found.append(best_turn(np.einsum("ni,nj->ij", other, one)))
     for turn in found:
-        places = there_mm - _turned(turn, here_mm)
+        places = there_mm - turned(turn, here_mm)
         yield float(np.median(np.linalg.norm(places - np.median(places, axis=0), axis=1))), turn
 
 
@@ -250,26 +250,6 @@ def _pairs(stamps_ns: Ints, others_ns: Ints) -> tuple[Ints, Ints]:
     nearer = np.where(stamps_ns - others_ns[before] <= others_ns[after] - stamps_ns, before, after)
     near = np.flatnonzero(np.abs(others_ns[nearer] - stamps_ns) <= PAIR_NS)
     return near, nearer[near]
-
-
-def _product(one: Floats, other: Floats) -> Floats:
-    """Multiply quaternions x, y, z, w."""
-    v, w = one[..., :3], one[..., 3:]
-    u, t = other[..., :3], other[..., 3:]
-    vector = w * u + t * v + np.cross(v, u)
-    return np.concatenate([vector, w * t - (v * u).sum(axis=-1, keepdims=True)], axis=-1)
-
-
-def _turned(turn: Floats, points_mm: Floats) -> Floats:
-    """Rotate points, shape (N, 3), by one unit quaternion."""
-    across = 2.0 * np.cross(turn[:3], points_mm)
-    turned: Floats = points_mm + turn[3] * across + np.cross(turn[:3], across)
-    return turned
-
-
-def _unit(quaternions: Floats) -> Floats:
-    unit: Floats = quaternions / np.linalg.norm(quaternions, axis=-1, keepdims=True)
-    return unit
 
 
 __all__ = [

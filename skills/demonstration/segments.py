@@ -568,4 +568,4 @@ def _nearness(seen: _Seen, arm: str, second: float) -> str:
     if partner is None:
         return ""
     tip_mm = seen.movement.tip_mm[seen.movement.index(second)]
-    return f", {np.linalg.norm(tip_mm - np.array(partner.position_mm)):.0f} mm from this tip"
+    return f", {np.linalg.norm(tip_mm - np.array(partner.position_mm), axis=-1):.0f} mm from this tip"

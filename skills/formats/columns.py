@@ -12,11 +12,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from skills.arithmetic import cos, sin
 from skills.arrays import Floats, Ints
 from skills.demonstration.motion import COORDINATE_LIMIT_MM
 from skills.demonstration.recording import Motion, Signal, recorded_motion, recorded_signal
 from skills.errors import MixedFrames, NotAQuaternion, NotMetres, NoUsableTopic, SkillsError
 from skills.kinematics import INSTRUMENTS, JOINTS, UNITS, forward, instrument_of, quaternion_of
+from skills.quaternions import of_vector
 from skills.remedies import Action, Remedy
 
 BASE = "base"  # as a frame: the base of each arm
@@ -134,7 +136,7 @@ def quaternion_of_rpy(rpy_rad: Floats) -> Floats:
     Returns:
         Shape (T, 4).
     """
-    (cr, cp, cy), (sr, sp, sy) = np.cos(rpy_rad.T / 2), np.sin(rpy_rad.T / 2)
+    (cr, cp, cy), (sr, sp, sy) = cos(rpy_rad.T / 2), sin(rpy_rad.T / 2)
     x, y = sr * cp * cy - cr * sp * sy, cr * sp * cy + sr * cp * sy
     z, w = cr * cp * sy - sr * sp * cy, cr * cp * cy + sr * sp * sy
     return np.stack([x, y, z, w], axis=1)
@@ -162,8 +164,7 @@ def quaternion_of_vector(topic: str, vector_rad: Floats) -> Floats:
             "its columns with their unit, rx_rad or rx_deg.",
             sample=row,
         )
-    half = 0.5 * np.sinc(angle / _TURN_RAD)  # sin(angle / 2) / angle, which is 1/2 at 0
-    return np.column_stack([vector_rad * half[:, None], np.cos(angle / 2)])
+    return of_vector(vector_rad)
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ from typing import BinaryIO, Literal
 
 import numpy as np
 
+from skills.arithmetic import product
 from skills.arrays import Floats, Ints
 from skills.demonstration.recording import Label, Motion, Recording, Signal, Topic, recorded_motion
 from skills.errors import NotAQuaternion, NotFinite, UnreadableRecording
@@ -225,7 +226,7 @@ def _quaternions(arm: str, matrices: Floats) -> Floats:
     Raises:
         NotAQuaternion: A matrix deviates from orthonormality by more than `ORTHONORMAL`, or is a reflection.
     """
-    off = np.abs(matrices @ matrices.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+    off = np.abs(product(matrices, matrices.transpose(0, 2, 1)) - np.eye(3)).max(axis=(1, 2))
     wrong = (off > ORTHONORMAL) | (np.linalg.det(matrices) < 0)
     if wrong.any():
         row = int(np.argmax(wrong)) + 1

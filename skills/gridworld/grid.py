@@ -424,7 +424,7 @@ def describe_path(demo: Demo, path: GridPath) -> PathReport:
         bridged_cells=path.bridged,
         returns=returns,
         discretisation_rmse_mm=lost_mm,
-        discretisation_rmse_3d_mm=float(np.linalg.norm(lost_mm)),
+        discretisation_rmse_3d_mm=float(np.linalg.norm(lost_mm, axis=-1)),
         outside_paper_grid_share=outside,
         advised_hysteresis=advised,
         advice=advice,
@@ -464,10 +464,11 @@ def _calming(
     if len(calm.states) > CALMED_SHARE * len(path.states):
         return None, ()
     calm_mm = discretisation_rmse(demo.tip_mm, path.grid, CALMING_HYSTERESIS)
+    became_mm, was_mm = np.linalg.norm([calm_mm, lost_mm], axis=1)
     return CALMING_HYSTERESIS, (
         f"The path returns to the cell that it has just left {times_in_words(returns)}, as with a tremor at a "
         f"cell face. Request hysteresis {CALMING_HYSTERESIS}: {len(calm.states)} states instead of "
-        f"{len(path.states)}, at {np.linalg.norm(calm_mm):.1f} instead of {np.linalg.norm(lost_mm):.1f} mm.",
+        f"{len(path.states)}, at {became_mm:.1f} instead of {was_mm:.1f} mm.",
     )
 
 

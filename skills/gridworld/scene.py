@@ -27,10 +27,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from skills.arithmetic import product
 from skills.arrays import Flags, Floats, Ints, xyz
 from skills.errors import BadSettings
 from skills.fields import Point, schema
 from skills.gridworld.grid import MOVES, GridPath, GridWorld
+from skills.quaternions import unit
 
 STAY = 13  # the action that stays: (0, 0, 0), the middle one of the moves
 SAMPLES_A_STEP = 4  # a move is compared with tissue at points at most a quarter of the map's step apart
@@ -141,8 +143,8 @@ class Tissue:
                 heights=count,
             )
         normal, along = np.array(self.normal), np.array(self.along)
-        lengths = np.linalg.norm(normal) * np.linalg.norm(along)
-        if not (lengths > 0 and abs(normal @ along) <= SQUARE * lengths):
+        lengths = np.linalg.norm([normal, along], axis=1).prod()
+        if not (lengths > 0 and abs(product(normal, along)) <= SQUARE * lengths):
             raise BadSettings("`normal` and `along` of tissue must be perpendicular directions, neither of length 0.")
 
     @classmethod
@@ -154,15 +156,15 @@ class Tissue:
 
     def above_mm(self, points_mm: ArrayLike) -> Floats:
         """Return the height of points, (..., 3), above the surface along the normal, (...,); negative inside."""
-        normal, along = (np.array(one) / np.linalg.norm(one) for one in (self.normal, self.along))
+        normal, along = unit(np.array([self.normal, self.along]))
         apart = np.asarray(points_mm, float) - self.at_mm
         heights = np.array(self.heights_mm)
-        row, u = _between(apart @ along / self.step_mm, heights.shape[0])
-        column, v = _between(apart @ np.cross(normal, along) / self.step_mm, heights.shape[1])
+        row, u = _between(product(apart, along) / self.step_mm, heights.shape[0])
+        column, v = _between(product(apart, np.cross(normal, along)) / self.step_mm, heights.shape[1])
         next_row, next_column = (np.minimum(i + 1, n - 1) for i, n in zip((row, column), heights.shape, strict=True))
         near = (1 - v) * heights[row, column] + v * heights[row, next_column]
         far = (1 - v) * heights[next_row, column] + v * heights[next_row, next_column]
-        return np.asarray(apart @ normal - ((1 - u) * near + u * far))
+        return np.asarray(product(apart, normal) - ((1 - u) * near + u * far))
 
     @property
     def flat(self) -> bool:
@@ -189,10 +191,13 @@ class Tissue:
         """
         if self.flat:
             return np.asarray(np.minimum(self.above_mm(a_mm), self.above_mm(b_mm)))
-        heights, normal = np.array(self.heights_mm), np.array(self.normal) / np.linalg.norm(self.normal)
+        heights, normal = np.array(self.heights_mm), unit(np.array(self.normal))
         steep = self.steep
         # Only the part of a line that is not far above the highest point of the tissue can be near it.
-        top, up_a, up_b = heights.max() + within_mm * steep, *((end - self.at_mm) @ normal for end in (a_mm, b_mm))
+        top, up_a, up_b = (
+            heights.max() + within_mm * steep,
+            *(product(end - self.at_mm, normal) for end in (a_mm, b_mm)),
+        )
         with np.errstate(divide="ignore", invalid="ignore"):
             crossing = np.clip((top - up_a) / (up_b - up_a), 0, 1)
         first, last = np.where(up_a > top, crossing, 0.0), np.where(up_b > top, crossing, 1.0)
@@ -500,8 +505,8 @@ def _between_segments_mm(a: Floats, b: Floats, c: Floats, d: Floats) -> Floats:
     The nearest points are inside both, or one is an end.
     """
     u, v, w = b - a, d - c, a - c
-    uu, vv, uv = (u * u).sum(-1), float(v @ v), u @ v
-    uw, vw = (u * w).sum(-1), w @ v
+    uu, vv, uv = (u * u).sum(-1), (v * v).sum(-1), (u * v).sum(-1)
+    uw, vw = (u * w).sum(-1), (w * v).sum(-1)
     det = uu * vv - uv * uv
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         s, t = (uv * vw - vv * uw) / det, (uu * vw - uv * uw) / det
@@ -553,9 +558,11 @@ def tissue_of_mesh(
     if not (np.isfinite(step_mm) and step_mm >= LEAST_STEP_MM):
         raise BadSettings(f"step_mm of a height map must be {LEAST_STEP_MM:g} or more.", step_mm=step_mm)
     plane = Tissue.plane((0.0, 0.0, 0.0), normal)
-    up, along = (np.array(one) / np.linalg.norm(one) for one in (normal, plane.along))
+    up, along = unit(np.array([normal, plane.along]))
     axes = np.stack([along, np.cross(up, along)])
-    places = np.column_stack([points @ axes.T / step_mm, points @ up])[corners]  # (m, 3, 3): steps, steps, mm
+    places = np.column_stack([product(points, axes.T) / step_mm, product(points, up)])[
+        corners
+    ]  # (m, 3, 3): steps, steps, mm
     flat = places.reshape(-1, 3)
     first = np.ceil(flat[:, :2].min(axis=0) - ROUNDING)
     shape = np.floor(flat[:, :2].max(axis=0) + ROUNDING) - first + 1
@@ -583,7 +590,7 @@ def tissue_of_mesh(
                 missing=missing,
             )
         heights = np.where(covered, heights, np.maximum(heights, beyond_mm))
-    x, y, z = (first * step_mm @ axes).tolist()
+    x, y, z = product(first * step_mm, axes).tolist()
     rows = tuple(tuple(row) for row in heights.tolist())
     return Tissue((x, y, z), normal, plane.along, step_mm, rows)
 

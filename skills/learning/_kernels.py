@@ -22,6 +22,7 @@ SMALLEST_SINE = 1e-6  # of half an angle: below it, a share of the chord equals 
 SCATTER = np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio (Knuth 6.4): spreads similar bits over the table
 ACTIONS, HALF, LOW_HALF = np.uint64(27), np.uint64(32), np.uint64(0xFFFFFFFF)
 STEPS = (0, 4294967296, 6074001000, 7439101574)  # lengths of moves along 0 to 3 axes, in 2^-32 of a cell
+HALVES = tuple(0.5**power for power in range(64))  # a part of a sum that is smaller does not change it
 NEVER = 2**62  # length of an approach that never enters a waypoint
 
 
@@ -407,6 +408,45 @@ def spread_worth(
                                 worth[x, y, z] = top + step
 
 
+def sum_around(
+    numbers: Any,
+    powers: Any,
+    total: Any,
+    total_powers: Any,
+) -> None:
+    """Add up each cell of a grid and its neighbours, at most 27 numbers, each times a power of two.
+
+    Args:
+        numbers: Not negative, shape (nx, ny, nz), float64; all but 0 of the same size within a few powers of two.
+        powers: The power of two of each, shape (nx, ny, nz), int32.
+        total: The sums, shape (nx, ny, nz), float64: 0, or from 1 to below 2.
+        total_powers: The power of two of each, shape (nx, ny, nz), int32; 0 for a sum of 0.
+    """
+    nx, ny, nz = numbers.shape
+    for x in range(nx):
+        for y in range(ny):
+            for z in range(nz):
+                added, top = 0.0, 0
+                for to_x in range(max(x - 1, 0), min(x + 2, nx)):
+                    for to_y in range(max(y - 1, 0), min(y + 2, ny)):
+                        for to_z in range(max(z - 1, 0), min(z + 2, nz)):
+                            number, power = numbers[to_x, to_y, to_z], powers[to_x, to_y, to_z]
+                            if number == 0.0:
+                                continue
+                            if added == 0.0 or power - top >= len(HALVES):
+                                added, top = number, power
+                            elif power > top:
+                                added, top = added * HALVES[power - top] + number, power
+                            elif top - power < len(HALVES):
+                                added += number * HALVES[top - power]
+                while added >= 2.0:
+                    added, top = 0.5 * added, top + 1
+                while 0.0 < added < 1.0:
+                    added, top = 2.0 * added, top - 1
+                total[x, y, z] = added
+                total_powers[x, y, z] = top
+
+
 def find_equal(
     q: Any,
     tie: float,
@@ -785,6 +825,7 @@ sweep_compiled = compiled(sweep)
 settle_compiled = compiled(settle)
 spread_distances_compiled = compiled(spread_distances)
 spread_worth_compiled = compiled(spread_worth)
+sum_around_compiled = compiled(sum_around)
 find_equal_compiled = compiled(find_equal)
 choose_ways_compiled = compiled(choose_ways)
 count_off_rule_compiled = compiled(count_off_rule)

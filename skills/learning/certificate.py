@@ -11,7 +11,7 @@ values nearly cancel, actions are equally good also if they differ by less than 
 """
 
 from dataclasses import asdict, dataclass
-from math import ceil, inf
+from math import inf, prod
 
 import numpy as np
 from numpy.typing import NDArray
@@ -408,9 +408,9 @@ def least_gamma(policy: Policy) -> float | None:
     moves[policy.domain.may_meet] = 0
     _kernels.spread_distances_compiled(moves.reshape(path.grid.shape))
     # A move multiplies a value by gamma (1 - slip) or more, and the worth of the path is at least `visited`.
-    least = (FAINT / policy.levels.visited) ** (1 / max(1, int(moves.max()))) / (1 - slip)
-    gamma = ceil(100 * least) / 100
-    return gamma if gamma < 1 else None
+    least, longest = FAINT / policy.levels.visited, max(1, int(moves.max()))
+    enough = (one / 100 for one in range(1, 100) if prod([one / 100 * (1 - slip)] * longest) >= least)
+    return next(enough, None)
 
 
 def coverage(policy: Policy) -> Coverage:

@@ -111,23 +111,28 @@ def exact_values(mdp: Mdp) -> Floats:
     domain = mdp.domain
     assert not domain.phased or mdp.reward.levels.other == 0, "otherwise a longer path earns more"
     moves, arrival = _moves_to_go(mdp)
-    values = mdp.gamma**moves * arrival
+    values = _powers(mdp.gamma, moves) * arrival
     values[domain.terminal] = 0.0  # before phase 0, which joins other phases and reads their values
     values[: domain.offset[1]] = _phase_0_values(mdp, values)
     return values
 
 
-def _moves_to_go(mdp: Mdp) -> tuple[Floats, Floats]:
+def _powers(gamma: float, exponents: Ints) -> Floats:
+    """Return gamma to the power of some exponents by repeated multiplication, whose bits no processor decides."""
+    return np.asarray(np.cumprod([1.0, *[gamma] * int(exponents.max(initial=0))])[exponents])
+
+
+def _moves_to_go(mdp: Mdp) -> tuple[Ints, Floats]:
     """Return d - 1 and A_p of each row above phase 0, both (rows,); 0 in phase 0."""
     domain, levels, gamma = mdp.domain, mdp.reward.levels, mdp.gamma
     waypoints, later = domain.path.cells, slice(domain.offset[1], None)
-    behind = moves_between(waypoints[1:], waypoints[:-1]).clip(1).tolist()
+    behind = _powers(gamma, moves_between(waypoints[1:], waypoints[:-1]).clip(1)).tolist()
     arrival = np.zeros(domain.phases)  # A_p
     arrival[1:] = levels.goal
     for phase in range(domain.phases - 2, 0, -1):
-        arrival[phase] = levels.visited + gamma * gamma ** (behind[phase] - 1.0) * arrival[phase + 1]
-    moves = np.zeros(domain.n_rows)
-    moves[later] = moves_between(domain.cell_of[later], waypoints[domain.phase_of[later]]).clip(1) - 1.0
+        arrival[phase] = levels.visited + behind[phase] * arrival[phase + 1]
+    moves = np.zeros(domain.n_rows, np.int64)
+    moves[later] = moves_between(domain.cell_of[later], waypoints[domain.phase_of[later]]).clip(1) - 1
     return moves, arrival[domain.phase_of]
 
 
@@ -283,7 +288,7 @@ def _logs(mdp: Mdp, values: Floats) -> tuple[Ints, Ints]:
     moves, arrival = _moves_to_go(mdp)
     best, step = np.full(domain.n_rows, LOG_NONE), _as_log(mdp.gamma)
     above = domain.phase_of > 0
-    best[above] = moves[above].astype(np.int64) * step + _as_log(arrival[above])
+    best[above] = moves[above] * step + _as_log(arrival[above])
     after = domain.rows_of(domain.joins[on_path], grid.cells_of(on_path))
     entering = np.full(grid.n_states, LOG_NONE)
     entering[on_path] = _as_log(domain.rewards_unjoined(mdp.reward)[on_path] + mdp.gamma * values[after])

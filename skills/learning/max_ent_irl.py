@@ -6,12 +6,12 @@ Symbols: the demonstration enters the states w_1 ... w_T from its start w_0, so 
 reward for entering state s, one feature per state. A trajectory of T moves from w_0 to the goal w_T has the probability
 exp(sum of its rewards) / Z; standing still is a move, a move off the grid is not. With
 
-    B_t(s)  log of the summed exp(rewards) of all trajectories from s at time t to the goal at T     (backward)
+    B_t(s)  summed exp(rewards) of all trajectories from s at time t to the goal at T     (backward)
     F_t(s)  the same of all trajectories from w_0 at 0 to s at t, the reward of s included           (forward)
 
-log Z = B_0(w_0), the expected visits of s are the sum over t = 1 ... T of exp(F_t + B_t - log Z), and the gradient of
+Z = B_0(w_0), the expected visits of s are the sum over t = 1 ... T of F_t B_t / Z, and the gradient of
 the demonstration's log-likelihood is its own visits minus the expected ones. Both recursions are the same sum over a
-cell and its neighbours, computed axis by axis in logarithms, so that nothing overflows or vanishes.
+cell and its neighbours of numbers with a power of two each, so that nothing overflows or vanishes.
 
 **The reward is recovered, and does not help.** On the paper's demonstration nearly all of the highest rewards lie on
 the visited cells. But a positive reward of a *state* pays again at every step, also for standing still: that is worth
@@ -28,15 +28,16 @@ from typing import ClassVar
 
 import numpy as np
 
+from skills.arithmetic import exp
 from skills.arrays import Floats, frozen
 from skills.errors import BadSettings
 from skills.gridworld.domain import Domain
 from skills.gridworld.grid import GridPath
 from skills.gridworld.reward import RewardMap
+from skills.learning._kernels import sum_around_compiled
 from skills.learning.dynamic_programming import Mdp, exact_q
 
-MAX_NUMBERS = 2**24  # ours: moves x cells; B_t for all t takes 128 MiB then, and an iteration some seconds
-LOWEST = np.finfo(np.float64).min
+MAX_NUMBERS = 2**24  # ours: moves x cells; B_t for all t takes 192 MiB then, and an iteration some seconds
 
 
 @dataclass(frozen=True)
@@ -132,44 +133,21 @@ def soft_visits(path: GridPath, rewards: Floats) -> tuple[float, Floats]:
         state is entered, shape (n_states,); these sum to T.
     """
     moves, shape = len(path.states) - 1, path.grid.shape
-    entered = rewards.reshape(shape)
-    backward = np.empty((moves + 1, *shape))
-    backward[moves] = _only_at(path.goal, shape)
+    factor, twos = exp(rewards.reshape(shape))
+    backward, powers = np.zeros((moves + 1, *shape)), np.zeros((moves + 1, *shape), np.int32)
+    backward[moves].flat[path.goal] = 1.0
     for t in range(moves - 1, -1, -1):
-        backward[t] = _log_sum_around(entered + backward[t + 1])
-    log_z = backward[0].flat[path.start]
-    forward, visits = _only_at(path.start, shape), np.zeros(shape)
+        sum_around_compiled(factor * backward[t + 1], twos + powers[t + 1], backward[t], powers[t])
+    z, z_power = backward[0].flat[path.start], powers[0].flat[path.start]
+    forward, power, visits = np.zeros(shape), np.zeros(shape, np.int32), np.zeros(shape)
+    forward.flat[path.start] = 1.0
     for t in range(1, moves + 1):
-        forward = entered + _log_sum_around(forward)
-        visits += np.exp(forward + backward[t] - log_z)
-    return float(log_z - rewards[path.states[1:]].sum()) / moves, visits.reshape(-1)
-
-
-def _only_at(state: int, shape: tuple[int, int, int]) -> Floats:
-    """Return the logarithms of 1 at a state and 0 elsewhere, in the grid's shape."""
-    logs = np.full(shape, -np.inf)
-    logs.flat[state] = 0.0
-    return logs
-
-
-def _log_sum_around(logs: Floats) -> Floats:
-    """Sum over each cell and its neighbours, at most 27 cells, in logarithms; in the grid's shape."""
-    for axis in range(logs.ndim):
-        logs = _log_sum_along(logs, axis)
-    return logs
-
-
-def _log_sum_along(logs: Floats, axis: int) -> Floats:
-    """Sum over each cell and its two neighbours along an axis, in logarithms."""
-    size = logs.shape[axis]
-    edge = np.full((*logs.shape[:axis], 1, *logs.shape[axis + 1 :]), -np.inf)
-    padded = np.moveaxis(np.concatenate((edge, logs, edge), axis), axis, 0)
-    before, here, after = padded[:size], padded[1:-1], padded[2:]
-    # The lower bound is finite, because where all three are -inf, subtracting -inf would give NaN.
-    peak = np.maximum(np.maximum(np.maximum(before, here), after), LOWEST)
-    with np.errstate(divide="ignore"):
-        total = peak + np.log(np.exp(before - peak) + np.exp(here - peak) + np.exp(after - peak))
-    return np.asarray(np.moveaxis(total, 0, axis))
+        after, after_power = np.empty(shape), np.empty(shape, np.int32)
+        sum_around_compiled(forward, power, after, after_power)
+        forward, power = factor * after, twos + after_power
+        visits += np.ldexp(forward * backward[t] / z, power + powers[t] - z_power)
+    log_z = float(np.log(z) + z_power * np.log(2.0))  # reported alone: no learnt number depends on it
+    return (log_z - float(rewards[path.states[1:]].sum())) / moves, visits.reshape(-1)
 
 
 class _Adam:
@@ -177,15 +155,16 @@ class _Adam:
 
     def __init__(self, values: Floats, learning_rate: float) -> None:
         self.values, self.learning_rate = values, learning_rate
-        self.mean, self.square, self.steps = np.zeros_like(values), np.zeros_like(values), 0
+        self.mean, self.square = np.zeros_like(values), np.zeros_like(values)
+        self.mean_left, self.square_left = 1.0, 1.0  # of the zeros that both began with
 
     def descend(self, gradient: Floats) -> None:
         """Make one step of gradient descent."""
-        self.steps += 1
+        self.mean_left, self.square_left = 0.9 * self.mean_left, 0.999 * self.square_left
         self.mean += 0.1 * (gradient - self.mean)
         self.square += 0.001 * (gradient**2 - self.square)
-        mean = self.mean / (1 - 0.9**self.steps)
-        square = self.square / (1 - 0.999**self.steps)
+        mean = self.mean / (1 - self.mean_left)
+        square = self.square / (1 - self.square_left)
         self.values -= self.learning_rate * mean / (np.sqrt(square) + 1e-8)
 
 

@@ -29,18 +29,21 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.ndimage import gaussian_filter1d
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.ndimage import correlate1d
 
+from skills.arithmetic import product
 from skills.arrays import Floats, frozen
 from skills.demonstration.demonstration import Demo
 from skills.demonstration.movement import same_signs
 from skills.demonstration.partner import PartnerMotion
 from skills.errors import BadInput, MixedFrames
 from skills.learning.evaluation import dtw
+from skills.quaternions import INVERSE, angle_of, between, dominant, multiplied, of_vector, turned, unit, vector_of
 
 PHASES = 101  # ours: a hundredth of a hand-off of 5 s is a twentieth of a second, in which a hand does not turn back
-WARP_SMOOTHING = 3.0  # ours: standard deviation in phases; the steps of a DTW path are no tempo
+# Ours: the steps of a DTW path are no tempo, so it is smoothed by a Gaussian window of standard deviation 3 phases.
+_POWERS = np.cumprod([1.0, *[0.9459594689067654] * 144])  # of exp(-1 / 18)
+WARP_SMOOTHING = _POWERS[np.square(np.arange(-12, 13))] / _POWERS[np.square(np.arange(-12, 13))].sum()
 UNIT_TOLERANCE = 1e-3  # of a quaternion's length; three printed decimals pass
 LIKE_FLOOR = 1e-6  # of squared distances between situations; several demonstrations may share one
 SHARES = np.linspace(
@@ -143,7 +146,7 @@ class PoseStyle:
             BadInput: A number is not finite, or a quaternion is not a unit quaternion.
         """
         ends = np.stack([frozen(start_mm, np.float64, (3,), "start_mm"), frozen(goal_mm, np.float64, (3,), "goal_mm")])
-        turns = Rotation.from_quat([unit_quaternion(start_xyzw, "start_xyzw"), unit_quaternion(goal_xyzw, "goal_xyzw")])
+        turns = unit(np.stack([unit_quaternion(start_xyzw, "start_xyzw"), unit_quaternion(goal_xyzw, "goal_xyzw")]))
         tips = np.stack([laid_tip(tip, ends) for tip in self.tip_mm])
         rotations = laid_rotations(self.rotation_xyzw, turns)
         weights = self._weights(ends, turns)
@@ -155,22 +158,22 @@ class PoseStyle:
             tips = np.stack([_at(tip, warp) for tip, warp in zip(tips, warps, strict=True)])
             rotations = np.stack([_turn_at(one, warp) for one, warp in zip(rotations, warps, strict=True)])
             jaws = np.stack([_at(jaw, warp) for jaw, warp in zip(jaws, warps, strict=True)])
-            elapsed = weights @ warps / (PHASES - 1)
+            elapsed = product(weights, warps) / (PHASES - 1)
         tip_mm, rotation = np.einsum("k,kpi->pi", weights, tips), mean_rotation(rotations, weights)
         apart = _apart(_shortest(turns, elapsed), rotation)
         turn_share = self.turn_share if np.linalg.norm(apart, axis=1).max() < FAR_RAD else 1.0
         if turn_share < 1.0:
-            rotation = (_shortest(turns, elapsed) * Rotation.from_rotvec(turn_share * apart)).as_quat()
+            rotation = multiplied(_shortest(turns, elapsed), of_vector(turn_share * apart))
         off_mm = np.linalg.norm(tips - tip_mm, axis=2)
-        dots = np.abs(np.einsum("kpi,pi->kp", rotations, rotation)).clip(0.0, 1.0)
-        spread_mm, spread_rad = (np.sqrt(weights @ apart**2) for apart in (off_mm, 2 * np.arccos(dots)))
+        off_rad = angle_of(multiplied(rotations * INVERSE, rotation))
+        spread_mm, spread_rad = (np.sqrt(product(weights, off * off)) for off in (off_mm, off_rad))
         # The phase of the result is the share of its own time again: the mean tempo of the demonstrations.
         again = np.interp(np.linspace(0.0, 1.0, PHASES), elapsed, np.arange(PHASES))
         return PosePath(
             _at(tip_mm, again),
             same_signs(_turn_at(rotation, again)),
-            np.linspace(0.0, 1.0, PHASES) * float(weights @ self.duration_s),
-            None if self.jaw_rad is None else _at(weights @ jaws, again),
+            np.linspace(0.0, 1.0, PHASES) * float(product(weights, self.duration_s)),
+            None if self.jaw_rad is None else _at(product(weights, jaws), again),
             _at(spread_mm, again),
             _at(spread_rad, again),
             turn_share,
@@ -178,22 +181,22 @@ class PoseStyle:
         )
 
     def _partner(
-        self, goal_mm: Floats, goal: Rotation, weights: Floats, warps: Floats, again: Floats
+        self, goal_mm: Floats, goal: Floats, weights: Floats, warps: Floats, again: Floats
     ) -> PartnerMotion | None:
         """Return the other arm beside a motion: the weighted mean as seen from the goal, in step with this arm."""
         if self.partners is None:
             return None
         tips = np.stack([_at(one.tip_mm, warp) for one, warp in zip(self.partners, warps, strict=True)])
         turns = np.stack([_turn_at(one.rotation_xyzw, warp) for one, warp in zip(self.partners, warps, strict=True)])
-        seen = Rotation.from_quat(_turn_at(mean_rotation(turns, weights), again))
-        tip_mm = goal_mm + goal.apply(_at(np.einsum("k,kpi->pi", weights, tips), again))
+        seen = _turn_at(mean_rotation(turns, weights), again)
+        tip_mm = goal_mm + turned(goal, _at(np.einsum("k,kpi->pi", weights, tips), again))
         jaws = [one.jaw_rad for one in self.partners if one.jaw_rad is not None]
         jaw_rad = None
         if len(jaws) == len(self.partners):
-            jaw_rad = _at(weights @ np.stack([_at(jaw, warp) for jaw, warp in zip(jaws, warps, strict=True)]), again)
-        return PartnerMotion(self.partners[0].arm, tip_mm, same_signs((goal * seen).as_quat()), jaw_rad)
+            jaw_rad = _at(product(weights, np.stack([_at(*one) for one in zip(jaws, warps, strict=True)])), again)
+        return PartnerMotion(self.partners[0].arm, tip_mm, same_signs(multiplied(goal, seen)), jaw_rad)
 
-    def _weights(self, ends: Floats, turns: Rotation) -> Floats:
+    def _weights(self, ends: Floats, turns: Floats) -> Floats:
         """Return the weight of each demonstration between two poses, (K,), with sum 1.
 
         Situations differ by the vector from start to goal and by the start's position, both in units of the mean
@@ -203,10 +206,10 @@ class PoseStyle:
         if len(self.tip_mm) == 1:
             return np.ones(1)
         shown = [
-            _Situation(tip[[0, -1]], Rotation.from_quat(rotation[[0, -1]]))
+            _Situation(tip[[0, -1]], rotation[[0, -1]])
             for tip, rotation in zip(self.tip_mm, self.rotation_xyzw, strict=True)
         ]
-        length = float(np.mean([np.linalg.norm(one.ends[1] - one.ends[0]) for one in shown]))
+        length = float(np.mean([np.linalg.norm(one.ends[1] - one.ends[0], axis=-1) for one in shown]))
         length = max(length, np.finfo(float).tiny)
         among = np.array([[one.apart(other, length) for other in shown] for one in shown])
         np.fill_diagonal(among, np.inf)
@@ -218,17 +221,17 @@ class PoseStyle:
 
 @dataclass(frozen=True, eq=False)
 class _Situation:
-    """Start and goal of a motion: positions (2, 3) and orientations."""
+    """Start and goal of a motion: positions (2, 3) and orientations (2, 4)."""
 
     ends: Floats
-    turns: Rotation
+    turns: Floats
 
     def apart(self, other: "_Situation", length_mm: float) -> float:
         """Return the squared distance of two situations."""
         line = (self.ends[1] - self.ends[0]) - (other.ends[1] - other.ends[0])
         moved = np.concatenate([line, self.ends[0] - other.ends[0]]) / length_mm
-        turned = (self.turns.inv() * other.turns).magnitude()
-        return float(moved @ moved + turned @ turned)
+        turned = angle_of(multiplied(self.turns * INVERSE, other.turns))
+        return float((moved * moved).sum() + (turned * turned).sum())
 
 
 def learn_pose_style(demos: Sequence[Demo], partners: Sequence[PartnerMotion | None] | None = None) -> PoseStyle:
@@ -298,12 +301,12 @@ def _partners(demos: Sequence[Demo], partners: Sequence[PartnerMotion | None]) -
                 "take it from the recording at the demonstration's stamps."
             )
         assert demo.rotation_xyzw is not None, "checked by the caller"
-        last = Rotation.from_quat(demo.rotation_xyzw[-1]).inv()
+        last = unit(demo.rotation_xyzw[-1]) * INVERSE
         at = np.interp(np.linspace(0.0, demo.stamps_s[-1], PHASES), demo.stamps_s, np.arange(len(demo.stamps_s)))
-        turned = Rotation.from_quat(_turn_at(other.rotation_xyzw, at))
-        seen_mm, jaw_rad = last.apply(_at(other.tip_mm, at) - demo.tip_mm[-1]), other.jaw_rad
+        seen = multiplied(last, _turn_at(other.rotation_xyzw, at))
+        seen_mm, jaw_rad = turned(last, _at(other.tip_mm, at) - demo.tip_mm[-1]), other.jaw_rad
         jaw_rad = None if jaw_rad is None else _at(jaw_rad, at)
-        found.append(PartnerMotion(other.arm, seen_mm, (last * turned).as_quat(), jaw_rad))
+        found.append(PartnerMotion(other.arm, seen_mm, seen, jaw_rad))
     return tuple(found)
 
 
@@ -323,25 +326,24 @@ def _turn_share(rotation_xyzw: Floats) -> float:
     errors, even = [], np.full(len(shown) - 1, 1.0 / (len(shown) - 1))
     phase = np.linspace(0.0, 1.0, shown.shape[1])
     for left_out, own in enumerate(shown):
-        ends = Rotation.from_quat(own[[0, -1]])
+        ends = own[[0, -1]]
         shortest = _shortest(ends, phase)
         mean = mean_rotation(laid_rotations(np.delete(shown, left_out, axis=0), ends), even)
-        wanted, apart = shortest.inv() * Rotation.from_quat(own), _apart(shortest, mean)
-        back = Rotation.from_rotvec((-SHARES[:, None, None] * apart).reshape(-1, 3))
-        off_rad = (back * Rotation.from_quat(np.tile(wanted.as_quat(), (len(SHARES), 1)))).magnitude()
-        errors.append(off_rad.reshape(len(SHARES), -1).mean(axis=1))
+        wanted, apart = multiplied(shortest * INVERSE, own), _apart(shortest, mean)
+        back = of_vector(-SHARES[:, None, None] * apart)
+        errors.append(angle_of(multiplied(back, wanted)).mean(axis=1))
     total = np.sum(errors, axis=0) - errors
     return float(np.median(SHARES[total.round(9).argmin(axis=1)]))
 
 
-def _shortest(ends: Rotation, shares: Floats) -> Rotation:
+def _shortest(ends: Floats, shares: Floats) -> Floats:
     """Return the shortest turn from one orientation to another, at shares of it, (N,)."""
-    return Slerp([0.0, 1.0], ends)(shares.clip(0.0, 1.0))  # rounding may leave the range
+    return between(ends[0], ends[1], shares.clip(0.0, 1.0))  # rounding may leave the range
 
 
-def _apart(base: Rotation, rotation_xyzw: Floats) -> Floats:
+def _apart(base: Floats, rotation_xyzw: Floats) -> Floats:
     """Return the rotations, as vectors in rad, (N, 3), that lead from a base to orientations, (N, 4)."""
-    return np.asarray((base.inv() * Rotation.from_quat(rotation_xyzw)).as_rotvec())
+    return vector_of(multiplied(base * INVERSE, rotation_xyzw))
 
 
 def unit_quaternion(values: ArrayLike, name: str) -> Floats:
@@ -358,8 +360,9 @@ def unit_quaternion(values: ArrayLike, name: str) -> Floats:
         BadInput: It has another shape, a number is NaN or infinite, or its length is not 1.
     """
     quaternion = frozen(values, np.float64, (4,), name)
-    if not abs(float(np.linalg.norm(quaternion)) - 1.0) <= UNIT_TOLERANCE:
-        raise BadInput(f"{name} must be a unit quaternion x, y, z, w; it has length {np.linalg.norm(quaternion):g}.")
+    length = float(np.linalg.norm(quaternion, axis=-1))
+    if not abs(length - 1.0) <= UNIT_TOLERANCE:
+        raise BadInput(f"{name} must be a unit quaternion x, y, z, w; it has length {length:g}.")
     return quaternion
 
 
@@ -385,33 +388,28 @@ def laid_tip(tip_mm: Floats, ends_mm: Floats) -> Floats:
     return np.asarray(tip_mm + (1.0 - share) * (ends_mm[0] - tip_mm[0]) + share * (ends_mm[1] - tip_mm[-1]))
 
 
-def laid_rotations(rotation_xyzw: Floats, ends: Rotation) -> Floats:
+def laid_rotations(rotation_xyzw: Floats, ends: Floats) -> Floats:
     """Return the orientations of each demonstration laid between two ends.
 
     As for `laid_tip`, the corrections of both ends are blended along the phases.
 
     Args:
         rotation_xyzw: Orientations of K demonstrations, unit quaternions, shape (K, P, 4).
-        ends: The new first and last orientation in the same frame.
+        ends: The new first and last orientation in the same frame, unit quaternions, shape (2, 4).
 
     Returns:
         Unit quaternions, shape (K, P, 4); the first and the last orientation of each demonstration are the ends.
     """
-    demos, phases, _ = rotation_xyzw.shape
-    shown = [Rotation.from_quat(rotation_xyzw[:, k]) for k in (0, -1)]
-    first, last = (ends[k] * shown[k].inv() for k in (0, 1))
-    over = (last * first.inv()).as_rotvec()[:, None] * _blend(phases)[:, None]
-    begun = Rotation.from_quat(first.as_quat().repeat(phases, axis=0)) * Rotation.from_quat(
-        rotation_xyzw.reshape(-1, 4)
-    )
-    return np.asarray((Rotation.from_rotvec(over.reshape(-1, 3)) * begun).as_quat()).reshape(demos, phases, 4)
+    first, last = (multiplied(ends[k], rotation_xyzw[:, k] * INVERSE)[:, None] for k in (0, -1))
+    over = vector_of(multiplied(last, first * INVERSE)) * _blend(rotation_xyzw.shape[1])[:, None]
+    return multiplied(of_vector(over), multiplied(first, rotation_xyzw))
 
 
 def _warp(tip_mm: Floats, mean_mm: Floats) -> Floats:
     """Return the place in a motion, an index with fraction, that corresponds to each phase of the mean, (PHASES,)."""
     pairs = dtw(mean_mm, tip_mm).pairs
     places = np.bincount(pairs[:, 0], pairs[:, 1]) / np.bincount(pairs[:, 0])
-    smooth = np.maximum.accumulate(gaussian_filter1d(places, WARP_SMOOTHING, mode="nearest"))
+    smooth = np.maximum.accumulate(correlate1d(places, WARP_SMOOTHING, mode="nearest"))
     smooth[0], smooth[-1] = 0.0, PHASES - 1.0
     return np.asarray(smooth)
 
@@ -425,7 +423,9 @@ def _at(values: Floats, places: Floats) -> Floats:
 
 def _turn_at(rotation_xyzw: Floats, places: Floats) -> Floats:
     """Return orientations at places, along the shorter way between two neighbours."""
-    return np.asarray(Slerp(np.arange(len(rotation_xyzw)), Rotation.from_quat(rotation_xyzw))(places).as_quat())
+    before = np.minimum(places.astype(np.int64), len(rotation_xyzw) - 2)
+    turns = unit(rotation_xyzw)
+    return between(turns[before], turns[before + 1], places - before)
 
 
 def mean_rotation(rotation_xyzw: Floats, weights: Floats) -> Floats:
@@ -440,5 +440,4 @@ def mean_rotation(rotation_xyzw: Floats, weights: Floats) -> Floats:
     Returns:
         Unit quaternions of either sign, shape (P, 4).
     """
-    outer = np.einsum("k,kpi,kpj->pij", weights, rotation_xyzw, rotation_xyzw)
-    return np.asarray(np.linalg.eigh(outer)[1][:, :, -1])
+    return dominant(np.einsum("k,kpi,kpj->pij", weights, rotation_xyzw, rotation_xyzw))

@@ -407,7 +407,7 @@ def odds(policy: Policy, slip: float, start: int, moves: int) -> Odds:
         if at.sum() < NEGLIGIBLE:
             break
     total = float(by_move.sum())
-    return Odds(total, float(by_move @ np.arange(1, moves + 1)) / total if total > 0 else None)
+    return Odds(total, float((by_move * np.arange(1, moves + 1)).sum()) / total if total > 0 else None)
 
 
 def _chain(policy: Policy) -> tuple[Ints, Flags]:
@@ -515,4 +515,4 @@ class TwoLineRule:
 
 def _action(steps: Ints) -> Ints:
     """Return the actions of moves, (..., 3) cells."""
-    return np.asarray((steps + 1) @ PLACE_VALUES, np.int64)
+    return np.asarray(((steps + 1) * PLACE_VALUES).sum(axis=-1), np.int64)

@@ -32,8 +32,8 @@ from math import ceil, isfinite, sqrt
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
+from skills.arithmetic import arcsin, cos, sin
 from skills.arrays import Flags, Floats, Ints, frozen, xyz
 from skills.demonstration.demonstration import Demo
 from skills.demonstration.partner import Partner, PartnerMotion
@@ -43,6 +43,7 @@ from skills.gridworld.scene import Scene
 from skills.learning._kernels import nearest_pose_compiled, step_along_compiled
 from skills.learning.pose_style import UNIT_TOLERANCE, PosePath, learn_pose_style, unit_quaternion
 from skills.learning.tube_certificate import TubeCertificate, TubeClearance, TubeLimits
+from skills.quaternions import INVERSE, angle_of, between, multiplied
 
 __all__ = [
     "CertifiedPoses",
@@ -76,11 +77,6 @@ class Hands:
     tip_mm: Floats
     rotation_xyzw: Floats
     phases: Ints
-
-    @property
-    def rotations(self) -> Rotation:
-        """The orientations."""
-        return Rotation.from_quat(self.rotation_xyzw)
 
 
 Update = Callable[[PosePath, Hands, TubeLimits], Hands]
@@ -353,25 +349,23 @@ def _nearest(scene: Scene, tip_mm: Floats) -> TubeClearance | None:
 
 def _moves(path: PosePath, ahead: int) -> tuple[float, float]:
     """Return the largest distance and angle between two poses of a path that are some phases apart."""
-    rotations = Rotation.from_quat(path.rotation_xyzw)
+    turns = path.rotation_xyzw
     moved = np.linalg.norm(path.tip_mm[ahead:] - path.tip_mm[:-ahead], axis=1)
-    return float(moved.max(initial=0.0)), float(
-        (rotations[:-ahead].inv() * rotations[ahead:]).magnitude().max(initial=0.0)
-    )
+    turned = angle_of(multiplied(turns[:-ahead] * INVERSE, turns[ahead:]))
+    return float(moved.max(initial=0.0)), float(turned.max(initial=0.0))
 
 
 def _bulge(path: PosePath, ahead: int) -> tuple[float, float]:
     """Return how far a path is at most from the straight way between two poses of it within the window, mm and rad."""
     furthest_mm, furthest_rad = 0.0, 0.0
-    rotations = Rotation.from_quat(path.rotation_xyzw)
+    turns = path.rotation_xyzw
     for window in range(2, ahead + 1):
-        turn = (rotations[:-window].inv() * rotations[window:]).as_rotvec()
         for inside in range(1, window):
             share = inside / window
             chord = (1 - share) * path.tip_mm[:-window] + share * path.tip_mm[window:]
             off = np.linalg.norm(path.tip_mm[inside : inside - window] - chord, axis=1)
-            way = rotations[:-window] * Rotation.from_rotvec(share * turn)
-            angle = (way.inv() * rotations[inside : inside - window]).magnitude()
+            way = between(turns[:-window], turns[window:], np.full(len(off), share))
+            angle = angle_of(multiplied(way * INVERSE, turns[inside : inside - window]))
             furthest_mm, furthest_rad = max(furthest_mm, off.max()), max(furthest_rad, angle.max())
     return float(furthest_mm), float(furthest_rad)
 
@@ -436,12 +430,12 @@ def _try_update(path: PosePath, limits: TubeLimits, update: Update) -> tuple[int
 def _angles(one_xyzw: Floats, other_xyzw: Floats) -> Floats:
     """Return the angles between orientations, unit quaternions (R, 4), by the chord between them, exact also near 0."""
     nearer = np.minimum(np.linalg.norm(one_xyzw - other_xyzw, axis=1), np.linalg.norm(one_xyzw + other_xyzw, axis=1))
-    return np.asarray(4.0 * np.arcsin(np.minimum(nearer / 2.0, 1.0)))
+    return np.asarray(4.0 * arcsin(np.minimum(nearer / 2.0, 1.0)))
 
 
 def _turned(rotation_xyzw: Floats, axes: Floats, angles: Floats) -> Floats:
     """Return orientations, (R, 4), turned about their own axes, (R, 3) of length 1, by angles, (R,)."""
-    turn, stay = axes * np.sin(angles / 2)[:, None], np.cos(angles / 2)[:, None]
+    turn, stay = axes * sin(angles / 2)[:, None], cos(angles / 2)[:, None]
     vector, scalar = rotation_xyzw[:, :3], rotation_xyzw[:, 3:]
     turned = scalar * turn + stay * vector + np.cross(vector, turn)
     return np.hstack([turned, scalar * stay - (vector * turn).sum(axis=1, keepdims=True)])

@@ -467,6 +467,8 @@ def _playback(row: StoredPlayback) -> Why:
         yield "it does not match the digest of plan and verdict"
     if row.feasible != row.report.get("feasible"):
         yield "its flag `feasible` contradicts its report"
+    if digest(row.measured.trajectory) != row.report.get("trajectory"):
+        yield "its motion is not the one that was judged"
 
 
 def _calibration(row: StoredCalibration) -> Why:

@@ -24,6 +24,7 @@ from sqlalchemy.orm import Session
 
 from skills.db import rfc3339
 from skills.db.models import StoredPictures, StoredPlayback
+from skills.db.packed import digest
 from skills.db.service_tables import Job, record_event
 from skills.db.session import Database
 from skills.errors import Conflict, NotDrawnYet
@@ -33,7 +34,6 @@ from skills.library.integrity import find_by_digest, learnt, planned
 from skills.library.jobs import PICTURES, PicturesRequest, PlaybackRequest
 from skills.library.plans import check_frame, find_plan, hand_of, hands_over, plan_in_words, psm_m_moves, trajectory_of
 from skills.packing import canonical, sha256
-from skills.planning.trajectory import Trajectory
 from skills.remedies import Action, Remedy
 from skills.settings import Settings
 from skills.verification.arm_errors import CALLED, NAMED, ArmErrors
@@ -193,7 +193,7 @@ def _percent(part: float | None) -> str:
     return f"{100 * part:.1f} %"
 
 
-CHECK_VERSION = 6  # part of the job's identity: raise it when verdicts change, so that plans can be played again
+CHECK_VERSION = 7  # part of the job's identity: raise it when verdicts change, so that plans can be played again
 
 
 def request_playback(
@@ -252,7 +252,7 @@ def check_playback(
         "scene": None if verdict.scene is None else _finite(asdict(verdict.scene)),
         "tissue": "not given" if plan.scene is None or plan.scene.tissue is None else "judged",
         "plan": request["plan"],
-        "trajectory": trajectory_digest(trajectory),
+        "trajectory": digest(trajectory),
         "policy": policy,
         "frame": plan.frame,
     }
@@ -292,18 +292,6 @@ def standing_of(session: Session, playback: StoredPlayback) -> dict[str, Any]:
     return {"version": policy.version, "sha256": policy.sha256, "released": releases.serves(session, policy)}
 
 
-def trajectory_digest(trajectory: Trajectory) -> str:
-    """Return the SHA-256 of a motion: of the stamps, joints and jaws that were checked, sample by sample."""
-    parts = [trajectory.stamps_s, trajectory.joints]
-    if trajectory.psm_m is not None:
-        parts += [trajectory.psm_m.base_mm, trajectory.psm_m.base_xyzw, trajectory.psm_m.joints]
-        if trajectory.psm_m.jaw_rad is not None:
-            parts.append(trajectory.psm_m.jaw_rad)
-    if trajectory.jaw_rad is not None:
-        parts.append(trajectory.jaw_rad)
-    return sha256(b"".join(part.tobytes() for part in parts))
-
-
 def _finite(data: Any) -> Any:
     """Return JSON data with null for NaN and infinity, which JSON does not have, and lists for tuples."""
     if isinstance(data, float):
@@ -328,10 +316,8 @@ def draw_pictures(
 
     with database.reading() as session:
         playback = _playback(session, request)
-        plan, measured, report = planned(playback.plan), playback.measured, playback.report
-    trajectory = trajectory_of(plan)
-    if len(measured) != len(trajectory):
-        raise Conflict("An older version played this plan with other samples; make the plan and play it again.")
+        measured, report = playback.measured, playback.report
+    trajectory = measured.trajectory
     shot = film.shoot(trajectory, pad_top_mm=float(measured.pad_mm[2]), memory_bytes=settings.playback_memory_bytes)
     drawn = Pictures(
         animation_mp4=shot.mp4,

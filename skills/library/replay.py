@@ -17,6 +17,7 @@ from sqlalchemy.orm import Session
 
 from skills.arrays import Floats
 from skills.db.models import Plan, PolicyVersion, StoredPlayback
+from skills.db.packed import digest
 from skills.db.session import Database
 from skills.errors import BadPlan, Conflict, Corrupt
 from skills.formats.replay_bag import (
@@ -41,7 +42,6 @@ from skills.library.playbacks import (
     errors_in_words,
     judged_under,
     not_judged,
-    trajectory_digest,
 )
 from skills.library.policies import learnt_from
 from skills.packing import canonical, sha256
@@ -140,10 +140,9 @@ def replay_bag(
 
     Raises:
         NotFound: There is no such plan.
-        Conflict: The plan must not be replayed, see `cleared`; the playback checked other samples than those that would
-            be exported; or consent was withdrawn during the export.
+        Conflict: The plan must not be replayed, see `cleared`; or consent was withdrawn during the export.
         BadPlan: The plan has no such pass.
-        Corrupt: A stored plan, policy or verdict does not match its digest, or is not as the history has it.
+        Corrupt: A stored plan, policy, verdict or motion does not match its digest, or is not as the history has it.
         Busy: The history cannot be signed now.
         BadSettings: The signing key cannot be read.
     """
@@ -153,14 +152,11 @@ def replay_bag(
         verdict = cleared(session, row, handoff=handoff, **asked)
         plan, demo, policy = planned(row), learnt_from(row.policy), row.policy
         learnt(policy)
-        trajectory = trajectory_of(plan)
+        trajectory = verdict.measured.trajectory
         papers = {PLAN: _plan(row, trajectory), VERDICT: _verdict(row, verdict), POLICY: _policy(policy)}
         rows = (("plans", row.row), ("playbacks", verdict.row), ("policy_versions", policy.row))
-    # The samples are computed anew; an older version may have computed and checked others.
-    if trajectory_digest(trajectory) != papers[VERDICT]["report"].get("trajectory"):
-        raise Conflict(
-            "This version computes another motion than the older version that played the plan; play it again."
-        )
+    if digest(trajectory) != papers[VERDICT]["report"]["trajectory"]:
+        raise Corrupt("A stored motion is not the one that its verdict judged; restore it from a backup.")
     arms = arms_of(
         trajectory,
         arm=plan.arm,
@@ -251,7 +247,7 @@ def cleared(
     if played is None:
         raise Conflict("This plan was not played in the simulator yet.", Remedy(Action.PLAY, plan=plan.sha256))
     if sha256(canonical([plan.sha256, played.report])) != played.sha256:
-        raise Corrupt("A stored verdict does not match its digest; restore it from a backup or play the plan again.")
+        raise Corrupt("A stored verdict does not match its digest; restore it from a backup.")
     if not (played.feasible and played.report["feasible"] is True):
         raise Conflict(
             f"The simulator found this plan infeasible: {played.report['failure_in_words']} Change the plan."

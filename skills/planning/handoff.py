@@ -27,9 +27,11 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
+from skills.arithmetic import arctan2, cos, product, sin
 from skills.arrays import Floats, frozen
 from skills.errors import BadPlan, NoApproach
 from skills.kinematics import DEFAULT_INSTRUMENT, check_rotation, instrument_of, matrix_of, quaternion_of
+from skills.quaternions import unit
 
 NEEDLE_RADIUS_MM = 26.0 / pi  # a half circle of 26 mm along the arc, as in `urdf/needle.urdf`
 HELD_MM = 9.0  # from the hinge along the approach to the place where the jaws hold the needle; the fingers end at 10.2
@@ -144,7 +146,7 @@ class Jaws:
         """
         ticks = ceil(JAW_S * rate_hz)
         u = np.arange(1, ticks + 1) / ticks
-        done = u**3 * (10 - 15 * u + 6 * u * u)
+        done = u * u * u * (10 - 15 * u + 6 * u * u)
         (open_rad, held_rad), (holds_rad, lets_rad) = taker_rad, giver_rad
         still = np.ones(ticks)
         closing, opening = open_rad + (held_rad - open_rad) * done, holds_rad + (lets_rad - holds_rad) * done
@@ -161,7 +163,7 @@ def needle_tips_mm() -> Floats:
 
     In the frame [n o a] of the jaws: `HELD_MM` along the approach the arc begins along n, to the one side or the other.
     """
-    along, across = NEEDLE_RADIUS_MM * np.sin(NEEDLE_FREE_RAD), NEEDLE_RADIUS_MM * (1 - np.cos(NEEDLE_FREE_RAD))
+    along, across = NEEDLE_RADIUS_MM * sin(NEEDLE_FREE_RAD), NEEDLE_RADIUS_MM * (1 - cos(NEEDLE_FREE_RAD))
     return np.array([[along, across, HELD_MM], [-along, -across, HELD_MM]])
 
 
@@ -175,7 +177,7 @@ def unit_approach(approach_m: ArrayLike) -> Floats:
         NoApproach: It has no length.
     """
     direction = frozen(approach_m, np.float64, (3,), "approach_m")
-    length = float(np.linalg.norm(direction))
+    length = float(np.linalg.norm(direction, axis=-1))
     if not length > _NO_LENGTH:
         raise NoApproach("PSM_M's approach has length 0; give its direction in PSM_A's base frame.")
     return np.asarray(direction / length)
@@ -199,7 +201,7 @@ def hand_off(tip_mm: ArrayLike, rotation: ArrayLike, approach_m: ArrayLike) -> t
     turned = frozen(rotation, np.float64, (None, 3, 3), "rotation")
     check_rotation(turned)
     a_m = unit_approach(approach_m)
-    if not (np.abs(turned[:, :, 0] @ a_m) >= 1 - _PARALLEL).all():
+    if not (np.abs(product(turned[:, :, 0], a_m)) >= 1 - _PARALLEL).all():
         raise BadPlan("PSM_A's jaw is not turned to PSM_M's approach; realign it first.")
     a = turned[:, :, 2]
     # The needle's tangent where PSM_M takes it: a quarter of a circle after PSM_A's grip it points from that grip
@@ -279,8 +281,8 @@ def turn(rotation: ArrayLike, target: ArrayLike, fractions: ArrayLike) -> Floats
     angle, axis = _turn_between(start, frozen(target, np.float64, (3, 3), "target"))
     u = frozen(fractions, np.float64, (None,), "fractions") * angle
     cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
-    about = np.eye(3) + np.sin(u)[:, None, None] * cross + (1 - np.cos(u))[:, None, None] * (cross @ cross)
-    return np.asarray(about @ start)
+    about = np.eye(3) + sin(u)[:, None, None] * cross + (1 - cos(u))[:, None, None] * product(cross, cross)
+    return product(about, start)
 
 
 def _across(a_m: Floats, present: Floats, toward: ArrayLike | None) -> Floats:
@@ -289,11 +291,11 @@ def _across(a_m: Floats, present: Floats, toward: ArrayLike | None) -> Floats:
     wanted = [a, o, n] if toward is None else [frozen(toward, np.float64, (3,), "toward"), a, o, n]
     for direction in wanted:
         v = _unit(direction)
-        across = None if v is None else v - a_m * (a_m @ v)
-        if across is not None and np.linalg.norm(across) >= _TOO_PARALLEL:
-            across = across / np.linalg.norm(across)
-            across = across - a_m * (a_m @ across)  # again, to remove the rest that round-off left along a_M
-            return np.asarray(across / np.linalg.norm(across))
+        across = None if v is None else v - a_m * product(a_m, v)
+        if across is not None and np.linalg.norm(across, axis=-1) >= _TOO_PARALLEL:
+            across = unit(across)
+            across = across - a_m * product(a_m, across)  # again, to remove the rest that round-off left along a_M
+            return unit(across)
     raise AssertionError("three orthogonal directions cannot all be along one")
 
 
@@ -305,14 +307,14 @@ def _toward(present: Floats, n_star: Floats, a_star: Floats, sign: int) -> Reali
 
 def _turn_between(start: Floats, target: Floats) -> tuple[float, Floats]:
     """Measure the turn that leads from start to target: its angle, 0 to pi, and its axis in the base frame."""
-    x, y, z, w = quaternion_of((target @ start.T)[None])[0]
+    x, y, z, w = quaternion_of(product(target, start.T)[None])[0]
     vector = np.array([x, y, z]) * (1.0 if w >= 0 else -1.0)
-    length = float(np.linalg.norm(vector))
+    length = float(np.linalg.norm(vector, axis=-1))
     if length < 1e-15:
         return 0.0, np.array([0.0, 0.0, 1.0])
-    return float(2 * np.arctan2(length, abs(w))), vector / length
+    return float(2 * arctan2(length, abs(w))), vector / length
 
 
 def _unit(vector: Floats) -> Floats | None:
-    length = float(np.linalg.norm(vector))
+    length = float(np.linalg.norm(vector, axis=-1))
     return vector / length if length > 1e-12 else None

@@ -22,6 +22,7 @@ from math import ceil, sqrt
 
 import numpy as np
 
+from skills.arithmetic import arccos
 from skills.arrays import Floats, Ints, frozen
 from skills.errors import BadSpeed
 from skills.kinematics import angle_between
@@ -115,7 +116,7 @@ def _ticks(line: Floats, lengths: Floats, mm_per_tick: float) -> Ints:
     each.
     """
     along = np.diff(line, axis=0) / lengths[:, None]
-    turn = np.arccos(np.einsum("ki,ki->k", along[:-1], along[1:]).clip(-1.0, 1.0))
+    turn = arccos(np.einsum("ki,ki->k", along[:-1], along[1:]).clip(-1.0, 1.0))
     radius = (lengths[:-1] + lengths[1:]) / 2 / np.maximum(turn, 1e-9)
     square = [0.0, *(radius / EASE_MM).clip(max=1.0).tolist(), 0.0]
     gain = (lengths / EASE_MM).tolist()
@@ -225,7 +226,7 @@ def move(start: Arms, end: Arms, pace: Pace, least_ticks: int = 0) -> tuple[Pose
     """
     ticks = max(least_ticks, *(_ticks_of_moves(a, b, pace) for a, b in zip(start, end, strict=True)))
     u = np.arange(ticks + 1) / max(1, ticks)
-    done = u**3 * (10 - 15 * u + 6 * u * u)
+    done = u * u * u * (10 - 15 * u + 6 * u * u)
     return tuple(_between(a, b, done) for a, b in zip(start, end, strict=True))
 
 
@@ -250,7 +251,7 @@ def joined(parts: Sequence[Poses]) -> Poses:
 
 def _ticks_of_moves(start: Pose, end: Pose, pace: Pace) -> int:
     """Count the ticks that one arm needs, 0 if it does not move."""
-    way_mm = float(np.linalg.norm(end.tip_mm - start.tip_mm))
+    way_mm = float(np.linalg.norm(end.tip_mm - start.tip_mm, axis=-1))
     angle = float(angle_between(start.rotation[None], end.rotation[None])[0])
     if way_mm <= SAME_POINT_MM and angle <= _SAME_TURN_RAD:
         return 0

@@ -34,12 +34,14 @@ from math import pi
 
 import numpy as np
 
+from skills.arithmetic import product
 from skills.arrays import Bytes, Floats, Ints, frozen
 from skills.errors import BadPlan, NoMotion, Unreachable
 from skills.kinematics import JOINTS, ROLL, check_rotation, instrument_of, inverse, matrix_of
 from skills.planning.handoff import OtherArm, PsmM, hand_off
 from skills.planning.motion_laws import PHASES, SAME_POINT_MM, Arms, Pose, Poses
 from skills.planning.path_fit import Hand
+from skills.quaternions import unit
 
 STAND_OFF_MM = 30.0  # ours: the needle's circle, 16.6 mm across, plus a finger of 10.2 mm, plus a little more
 _HINGE_REVERSED = np.diag([-1.0, -1.0, 1.0])
@@ -180,12 +182,12 @@ def other_arm(poses: Poses, ticks: Ticks, psm_m: PsmM) -> OtherArm:
     assert psm_m.base_mm is not None and psm_m.base_xyzw is not None
     base_mm, base_xyzw = np.array(psm_m.base_mm), np.array(psm_m.base_xyzw)
     base = matrix_of(base_xyzw[None])[0]
-    seen = Poses((poses.tip_mm - base_mm) @ base, base.T @ poses.rotation)
-    reversed_ = Poses(seen.tip_mm, seen.rotation @ _HINGE_REVERSED)
+    seen = Poses(product(poses.tip_mm - base_mm, base), product(base.T, poses.rotation))
+    reversed_ = Poses(seen.tip_mm, product(seen.rotation, _HINGE_REVERSED))
     # Both are solved over the complete motion, because the jaws must not change sides on the way.
     either = [solve(one, ticks, psm_m.instrument, "PSM_M") for one in (seen, reversed_)]
     joints = min(either, key=_most_roll)
-    return OtherArm(base_mm, base_xyzw / np.linalg.norm(base_xyzw), psm_m.instrument, joints)
+    return OtherArm(base_mm, unit(base_xyzw), psm_m.instrument, joints)
 
 
 def _most_roll(joints: Floats) -> float:

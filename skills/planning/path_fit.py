@@ -52,6 +52,7 @@ from math import dist
 
 import numpy as np
 
+from skills.arithmetic import product
 from skills.arrays import Flags, Floats, Ints, frozen
 from skills.demonstration.demonstration import Demo
 from skills.demonstration.movement import same_signs, smoothed_tip
@@ -59,6 +60,7 @@ from skills.errors import BadPlan
 from skills.gridworld.grid import GridPath
 from skills.kinematics import instrument_of, matrix_of, quaternion_of
 from skills.learning.policy import Rollout
+from skills.quaternions import unit
 
 TREMOR_S = 0.25  # a Hann window this wide has its zeros at 8, 12, 16 Hz and passes less than 3 % in between
 # Lengths as parts of a cell:
@@ -382,7 +384,7 @@ class Hand:
         turned = None
         if self.rotation_xyzw is not None:
             quaternions = self._between(same_signs(self.rotation_xyzw), count)
-            turned = matrix_of(quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True))
+            turned = matrix_of(quaternions)
         jaw = self.jaw_rad
         return (
             self._between(self.tip_mm, count),
@@ -421,7 +423,7 @@ def hand_along(demo: Demo, fitted: FittedPath, *, turning: bool) -> Hand:
     turned, opened = None, None
     if turning and demo.rotation_xyzw is not None:
         _, turned = _calm(times, _at(recorded_s, demo.stamps_s, same_signs(demo.rotation_xyzw)), TREMOR_S)
-        turned = turned / np.linalg.norm(turned, axis=1, keepdims=True)
+        turned = unit(turned)
     if (jaw := jaw_within(demo)) is not None:
         opened = _calm(times, np.interp(recorded_s, demo.stamps_s, jaw)[:, None], TREMOR_S)[1][:, 0]
     off_mm = _off_mm(tip_mm, fitted.tip_mm, np.interp(grid_s, clock_s, places))
@@ -481,8 +483,8 @@ def moved(hand: Hand, rotation: Floats, about_mm: Floats, to_mm: Floats) -> Hand
     """
     turned = hand.rotation_xyzw
     if turned is not None:
-        turned = same_signs(quaternion_of(rotation @ matrix_of(turned)))
-    return replace(hand, tip_mm=(hand.tip_mm - about_mm) @ rotation.T + to_mm, rotation_xyzw=turned)
+        turned = same_signs(quaternion_of(product(rotation, matrix_of(turned))))
+    return replace(hand, tip_mm=product(hand.tip_mm - about_mm, rotation.T) + to_mm, rotation_xyzw=turned)
 
 
 def jaw_recorded(hand: Hand | None) -> bool:
@@ -535,7 +537,7 @@ def styled(followed: Demo, demos: Sequence[Demo]) -> Demo:
     return replace(
         followed,
         stamps_s=np.append(0.0, np.cumsum(steps_s)),
-        rotation_xyzw=quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True),
+        rotation_xyzw=unit(quaternions),
         jaw_rad=None if path.jaw_rad is None else np.interp(elapsed_s, path.elapsed_s, path.jaw_rad),
     )
 

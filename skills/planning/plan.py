@@ -39,6 +39,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from skills.arithmetic import product
 from skills.arrays import Floats, Ints, frozen
 from skills.demonstration.demonstration import Demo
 from skills.errors import BadPlan, BadSpeed, OutsideGrid
@@ -362,7 +363,7 @@ def departure_of(demo: Demo, rotation: Floats | None = None) -> Departure | None
     rotation = seen[0] if rotation is None else rotation
     turn_deg = np.degrees(angle_between(seen, np.broadcast_to(rotation, seen.shape)))
     # The free end is on either side of the jaws, so the further one counts.
-    apart_mm = np.linalg.norm((seen - rotation) @ needle_tips_mm().T, axis=1).max(axis=1)
+    apart_mm = np.linalg.norm(product(seen - rotation, needle_tips_mm().T), axis=1).max(axis=1)
     return Departure(*(float(v) for v in (turn_deg.max(), apart_mm.max(), turn_deg[-1], apart_mm[-1])))
 
 
@@ -396,18 +397,20 @@ def _pass(
     turned = matrix_of(np.array([point.rotation_xyzw]))[0]
     last = recorded.last_rotation if recorded is not None and recorded.turning else None
     # offsets from a given place to the tip, which is the hinge
-    at_start, at_end = (-plan.tip_offset_mm * (turned @ one)[:, 2] for one in (jaw, jaw if last is None else last))
+    at_start, at_end = (
+        -plan.tip_offset_mm * product(turned, one)[:, 2] for one in (jaw, jaw if last is None else last)
+    )
     place = frozen(point.position_mm, np.float64, (3,), "position_mm") + at_end
     # `grid`, `goal` and `begin` are in the frame of the learnt grid; `place` and `start` are in the arm's frame.
     begin = grid.centres_mm(policy.path.start) if recorded is None else recorded.trace.ends_mm[0]
-    start = turned @ (begin - goal) + place
+    start = product(turned, begin - goal) + place
     if start_mm is not None:
         start = frozen(start_mm, np.float64, (3,), "start") + at_start
-        begin = _entered(grid, turned.T @ (start - place) + goal, number)
+        begin = _entered(grid, product(turned.T, start - place) + goal, number)
     followed = rollout(policy, begin)
     if not followed.finished:
         raise BadPlan(f"From its start pass {number} does not reach the goal.", **{"pass": number})
-    hand, held = None, turned @ jaw
+    hand, held = None, product(turned, jaw)
     if recorded is None:
         path = followed.tip_mm
     else:
@@ -418,7 +421,7 @@ def _pass(
             held = matrix_of(hand.rotation_xyzw[:1])[0]
     if np.abs(path[0] - begin).max() > NEGLIGIBLE_MM:
         path = np.concatenate((begin[None], path))
-    one = Pass(point, start, followed.states, (path - goal) @ turned.T + place, held, None, hand)
+    one = Pass(point, start, followed.states, product(path - goal, turned.T) + place, held, None, hand)
     return _with_a2(one, plan, recorded, goal, turned)
 
 
@@ -432,9 +435,11 @@ def _with_a2(one: Pass, plan: SuturePlan, recorded: _Recorded | None, goal_mm: F
         return replace(one, target_rotation=realign(brought, psm_m.approach).rotation)
     assert recorded is not None and recorded.last_rotation is not None
     assert psm_m.taken_mm is not None and psm_m.taken_xyzw is not None
-    target = brought if recorded.turning else turned @ recorded.last_rotation
-    taken_mm = turned @ (np.array(psm_m.taken_mm) - goal_mm) + one.tip_mm[-1]
-    return replace(one, target_rotation=target, taking=Pose(taken_mm, turned @ matrix_of([psm_m.taken_xyzw])[0]))
+    target = brought if recorded.turning else product(turned, recorded.last_rotation)
+    taken_mm = product(turned, np.array(psm_m.taken_mm) - goal_mm) + one.tip_mm[-1]
+    return replace(
+        one, target_rotation=target, taking=Pose(taken_mm, product(turned, matrix_of([psm_m.taken_xyzw])[0]))
+    )
 
 
 def _entered(grid: GridWorld, start_mm: Floats, number: int) -> Floats:

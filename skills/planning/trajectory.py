@@ -541,7 +541,7 @@ def seams(trajectory: Trajectory) -> list[Seam]:
         Seam(
             after_pass=number,
             pause_s=float(trajectory.stamps_s[after[number]] - trajectory.stamps_s[last]),
-            leap_mm=float(np.linalg.norm(trajectory.tip_mm[after[number]] - trajectory.tip_mm[last])),
+            leap_mm=float(np.linalg.norm(trajectory.tip_mm[after[number]] - trajectory.tip_mm[last], axis=-1)),
             leap_deg=float(turned[number]),
             joint_leap=max(float(leap[number].max()) for leap in leaps),
         )

@@ -152,6 +152,7 @@ def _playback(answer: dict[str, Any], trajectory: Trajectory, pad_top_mm: float)
     low, high = trajectory.tip_mm[:, :2].min(axis=0), trajectory.tip_mm[:, :2].max(axis=0)
     try:
         return Playback(
+            trajectory=trajectory,
             tip_mm=array_from(answer, "tip_mm", np.float64, (count, 3)),
             rotation_xyzw=array_from(answer, "rotation_xyzw", np.float64, (count, 4)),
             joints=array_from(answer, "joints", np.float64, (count, 6)),

@@ -40,6 +40,8 @@ from skills.verification.intent import LIMITS, IntentComparison
 from skills.verification.playback import PAD, PSM_A, PSM_M, Playback
 from skills.verification.scene_clearance import SceneClearance
 
+TOLERANCE = 1e-9  # in the unit of a figure: two processors differ by less, so both accept or one is too strict
+ROUND_OFF = 2e-9  # rad and mm: a joint may be as far beyond its limit as `inverse` allows, 1e-9
 SCENE = "clearance of the scene"  # the quantity of a failure beside tissue or an obstacle
 
 
@@ -211,8 +213,9 @@ class _Gate:
     at_least: bool = False
 
     def broken(self) -> int | None:
-        """Return the index of the first sample that does not pass, or None; NaN does not pass."""
-        passes = self.values >= self.limit if self.at_least else self.values <= self.limit
+        """Return the index of the first sample that does not pass, or None; NaN, or within `TOLERANCE`, does not."""
+        beyond = self.values - self.limit if self.at_least else self.limit - self.values
+        passes = beyond >= TOLERANCE
         return None if passes.all() else int(np.argmin(passes))
 
 
@@ -288,11 +291,12 @@ def _gates(figures: Figures, playback: Playback, trajectory: Trajectory, limits:
 
 def _joint_gates(arm: ArmSamples, limits: Limits) -> Iterator[_Gate]:
     whose = "" if arm.name == PSM_A else f"{arm.name}'s "
-    spare = limits.joint_margin * (arm.tool.upper - arm.tool.lower)
+    spare = limits.joint_margin * (arm.tool.upper - arm.tool.lower) - ROUND_OFF
+    upper, lower = arm.tool.upper - spare, arm.tool.lower + spare
     for joint, name in enumerate(JOINTS):
         values = arm.joints[:, joint]
-        yield _Gate(f"{whose}{name}", UNITS[joint], values, float(arm.tool.upper[joint] - spare[joint]) + 1e-9)
-        yield _Gate(f"{whose}{name}", UNITS[joint], values, float(arm.tool.lower[joint] + spare[joint]) - 1e-9, True)
+        yield _Gate(f"{whose}{name}", UNITS[joint], values, float(upper[joint]))
+        yield _Gate(f"{whose}{name}", UNITS[joint], values, float(lower[joint]), at_least=True)
     least_mm = limits.insertion_mm + arm.tool.cannula_mm - CANNULA_MM
     yield _Gate(f"{whose}insertion out of the cannula", "mm", arm.joints[:, INSERTION], least_mm, True)
     for joint, name in enumerate(JOINTS):

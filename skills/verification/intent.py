@@ -55,7 +55,7 @@ _FLIPPED = np.diag([-1.0, -1.0, 1.0])  # jaws are symmetric about their approach
 # cells, 0.01 s, and nothing of rotation and opening beyond the hand's own spread.
 LIMITS: Mapping[str, tuple[str, float]] = MappingProxyType(
     {
-        "number of passes off the suture points": ("passes", 0.0),
+        "number of passes off the suture points": ("passes", 0.5),
         "PSM_M's base off the stated one": ("mm", 0.05),
         "PSM_M's base turned from the stated one": ("deg", 0.05),
         "start of the pass off the asked one": ("mm", 0.05),

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from skills.arrays import Floats, Ints
 from skills.errors import BadInput
+from skills.planning.trajectory import Trajectory
 
 CLEARANCE_SEEN_MM = 50.0  # surfaces further apart than this are reported as this far
 PSM_A, PSM_M, PAD = "PSM_A", "PSM_M", "pad"
@@ -90,9 +91,10 @@ def pad_scale(tip_mm: Floats) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Playback:
-    """The simulator's measurements, stored as they came, NaN included.
+    """A motion and the simulator's measurements of it, stored as they came, NaN included.
 
     Attributes:
+        trajectory: The motion that was played, T samples: what is exported is what was judged.
         tip_mm: Tip in the kinematic pass, PSM base frame, shape (T, 3).
         rotation_xyzw: The jaw's rotation there, shape (T, 4).
         joints: Joints of the kinematic pass, rad and mm, shape (T, 6).
@@ -111,6 +113,7 @@ class Playback:
         seconds_per_step: Wall time of one servo step: a timing, so it is not part of any report or digest.
     """
 
+    trajectory: Trajectory
     tip_mm: Floats
     rotation_xyzw: Floats
     joints: Floats
@@ -128,7 +131,7 @@ class Playback:
     seconds_per_step: float
 
     def __post_init__(self) -> None:
-        count, looks, pairs = len(self.tip_mm), len(self.looked_at), len(self.link_pairs)
+        count, looks, pairs = len(self.trajectory), len(self.looked_at), len(self.link_pairs)
         for name, shape in {
             "tip_mm": (count, 3),
             "rotation_xyzw": (count, 4),
@@ -152,7 +155,7 @@ class Playback:
 
     def __len__(self) -> int:
         """The number of samples."""
-        return len(self.tip_mm)
+        return len(self.trajectory)
 
     @property
     def link_pairs(self) -> tuple[LinkPair, ...]:

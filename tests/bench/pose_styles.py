@@ -131,7 +131,7 @@ def medoid(shown: list[Poses], middle: Poses, ends: Poses) -> Poses:
 
 def laid(one: Poses, ends: Poses) -> Poses:
     """Return a demonstration laid between start and goal, as in `skills.learning.pose_style`."""
-    return laid_tip(one[0], ends[0][[0, -1]]), laid_rotations(one[1][None], Rotation.from_quat(ends[1][[0, -1]]))[0]
+    return laid_tip(one[0], ends[0][[0, -1]]), laid_rotations(one[1][None], ends[1][[0, -1]])[0]
 
 
 def laid_medoid(shown: list[Poses], middle: Poses, ends: Poses) -> Poses:

@@ -31,8 +31,10 @@ from skills.learning.networks import DDPG, DQN, TRPO
 from skills.learning.policy import learn_tabular
 from skills.learning.q_learning import CellQLearning, PhaseQLearning
 from skills.learning.tube import certified_poses
-from skills.planning.handoff import PsmM
+from skills.planning.handoff import OtherArm, PsmM
+from skills.planning.motion_laws import Poses
 from skills.planning.plan import Departure, SuturePoint, stack
+from skills.planning.trajectory import Trajectory
 from skills.verification.playback import Pictures, Playback
 from tests.deep.networks import always
 from tests.library.cases import bag, hand_off
@@ -60,7 +62,25 @@ HANDED = stack(
     psm_m=PsmM((-0.94, 0.10, -0.33), taken_mm=(15.0, 55.0, -125.0), taken_xyzw=(0.0, 0.0, 0.0, 1.0)),
 )
 HANDED = replace(HANDED, departure=Departure(60.0, 15.5, 59.0, 15.0))
+MOTION = Trajectory(
+    rate_hz=240.0,
+    instrument="400006",
+    stamps_s=np.array([0.0, 1 / 240]),
+    tip_mm=np.zeros((2, 3)),
+    rotation_xyzw=np.tile([0.0, 0.0, 0.0, 1.0], (2, 1)),
+    joints=np.full((2, 6), 0.1),
+    pass_index=np.zeros(2, np.int64),
+    phase=np.array([0, 2], np.int8),
+    speed_mm_s=20.0,
+    turn_rad_s=0.1 + 0.2,
+    speed_ratio=0.5,
+    acceleration_ratio=0.5,
+    deviation_mm=0.0,
+    psm_m=OtherArm(np.ones(3), np.array([0.0, 0.0, 0.0, 1.0]), "420006", np.zeros((2, 6))),
+    taking=Poses(np.ones((1, 3)), np.eye(3)[None]),
+)
 PLAYBACK = Playback(
+    trajectory=MOTION,
     tip_mm=np.array([[1.0, np.nan, np.inf], [-0.0, 5e-324, 1e308]]),
     rotation_xyzw=np.zeros((2, 4)),
     joints=np.asfortranarray(np.arange(12.0).reshape(2, 6)),

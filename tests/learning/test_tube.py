@@ -66,12 +66,12 @@ def excursions(path: PosePath, limits: TubeLimits, runs: int, seed: int) -> tupl
         far = np.linalg.norm(away, axis=1, keepdims=True)
         push = np.where(hostile[:, None] & (far > 1e-9), away / np.maximum(far, 1e-12), unit(rng, runs))
         size = np.where(hostile, 1.0, rng.random(runs))[:, None]
-        twist = (poses[sent.phases].inv() * sent.rotations).as_rotvec()
+        twist = (poses[sent.phases].inv() * turns(sent)).as_rotvec()
         angle = np.linalg.norm(twist, axis=1, keepdims=True)
         spin = np.where(hostile[:, None] & (angle > 1e-9), twist / np.maximum(angle, 1e-12), unit(rng, runs))
-        reached = sent.rotations * Rotation.from_rotvec(limits.disturbance_rad * size * spin)
+        reached = turns(sent) * Rotation.from_rotvec(limits.disturbance_rad * size * spin)
         hands = Hands(sent.tip_mm + limits.disturbance_mm * size * push, reached.as_quat(), sent.phases)
-        off_rad = (hands.rotations.inv() * poses[hands.phases]).magnitude().max()
+        off_rad = (turns(hands).inv() * poses[hands.phases]).magnitude().max()
         off_mm = np.linalg.norm(hands.tip_mm - path.tip_mm[hands.phases], axis=1).max()
         furthest = np.maximum(furthest, [off_mm, off_rad])
     return float(furthest[0]), float(furthest[1]), tick
@@ -87,6 +87,10 @@ def held_in_the_tube(runs: int, seed: int) -> None:
         assert off_mm <= proven.radius_mm + 1e-9 and off_rad <= proven.radius_rad + 1e-9
         assert ticks <= proven.ticks
         assert proven.radius_mm <= 2 * off_mm and proven.radius_rad <= 2 * off_rad
+
+
+def turns(hands: Hands) -> Rotation:
+    return Rotation.from_quat(hands.rotation_xyzw)
 
 
 def test_no_run_leaves_the_tube_and_all_arrive_in_time() -> None:
@@ -173,7 +177,7 @@ def test_a_replay_by_the_clock_leaves_the_tube() -> None:
 def by_scipy(path: PosePath, hands: Hands, limits: TubeLimits) -> tuple[Hands, np.ndarray]:
     """Compute a tick with scipy's rotations, for all hands at once; return also distance and angle before it."""
     poses, last = Rotation.from_quat(path.rotation_xyzw), len(path.tip_mm) - 1
-    back = hands.rotations.inv()
+    back = turns(hands).inv()
     phases, reached = hands.phases.copy(), np.zeros(len(hands.phases), bool)
     for ahead in range(limits.ahead, -1, -1):
         there = np.minimum(hands.phases + ahead, last)
@@ -186,7 +190,7 @@ def by_scipy(path: PosePath, hands: Hands, limits: TubeLimits) -> tuple[Hands, n
     tip = hands.tip_mm + to_mm * (limits.step_mm / np.maximum(far_mm, limits.step_mm))[:, None]
     shorter = Rotation.from_rotvec(turn * (limits.step_rad / np.maximum(far_rad, limits.step_rad))[:, None])
     tip[reached] = path.tip_mm[phases[reached]]
-    rotation = np.where(reached[:, None], path.rotation_xyzw[phases], (hands.rotations * shorter).as_quat())
+    rotation = np.where(reached[:, None], path.rotation_xyzw[phases], (turns(hands) * shorter).as_quat())
     return Hands(tip, rotation, phases), np.stack([off_mm, off_rad], axis=1)
 
 
@@ -201,7 +205,7 @@ def test_the_compiled_tick_equals_that_of_scipy(ahead: int) -> None:
     ours, (theirs, off) = advance(path, hands, limits), by_scipy(path, hands, limits)
     assert (ours.phases == theirs.phases).all()
     assert np.abs(ours.tip_mm - theirs.tip_mm).max() < 1e-9
-    assert (ours.rotations.inv() * theirs.rotations).magnitude().max() < 1e-9
+    assert (turns(ours).inv() * turns(theirs)).magnitude().max() < 1e-9
     for run in range(0, runs, 100):
         step = next_pose(path, hands.tip_mm[run], hands.rotation_xyzw[run], int(phases[run]), limits)
         assert np.abs(np.array(step.position_mm) - theirs.tip_mm[run]).max() < 1e-9

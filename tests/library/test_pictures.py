@@ -23,7 +23,7 @@ from skills.simulation import film, pictures
 from skills.verification.bodies import bodies_clearance, distances_at, names_of
 from skills.verification.playback import Pictures, Playback
 from tests.library import cases
-from tests.planning.motions import hand_off, ideal_playback, small_trajectory
+from tests.planning.motions import hand_off, ideal_playback
 from tests.planning.test_transfers import BESIDE
 
 REPORT = {
@@ -122,14 +122,6 @@ def test_a_film_that_fails_fails_the_job_and_nothing_is_stored(
     assert (ended.state, ended.error) == ("failed", "The simulator hung; play fewer passes.")
     assert drawn(database) == []
     assert job.id in refusal(database, playback)
-
-
-def test_a_playback_of_other_samples_is_refused_in_words(database: Database, playback: StoredPlayback):
-    with database.writing() as session:
-        store_playback(session, playback.plan, "b" * 64, ideal_playback(small_trajectory()))
-    ended = cases.work(database, asked(database)[-1])
-    assert ended.state == "failed"
-    assert "make the plan and play it again" in ended.error
 
 
 @pytest.mark.parametrize("what", ["surgeon", "demonstration"])

@@ -4,7 +4,7 @@ import io
 import json
 import math
 import zipfile
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ import pytest
 from sqlalchemy import select, update
 
 from skills.db.models import Plan, StoredPlayback
+from skills.db.packed import digest as digest_of
 from skills.db.session import Database
 from skills.errors import BadPlan, Conflict, Corrupt, NotFound
 from skills.formats.replay_bag import arms_of
@@ -21,57 +22,37 @@ from skills.library.catalogue import find_surgeon, put_surgeon
 from skills.library.demos import withdraw_demo
 from skills.library.history import newest_checkpoint, sign_history
 from skills.library.plans import find_plan, plan_in_words, plan_sutures, trajectory_of
-from skills.library.playbacks import trajectory_digest
 from skills.library.policies import find_version
 from skills.library.replay import check_doubt, cleared, replay_bag
 from skills.packing import canonical, sha256
+from skills.planning.plan import SuturePlan
+from skills.planning.trajectory import Trajectory
 from skills.schemas.plans import PlanIn
 from skills.transparency import PublicKey, read_notes
 from skills.verification.arm_errors import CALIBRATED, UNCALIBRATED, ArmErrors
-from skills.verification.playback import Playback, link_pairs
 from skills.verification.probabilities import JUDGE_VERSION
 from tests.independent_history import check_envelope
 from tests.library import cases
 from tests.library.attacks import tampering
+from tests.planning.motions import ideal_playback
 
 ASKED: dict[str, Any] = {"errors": UNCALIBRATED, "lower_bound": 0.9}
 OF_A1_ALONE: dict[str, Any] = ASKED | {"handoff": "none"}
-
-
-def measured() -> Playback:
-    """Return a simulator's measurements of nothing: the gate reads the report alone."""
-    one = np.zeros((1, 3))
-    return Playback(
-        tip_mm=one,
-        rotation_xyzw=np.zeros((1, 4)),
-        joints=np.zeros((1, 6)),
-        tracking_mm=np.zeros(1),
-        efforts=np.zeros((1, 6)),
-        contact_n=np.zeros(1),
-        looked_at=np.zeros(1, np.int64),
-        clearances_mm=np.zeros((1, len(link_pairs(False)))),
-        shaft_off_mm=np.zeros(1),
-        psm_m_tip_mm=None,
-        pad_mm=one[0],
-        picture_png=b"",
-        engine="none",
-        files={},
-        seconds_per_step=0.0,
-    )
 
 
 def judged(database: Database, plan: Plan, *, feasible: bool = True, digest: str | None = None, **more: Any) -> str:
     """Store a verdict on a plan as a playback does."""
     words = None if feasible else "Pass 0, A1, sample 3 (0.015 s): clearance to the pad is -2 mm, the limit is 1."
     with database.reading() as session:
-        digest_of_it = trajectory_digest(trajectory_of(find_plan(session, plan.sha256).plan))
+        trajectory = trajectory_of(find_plan(session, plan.sha256).plan)
     judged_all = {"bodies": {"arms": []}, "intent": []}
-    told = {"feasible": feasible, "failure_in_words": words, "trajectory": digest_of_it} | judged_all
+    told = {"feasible": feasible, "failure_in_words": words, "trajectory": digest_of(trajectory)} | judged_all
     report = told | doubt(0.97) | more
     identity = digest or sha256(canonical([plan.sha256, report]))
     with database.writing() as session:
         row = find_plan(session, plan.sha256)
-        session.add(StoredPlayback(sha256=identity, plan=row, feasible=feasible, report=report, measured=measured()))
+        measured = ideal_playback(trajectory)
+        session.add(StoredPlayback(sha256=identity, plan=row, feasible=feasible, report=report, measured=measured))
     return identity
 
 
@@ -294,8 +275,22 @@ def test_the_bag_is_complete_deterministic_and_holds_the_plans_samples(database:
     assert np.array_equal(arm.joints[:, [0, 1, 3, 4, 5]], trajectory.joints[:, [0, 1, 3, 4, 5]])
     papers_say_whose_it_is_and_how_far_it_goes(data, plan)
     judged(database, plan, trajectory="1" * 64)
-    with pytest.raises(Conflict, match="another motion than the older version"):
+    with pytest.raises(Corrupt, match="not the one that its verdict judged"):
         replay_bag(database, plan.sha256, **OF_A1_ALONE)
+
+
+def test_the_bag_has_the_judged_motion_where_another_is_computed(
+    database: Database, plan: Plan, monkeypatch: pytest.MonkeyPatch
+):
+    judged(database, plan)
+    data = replay_bag(database, plan.sha256, **OF_A1_ALONE)
+
+    def elsewhere(plan: SuturePlan) -> Trajectory:
+        here = trajectory_of(plan)
+        return replace(here, joints=np.nextafter(here.joints, np.inf))
+
+    monkeypatch.setattr(replay, "trajectory_of", elsewhere)  # as by another version of the law of motion
+    assert replay_bag(database, plan.sha256, **OF_A1_ALONE) == data
 
 
 def test_the_bag_is_signed_under_the_first_checkpoint_with_its_verdict(database: Database, plan: Plan):

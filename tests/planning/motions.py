@@ -29,6 +29,7 @@ def ideal_playback(trajectory: Trajectory) -> Playback:
     """Return the measurements of a simulator without any fault."""
     count = len(trajectory)
     return Playback(
+        trajectory=trajectory,
         tip_mm=trajectory.tip_mm,
         rotation_xyzw=trajectory.rotation_xyzw,
         joints=trajectory.joints,
