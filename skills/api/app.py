@@ -1,5 +1,6 @@
 """The FastAPI application: routes, middleware, one database, one job engine, and errors as problem documents."""
 
+import logging
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
 from math import inf
@@ -31,6 +32,7 @@ from skills.library.recordings import confined_reader
 from skills.logs import request_id
 from skills.settings import Settings
 
+log = logging.getLogger(__name__)
 DESCRIPTION = (
     "Suture styles as a service: a recorded needle hand-off of a surgeon is discretised, learnt, certified, "
     "served, stacked at suture points and played back in simulation. Lengths are mm. **Research use only; not a "
@@ -132,9 +134,10 @@ def prepare_to_serve(database: Database, settings: Settings) -> None:
     """Prepare a database; if it is not the one that was signed last, serve only the reason, `History.refused`."""
     try:
         prepare_database(database, settings)
-    except NotReady:
+    except NotReady as refused:
         if database.history.refused is None:
             raise
+        log.critical("Nothing is served or written. %s", refused)
 
 
 class Service(FastAPI):

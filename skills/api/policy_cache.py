@@ -23,7 +23,7 @@ from skills.db.changes import Unasked, WeightedCache, changes_of
 from skills.db.session import Database
 from skills.errors import Busy, SkillsError, UnknownFormat
 from skills.library import consent, integrity, neighbours, policies
-from skills.library.history import sign_history
+from skills.library.history import is_right, sign_history
 from skills.library.proofs import first_head
 from skills.library.releases import STANDS
 
@@ -152,9 +152,8 @@ class PolicyCache:
         """Compare the database with its kept head, and remove erased policies from memory, periodically."""
         while True:
             await asyncio.sleep(SWEEP_S)
-            with suppress(SkillsError, SQLAlchemyError):  # `History.refused` says what is wrong
-                await asyncio.to_thread(self._database.compare_history)
             with suppress(SkillsError, SQLAlchemyError):  # the database may be readable again at the next sweep
+                await asyncio.to_thread(is_right, self._database)  # sets `History.refused`
                 await asyncio.to_thread(self.forget_erased)
                 await asyncio.to_thread(neighbours.forget_gone, self._database)
 

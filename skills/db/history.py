@@ -15,7 +15,6 @@ guessed, so all proofs stay valid. `skills.library.history` numbers the leaves, 
 
 import hmac
 import json
-import logging
 import os
 import secrets
 import tempfile
@@ -111,7 +110,6 @@ class StoredCheckpoint(Base):
     signed_at: Mapped[datetime] = mapped_column(default=now)
 
 
-log = logging.getLogger(__name__)
 LEAVES = cast(Table, Leaf.__table__)
 CHECKPOINTS = cast(Table, StoredCheckpoint.__table__)
 
@@ -225,8 +223,6 @@ class History:
         try:
             return last_head(self.heads_file)
         except NotReady as refused:
-            if self.refused is None:
-                log.critical("Nothing is served or written (%s). %s", self.heads_file, refused)
             self.refused = refused
             raise
 
@@ -256,8 +252,6 @@ class History:
         try:
             self._refuse_another(connection, newest, kept)
         except NotReady as refused:
-            if self.refused is None:
-                log.critical("Nothing is served or written (%s, %s). %s", self.key_file, self.heads_file, refused)
             self.refused, self._agreed = refused, None
             raise
         self.refused, self._agreed = None, (newest, kept)

@@ -95,12 +95,25 @@ def sign_history(database: Database, at_most_s: float = inf) -> str | None:
     return note
 
 
+def is_right(database: Database) -> bool:
+    """Return whether it is the database that was signed last; log the reason when it is found not to be."""
+    before = database.history.refused
+    try:
+        database.compare_history()
+    except NotReady as refused:
+        if before is None:
+            files = database.history.key_file, database.history.heads_file
+            log.critical("Nothing is served or written (%s, %s). %s", *files, refused)
+        return False
+    return True
+
+
 def keep_signed(database: Database, at_most_s: float = SIGNING_S) -> bool:
-    """Sign some of the history; return whether it is the database that was signed last, and log why where it is not."""
+    """Sign some of the history, if it is the right one, and return whether it is; work goes on where signing fails."""
+    if not is_right(database):
+        return False
     try:
         sign_history(database, at_most_s)
-    except NotReady:
-        return False  # logged when it was found
     except (BadSettings, Corrupt) as error:
         log.error("The history is not signed: %s", error)
     return True
