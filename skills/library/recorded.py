@@ -70,9 +70,10 @@ def episodes_of(demonstrations: Sequence[int], *, whole: bool) -> Iterator[Selec
 
 def in_recording(session: Session, recording: StoredRecording) -> SurgeonsRecorded:
     """Return who is recorded in a whole recording."""
-    values = {"recording_row": recording.row, "surgeon_row": 0, "start_s": 0.0, "end_s": 0.0, "whole": True}
-    episode: Select[Any] = select(*(literal(value).label(name) for name, value in values.items()))
-    return recorded_in(session, [episode])
+    values: dict[str, Any] = {"recording_row": recording.row, "surgeon_row": 0}
+    values |= {"start_s": 0.0, "end_s": 0.0, "whole": True}
+    columns: list[ColumnElement[Any]] = [literal(value).label(name) for name, value in values.items()]
+    return recorded_in(session, [select(*columns)])
 
 
 def recorded_in(session: Session, episodes: Episodes) -> SurgeonsRecorded:
