@@ -155,7 +155,8 @@ def test_no_array_is_loaded_or_saved_with_pickles_in_it():
 
 
 ROOMS = ("demonstration", "gridworld", "learning", "planning", "verification", "comparison", "scoring")
-DOMAIN = [file for file in FILES if named(file).split("/")[0].removesuffix(".py") in (*ROOMS, "arrays", "kinematics")]
+ALONE = ("arithmetic", "arrays", "kinematics", "quaternions")
+DOMAIN = [file for file in FILES if named(file).split("/")[0].removesuffix(".py") in (*ROOMS, *ALONE)]
 MAY_IMPORT = {
     *("bisect", "collections", "dataclasses", "functools", "itertools", "math", "types", "typing"),
     *("numpy", "safetensors", "skills", "scipy"),

@@ -276,6 +276,24 @@ def test_worth_spreads_from_given_cells_and_never_through_them(shape, count, see
         assert np.array_equal(entering, worth)
 
 
+@settings(deadline=None)
+@given(st.tuples(*[st.integers(1, 5)] * 3), st.integers(0, 2**32))
+def test_each_cell_and_its_neighbours_are_added_at_any_power_of_two(shape, seed):
+    rng = np.random.default_rng(seed)
+    numbers = rng.uniform(0.7, 2.8, shape) * (rng.random(shape) < 0.8)
+    powers = rng.integers(-100, 100, shape).astype(np.int32) + np.int32(5000)
+    padded = np.pad(np.ldexp(numbers, powers - 5000), 1)
+    expected = sum(padded[a : a + shape[0], b : b + shape[1], c : c + shape[2]] for a, b, c in MOVES + 1)
+    made = []
+    for add in (_kernels.sum_around, _kernels.sum_around_compiled):
+        total, total_powers = np.empty(shape), np.empty(shape, np.int32)
+        add(numbers, powers, total, total_powers)
+        assert np.allclose(np.ldexp(total, total_powers - 5000 * (total > 0)), expected, rtol=1e-14, atol=0.0)
+        assert ((total == 0) | ((total >= 1) & (total < 2))).all()
+        made.append((total.tobytes(), total_powers.tobytes()))
+    assert made[0] == made[1]
+
+
 @pytest.mark.parametrize("sweeps", [2, 10])
 def test_the_compiled_values_settle_as_the_plain_ones_do_to_the_last_bit(sweeps):
     path = named_path("a figure of eight")
