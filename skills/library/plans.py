@@ -22,7 +22,7 @@ from skills.db.service_tables import record_event
 from skills.db.session import Database
 from skills.demonstration.demonstration import Demo
 from skills.demonstration.partner import Partner
-from skills.errors import BadPlan, BadSpeed, NoApproach, NoHandOff
+from skills.errors import BadPlan, BadSpeed, Conflict, NoApproach, NoHandOff
 from skills.formats.suture_points import PARSE, SuturePoints, suture_points
 from skills.gridworld.grid import refuse_metres
 from skills.gridworld.scene import Scene, Tissue
@@ -67,7 +67,8 @@ def plan_sutures(database: Database, request: PlanIn, actor: str) -> tuple[Plan,
     Raises:
         BadPlan: The arm, frame or instrument is not the demonstration's, an orientation or a hand-off is requested that
             was not recorded, or a pass is out of reach of either arm.
-        Conflict: The surgeon's consent does not cover training.
+        Conflict: The surgeon's consent does not cover training, or a demonstration of the served version was withdrawn
+            or marked recovery or failure meanwhile.
         NoApproach: A hand-off is requested, and neither request nor demonstration has PSM_M's approach.
         NoHandOff: The plan would have no hand-off, and such a plan was not requested.
     """
@@ -77,8 +78,10 @@ def plan_sutures(database: Database, request: PlanIn, actor: str) -> tuple[Plan,
     identity = plan_identity(sha, plan)
     about = describe_plan(plan, trajectory, learnt_in)
     with database.writing([locks.surgeon(request.surgeon)]) as session:
-        # Consent may have ended while the plan was computed.
+        # Consent may have ended, or a demonstration been withdrawn, while the plan was computed.
         policy = policies.followable(policies.find_by_digest(session, sha))
+        if request.version is None and (changes := policy.objections):
+            raise Conflict(f"The demonstration that the plan would follow {changes[0]}; plan again.")
         # An equal plan has the same digest, so a repeated request returns the stored row.
         known = session.scalar(select(Plan).where(Plan.sha256 == identity))
         if known is not None:
