@@ -107,6 +107,17 @@ class Surgeon(Base):
     created_at: Mapped[datetime] = mapped_column(default=now)
 
 
+class UsedNumber(Base):
+    """The last number of a style's versions that were erased, or lost with a restoration: no version has it again."""
+
+    __tablename__ = "used_numbers"
+
+    row: Mapped[RowId]
+    surgeon_row: Mapped[int] = mapped_column(ForeignKey("surgeons.row", ondelete="CASCADE"), index=True)
+    suture: Mapped[str] = mapped_column(Slug)  # not of the catalogue alone: a restored one may be older
+    last: Mapped[int]
+
+
 class Erasure(Base):
     """A record that a surgeon was erased, with a salted digest of the pseudonym instead of the pseudonym."""
 
@@ -162,6 +173,21 @@ class RecordingSurgeon(Base):
 
     recording_row: Mapped[int] = mapped_column(ForeignKey("recordings.row", ondelete="CASCADE"), primary_key=True)
     surgeon_row: Mapped[int] = mapped_column(ForeignKey("surgeons.row"), primary_key=True, index=True)
+
+
+class ErasedInterval(Base):
+    """An interval of a recording in which somebody is seen whose demonstration was erased; without times all of it.
+
+    The surgeon is null once that surgeon is erased: then nobody can allow a use of it any more.
+    """
+
+    __tablename__ = "erased_intervals"
+
+    row: Mapped[RowId]
+    recording_row: Mapped[int] = mapped_column(ForeignKey("recordings.row", ondelete="CASCADE"), index=True)
+    surgeon_row: Mapped[int | None] = mapped_column(ForeignKey("surgeons.row"), index=True)
+    start_s: Mapped[float | None]
+    end_s: Mapped[float | None]
 
 
 class RecordingChunk(Base):

@@ -17,6 +17,7 @@ from skills.db import Base
 from skills.db.models import (
     Demonstration,
     DemonstrationOutcome,
+    ErasedInterval,
     MeasuredShape,
     ParsedChunk,
     ParsedRecording,
@@ -34,6 +35,7 @@ from skills.db.models import (
     StoredRecording,
     StoredRewardMap,
     Surgeon,
+    UsedNumber,
 )
 from skills.db.service_tables import DatasetChunk, DatasetDemonstration, Job, StoredDataset, StyleToRetrain
 
@@ -84,6 +86,7 @@ class Only:
             Surgeon: Surgeon.row.in_(mine),
             StoredRecording: StoredRecording.row.in_(recordings),
             RecordingSurgeon: RecordingSurgeon.surgeon_row.in_(mine),
+            ErasedInterval: ErasedInterval.recording_row.in_(recordings),
             RecordingChunk: RecordingChunk.recording.in_(recordings),
             ParsedRecording: ParsedRecording.recording_row.in_(recordings),
             ParsedChunk: ParsedChunk.recording_row.in_(recordings),
@@ -95,6 +98,7 @@ class Only:
             PolicyVersion: PolicyVersion.surgeon_row.in_(mine),
             PolicyDemonstration: PolicyDemonstration.policy_row.in_(policies),
             StoredPoses: StoredPoses.policy_row.in_(policies),
+            UsedNumber: UsedNumber.surgeon_row.in_(mine),
             Release: Release.surgeon_row.in_(mine),
             Plan: Plan.policy_row.in_(policies),
             StoredPlayback: StoredPlayback.plan_row.in_(plans),

@@ -26,7 +26,16 @@ from skills import __version__
 from skills.db import Base, dump, rfc3339
 from skills.db.dump import Manifest
 from skills.db.kept_heads import set_aside
-from skills.db.models import SUCCESS, Demonstration, Erasure, PolicyVersion, Release, StoredRecording, Surgeon
+from skills.db.models import (
+    SUCCESS,
+    Demonstration,
+    Erasure,
+    PolicyVersion,
+    Release,
+    StoredRecording,
+    Surgeon,
+    UsedNumber,
+)
 from skills.db.service_tables import Event, Job, Key, record_event
 from skills.db.session import Database
 from skills.db.tiles import fill_tiles
@@ -62,6 +71,7 @@ LISTED = (
     RELEASED,
     ("add", "surgeon"),
     ("change", "surgeon"),
+    ("train", "policy-version"),
 )
 
 T = TypeVar("T")
@@ -84,12 +94,14 @@ class Erasures:
         consents: The consent of each surgeon as last stated, by subject, and the moment of the statement.
         outcomes: The outcome of each marked demonstration, by its SHA-256, and the moment of the newest mark; not the
             reason, which may name a person.
+        numbers: The last version number of each style, by subject and suture type: it is never used again.
     """
 
     surgeons: frozenset[tuple[str, str, datetime]] = frozenset()
     ended: Ended = field(default_factory=dict)
     consents: Mapping[str, tuple[datetime, Consent]] = field(default_factory=dict)
     outcomes: Mapping[str, tuple[datetime, DemoOutcome]] = field(default_factory=dict)
+    numbers: Mapping[tuple[str, str], int] = field(default_factory=dict)
 
     @property
     def demos(self) -> frozenset[str]:
@@ -104,6 +116,7 @@ class Erasures:
             {kind: _latest(self.ended.get(kind, {}), other.ended.get(kind, {})) for kind in kinds},
             {**other.consents, **_later(self.consents, other.consents)},
             {**other.outcomes, **_later(self.outcomes, other.outcomes)},
+            {**other.numbers, **_higher(self.numbers, other.numbers)},
         )
 
     def since(self, known: "Erasures") -> "Erasures":
@@ -116,7 +129,8 @@ class Erasures:
             for kind, names in self.ended.items()
         }
         consents, outcomes = _later(self.consents, known.consents), _later(self.outcomes, known.outcomes)
-        return Erasures(self.surgeons - known.surgeons, ended, consents, outcomes)
+        numbers = _higher(self.numbers, known.numbers)
+        return Erasures(self.surgeons - known.surgeons, ended, consents, outcomes, numbers)
 
 
 def _latest(one: Mapping[str, datetime], other: Mapping[str, datetime]) -> dict[str, datetime]:
@@ -132,6 +146,10 @@ def _later(
 ) -> dict[str, tuple[datetime, T]]:
     """Return the statements of one list that are later than the other's on the same object, or the only ones."""
     return {name: said for name, said in one.items() if name not in other or other[name][0] < said[0]}
+
+
+def _higher(one: Mapping[tuple[str, str], int], other: Mapping[tuple[str, str], int]) -> dict[tuple[str, str], int]:
+    return {style: last for style, last in one.items() if last > other.get(style, 0)}
 
 
 NOTHING = Erasures()
@@ -257,6 +275,7 @@ def keep_erasures(database: Database, target: Path) -> Erasures:
             **{kind: _written(listed.ended.get(kind, {})) for kind in sorted(set(ENDS.values()))},
             "consents": {who: [rfc3339(at), consent] for who, (at, consent) in sorted(listed.consents.items())},
             "outcomes": {demo: [rfc3339(at), outcome] for demo, (at, outcome) in sorted(listed.outcomes.items())},
+            "numbers": [[*style, last] for style, last in sorted(listed.numbers.items())],
         }
         with _appearing(target) as file:
             about = {"format": ERASURES, "erasures": content, "sha256": sha256(canonical(content))}
@@ -310,6 +329,7 @@ def _read(content: dict[str, Any]) -> Erasures:
         {who: (datetime.fromisoformat(at), consent) for who, (at, consent) in content["consents"].items()},
         # A list of an older version has none.
         {demo: (datetime.fromisoformat(at), outcome) for demo, (at, outcome) in content.get("outcomes", {}).items()},
+        {(subject, suture): last for subject, suture, last in content.get("numbers", ())},
     )
 
 
@@ -348,7 +368,17 @@ def _listed(session: Session) -> Erasures:
             stated[event.subject] = at
     described = session.execute(select(Surgeon.subject, Surgeon.created_at, Surgeon.consent))
     consents = {subject: (stated.get(subject, created_at), consent) for subject, created_at, consent in described}
-    return Erasures(frozenset(surgeons), ended, consents, outcomes)
+    return Erasures(frozenset(surgeons), ended, consents, outcomes, _numbers(session))
+
+
+def _numbers(session: Session) -> dict[tuple[str, str], int]:
+    """Return the last version number of each style, by subject and suture type, also of erased versions."""
+    found: dict[tuple[str, str], int] = {}
+    for of, number in ((PolicyVersion, PolicyVersion.version), (UsedNumber, UsedNumber.last)):
+        query = select(Surgeon.subject, of.suture, func.max(number)).join(of, of.surgeon_row == Surgeon.row)
+        for subject, suture, last in session.execute(query.group_by(Surgeon.subject, of.suture)):
+            found[subject, suture] = max(last, found.get((subject, suture), 0))
+    return found
 
 
 def _in_order(session: Session) -> Iterator[tuple[Any, datetime]]:
@@ -400,6 +430,10 @@ def _end_again(session: Session, erasures: Erasures) -> dict[str, int]:
     for key in keys:
         revoke_key(session, key, "restore")
     narrowed = _narrow(session, later.consents)
+    rows = {one.subject: one.row for one in session.scalars(select(Surgeon))}
+    for (subject, suture), last in later.numbers.items():
+        if subject in rows:
+            session.add(UsedNumber(surgeon_row=rows[subject], suture=suture, last=last))
     stopped = len(served - _served(session))
     return {
         "surgeons_erased": len(surgeons),

@@ -13,6 +13,7 @@ from sqlalchemy.orm import InstrumentedAttribute, Session
 from skills.db import rfc3339
 from skills.db.changes import announce
 from skills.db.models import Erasure, Surgeon, SutureType
+from skills.db.row_visibility import ONLY
 from skills.db.service_tables import record_event
 from skills.errors import Erased, NotFound
 from skills.library import releases
@@ -60,8 +61,8 @@ def find_surgeon(session: Session, slug: str) -> Surgeon:
     """Return a surgeon.
 
     Raises:
-        NotFound: There is none of this pseudonym.
-        Erased: The surgeon of this pseudonym was erased.
+        NotFound: There is none of this pseudonym, among those that the caller may see.
+        Erased: The surgeon of this pseudonym was erased; only a caller who may see all surgeons is told.
     """
     surgeon = known_surgeon(session, slug)
     if surgeon is None:
@@ -163,6 +164,8 @@ def _near(column: InstrumentedAttribute[str], given: str) -> Select[str]:
 
 
 def _refuse_erased(session: Session, slug: str) -> None:
+    if ONLY in session.info:  # a restricted key may not learn who was here
+        return
     # Each erasure has its own salt, so the pseudonym is digested with every one.
     if any(salted(e.salt, slug) == e.digest for e in session.scalars(select(Erasure))):
         raise Erased("This surgeon's data was erased permanently; use another pseudonym for new recordings.")

@@ -23,19 +23,17 @@ from time import monotonic
 from typing import IO, Any, NamedTuple, cast
 from zipfile import ZipFile, ZipInfo
 
-from sqlalchemy import ColumnElement, Select, Table, and_, delete, exists, insert, literal, or_, select
+from sqlalchemy import ColumnElement, Select, Table, delete, exists, insert, or_, select
 from sqlalchemy.orm import Session
 
 from skills.db import in_parts
 from skills.db.models import (
     SUCCESS,
     Demonstration,
-    RecordingSurgeon,
     StoredRecording,
     Surgeon,
     SutureType,
 )
-from skills.db.row_visibility import EVERYBODYS
 from skills.db.service_tables import (
     DatasetChunk,
     DatasetDemonstration,
@@ -63,6 +61,7 @@ from skills.library.catalogue import find_surgeon, find_suture_type
 from skills.library.demos import find_demo
 from skills.library.integrity import find_by_digest
 from skills.library.jobs import EXPORT, UNSYNCHRONISED, DatasetRequest, Store
+from skills.library.recorded import RECORDED, episodes_of, overlap, recorded_in
 from skills.library.recordings import CHUNK_BYTES, Teller, confined_reader, stored_recording
 from skills.packing import canonical, sha256
 from skills.remedies import Action, Remedy
@@ -72,10 +71,8 @@ from skills.settings import Settings
 MOST = 20_000  # demonstrations of a dataset, ours: their rows are in memory at once
 TOLD_S = 0.5  # progress is stored about so often, each time in a transaction
 
-_EXPORTED, _DEMOS, _NAMED = (
-    cast(Table, one.__table__).alias() for one in (DatasetDemonstration, Demonstration, RecordingSurgeon)
-)
-_RECORDED = cast(Table, Demonstration.__table__).alias("recorded")
+_EXPORTED, _DEMOS = (cast(Table, one.__table__).alias() for one in (DatasetDemonstration, Demonstration))
+EPISODE = (_DEMOS.c.recording_row, _DEMOS.c.surgeon_row, _DEMOS.c.start_s, _DEMOS.c.end_s)
 
 
 # ---- request -------------------------------------------------------------------------------------------------------
@@ -114,8 +111,8 @@ def request_dataset(session: Session, asked: DatasetIn, actor: str) -> tuple[Job
     chosen = _chosen(session, asked)
     splits = _splits(chosen, asked)
     arms = _arms(session, chosen, asked.arms)
-    surgeons = _surgeons(session, _recorded_with([one.row for one in chosen], whole=asked.whole))
-    _require_consent(surgeons, {one.surgeon_row for one in chosen})
+    recorded = recorded_in(session, episodes_of([one.row for one in chosen], whole=asked.whole))
+    recorded.require("export", {one.surgeon_row for one in chosen})
     request: DatasetRequest = {
         "name": asked.name,
         "version": asked.version,
@@ -126,7 +123,7 @@ def request_dataset(session: Session, asked: DatasetIn, actor: str) -> tuple[Job
         "licence": asked.licence,
         "description": asked.description,
         "procedure": asked.procedure,
-        "consent": consents_in_words(surgeons),
+        "consent": consents_in_words(recorded.surgeons),
         "episodes": len({one.recording_row for one in chosen}) if asked.whole else len(chosen),
         "demos_sha256": sha256(canonical([[one.sha256, splits[one.row]] for one in chosen])),
     }
@@ -232,80 +229,21 @@ def _arms(session: Session, chosen: Sequence[_Chosen], wanted: list[str] | None)
 # ---- consent -------------------------------------------------------------------------------------------------------
 
 
-def _overlap(of: Any) -> ColumnElement[bool]:
-    """Return the condition that a demonstration `_RECORDED` is seen in an episode with the columns `of`."""
-    at_once = and_(_RECORDED.c.start_s <= of.end_s, _RECORDED.c.end_s >= of.start_s)
-    return and_(_RECORDED.c.recording_row == of.recording_row, or_(of.whole, at_once))
-
-
-EPISODE = (_DEMOS.c.recording_row, _DEMOS.c.surgeon_row, _DEMOS.c.start_s, _DEMOS.c.end_s)
-
-
-def _recorded_with(rows: Sequence[int], *, whole: bool) -> Iterator[Select[Any]]:
-    """Yield queries of the surgeons who are recorded in the episodes of some demonstrations."""
-    for some in in_parts(rows):
-        yield from _recorded(select(*EPISODE, literal(whole).label("whole")).where(_DEMOS.c.row.in_(some)))
-
-
-def _recorded_in(job_row: int) -> Iterator[Select[Any]]:
-    """Yield queries of the surgeons who are recorded in the episodes of an export."""
-    mine = _EXPORTED.c.demonstration_row == _DEMOS.c.row
-    yield from _recorded(
-        select(*EPISODE, _EXPORTED.c.whole).join(_EXPORTED, mine).where(_EXPORTED.c.job_row == job_row)
-    )
-
-
-def _recorded(episodes: Select[Any]) -> Iterator[Select[Any]]:
-    """Yield queries of the surgeons who are recorded in some episodes.
-
-    The tables are bare, because a surgeon whom the caller may not see has to consent too. Only demonstrations of other
-    surgeons are compared with the episodes, so the time does not grow with the square of those in one recording.
-    """
-    of = episodes.cte("episodes").c
-    yield select(of.surgeon_row)
-    others = (
-        _RECORDED.c.recording_row.in_(select(of.recording_row)),
-        _RECORDED.c.surgeon_row.not_in(select(of.surgeon_row)),
-    )
-    yield select(_RECORDED.c.surgeon_row).where(*others, exists().where(_overlap(of)))
-    yield select(_NAMED.c.surgeon_row).where(_NAMED.c.recording_row.in_(select(of.recording_row).where(of.whole)))
-
-
-def _surgeons(session: Session, queries: Iterable[Select[Any]]) -> list[Surgeon]:
-    rows = sorted({row for query in queries for row in session.scalars(query.distinct())})
-    found = (select(Surgeon).where(Surgeon.row.in_(some)).order_by(Surgeon.row) for some in in_parts(rows))
-    return [one for query in found for one in session.scalars(query, execution_options=EVERYBODYS)]
-
-
-def _require_consent(surgeons: Sequence[Surgeon], chosen: set[int]) -> None:
-    """Refuse an export that a consent does not cover today.
-
-    Raises:
-        Conflict: It names a surgeon whose demonstration was chosen; others may be unknown to the caller.
-    """
-    for surgeon in surgeons:
-        if surgeon.row in chosen:
-            consent.require(surgeon, "export")
-    if not all(consent.may(one, "export") for one in surgeons):
-        raise Conflict("An episode also has the hand-off of another surgeon whose consent does not cover export.")
-
-
 def require_exportable(session: Session, job: Job) -> list[Surgeon]:
     """Refuse an export whose demonstrations may not be passed on now; return all surgeons who are recorded in it.
 
     Raises:
         Conflict: A consent does not cover it, or a demonstration was withdrawn.
     """
-    mine = _EXPORTED.c.job_row == job.row
-    of = select(_DEMOS.c.surgeon_row, _DEMOS.c.withdrawn_at).join(
-        _EXPORTED, _EXPORTED.c.demonstration_row == _DEMOS.c.row
-    )
-    found = session.execute(of.where(mine).distinct()).all()
-    surgeons = _surgeons(session, _recorded_in(job.row))
-    _require_consent(surgeons, {one.surgeon_row for one in found})
+    exported = _DEMOS.join(_EXPORTED, _EXPORTED.c.demonstration_row == _DEMOS.c.row)
+    of = select(_DEMOS.c.surgeon_row, _DEMOS.c.withdrawn_at).select_from(exported).distinct()
+    found = session.execute(of.where(_EXPORTED.c.job_row == job.row)).all()
+    episodes = select(*EPISODE, _EXPORTED.c.whole).select_from(exported).where(_EXPORTED.c.job_row == job.row)
+    recorded = recorded_in(session, [episodes])
+    recorded.require("export", {one.surgeon_row for one in found})
     if any(one.withdrawn_at is not None for one in found):
         raise Conflict("A demonstration in this dataset was withdrawn; export the others again.")
-    return surgeons
+    return recorded.surgeons
 
 
 def consents_in_words(surgeons: Sequence[Surgeon]) -> str:
@@ -548,15 +486,15 @@ def exports_of(which: ColumnElement[bool]) -> Select[int]:
     erased = select(Demonstration.row).where(which)
     mine = _EXPORTED.c.demonstration_row == _DEMOS.c.row
     of = select(_EXPORTED.c.job_row, _DEMOS.c.row, *EPISODE, _EXPORTED.c.whole).join(_EXPORTED, mine).subquery().c
-    seen = exists().where(_RECORDED.c.row.in_(erased), _overlap(of))
+    seen = exists().where(RECORDED.c.row.in_(erased), overlap(of))
     return select(of.job_row).where(or_(of.row.in_(erased), seen)).distinct()
 
 
-def exports_of_whole(recordings: Select[int]) -> Select[int]:
-    """Return the query of the jobs that export some recordings as a whole."""
+def exports_from(recordings: Select[int]) -> Select[int]:
+    """Return the query of the jobs that export some recordings or parts of them."""
     of_job = _EXPORTED.c.demonstration_row == _DEMOS.c.row
     seen = select(_EXPORTED.c.job_row).select_from(_EXPORTED).join(_DEMOS, of_job)
-    return seen.where(_EXPORTED.c.whole, _DEMOS.c.recording_row.in_(recordings)).distinct()
+    return seen.where(_DEMOS.c.recording_row.in_(recordings)).distinct()
 
 
 def drop_exports(session: Session, job_rows: Sequence[int]) -> None:

@@ -20,10 +20,8 @@ from skills.db.models import (
     Release,
     StoredRecording,
     StoredRewardMap,
-    Surgeon,
 )
 from skills.db.packed import digest
-from skills.db.row_visibility import EVERYBODYS
 from skills.db.service_tables import record_event
 from skills.db.session import Database
 from skills.demonstration.demonstration import Demo, Segment, cut_demo
@@ -35,9 +33,10 @@ from skills.fields import as_json
 from skills.formats.reader_process import MOST, Told, read_told
 from skills.gridworld.grid import PAPER_GRID, GridPath, choose_grid, describe_path, discretize
 from skills.gridworld.reward import RewardMap, sparse_reward
-from skills.library import consent, locks
+from skills.library import locks
 from skills.library.catalogue import find_surgeon, find_suture_type
 from skills.library.integrity import demo_identity, find_by_digest
+from skills.library.recorded import in_recording
 from skills.library.recordings import (
     Teller,
     Upload,
@@ -313,30 +312,22 @@ def exported_recording(session: Session, demo_sha256: str) -> StoredRecording:
     """Return the recording of a demonstration, for an export of its bytes.
 
     Raises:
-        Conflict: The consent of a surgeon with a demonstration in this recording does not cover an export.
+        Conflict: Somebody in this recording does not allow an export.
     """
     demo = find_demo(session, demo_sha256)
-    consent.require(demo.surgeon, "export")
-    also = select(Demonstration.surgeon_row).where(Demonstration.recording_row == demo.recording_row)
-    others = select(Surgeon).where(Surgeon.row.in_(also), Surgeon.row != demo.surgeon_row)
-    if not all(consent.may(other, "export") for other in session.scalars(others, execution_options=EVERYBODYS)):
-        # The message does not name the surgeon, whom the caller may not be allowed to see.
-        raise Conflict("The recording contains the hand-off of another surgeon whose consent does not cover export.")
+    in_recording(session, demo.recording).require("export", {demo.surgeon_row})
     return demo.recording
 
 
 def exported_chunk(database: Database, demo_sha256: str, number: int) -> bytes | None:
     """Return one chunk of a demonstration's recording, counted from 0, in a transaction of its own.
 
-    None: there are no more chunks, or the demonstration was erased since (`exported_recording` then raises an error).
+    None: there are no more chunks. It raises the errors of `exported_recording`.
     """
-    query = (
-        select(RecordingChunk.data)
-        .join(Demonstration, Demonstration.recording_row == RecordingChunk.recording)
-        .where(Demonstration.sha256 == demo_sha256, RecordingChunk.number == number)
-    )
     with database.reading() as session:
-        return session.scalar(query)
+        row = exported_recording(session, demo_sha256).row
+        of = RecordingChunk.recording == row, RecordingChunk.number == number
+        return session.scalar(select(RecordingChunk.data).where(*of))
 
 
 def newest_demo(session: Session, surgeon_row: int, suture: str) -> Demonstration | None:

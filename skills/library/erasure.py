@@ -11,8 +11,9 @@ One transaction erases all that can be seen. Of many jobs and of large recording
 
 import secrets
 from collections.abc import Sequence
+from typing import Any
 
-from sqlalchemy import ColumnElement, Select, delete, func, select
+from sqlalchemy import ColumnElement, Select, delete, func, insert, select
 from sqlalchemy.orm import Session
 
 from skills.db import in_parts, now
@@ -20,6 +21,7 @@ from skills.db.changes import announce
 from skills.db.models import (
     Demonstration,
     DemonstrationOutcome,
+    ErasedInterval,
     Erasure,
     LooseChunks,
     MeasuredShape,
@@ -36,12 +38,13 @@ from skills.db.models import (
     StoredRecording,
     StoredRewardMap,
     Surgeon,
+    UsedNumber,
 )
 from skills.db.row_visibility import EVERYBODYS
 from skills.db.service_tables import Job, record_event
 from skills.errors import Conflict, NotAllowed
 from skills.library.catalogue import find_surgeon, salted
-from skills.library.datasets import drop_exports, exports_of, exports_of_whole
+from skills.library.datasets import drop_exports, exports_from, exports_of
 from skills.library.demos import find_demo
 from skills.library.jobs import ACTIVE as NOT_ENDED
 from skills.library.jobs import UNSYNCHRONISED, forget_styles
@@ -73,13 +76,32 @@ def erase_surgeon(session: Session, slug: str, actor: str) -> Dropped:
     delete_jobs(session, surgeon.row)
     named = session.scalars(select(RecordingSurgeon.recording_row).where(RecordingSurgeon.surgeon_row == surgeon.row))
     _erase(session, of_surgeon, surgeon, {*named})
+    _forget_name(session, surgeon)
     record_event(session, actor, "erase", "surgeon", surgeon.subject, surgeon)
     # A salted digest recognises the pseudonym if somebody uses it again, and cannot be read back.
     salt = secrets.token_hex(32)
     session.add(Erasure(salt=salt, digest=salted(salt, slug)))
-    session.execute(delete(RecordingSurgeon).where(RecordingSurgeon.surgeon_row == surgeon.row), **UNSYNCHRONISED)
     session.execute(delete(Surgeon).where(Surgeon.row == surgeon.row))
     return dropped
+
+
+def _forget_name(session: Session, surgeon: Surgeon) -> None:
+    """Leave intervals without a name in the recordings that stay, so that what the surgeon refused stays refused."""
+    named, gone = RecordingSurgeon, ErasedInterval
+    theirs = session.scalars(select(named.recording_row).where(named.surgeon_row == surgeon.row)).all()
+    intervals = select(gone.recording_row, gone.start_s, gone.end_s).where(gone.surgeon_row == surgeon.row)
+    _mark(session, None, [*((row, None, None) for row in theirs), *session.execute(intervals)])
+    for of in (named, gone):
+        session.execute(delete(of).where(of.surgeon_row == surgeon.row), **UNSYNCHRONISED)
+
+
+def _mark(session: Session, surgeon_row: int | None, intervals: Sequence[Any]) -> None:
+    values = [
+        {"recording_row": row, "surgeon_row": surgeon_row, "start_s": start_s, "end_s": end_s}
+        for row, start_s, end_s in intervals
+    ]
+    if values:
+        session.execute(insert(ErasedInterval), values)
 
 
 def erased_with(session: Session, surgeon: Surgeon, demo: Demonstration | None = None) -> list[int]:
@@ -132,11 +154,12 @@ def erase_demo(session: Session, demo_sha256: str, actor: str) -> Dropped:
 
 
 def _drop_exports(session: Session, which: ColumnElement[bool], surgeon: Surgeon | None = None) -> Dropped:
-    """Delete every dataset in which some demonstrations, or a surgeon's recordings as a whole, can be seen."""
+    """Delete every dataset in which some demonstrations, or anything of a surgeon's recordings, can be seen."""
     rows = {*session.scalars(exports_of(which))}
     if surgeon is not None:
-        named = select(RecordingSurgeon.recording_row).where(RecordingSurgeon.surgeon_row == surgeon.row)
-        rows |= {*session.scalars(exports_of_whole(named))}
+        for of in (RecordingSurgeon, ErasedInterval):
+            theirs = select(of.recording_row).where(of.surgeon_row == surgeon.row)
+            rows |= {*session.scalars(exports_from(theirs))}
     found = select(Job.row, Job.attempt).where(Job.row.in_(rows), ACTIVE)
     dropped = [(row, at) for row, at in session.execute(found.execution_options(**EVERYBODYS))]
     drop_exports(session, sorted(rows))
@@ -198,7 +221,9 @@ def _erase(session: Session, which: ColumnElement[bool], surgeon: Surgeon, recor
     Long lists of rows are not bound as parameters at once: a statement has a limited number of them.
     """
     announce(session)
-    recordings = recordings | {*session.scalars(select(Demonstration.recording_row).where(which))}
+    seconds = select(Demonstration.recording_row, Demonstration.start_s, Demonstration.end_s).where(which)
+    intervals = session.execute(seconds).all()
+    recordings = recordings | {row for row, _, _ in intervals}
     policies = session.scalars(_resting_on(which)).all()
     demos = select(Demonstration.row).where(which)
     # Every cached row with distances of the suture type may hold one from an erased demonstration. Shapes alone, of
@@ -208,6 +233,10 @@ def _erase(session: Session, which: ColumnElement[bool], surgeon: Surgeon, recor
     touched = cached.in_(demos) | (cached.in_(beside) & (MeasuredShape.version >= 0))
     session.execute(delete(MeasuredShape).where(touched), **UNSYNCHRONISED)
     for some in in_parts(policies):
+        by = PolicyVersion
+        numbers = select(by.surgeon_row, by.suture, func.max(by.version)).where(by.row.in_(some))
+        used = numbers.group_by(by.surgeon_row, by.suture)
+        session.execute(insert(UsedNumber).from_select(["surgeon_row", "suture", "last"], used))
         plans = select(Plan.row).where(Plan.policy_row.in_(some))
         playbacks = select(StoredPlayback.row).where(StoredPlayback.plan_row.in_(plans))
         # From the leaves to the roots, because of the foreign keys.
@@ -224,12 +253,16 @@ def _erase(session: Session, which: ColumnElement[bool], surgeon: Surgeon, recor
     for of in (StoredRewardMap, DemonstrationOutcome):
         session.execute(delete(of).where(of.demonstration_row.in_(demos)), **UNSYNCHRONISED)
     session.execute(delete(Demonstration).where(which), **UNSYNCHRONISED)
+    kept: set[int] = set()
     for some in in_parts(sorted(recordings)):
         cut = select(Demonstration.recording_row).where(Demonstration.recording_row.in_(some))
         others = select(RecordingSurgeon.recording_row).where(
             RecordingSurgeon.recording_row.in_(some), RecordingSurgeon.surgeon_row != surgeon.row
         )
-        _delete_recordings(session, sorted({*some} - {*session.scalars(cut)} - {*session.scalars(others)}))
+        still = {*session.scalars(cut), *session.scalars(others)}
+        _delete_recordings(session, sorted({*some} - still))
+        kept |= still
+    _mark(session, surgeon.row, [one for one in intervals if one.recording_row in kept])
 
 
 def _delete_recordings(session: Session, rows: Sequence[int]) -> None:

@@ -20,7 +20,7 @@ from sqlalchemy import Row, Select, or_, select
 from sqlalchemy.orm import Session
 
 from skills.db import rfc3339
-from skills.db.models import Demonstration, ProposalMark, RecordingSurgeon, StoredRecording, Surgeon
+from skills.db.models import Demonstration, ErasedInterval, ProposalMark, RecordingSurgeon, StoredRecording, Surgeon
 from skills.db.service_tables import record_event
 from skills.db.session import Database
 from skills.errors import Conflict, NotFound
@@ -153,26 +153,27 @@ def find_proposal(session: Session, recording: str, number: int) -> Proposal:
 
 def _proposals_in(session: Session, recordings: Sequence[Any]) -> Iterator[Proposal]:
     rows = [one.row for one in recordings]
-    of, named, marked = Demonstration, RecordingSurgeon, ProposalMark
+    of, named, gone, marked = Demonstration, RecordingSurgeon, ErasedInterval, ProposalMark
     columns = (of.row, of.recording_row, of.surgeon_row, of.arm, of.start_s, of.end_s, of.sha256, of.suture)
     cut = select(*columns, of.withdrawn_at, of.outcome, of.outcome_reason).where(of.recording_row.in_(rows))
     demos: defaultdict[int, list[Any]] = defaultdict(list)
     for demo in sorted(session.execute(cut), key=lambda one: one.row):
         demos[demo.recording_row].append(demo)
-    owners: defaultdict[int, list[int]] = defaultdict(list)
+    owners: defaultdict[int, set[int | None]] = defaultdict(set)
     sent_as = select(named.recording_row, named.surgeon_row).where(named.recording_row.in_(rows))
-    for row, owner in session.execute(sent_as):
-        owners[row].append(owner)
+    erased = select(gone.recording_row, gone.surgeon_row).where(gone.recording_row.in_(rows), gone.start_s.is_(None))
+    for row, owner in (*session.execute(sent_as), *session.execute(erased)):
+        owners[row].add(owner)  # null: somebody who was erased
     known = {*chain.from_iterable(owners.values()), *(demo.surgeon_row for some in demos.values() for demo in some)}
-    called = select(Surgeon.row, Surgeon.slug).where(Surgeon.row.in_(known))
+    called = select(Surgeon.row, Surgeon.slug).where(Surgeon.row.in_(known - {None}))
     slugs = {one.row: one.slug for one in session.execute(called)}
     all_marks = session.scalars(select(marked).where(marked.recording_row.in_(rows)).order_by(marked.row))
     marks = {(one.recording_row, one.number): one for one in all_marks}  # the newest of each
     for one in recordings:
         for number, segment in enumerate(one.about["segments"], 1):
             demo = _cut_there(segment, demos[one.row])
-            theirs = owners[one.row] if demo is None else [demo.surgeon_row]
-            surgeon = slugs[theirs[0]] if len(theirs) == 1 else None
+            theirs = owners[one.row] if demo is None else {demo.surgeon_row}
+            surgeon = slugs.get(min(theirs)) if len(theirs) == 1 else None
             yield Proposal(one, number, segment, surgeon, demo, marks.get((one.row, number)))
 
 

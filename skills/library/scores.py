@@ -22,7 +22,6 @@ from sqlalchemy.orm import Session
 from skills.arrays import Floats
 from skills.comparison.distances import distances, shape_of
 from skills.db.models import Demonstration, MeasuredShape, StoredRecording, Surgeon
-from skills.db.row_visibility import EVERYBODYS
 from skills.db.session import Database
 from skills.demonstration.demonstration import Demo, cut_demo
 from skills.errors import BadInput, BadPath, Conflict, NotFound
@@ -33,6 +32,7 @@ from skills.library.catalogue import find_surgeon, find_suture_type
 from skills.library.consent import may, require
 from skills.library.demos import find_demo, newest_demo
 from skills.library.members import member_of, sessions_of, without_overlaps
+from skills.library.recorded import in_recording
 from skills.library.recordings import Teller, find_recording, stored_recording
 from skills.schemas.comparison import (
     CurvePoint,
@@ -306,7 +306,7 @@ def score(database: Database, asked: ScoreIn, tell: Teller) -> Score:
         _agreed_still(session, [reference, scored.row], scored.recording)
         compared = [reference, *([scored.row] if scored.row else [])]
         others = list(others_of(session, asked.suture, np.array(deviation.reference_mm), compared))
-        if skill.calibrated and not _all_agree(session, scored.recording):
+        if skill.calibrated and not in_recording(session, scored.recording).may("atlas"):
             skill = unrated(NOT_AGREED)
     mine = {**numbers, "distance_mm": deviation.distance_mm}
     row = scored.row
@@ -420,14 +420,8 @@ def _agreed_by_all(session: Session, recording: StoredRecording) -> None:
     Raises:
         Conflict: The consent of a surgeon with a demonstration in this recording does not cover a comparison.
     """
-    if not _all_agree(session, recording):
+    if not in_recording(session, recording).may("atlas"):
         raise Conflict("The consent of a surgeon in this recording does not cover comparisons.")
-
-
-def _all_agree(session: Session, recording: StoredRecording) -> bool:
-    also = select(Demonstration.surgeon_row).where(Demonstration.recording_row == recording.row)
-    surgeons = session.scalars(select(Surgeon).where(Surgeon.row.in_(also)), execution_options=EVERYBODYS)
-    return all(may(surgeon, "atlas") for surgeon in surgeons)
 
 
 def _agreed_still(session: Session, compared: Sequence[Demonstration | None], recording: StoredRecording) -> None:
@@ -451,7 +445,7 @@ def _skill(database: Database, recording: StoredRecording, task: str | None, tel
     """Return the calibrated model's rating of a whole recording, or the reason why there is none."""
     with database.reading() as session:
         stored = calibrations.newest(session)
-        agreed = _all_agree(session, recording)
+        agreed = in_recording(session, recording).may("atlas")
     if stored is None:
         return unrated("Not calibrated: the operator of this installation can calibrate it on rated trials.")
     model = calibrations.read_calibration(stored)

@@ -15,18 +15,16 @@ from skills.db.models import (
     Demonstration,
     Plan,
     PolicyVersion,
-    RecordingSurgeon,
     StoredPlayback,
     StoredRecording,
-    Surgeon,
 )
-from skills.db.row_visibility import EVERYBODYS
 from skills.db.session import Database
-from skills.errors import Conflict, NotFound
-from skills.library import consent, policies
-from skills.library.demos import exported_recording, find_demo
+from skills.errors import NotFound
+from skills.library import policies
+from skills.library.demos import find_demo
 from skills.library.plans import find_plan, motion_of, trajectory_of
 from skills.library.policies import poses_of
+from skills.library.recorded import episodes_of, in_recording, recorded_in
 from skills.library.recordings import Teller, find_recording, stored_recording
 from skills.verification.timeline import (
     Timeline,
@@ -74,17 +72,13 @@ def check_export(session: Session, source: Source, sha256: str) -> None:
     """Refuse a file of a recorded motion that a surgeon's consent does not cover; others are checked as they are read.
 
     Raises:
-        Conflict: The consent of a surgeon in the recording does not cover an export.
+        Conflict: Somebody in these seconds of the recording does not allow an export.
     """
     if source == "demos":
-        exported_recording(session, sha256)
+        demo = find_demo(session, sha256)
+        recorded_in(session, episodes_of([demo.row], whole=False)).require("export", {demo.surgeon_row})
     if source == "recordings":
-        row = find_recording(session, sha256).row
-        cut = select(Demonstration.surgeon_row).where(Demonstration.recording_row == row)
-        named = select(RecordingSurgeon.surgeon_row).where(RecordingSurgeon.recording_row == row)
-        theirs = select(Surgeon).where(Surgeon.row.in_(cut) | Surgeon.row.in_(named))
-        if not all(consent.may(one, "export") for one in session.scalars(theirs, execution_options=EVERYBODYS)):
-            raise Conflict("The recording contains a surgeon whose consent does not cover an export.")
+        in_recording(session, find_recording(session, sha256)).require("export")
 
 
 class TimelineLink(NamedTuple):

@@ -27,6 +27,7 @@ from skills.db.models import (
     StoredRecording,
     StoredRewardMap,
     Surgeon,
+    UsedNumber,
     newest_mark,
 )
 from skills.db.packed import Sealed, seal, unpack_as
@@ -84,7 +85,7 @@ from skills.settings import Settings
 
 # Statements executed for every style, built once: building one takes as long as executing it.
 _VERSIONS, _DEMOS, _SURGEONS = (cast(Table, one.__table__) for one in (PolicyVersion, Demonstration, Surgeon))
-_OF_STYLE = _VERSIONS.alias("of_style")
+_OF_STYLE, _USED = _VERSIONS.alias("of_style"), cast(Table, UsedNumber.__table__)
 STANDING = (
     select(
         _DEMOS.c.row,
@@ -96,6 +97,10 @@ STANDING = (
         .where(_OF_STYLE.c.surgeon_row == _DEMOS.c.surgeon_row, _OF_STYLE.c.suture == _DEMOS.c.suture)
         .scalar_subquery()
         .label("last"),
+        select(func.max(_USED.c.last))
+        .where(_USED.c.surgeon_row == _DEMOS.c.surgeon_row, _USED.c.suture == _DEMOS.c.suture)
+        .scalar_subquery()
+        .label("used"),
     )
     .join_from(_DEMOS, _SURGEONS, _SURGEONS.c.row == _DEMOS.c.surgeon_row)
     .where(_DEMOS.c.row.in_(bindparam("demonstrations", expanding=True)))
@@ -500,7 +505,8 @@ def store_styles(session: Session, learnt: Sequence[Learnt]) -> list[Stored | Sk
     # A version that is already stored is returned as it is, so a retry of a job stores nothing twice.
     new = [one for one in learnt if one.sha256 not in known and refused[one.sha256] is None]
     if new:
-        values = [_version(one, (standing[one.lesson.row].last or 0) + 1) for one in new]
+        of_style = [standing[one.lesson.row] for one in new]
+        values = [_version(one, max(of.last or 0, of.used or 0) + 1) for one, of in zip(new, of_style, strict=True)]
         known |= _stored(session.execute(ADD, values))
         record_events(session, "worker", "train", "policy-version", [(one.sha256, one.lesson.surgeon) for one in new])
     _store_poses(session, [one for one in learnt if refused[one.sha256] is None], known)

@@ -16,13 +16,12 @@ from dataclasses import dataclass, replace
 from math import log
 
 import numpy as np
-from sqlalchemy import func, select
+from sqlalchemy import select
 
 from skills.arrays import Floats, Ints
 from skills.comparison.distances import shape_of
 from skills.comparison.recognition import NUMBERS, Validated, recognise, signature_of, usable, validate, vote
-from skills.db.models import Demonstration, StoredRecording
-from skills.db.row_visibility import EVERYBODYS
+from skills.db.models import StoredRecording
 from skills.db.session import Database
 from skills.demonstration.demonstration import cut_demo
 from skills.demonstration.segments import movements_by_arm
@@ -30,6 +29,7 @@ from skills.errors import BadInput, BadPath, BadRecording, Conflict, NotFound
 from skills.learning.slip import wilson
 from skills.library.catalogue import find_suture_type
 from skills.library.members import Member, members_of, numbered, sessions_of
+from skills.library.recorded import in_recording
 from skills.library.recordings import Teller, find_recording, stored_recording
 from skills.schemas.comparison import Calibrated, Likely, RecognisedRecording, Recognition, Votes, Whose
 
@@ -229,12 +229,10 @@ def _known(database: Database, recording_sha256: str, suture: str) -> dict[int, 
             raise NotFound(f"This recording has no demonstration of '{suture}' that may be compared; cut one.")
         rows = [asked.row, *sorted({*by_row} - {asked.row}, reverse=True)[:MOST_RECORDINGS]]
         # Of all surgeons, also those whom the caller may not see: a movement of a recording may be of any of them.
-        of = Demonstration
-        query = select(of.recording_row, func.count(of.surgeon_row.distinct())).where(of.recording_row.in_(rows))
-        counts = session.execute(query.group_by(of.recording_row), execution_options=EVERYBODYS).all()
-        single = {row for row, surgeons in counts if surgeons == 1}
+        found = select(StoredRecording).where(StoredRecording.row.in_(rows))
+        single = {one.row for one in session.scalars(found) if in_recording(session, one).single}
         if asked.row not in single:
-            raise Conflict("Several surgeons have demonstrations in this recording, so it has no single one.")
+            raise Conflict("Several surgeons are in this recording, so it has no single one.")
         digests = select(StoredRecording.row, StoredRecording.sha256).where(StoredRecording.row.in_(single))
         return {row: _Known(sha256, by_row[row]) for row, sha256 in session.execute(digests).all()}
 

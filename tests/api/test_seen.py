@@ -188,6 +188,43 @@ def test_a_key_whose_surgeon_is_erased_sees_nobody_rather_than_everybody(tmp_pat
         assert admin("GET", "/keys").json()["items"][1]["surgeons"] == []
 
 
+def naming(service: Service, name: str) -> list[tuple[str, str, dict[str, Any]]]:
+    """List calls that name a surgeon in a path, a query or a body."""
+    style = f"surgeon={name}&suture={cases.SUTURE}"
+    queries = ("/demos?", "/policies?", "/proposals?", "/history?at=2100-01-01T00:00:00Z&")
+    body, about = {"surgeon": name, "suture": cases.SUTURE}, {"suture": cases.SUTURE, "version": "1", "surgeon": name}
+    paths = [(method, filled(path, about)) for method, path, _ in routes(service) if "{surgeon}" in path]
+    return [
+        *(("GET", f"{where}{style}", {}) for where in queries),
+        ("GET", f"/surgeons/heron/progress?suture={cases.SUTURE}&against={name}", {}),
+        ("POST", "/trainings", {"json": body}),
+        ("POST", "/retrainings", {"json": {"surgeon": name}}),
+        ("POST", "/datasets", {"json": {"surgeons": [name]}}),
+        ("POST", f"/recordings?surgeon={name}", {"content": cases.hand_off(), "headers": {"Content-Type": CSV}}),
+        ("POST", f"/demos?{style}", {"content": cases.hand_off(), "headers": {"Content-Type": CSV}}),
+        *((method, path or "", {"json": {}} if method in ("POST", "PUT") else {}) for method, path in paths),
+    ]
+
+
+def test_an_erased_surgeon_is_as_unknown_to_a_restricted_key_as_nobody(tmp_path: Path):
+    with serving(copy_of_told(tmp_path)) as service:
+        admin, heron = (
+            As(service, key(service, "anna", "admin")),
+            As(service, key(service, "h", "releaser", surgeons=["heron"])),
+        )
+        assert admin("DELETE", "/surgeons/kestrel").status_code == 204
+
+        def said(who: As, name: str, most: int) -> list[tuple[str, int, str]]:
+            calls = naming(service, name)[:most]
+            answers = [(path, who(method, path, **how)) for method, path, how in calls]
+            return [(path.replace(name, "-"), one.status_code, one.text.replace(name, "-")) for path, one in answers]
+
+        erased, unknown = said(heron, "kestrel", 99), said(heron, "nestrel", 99)
+        assert erased == unknown
+        assert {status for _, status, _ in erased} <= {403, 404, 422}
+        assert [status for _, status, _ in said(admin, "kestrel", 10)] == [410] * 10
+
+
 def test_every_table_has_a_rule_or_is_said_to_need_none():
     ruled = {table.__tablename__ for table in Only("somebody", frozenset({1})).rules}
     assert ruled | set(OF_NOBODY) == set(Base.metadata.tables)

@@ -419,16 +419,16 @@ def test_a_hand_off_added_later_needs_consent_too(database: Database):
         zip_of(database, dataset)
 
 
-def test_a_whole_recording_needs_the_surgeon_it_was_uploaded_for(database: Database):
+@pytest.mark.parametrize("whole", [False, True])
+def test_a_recording_needs_the_surgeon_it_was_uploaded_for(database: Database, whole: bool):
     from skills.formats import write_mcap
 
     cases.add_surgeon(database, "wren", consent=NO_EXPORT)
     add(database, session_of())
     sent = cases.upload(write_mcap(session_of()), "application/vnd.mcap")
     store_recording(database, sent, "test", surgeon="wren")
-    assert ask(database)
     with pytest.raises(Conflict, match="another surgeon"):
-        ask(database, whole=True)
+        ask(database, whole=whole)
 
 
 # ---- erasure and visibility ----------------------------------------------------------------------------------------
@@ -457,14 +457,15 @@ def test_erasing_a_surgeon_deletes_the_datasets_with_them(database: Database, ap
     assert not faults(database)
 
 
-def test_erasing_the_surgeon_of_a_whole_recording_deletes_it(database: Database):
+@pytest.mark.parametrize("whole", [False, True])
+def test_erasing_a_surgeon_whom_an_upload_named_deletes_it(database: Database, whole: bool):
     from skills.formats import write_mcap
 
     cases.add_surgeon(database, "wren")
     add(database, session_of())
     sent = cases.upload(write_mcap(session_of()), "application/vnd.mcap")
     store_recording(database, sent, "test", surgeon="wren")
-    export(database, whole=True)
+    export(database, whole=whole)
     with database.writing() as session:
         erase_surgeon(session, "wren", "test")
         assert session.query(StoredRecording).count() == 1  # kestrel's demonstration is of it

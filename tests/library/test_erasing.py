@@ -2,6 +2,8 @@
 
 import secrets
 import time
+from contextlib import closing
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -9,13 +11,13 @@ from sqlalchemy import event, insert, select, text
 
 from skills import db
 from skills.db import history
-from skills.db.models import Demonstration, MeasuredShape, RecordingChunk, StoredRecording, Surgeon
+from skills.db.models import Demonstration, MeasuredShape, PolicyVersion, RecordingChunk, StoredRecording, Surgeon
 from skills.db.service_tables import Job
 from skills.db.session import Database
 from skills.errors import Conflict, NotAllowed, NotFound
 from skills.library import atlas, sweep
 from skills.library.atlas import atlas_of
-from skills.library.backup import back_up, erasures_of, restore
+from skills.library.backup import back_up, erasures_of, keep_up_erasures, read_erasures, restore
 from skills.library.catalogue import put_surgeon
 from skills.library.demos import add_demo, withdraw_demo
 from skills.library.erasure import delete_recording, erase_demo, erase_surgeon
@@ -27,6 +29,7 @@ from tests import backends
 from tests.comparison.cohort import cohort
 from tests.db.test_query_plans import noted, plan_of
 from tests.library import cases, cohorts
+from tests.library.styles import ask_retraining, parts_of
 
 
 def test_cached_distances_to_erased_demos_outside_the_atlas_are_deleted(
@@ -178,6 +181,60 @@ def test_a_deleted_recording_does_not_come_back_with_a_backup(database: Database
     assert restore(restored, tmp_path / "b.zip", erasures_of(database)).recordings_deleted == 1
     assert recordings(restored) == [kept]
     restored.close()
+
+
+# ---- version numbers -----------------------------------------------------------------------------------------------
+
+
+def numbered(database: Database, demo: str, seed: int = 0) -> tuple[int, str]:
+    version = cases.train(database, demos=[demo], seed=seed, release=True)
+    return version.version, version.sha256
+
+
+def test_the_number_of_an_erased_version_is_never_used_again(database: Database):
+    first, second = (cases.add_demo(database, cases.hand_off((x, 0.0, 0.0))).sha256 for x in (0.0, 2.5))
+    assert numbered(database, first)[0] == 1
+    _, before = numbered(database, second)
+    with database.writing() as session:
+        erase_demo(session, second, "test")
+    assert numbered(database, first, seed=1)[0] == 3
+    third = cases.add_demo(database, cases.hand_off((5.0, 0.0, 0.0))).sha256
+    number, after = numbered(database, third)
+    assert number == 4 and after != before
+    with database.writing() as session:
+        for demo in (first, third):
+            erase_demo(session, demo, "test")
+    assert numbered(database, cases.add_demo(database).sha256)[0] == 5
+
+
+def test_a_batch_uses_no_number_again_either(database: Database):
+    demo = cases.add_demo(database).sha256
+    other = cases.add_demo(database, cases.hand_off((2.5, 0.0, 0.0))).sha256
+    assert numbered(database, other)[0] == 1
+    with database.writing() as session:
+        erase_demo(session, other, "test")
+    (part,) = parts_of(database, ask_retraining(database))
+    cases.work(database, part)
+    with database.reading() as session:
+        (version,) = session.scalars(select(PolicyVersion)).all()
+    assert (version.version, version.manifest["demos"]) == (2, [demo])
+
+
+@pytest.mark.parametrize("erased", [False, True])
+def test_a_restored_backup_uses_no_number_again(database: Database, tmp_path: Path, erased: bool):
+    first, second = (cases.add_demo(database, cases.hand_off((x, 0.0, 0.0))).sha256 for x in (0.0, 2.5))
+    assert numbered(database, first)[0] == 1
+    back_up(database, tmp_path / "b.zip")
+    known = keep_up_erasures(database, tmp_path / "erasures.json")
+    assert numbered(database, second)[0] == 2
+    if erased:
+        with database.writing() as session:
+            erase_demo(session, second, "test")
+    keep_up_erasures(database, tmp_path / "erasures.json", known)
+    with closing(Database(backends.blank("sqlite", tmp_path))) as restored:
+        restore(restored, tmp_path / "b.zip", read_erasures(str(tmp_path / "erasures.json")))
+        assert numbered(restored, first, seed=1)[0] == 3
+        assert numbered(restored, first, seed=2)[0] == 4
 
 
 # ---- very many rows ------------------------------------------------------------------------------------------------

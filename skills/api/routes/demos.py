@@ -458,7 +458,7 @@ def score(body: ScoreIn, db: Db, tell: Tell) -> Response:
     return say(scores.score(db, body, tell))
 
 
-@score_router.get("/surgeons/{surgeon}/progress", dependencies=[needs("reader")], **gives(Progress, 404, 409))
+@score_router.get("/surgeons/{surgeon}/progress", dependencies=[needs("reader")], **gives(Progress, 404, 409, 410))
 def surgeon_progress(
     surgeon: Slug,
     db: Db,
