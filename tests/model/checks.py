@@ -1,8 +1,9 @@
 """An installation compared with `tests.model.invariant`: the objects that it serves, and the rows that it stores."""
 
 from collections import Counter
+from collections.abc import Set
 from functools import cache
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from hypothesis.stateful import RuleBasedStateMachine, invariant
@@ -44,6 +45,7 @@ class Compared(RuleBasedStateMachine):
 
     model: Model
     service: Service
+    without: ClassVar[Set[str]] = frozenset()  # steps and checks that are left out, to look past a known defect
     styles: set[Style]  # styles that were ever learnt
 
     def call(self, method: str, path: str, *expected: int, **how: Any) -> Any:
@@ -66,6 +68,7 @@ class Compared(RuleBasedStateMachine):
         self._check_proposals(stored)
         self._check_books(stored)
         self._check_distances()
+        self._check_exports()
         for table, rows in stored.items():
             said = str(rows)
             assert not any(surgeon in said for surgeon in self.model.erased), f"'{table}' names an erased surgeon"
@@ -130,6 +133,12 @@ class Compared(RuleBasedStateMachine):
         assert {name for name, state in jobs.items() if state in ACTIVE} == {
             one.id for one in model.jobs.values() if one.state in ACTIVE
         }
+
+    def _check_exports(self) -> None:
+        """Check that the bytes of each recording are passed on or refused."""
+        for demo in self.model.demos.values() if "exports" not in self.without else ():
+            may = self.model.may_export(demo.recording)
+            self.call("GET", f"/demos/{demo.sha256}/recording", 200 if may else 409)
 
     def _rows(self) -> dict[str, Any]:
         """Read all tables, without packed values."""

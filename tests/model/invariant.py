@@ -15,14 +15,23 @@ Nothing here depends on the service. `Model` is updated after each action of a u
     holds the pseudonym.
 3.  **Answered.** A job that succeeded has stored its stated result. A client that requests a training with a release,
     and waits, gets the answer "released" if, and only if, that version is then served; otherwise it gets the reason.
-    A call that consent or a withdrawal forbids is refused. A job fails only if there was an obstacle.
+    A call that consent or a withdrawal forbids is refused. A job fails only if there was an obstacle. A job that was
+    cancelled, or erased with what it is about, stores nothing from then on, whatever step it is in. The number of a
+    version is never used twice in a style.
 4.  **Restored.** Of the backup's content, everything erased, withdrawn, superseded or revoked since is so again after
     a restore, what was last marked recovery or failure since is marked so, and consent covers what it covered then and
     as it was last stated; the rest is as in the backup.
     Objects that were erased or withdrawn before another restore, and uploaded again since, end again as well: the
     list only removes. A restore never fails because of an entry of the list.
 5.  **Keys.** A key is valid until it is revoked or has expired, and not after.
-6.  **Proposals.** A proposal is accepted while a demonstration that was cut there is stored, also a withdrawn one.
+6.  **Passed on.** A recording, as bytes, as a timeline or in a dataset, is passed on while every surgeon in it allows
+    export: who was named at its upload, or has, or had, a demonstration there. Erasing one of them closes it for good.
+7.  **Rolled back.** If the database is put back to a state older than the kept head, nothing is served and nothing
+    is written until the right one is back, or the rollback is accepted, which is a restore of the older one. Nor is
+    anything served or written with another signing key.
+8.  **Elsewhere.** Another machine, with another processor, learns every version again as it is stored, and exports the
+    same bytes, or refuses for the same reason.
+9.  **Proposals.** A proposal is accepted while a demonstration that was cut there is stored, also a withdrawn one.
     Otherwise it is as was last decided, and open at the beginning. After a restore the decisions are as in the
     backup: an open proposal gives nobody a permission, so the list has no rejections.
 """
@@ -96,7 +105,10 @@ class Release:
 
 @dataclass
 class Job:
-    """A training with its demonstrations; or a batch, with `ended` as the styles whose end is known."""
+    """A training with its demonstrations; a batch, with `ended` as the styles whose end is known; or a try.
+
+    A try has no demonstrations, but a recording and a style.
+    """
 
     id: str
     surgeon: str | None
@@ -105,8 +117,10 @@ class Job:
     state: str
     batch: bool = False
     of_any: bool = False
+    recording: str | None = None
+    style: Style = ("", "")
     ended: set[str] = field(default_factory=set)
-    doubt: set[str] = field(default_factory=set)  # demonstrations that had an obstacle during the work on it
+    doubt: set[str] = field(default_factory=set)  # obstacles during the work on it, by demonstration or recording
 
 
 @dataclass
@@ -145,9 +159,12 @@ class Model:
     subjects: dict[str, int] = field(default_factory=dict)  # identities: a later surgeon may reuse a pseudonym
     erased: set[str] = field(default_factory=set)
     recordings: dict[str, set[str]] = field(default_factory=dict)  # the surgeons named at upload
+    left: dict[str, set[str]] = field(default_factory=dict)  # whose erased demonstrations are still in its bytes
+    closed: set[str] = field(default_factory=set)  # recordings in which somebody was erased
     decided: dict[str, tuple[str, str | None]] = field(default_factory=dict)  # on the proposal of a recording, and why
     demos: dict[str, Demo] = field(default_factory=dict)
     versions: dict[str, Version] = field(default_factory=dict)
+    numbers: dict[Style, int] = field(default_factory=dict)  # the highest that a version of a style ever had
     plans: dict[str, str] = field(default_factory=dict)  # the versions that they are made of
     releases: list[Release] = field(default_factory=list)
     jobs: dict[str, Job] = field(default_factory=dict)
@@ -199,8 +216,18 @@ class Model:
         """Return the state of the only proposal of a recording."""
         return "accepted" if self.cut_from(recording) else self.decided.get(recording, ("open", None))[0]
 
+    def seen_in(self, recording: str) -> set[str]:
+        cut = {one.style[0] for one in self.cut_from(recording)}
+        return cut | self.recordings[recording] | self.left.get(recording, set())
+
     def may_export(self, recording: str) -> bool:
-        return all(self.may(one.style[0], "export") for one in self.cut_from(recording))
+        return recording not in self.closed and all(self.may(one, "export") for one in self.seen_in(recording))
+
+    def may_try(self, job: Job) -> bool:
+        """Return whether a try has no obstacle now."""
+        cut = [one for one in self.cut_from(job.recording or "") if one.style == job.style]
+        free = job.recording in self.recordings and self.may(job.style[0], "training")
+        return free and not any(one.withdrawn or one.failed for one in cut)
 
     def lets_in(self, key: Key) -> bool:
         return not key.revoked and (key.last_day is None or self.today <= key.last_day)
@@ -225,6 +252,11 @@ class Model:
     def decide(self, recording: str, state: str, note: str | None) -> None:
         if self.proposal(recording) != state or recording in self.decided:
             self.decided[recording] = state, note
+
+    def add_version(self, version: Version) -> None:
+        assert self.may_serve(version), "stored, and consent, a withdrawal or a mark forbids it"
+        self.versions[version.sha256] = version
+        self.numbers[version.style] = max(version.number, self.numbers.get(version.style, 0))
 
     def delete_recording(self, recording: str) -> None:
         self._drop(recording)
@@ -280,6 +312,12 @@ class Model:
         listed = self.listed | self.facts
         model = backup.snapshot()
         model.today, model.listed = self.today, listed
+        for (
+            surgeon,
+            suture,
+        ), number in self.numbers.items():  # of the same surgeon, and not of a later one's pseudonym
+            if model.subjects.get(surgeon, 0) == self.subjects[surgeon]:
+                model.numbers[surgeon, suture] = max(number, model.numbers.get((surgeon, suture), 0))
         known = {(kind, _key(about)): number for kind, about, number in sorted(backup.facts, key=lambda fact: fact[2])}
         stated: dict[int, Consent] = {}
         marked: dict[str, str] = {}
@@ -336,6 +374,8 @@ class Model:
 
     def _drop(self, recording: str) -> None:
         del self.recordings[recording]
+        self.left.pop(recording, None)
+        self.closed.discard(recording)
         self.decided.pop(recording, None)
 
     def _erase_demo(self, sha256: str) -> None:
@@ -344,17 +384,27 @@ class Model:
         self.versions = {name: one for name, one in self.versions.items() if sha256 not in one.demos}
         self.plans = {name: one for name, one in self.plans.items() if one in self.versions}
         self.releases = [one for one in self.releases if sha256 not in one.version.demos]
-        self.jobs = {name: one for name, one in self.jobs.items() if one.batch or sha256 not in one.demos}
+        self.jobs = {
+            name: one
+            for name, one in self.jobs.items()
+            if one.batch or (sha256 not in one.demos and (one.recording, one.surgeon) != (recording, style[0]))
+        }
         if not self.cut_from(recording) and self.recordings[recording] <= {style[0]}:
             self._drop(recording)
+        else:
+            self.left.setdefault(recording, set()).add(style[0])
 
     def _erase_surgeon(self, surgeon: str) -> None:
+        seen = {one for one in self.recordings if surgeon in self.seen_in(one)}
         for one in [one for one in self.demos.values() if one.style[0] == surgeon]:
             self._erase_demo(one.sha256)
         for recording, brought_as in list(self.recordings.items()):
             if brought_as == {surgeon} and not self.cut_from(recording):
                 self._drop(recording)
             brought_as.discard(surgeon)
+        self.closed |= seen & {*self.recordings}
+        for left in self.left.values():
+            left.discard(surgeon)
         self.jobs = {name: one for name, one in self.jobs.items() if one.surgeon != surgeon}
         del self.surgeons[surgeon]
         self.erased.add(surgeon)

@@ -2,17 +2,19 @@
 
 A step is a tuple: the action and its arguments. Between any two transactions of a job, and of the atlas while it
 measures, another action may happen: such a step contains another one, `(4, ("agree", ...))` being the action before
-its fourth transaction. Results that the service alone decides (digests, numbers of versions, whether a version passes
+its fourth transaction. A step may also put an older copy of the database back, start with another signing key, or ask
+another machine. Results that the service alone decides (digests, numbers of versions, whether a version passes
 the gate, whether a batch finds it worse) are taken from its responses; the expected state comes from the model.
 
 The calls go over HTTP to the application in this process; the machine is the worker, and does the command line's part
 for backups. The date, the reader of uploads and the job engine are replaced (`tests.model.replaced`).
 """
 
+import secrets
 import shutil
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from copy import copy
 from datetime import timedelta
 from pathlib import Path
@@ -22,27 +24,35 @@ from hypothesis import strategies as st
 from hypothesis.stateful import rule
 from sqlalchemy import select
 
+from skills.db.history import newest_checkpoint
+from skills.db.models import Demonstration, Plan, PolicyVersion, StoredPlayback
 from skills.db.service_tables import Job as JobRow
 from skills.db.session import Database
 from skills.errors import NotFound, SkillsError
 from skills.jobs.workflows import Work
 from skills.library import perform_job
 from skills.library.atlas import atlas_of
-from skills.library.backup import back_up, keep_erasures, read_erasures, restore
+from skills.library.backup import accept_rollback, back_up, keep_erasures, read_erasures, restore
+from skills.library.history import Verified, sign_history, verify_history
 from skills.library.jobs import BATCH, PART
 from skills.packing import sha256
 from skills.settings import Settings
+from skills.transparency import SigningKey
 from tests import backends
 from tests.api.service import CSV, Service
 from tests.library import cases
+from tests.library.test_replay import judged
 from tests.model.checks import ACTIVE, FILES, PROPOSED, Compared
 from tests.model.invariant import ALL_USES, Consent, Demo, Job, Key, Model, Style, Version
 from tests.model.replaced import FIRST_DAY, Clock, Interruptible, settled
+from tests.model.second_machine import SecondMachine, seen
+from tests.put_back import copy_away, put_back
 
 REQUESTS = ("train", "ask_training", "retrain", "ask_retraining")
 SURGEONS = ("kestrel", "heron", "lark", "wren")
 SUTURES = (cases.SUTURE, "horizontal-mattress")
-MOST_BACKUPS = 3
+MOST_BACKUPS, MOST_COPIES = 3, 2
+CELL_MM = 5.0  # the default, so that a try cuts as `add_demo` does
 WHY = "The needle fell."
 
 Step = tuple[Any, ...]
@@ -87,6 +97,17 @@ def training(surgeon: str) -> Any:
 
 
 TRAIN = SURGEON.flatmap(training)
+
+
+def trying(surgeon: str) -> Any:
+    """Return a try during which, more often than anything else, its job or what it is about ends."""
+    cancel, erase = step("cancel", st.just(-1)), step("erase_surgeon", st.just(surgeon), st.integers(0, 3))
+    ends = step("agree", st.just(surgeon), st.just(frozenset({"atlas", "export"})), st.none())
+    meanwhile = st.tuples(st.integers(1, 14), st.one_of(*ELSEWHERE, *[cancel, ERASE_DEMO] * 4, erase, ends))
+    return step("try", st.just(surgeon), SUTURE, FILE, st.none() | meanwhile)
+
+
+TRY = SURGEON.flatmap(trying)
 PLAN = step("plan", SURGEON, MEANWHILE)
 ERASED = st.tuples(st.integers(4, 7), ERASE_DEMO)  # while distances are measured
 ATLAS = step("atlas", SUTURE, st.one_of(MEANWHILE, ERASED, ERASED))
@@ -114,6 +135,13 @@ STEPS = (
     step("use_key", INDEX),
     step("write_list"),
     step("restore", INDEX),
+    TRY,
+    TRY,
+    step("copy"),
+    step("put_back", INDEX, st.booleans()),
+    step("other_key"),
+    step("second_machine"),
+    step("verify"),
 )
 
 
@@ -121,7 +149,6 @@ class Installation(Compared):
     """The state machine of all user actions; two surgeons have a demonstration each at the beginning."""
 
     backend: ClassVar[str]
-    without: ClassVar[frozenset[str]] = frozenset()  # steps that are skipped, in order to look past a known defect
     steps: ClassVar[list[Step]] = []  # of the last installation
 
     def __init__(self) -> None:
@@ -130,6 +157,7 @@ class Installation(Compared):
         self.model = Model(FIRST_DAY)
         Clock.day = FIRST_DAY
         self.backups: list[tuple[Path, Model]] = []
+        self.copies: list[tuple[str, Model, str]] = []  # their URLs, and the newest checkpoints in them
         self.digests: dict[tuple[str, Style], str] = {}  # of demonstrations, by recording and style
         self.styles: set[Style] = set()  # styles that were ever learnt
         type(self).steps = []
@@ -141,17 +169,22 @@ class Installation(Compared):
 
     def teardown(self) -> None:
         self._close()
+        for url, _, _ in self.copies:
+            backends.drop(url)
         shutil.rmtree(self.folder)
 
-    def _open(self) -> None:
-        self.service = Service(self.url, key_requests_per_s=1e6)
+    def _open(self, **settings: Any) -> None:
+        self.service = Service(self.url, key_requests_per_s=1e6, **settings)
         self.service.http.__enter__()
         self.service.http.headers["X-API-Key"] = self.admin
         self.worker = copy(self.service.database)  # with the same connections, so that its commits are visible at once
         self.worker.__class__ = Interruptible
 
-    def _close(self) -> None:
+    def _stop(self) -> None:
         self.service.http.__exit__(None, None, None)
+
+    def _close(self) -> None:
+        self._stop()
         backends.drop(self.url)
 
     @rule(step=st.one_of(*STEPS))  # one rule: with several, hypothesis would leave some out of each run
@@ -259,9 +292,17 @@ class Installation(Compared):
             self.call("DELETE", f"/surgeons/{surgeon}", self._unknown(surgeon))
 
     def _export(self, index: int) -> None:
-        if (demo := pick(self.model.demos, index)) is not None:
-            may = self.model.may_export(self.model.demos[demo].recording)
-            self.call("GET", f"/demos/{demo}/recording", 200 if may else 409)
+        """Ask for a demonstration's motion as a file, and for a dataset of its whole recording."""
+        if (name := pick(self.model.demos, index)) is None or "exports" in self.without:
+            return
+        demo = self.model.demos[name]
+        may = self.model.may_export(demo.recording)
+        as_mcap = {"headers": {"Accept": "application/vnd.mcap"}}
+        self.call("GET", f"/timelines/demos/{name}", 200 if may else 409, **as_mcap)
+        body = {"demos": [name], "whole": True, "outcomes": "any"}
+        job = self.call("POST", "/datasets", *((200, 202) if may and not demo.withdrawn else (409,)), json=body)
+        if may and not demo.withdrawn:
+            self.call("DELETE", f"/jobs/{job['id']}", 200)
 
     # ---- releases ----
 
@@ -318,6 +359,23 @@ class Installation(Compared):
         job = self.call("POST", "/trainings", 200, 202, json=body)
         assert job["request"]["demos"] == chosen
         return self._asked(job, Job(job["id"], surgeon, release, frozenset(chosen), job["state"], of_any=of_any))
+
+    def _try(self, surgeon: str, suture: str, file: int, meanwhile: Meanwhile = None) -> None:
+        """Request a try of a recording that leaves the later questions open, and wait for its end."""
+        recording = sha256(FILES[file])
+        body = {"recording": recording, "surgeon": surgeon, "suture": suture, "cell_mm": CELL_MM, "hysteresis": 0.0}
+        if surgeon not in self.model.surgeons:
+            self.call("POST", "/tries", self._unknown(surgeon), json=body)
+        elif not self.model.may(surgeon, "training"):
+            self.call("POST", "/tries", 409, json=body)
+        elif recording not in self.model.recordings:
+            self.call("POST", "/tries", 404, json=body)
+        else:
+            said = self.call("POST", "/tries", 200, 202, json=body)
+            job = Job(
+                said["id"], surgeon, False, frozenset(), said["state"], recording=recording, style=(surgeon, suture)
+            )
+            self._wait(self._asked(said, job), meanwhile)
 
     def _retrain(self, surgeon: str | None, only_stale: bool, release: bool, meanwhile: Meanwhile = None) -> None:
         """Request a batch and wait for its end, as `skills retrain` does."""
@@ -424,6 +482,8 @@ class Installation(Compared):
     def _doubt(self) -> None:
         """Record the present obstacles of jobs."""
         for job in self.model.jobs.values():
+            if job.recording is not None and not self.model.may_try(job):
+                job.doubt.add(job.recording)
             job.doubt |= {one for one in job.demos if not self.model.may_learn({one}, job.of_any)}
 
     def _take_in(self, name: str) -> None:
@@ -433,6 +493,8 @@ class Installation(Compared):
         said = self.call("GET", f"/jobs/{name}", 200)
         if job.batch:
             self._take_in_styles(job)
+        elif job.recording is not None:
+            self._take_in_try(job, said)
         elif said["state"] == "succeeded" and job.state != "succeeded":
             made, style = said["result"], (said["request"]["surgeon"], said["request"]["suture"])
             version = self._learnt(made["sha256"], style)
@@ -443,6 +505,28 @@ class Installation(Compared):
             assert job.doubt, f"nothing stood in its way: {said['error']}"
             assert said["error"]
         job.state = said["state"]
+
+    def _take_in_try(self, job: Job, said: dict[str, Any]) -> None:
+        """Record the demonstration and the version that a try has stored while it stood."""
+        if job.state in ACTIVE:
+            with self.service.database.reading() as session:
+                cut = select(Demonstration).where(Demonstration.suture == job.style[1])
+                demos = [(one.sha256, one.surgeon.slug, one.recording.sha256) for one in session.scalars(cut)]
+                learnt = session.scalars(select(PolicyVersion)).all()
+                versions = [(one.sha256, [of.sha256 for of in one.demonstrations]) for one in learnt]
+            made = {name for name, *of in demos if of == [job.surgeon, job.recording]}
+            for name in made - {*self.model.demos}:
+                assert self.model.may(job.style[0], "training"), "cut, and consent forbids it"
+                assert self.digests.setdefault((job.recording or "", job.style), name) == name
+                self.model.add_demo(Demo(name, job.style, job.recording or ""))
+            for name, of in versions:
+                if name not in self.model.versions and {*of} <= made:
+                    self._learnt(name, job.style)
+        if said["state"] == "succeeded" and job.state != "succeeded":
+            ids = {one["name"]: one["id"] for one in said["result"]["steps"]}
+            assert ids["cut"] in self.model.demos and ids["train"] in self.model.versions
+        elif said["state"] == "failed" and job.state != "failed":
+            assert job.doubt and said["error"], f"nothing stood in its way: {said['error']}"
 
     def _take_in_styles(self, job: Job) -> None:
         for one in self._styles(job.id):
@@ -469,11 +553,9 @@ class Installation(Compared):
         of_any = said.get("outcomes") is not None
         version = Version(name, style, said["version"], frozenset(said["demos"]), releasable, of_any)
         if name not in self.model.versions:
-            assert self.model.may_serve(version), "stored, and consent, a withdrawal or a mark forbids it"
-            assert version.number > max(
-                (one.number for one in self.model.versions.values() if one.style == style), default=0
-            )
-            self.model.versions[name] = version
+            used = self.model.numbers.get(style, 0)
+            assert version.number > used or "numbers" in self.without, "the number of a version is used again"
+            self.model.add_version(version)
         assert self.model.versions[name] == version
         return version
 
@@ -537,6 +619,8 @@ class Installation(Compared):
             return
         seen = {one["surgeon"] for one in self.call("GET", "/surgeons", 200, **with_it)["items"]}
         assert seen == {one for one in self.model.surgeons if key.surgeon in (None, one)}
+        for surgeon in self.model.erased if "numbers" not in self.without else ():
+            self.call("GET", f"/surgeons/{surgeon}", 410 if key.surgeon is None else 404, **with_it)
 
     # ---- backups ----
 
@@ -562,6 +646,76 @@ class Installation(Compared):
         database.close()
         self._open()
         self.model = self.model.restored(backup)
+
+    # ---- rollbacks, keys and machines ----
+
+    def _copy(self) -> None:
+        """Copy the whole database, as a snapshot of its disk would."""
+        if len(self.copies) < MOST_COPIES:
+            head = self._signed()
+            self._stop()
+            self.copies.append((copy_away(self.url), self.model.snapshot(), head))
+            self._open()
+
+    def _put_back(self, index: int, accepted: bool) -> None:
+        """Put an older copy in place of the database; then accept it, or put the right one back."""
+        if (chosen := pick(self.copies, index)) is None:
+            return
+        copy, model, head = chosen
+        self._write_list()
+        same = self._signed() == head
+        self._stop()
+        right = copy_away(self.url)
+        put_back(copy, self.url)
+        self._open()
+        if not same:  # otherwise nothing was logged since, so it is no older one
+            self._serves_nothing("kept last")
+            self._stop()
+            if accepted:
+                with closing(Database(self.url)) as database:
+                    accept_rollback(database, read_erasures(str(self.folder / "list.json")))
+                self.model = self.model.restored(model)
+            else:
+                put_back(right, self.url)
+            self._open()
+        backends.drop(right)
+
+    def _serves_nothing(self, because: str) -> None:
+        """Check that nothing is served and nothing written, and that the answers say why."""
+        calls = [("PUT", "/surgeons/kestrel"), ("GET", "/readyz")]
+        for method, path in calls + [("GET", f"/policies/{'/'.join(style)}") for style in sorted(self.styles)]:
+            said = self.call(method, path, 503, json={"consent": None} if method == "PUT" else None)
+            assert because in said["detail"], said
+
+    def _signed(self) -> str:
+        """Sign all that is not signed yet, as a worker does, and return the newest checkpoint."""
+        sign_history(self.service.database)
+        with self.service.database.reading() as session:
+            return newest_checkpoint(session.connection()) or ""
+
+    def _other_key(self) -> None:
+        """Start with another signing key, and then with the right one."""
+        other = self.folder / "other.key"
+        other.write_text(str(SigningKey(secrets.token_bytes(32))))
+        self._stop()
+        self._open(signing_key=other)
+        self._serves_nothing("another key")
+        self._stop()
+        self._open()
+
+    def _second_machine(self) -> None:
+        """Let another machine learn every version again and export every plan, judged here."""
+        with self.service.database.reading() as session:
+            unplayed = session.scalars(select(Plan).where(Plan.row.not_in(select(StoredPlayback.plan_row)))).all()
+        for plan in unplayed:
+            judged(self.service.database, plan)
+        here, there = seen(self.url), SecondMachine.seen(self.url)
+        assert not any(here["differing"].values()), here["differing"]
+        assert there == here, f"another machine: {there}, and this one: {here}"
+
+    def _verify(self) -> None:
+        with self.service.database.reading() as session:
+            assert [*verify_history(session.connection(), self.service.database.history, None, Verified())] == []
 
 
 def pick(some: Any, index: int) -> Any:

@@ -11,6 +11,7 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from datetime import date, datetime
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, BinaryIO, ClassVar
 
 import pytest
@@ -23,7 +24,7 @@ from skills.db.session import Database
 from skills.demonstration.demonstration import Recording
 from skills.formats import read_recording
 from skills.formats.reader_process import read_told
-from skills.library import retraining
+from skills.library import retraining, tries
 from skills.library.keys import create_key
 from skills.settings import Settings
 from tests import backends
@@ -79,6 +80,7 @@ def in_our_hands() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(skills.db, "datetime", Clock)
         patch.setattr(skills.api.app, "confined_reader", lambda _settings: nullcontext(read_here))
+        patch.setattr(tries, "confined_reader", lambda _settings: SimpleNamespace(server=Deaf(), tell=read_told))
         patch.setattr(skills.api.app, "Engine", lambda _settings: Deaf())
         patch.setattr(retraining, "FEWEST_PARTS", 2)
         yield
