@@ -555,6 +555,19 @@ def quaternion_of(rotation: ArrayLike) -> Floats:
     """
     m = frozen(rotation, np.float64, (None, 3, 3), "rotation")
     check_rotation(m)
+    return nearest_quaternions(m)
+
+
+def nearest_quaternions(rotation: Floats) -> Floats:
+    """Convert matrices that are nearly rotations to unit quaternions, with signs as by `quaternion_of`.
+
+    Args:
+        rotation: Matrices, shape (T, 3, 3); they are not checked.
+
+    Returns:
+        Unit quaternions x, y, z, w, shape (T, 4).
+    """
+    m = rotation
     xx, yy, zz = m[:, 0, 0], m[:, 1, 1], m[:, 2, 2]
     xy, xz, yz = m[:, 0, 1] + m[:, 1, 0], m[:, 0, 2] + m[:, 2, 0], m[:, 1, 2] + m[:, 2, 1]
     xw, yw, zw = m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1]

@@ -52,8 +52,9 @@ from skills.comparison.distances import STATES, TREMOR_S, placed, resampled
 from skills.demonstration.demonstration import Demo
 from skills.demonstration.movement import same_signs, smoothed_tip
 from skills.errors import BadInput, BadPath
-from skills.kinematics import matrix_of
+from skills.kinematics import matrix_of, quaternion_of
 from skills.learning.slip import wilson
+from skills.quaternions import vector_of
 
 PHASES = 16  # of a curve
 RESTING_MM_S = 5.0  # a slow hand, rather than one at rest
@@ -147,18 +148,11 @@ def _turning(seconds: Floats, rotation_xyzw: Floats, tip_mm: Floats) -> dict[str
     at = _at_phases(seconds, rotation_xyzw)
     at = at / np.linalg.norm(at, axis=1, keepdims=True).clip(1e-12)
     matrices = matrix_of(at)
-    since = _rotation_vectors(matrices[0].T @ matrices)
+    since = vector_of(quaternion_of(matrices[0].T @ matrices))
     return {
         "turning": np.concatenate([_coefficients(since, 4), speeds, [ratio]]),
         "orientation": _coefficients(matrices[:, :, :2].reshape(-1, 6), 4),
     }
-
-
-def _rotation_vectors(matrices: Floats) -> Floats:
-    """Return rotations as axis times angle in rad, shape (T, 3)."""
-    from scipy.spatial.transform import Rotation
-
-    return np.asarray(Rotation.from_matrix(matrices).as_rotvec())
 
 
 _PHASE = np.linspace(0.0, 1.0, PHASES)

@@ -27,6 +27,7 @@ from skills.arrays import Floats, Ints
 from skills.demonstration.recording import Label, Motion, Recording, Signal, Topic, recorded_motion
 from skills.errors import NotAQuaternion, NotFinite, UnreadableRecording
 from skills.formats.cells import is_number
+from skills.kinematics import nearest_quaternions
 from skills.scoring.calibration import PARTS
 
 COLUMNS = 76
@@ -236,33 +237,7 @@ def _quaternions(arm: str, matrices: Floats) -> Floats:
             row=row,
             off=float(off[row - 1]),
         )
-    return _continuous(_nearest(matrices))
-
-
-def _nearest(matrices: Floats) -> Floats:
-    """Convert matrices to unit quaternions by the largest of the four components (Shepperd, 1978).
-
-    Dividing by the largest component is numerically stable for every rotation.
-    """
-    m = matrices
-    trace = np.trace(m, axis1=1, axis2=2)
-    squares = np.stack([*(2 * m[:, k, k] - trace + 1 for k in range(3)), trace + 1], axis=1)  # four times x2 y2 z2 w2
-    best = squares.argmax(axis=1)
-    xy, xz, yz = m[:, 0, 1] + m[:, 1, 0], m[:, 0, 2] + m[:, 2, 0], m[:, 1, 2] + m[:, 2, 1]
-    xw, yw, zw = m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1]
-    x2, y2, z2, w2 = squares.T
-    columns = [(x2, xy, xz, xw), (xy, y2, yz, yw), (xz, yz, z2, zw), (xw, yw, zw, w2)]
-    products = np.array(columns)  # [k, j]: four times component k by component j
-    chosen = products[best, :, np.arange(len(m))]
-    unit: Floats = chosen / np.linalg.norm(chosen, axis=1, keepdims=True)
-    return unit
-
-
-def _continuous(turns: Floats) -> Floats:
-    """Choose the sign of each quaternion, as q and -q are the same rotation, to be nearer to the one before."""
-    flips = np.where((turns[1:] * turns[:-1]).sum(axis=1) < 0, -1.0, 1.0)
-    signed: Floats = turns * np.concatenate(([1.0], np.cumprod(flips)))[:, None]
-    return signed
+    return nearest_quaternions(matrices)
 
 
 def _gestures(transcription: str, stamps_ns: Ints) -> tuple[Label, ...]:

@@ -33,7 +33,6 @@ from math import ceil, isfinite, sqrt
 import numpy as np
 from numpy.typing import ArrayLike
 
-from skills.arithmetic import arcsin, cos, sin
 from skills.arrays import Flags, Floats, Ints, frozen, xyz
 from skills.demonstration.demonstration import Demo
 from skills.demonstration.partner import Partner, PartnerMotion
@@ -43,7 +42,7 @@ from skills.gridworld.scene import Scene
 from skills.learning._kernels import nearest_pose_compiled, step_along_compiled
 from skills.learning.pose_style import UNIT_TOLERANCE, PosePath, learn_pose_style, unit_quaternion
 from skills.learning.tube_certificate import TubeCertificate, TubeClearance, TubeLimits
-from skills.quaternions import INVERSE, angle_of, between, multiplied
+from skills.quaternions import INVERSE, angle_of, between, multiplied, of_vector
 
 __all__ = [
     "CertifiedPoses",
@@ -428,17 +427,13 @@ def _try_update(path: PosePath, limits: TubeLimits, update: Update) -> tuple[int
 
 
 def _angles(one_xyzw: Floats, other_xyzw: Floats) -> Floats:
-    """Return the angles between orientations, unit quaternions (R, 4), by the chord between them, exact also near 0."""
-    nearer = np.minimum(np.linalg.norm(one_xyzw - other_xyzw, axis=1), np.linalg.norm(one_xyzw + other_xyzw, axis=1))
-    return np.asarray(4.0 * arcsin(np.minimum(nearer / 2.0, 1.0)))
+    """Return the angles between orientations, unit quaternions (R, 4), exact also near 0."""
+    return angle_of(multiplied(one_xyzw * INVERSE, other_xyzw))
 
 
 def _turned(rotation_xyzw: Floats, axes: Floats, angles: Floats) -> Floats:
     """Return orientations, (R, 4), turned about their own axes, (R, 3) of length 1, by angles, (R,)."""
-    turn, stay = axes * sin(angles / 2)[:, None], cos(angles / 2)[:, None]
-    vector, scalar = rotation_xyzw[:, :3], rotation_xyzw[:, 3:]
-    turned = scalar * turn + stay * vector + np.cross(vector, turn)
-    return np.hstack([turned, scalar * stay - (vector * turn).sum(axis=1, keepdims=True)])
+    return multiplied(rotation_xyzw, of_vector(axes * angles[:, None]))
 
 
 def _deciding(step: float, disturbance: float, start: float) -> Floats:

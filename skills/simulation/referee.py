@@ -45,6 +45,7 @@ from skills.kinematics import JAW_TIP_MM, matrix_of, quaternion_of
 from skills.planning.handoff import HELD_MM, JAW_CLOSED_RAD, NEEDLE_RADIUS_MM, OPEN_RAD
 from skills.planning.motion_laws import PEAK
 from skills.planning.trajectory import A2, Trajectory
+from skills.quaternions import vector_of
 from skills.sandbox import ProcessLimits
 from skills.simulation.player import array_from, simulated
 from skills.verification.arm_errors import ArmErrors, Displaced, Drawn, draw
@@ -476,7 +477,7 @@ class _Trial:
         self.jaws_s, self.jaws_rad, self.back_s = jaws_s, jaws_rad, back_s
         self.closed_s = float(jaws_s[np.argmin(jaws_rad[1])])  # then PSM_M's jaw has closed
         self.last = jaw[:, -1]  # the rotation at the hand-off, from which all others are counted
-        self.turn = [_vectors(last.T @ one) for last, one in zip(self.last, jaw, strict=True)]
+        self.turn = [vector_of(quaternion_of(last.T @ one)) for last, one in zip(self.last, jaw, strict=True)]
         self.arms = [model.body(name).id for name in "am"]
         self.needle = model.body("needle").id
         self.fingers = [[model.geom(f"{name}{side}").id for side in "12"] for name in "am"]
@@ -507,7 +508,7 @@ class _Trial:
         if not all(touched[1]) or any(touched[0]):
             return 3, (0.0, 0.0, 0.0)
         after, turned = self._in_jaws()
-        angle = float(np.degrees(np.linalg.norm(_vectors((turned @ rotation.T)[None])[0])))
+        angle = float(np.degrees(np.linalg.norm(vector_of(quaternion_of((turned @ rotation.T)[None])))))
         return 0, (float(np.linalg.norm(after - place)), angle, _askew_deg(after, turned))
 
     def _controls(self, at_s: Floats, ends: Floats) -> Floats:
@@ -560,11 +561,3 @@ def _askew_deg(place: Floats, rotation: Floats) -> float:
 def _wxyz(rotations: Floats) -> Floats:
     """Return rotations (N, 3, 3) as MuJoCo's quaternions, w first, (N, 4)."""
     return np.asarray(np.roll(quaternion_of(rotations), 1, axis=1))
-
-
-def _vectors(rotations: Floats) -> Floats:
-    """Return rotations (N, 3, 3) as axes times angles of at most pi, (N, 3)."""
-    quaternions = quaternion_of(rotations)
-    quaternions = quaternions * np.where(quaternions[:, 3:] < 0, -1.0, 1.0)
-    length = np.linalg.norm(quaternions[:, :3], axis=1, keepdims=True)
-    return np.asarray(quaternions[:, :3] * 2 * np.arctan2(length, quaternions[:, 3:]) / np.maximum(length, 1e-15))

@@ -53,6 +53,7 @@ from skills.arrays import Floats, frozen
 from skills.errors import BadInput, BadSettings
 from skills.fields import Count, Fraction, schema
 from skills.kinematics import check_rotation, matrix_of, quaternion_of
+from skills.quaternions import of_vector, vector_of
 
 MEAN_LENGTH = sqrt(8 / pi)  # of a vector of three standard normal numbers
 CALIBRATED_MM, UNCALIBRATED_MM = 0.65, 2.96  # mean tracking errors of a dVRK (Hwang et al., arXiv:2003.08520)
@@ -313,9 +314,7 @@ def rotation_of(vectors: Floats) -> Floats:
     Returns:
         Rotation matrices, shape (N, 3, 3).
     """
-    half = np.linalg.norm(vectors, axis=1, keepdims=True) / 2
-    # sin(x) / x, which numpy has for pi x, is 1 where nothing turns
-    return matrix_of(np.concatenate([np.sinc(half / pi) * vectors / 2, np.cos(half)], axis=1))
+    return matrix_of(of_vector(vectors))
 
 
 def _correlated(normal: Floats, stamps_s: Floats, correlation_s: float) -> Floats:
@@ -456,7 +455,7 @@ def calibrate_arm(measured: MeasuredArm, *, name: str, blocks: int = BLOCKS) -> 
         BadSettings: The name is not possible.
     """
     encoders_mm = encoder_errors_mm(measured, blocks)
-    turns_deg = np.degrees(_vectors(np.swapaxes(measured.setpoint, 1, 2) @ measured.measured))
+    turns_deg = np.degrees(vector_of(quaternion_of(np.swapaxes(measured.setpoint, 1, 2) @ measured.measured)))
     assumed_mm = sqrt(CALIBRATED.tip_bias_mm**2 + CALIBRATED.tip_noise_mm**2)
     tip = _axes(encoders_mm, "mm", blocks, assumed_mm)
     tracked = None
@@ -653,14 +652,6 @@ def _correlation_s(errors: Floats, stamps_s: Floats) -> float:
 
 
 # ---- rotations and the tracker ---------------------------------------------------------------------------------------
-
-
-def _vectors(rotation: Floats) -> Floats:
-    """Return rotation vectors of small rotations, rad: shape (N, 3, 3) to (N, 3)."""
-    turns = quaternion_of(rotation)
-    axis, w = turns[:, :3] * np.where(turns[:, 3:] < 0, -1.0, 1.0), np.abs(turns[:, 3])
-    length = np.linalg.norm(axis, axis=1)
-    return np.asarray(axis * (2 * np.arctan2(length, w) / np.maximum(length, 1e-300))[:, None])
 
 
 def _tracked_mm(measured: MeasuredArm, marker_mm: Floats) -> Floats:

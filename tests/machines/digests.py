@@ -189,7 +189,7 @@ def of_plans(database: Database, plans: dict[str, Plan]) -> Iterator[tuple[str, 
             row = session.get_one(Plan, plan.row)
             yield f"plan {name}", row.sha256
             yield f"description of plan {name}", sha256(canonical(row.about))
-            yield f"trajectory of plan {name}", digest(trajectory_of(planned(row)))
+            yield f"trajectory of plan {name}", bits(trajectory_of(planned(row)))
 
 
 def played(database: Database, plan: Plan) -> dict[str, Any]:
