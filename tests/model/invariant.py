@@ -312,6 +312,12 @@ class Model:
         listed = self.listed | self.facts
         model = backup.snapshot()
         model.today, model.listed = self.today, listed
+        for (
+            surgeon,
+            suture,
+        ), number in self.numbers.items():  # of the same surgeon, and not of a later one's pseudonym
+            if model.subjects.get(surgeon, 0) == self.subjects[surgeon]:
+                model.numbers[surgeon, suture] = max(number, model.numbers.get((surgeon, suture), 0))
         known = {(kind, _key(about)): number for kind, about, number in sorted(backup.facts, key=lambda fact: fact[2])}
         stated: dict[int, Consent] = {}
         marked: dict[str, str] = {}
