@@ -33,6 +33,8 @@ ON_BOTH = {
     "test_withdrawn_consent_withdraws_a_surgeons_combined_and_other_styles",
     "test_exports_need_export_consent_and_training_needs_training_consent",
     "test_a_consent_acts_at_once_in_both_directions",
+    "test_a_surgeon_named_at_the_upload_is_asked_at_every_door",
+    "test_erasing_a_surgeon_leaves_their_seconds_for_no_use",
     # releases that other processes are notified of
     "test_a_release_or_withdrawal_in_one_process_takes_effect_in_another",
     "test_also_while_the_line_that_tells_of_changes_is_cut",

@@ -18,6 +18,7 @@ import pytest
 from typer.main import get_command
 
 import skills
+from skills.api.routes import demos, operating, pages, plans
 from skills.cli import app
 from tests.api.conformance import conformance
 
@@ -34,6 +35,13 @@ NAMES_FILE = re.compile(r"(?<![\w./*{}-])(?:[\w-]+/)*[\w-]+\.(?:py|md)\b")
 DOTTED = re.compile(r"`([A-Za-z]\w*(?:\.[A-Za-z_]\w*)+)(?:\(\))?`")
 SLASHED = re.compile(r"`([a-z_]+(?:/[a-z_]+)+)((?:\.\w+)*)`")
 COMMAND = re.compile(r"(?:^(?:\$ )?|`)skills ([a-z][^`\n#|]*)", re.MULTILINE)
+UNDESCRIBED = (
+    pages.router,
+    demos.page_router,
+    plans.timeline_page_router,
+    operating.sign_in_router,
+    operating.reference_router,
+)
 CALL = re.compile(r"\b(?:GET|POST|PUT|DELETE) (/[^\s`\"'?,)|]+)")
 WRONG = ROOT / "docs" / "mistakes.md"  # its commands are misspelt on purpose
 COMMENTED = re.compile(r"#.*(?:`|\.py|\.md)")
@@ -230,8 +238,11 @@ def test_a_command_that_does_not_exist_is_found(line: str) -> None:
 
 def is_call(path: str) -> bool:
     """Return whether the service has a path, as a page writes it: `/demos/{id}`, `/demos[/{id}]` or `/policies/...`."""
-    given = re.sub(r"\{[^}]*\}", "x", re.sub(r"\[.*?\]", "", path)).rstrip(".:;/")
-    served = [re.sub(r"\{[^}]*\}", "[^/]+", one) for one in conformance().document["paths"]]
+    given = re.sub(r"\{[^}]*\}", "x", re.sub(r"\[.*?\]", "", path)).rstrip(".:;/") or "/"
+    undescribed = [str(getattr(route, "path", "")) for router in UNDESCRIBED for route in router.routes]
+    served = [
+        re.sub(r"\{[^}]*\}", "[^/]+", one) for one in (*conformance().document["paths"], "/openapi.json", *undescribed)
+    ]
     return any(re.fullmatch(one, given) for one in served)
 
 

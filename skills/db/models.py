@@ -107,7 +107,7 @@ class Surgeon(Base):
     created_at: Mapped[datetime] = mapped_column(default=now)
 
 
-class UsedNumber(Base):
+class LastUsed(Base):
     """The last number of a style's versions that were erased, or lost with a restoration: no version has it again."""
 
     __tablename__ = "used_numbers"

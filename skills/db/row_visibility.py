@@ -18,6 +18,7 @@ from skills.db.models import (
     Demonstration,
     DemonstrationOutcome,
     ErasedInterval,
+    LastUsed,
     MeasuredShape,
     ParsedChunk,
     ParsedRecording,
@@ -35,7 +36,6 @@ from skills.db.models import (
     StoredRecording,
     StoredRewardMap,
     Surgeon,
-    UsedNumber,
 )
 from skills.db.service_tables import DatasetChunk, DatasetDemonstration, Job, StoredDataset, StyleToRetrain
 
@@ -98,7 +98,7 @@ class Only:
             PolicyVersion: PolicyVersion.surgeon_row.in_(mine),
             PolicyDemonstration: PolicyDemonstration.policy_row.in_(policies),
             StoredPoses: StoredPoses.policy_row.in_(policies),
-            UsedNumber: UsedNumber.surgeon_row.in_(mine),
+            LastUsed: LastUsed.surgeon_row.in_(mine),
             Release: Release.surgeon_row.in_(mine),
             Plan: Plan.policy_row.in_(policies),
             StoredPlayback: StoredPlayback.plan_row.in_(plans),

@@ -10,8 +10,6 @@ once.
 from collections.abc import Callable
 from typing import Any
 
-from sqlalchemy import update
-
 from skills.db import now
 from skills.db.service_tables import Job, record_event
 from skills.db.session import Database
@@ -47,20 +45,18 @@ def perform_job(database: Database, row: int, attempt: int, settings: Settings) 
         settings: Limits of time and memory for the computation.
 
     Raises:
-        SkillsError: The request cannot be met; a retry would not help.
+        SkillsError: The request cannot be met, or what it uses was erased; a retry would not help.
     """
     with database.reading() as session:
         job = session.get(Job, row)
         if job is None or job.state != "running" or job.attempt != attempt:
             return  # erased, cancelled, or taken by another attempt
         kind, request, names = job.kind, job.request, names_of(session, row)
-    store = MAKERS[kind](while_running(database, row, attempt), request, settings)
-    with database.writing(names) as session:
-        ended = {"state": "succeeded", "progress": 1.0, "ended_at": now()}
-        mine = (Job.row == row, Job.state == "running", Job.attempt == attempt)
-        # The condition on state and attempt makes the first finished attempt the only one that stores a result.
-        if session.execute(update(Job).where(*mine).values(**ended).returning(Job.row)).first() is None:
-            return  # cancelled during the computation, or another attempt was faster
+    running = while_running(database, row, attempt)
+    store = MAKERS[kind](running, request, settings)
+    with running.writing(names) as session:  # the first finished attempt is the only one that stores a result
         job = session.get_one(Job, row)
+        job.state, job.progress, job.ended_at = "succeeded", 1.0, now()
+        session.flush()
         job.result = store(session, job.asked_by)
         record_event(session, "worker", "finish", f"job-{kind}", job.id)

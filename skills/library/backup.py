@@ -26,16 +26,7 @@ from skills import __version__
 from skills.db import Base, dump, rfc3339
 from skills.db.dump import Manifest
 from skills.db.kept_heads import set_aside
-from skills.db.models import (
-    SUCCESS,
-    Demonstration,
-    Erasure,
-    PolicyVersion,
-    Release,
-    StoredRecording,
-    Surgeon,
-    UsedNumber,
-)
+from skills.db.models import SUCCESS, Demonstration, Erasure, LastUsed, PolicyVersion, Release, StoredRecording, Surgeon
 from skills.db.service_tables import Event, Job, Key, record_event
 from skills.db.session import Database
 from skills.db.tiles import fill_tiles
@@ -75,6 +66,7 @@ LISTED = (
 )
 
 T = TypeVar("T")
+M = TypeVar("M", datetime, int)
 Consent = dict[str, Any] | None
 # By the list names in `ENDS`: digests or ids, and the moment at which each last ended.
 Ended = Mapping[str, Mapping[str, datetime]]
@@ -116,7 +108,7 @@ class Erasures:
             {kind: _latest(self.ended.get(kind, {}), other.ended.get(kind, {})) for kind in kinds},
             {**other.consents, **_later(self.consents, other.consents)},
             {**other.outcomes, **_later(self.outcomes, other.outcomes)},
-            {**other.numbers, **_higher(self.numbers, other.numbers)},
+            _latest(self.numbers, other.numbers),
         )
 
     def since(self, known: "Erasures") -> "Erasures":
@@ -129,15 +121,15 @@ class Erasures:
             for kind, names in self.ended.items()
         }
         consents, outcomes = _later(self.consents, known.consents), _later(self.outcomes, known.outcomes)
-        numbers = _higher(self.numbers, known.numbers)
+        numbers = {style: last for style, last in self.numbers.items() if not _knows(known.numbers, style, last)}
         return Erasures(self.surgeons - known.surgeons, ended, consents, outcomes, numbers)
 
 
-def _latest(one: Mapping[str, datetime], other: Mapping[str, datetime]) -> dict[str, datetime]:
+def _latest(one: Mapping[Any, M], other: Mapping[Any, M]) -> dict[Any, M]:
     return {**other, **{name: at for name, at in one.items() if not _knows(other, name, at)}}
 
 
-def _knows(known: Mapping[str, datetime], name: str, at: datetime) -> bool:
+def _knows(known: Mapping[Any, M], name: Any, at: M) -> bool:
     return name in known and known[name] >= at
 
 
@@ -146,10 +138,6 @@ def _later(
 ) -> dict[str, tuple[datetime, T]]:
     """Return the statements of one list that are later than the other's on the same object, or the only ones."""
     return {name: said for name, said in one.items() if name not in other or other[name][0] < said[0]}
-
-
-def _higher(one: Mapping[tuple[str, str], int], other: Mapping[tuple[str, str], int]) -> dict[tuple[str, str], int]:
-    return {style: last for style, last in one.items() if last > other.get(style, 0)}
 
 
 NOTHING = Erasures()
@@ -374,7 +362,7 @@ def _listed(session: Session) -> Erasures:
 def _numbers(session: Session) -> dict[tuple[str, str], int]:
     """Return the last version number of each style, by subject and suture type, also of erased versions."""
     found: dict[tuple[str, str], int] = {}
-    for of, number in ((PolicyVersion, PolicyVersion.version), (UsedNumber, UsedNumber.last)):
+    for of, number in ((PolicyVersion, PolicyVersion.version), (LastUsed, LastUsed.last)):
         query = select(Surgeon.subject, of.suture, func.max(number)).join(of, of.surgeon_row == Surgeon.row)
         for subject, suture, last in session.execute(query.group_by(Surgeon.subject, of.suture)):
             found[subject, suture] = max(last, found.get((subject, suture), 0))
@@ -433,7 +421,7 @@ def _end_again(session: Session, erasures: Erasures) -> dict[str, int]:
     rows = {one.subject: one.row for one in session.scalars(select(Surgeon))}
     for (subject, suture), last in later.numbers.items():
         if subject in rows:
-            session.add(UsedNumber(surgeon_row=rows[subject], suture=suture, last=last))
+            session.add(LastUsed(surgeon_row=rows[subject], suture=suture, last=last))
     stopped = len(served - _served(session))
     return {
         "surgeons_erased": len(surgeons),

@@ -1,4 +1,4 @@
-"""Consent: whether a surgeon's data may be used for training, export or an atlas.
+"""Consent: whether a surgeon's data may be used for training, export or an atlas, or shown at all.
 
 Every use is decided by `may` (or by `refusal` and `require`, which also give the reason), inside the transaction that
 stores or returns the data. A transaction that stores holds the name of the surgeon from its beginning
@@ -19,7 +19,10 @@ from skills.db import now
 from skills.db.models import Surgeon
 from skills.errors import Conflict
 
-Use = Literal["training", "export", "atlas"]
+Use = Literal["training", "export", "atlas", "any"]  # the last one is covered by each of the others: docs/keys.md
+
+
+CALLED = {"training": "training", "export": "export", "atlas": "atlas", "any": "that this is shown"}
 
 
 class Consenting(Protocol):
@@ -44,9 +47,9 @@ def refusal(surgeon: Consenting, use: Use) -> Conflict | None:
     consent = surgeon.consent
     if consent is None:
         return None
-    if use not in consent["uses"]:
+    if use not in consent["uses"] and not (use == "any" and consent["uses"]):
         covers = ", ".join(consent["uses"]) or "nothing"
-        return Conflict(f"The consent of '{surgeon.slug}' does not cover {use}; it covers {covers}.")
+        return Conflict(f"The consent of '{surgeon.slug}' does not cover {CALLED[use]}; it covers {covers}.")
     until = last_day(consent)
     # The last day itself is covered.
     if until is not None and not today() <= until:

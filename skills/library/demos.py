@@ -33,10 +33,10 @@ from skills.fields import as_json
 from skills.formats.reader_process import MOST, Told, read_told
 from skills.gridworld.grid import PAPER_GRID, GridPath, choose_grid, describe_path, discretize
 from skills.gridworld.reward import RewardMap, sparse_reward
-from skills.library import locks
+from skills.library import consent, locks
 from skills.library.catalogue import find_surgeon, find_suture_type
 from skills.library.integrity import demo_identity, find_by_digest
-from skills.library.recorded import in_recording
+from skills.library.recorded import episodes_of, in_recording, recorded_in
 from skills.library.recordings import (
     Teller,
     Upload,
@@ -306,6 +306,17 @@ def _refuse_other_outcome(known: Demonstration, cut: DemoIn) -> None:
 def find_demo(session: Session, demo_sha256: str) -> Demonstration:
     """Return a demonstration by its digest, see `find_by_digest`."""
     return find_by_digest(session, Demonstration, demo_sha256, "demonstration", Remedy(Action.LIST_DEMOS))
+
+
+def demo_for(session: Session, demo_sha256: str, use: consent.Use) -> Demonstration:
+    """Return a demonstration whose motion is used.
+
+    Raises:
+        Conflict: Somebody in these seconds of the recording does not allow the use.
+    """
+    demo = find_demo(session, demo_sha256)
+    recorded_in(session, episodes_of([demo.row], whole=False)).require(use, {demo.surgeon_row})
+    return demo
 
 
 def exported_recording(session: Session, demo_sha256: str) -> StoredRecording:

@@ -11,9 +11,8 @@ One transaction erases all that can be seen. Of many jobs and of large recording
 
 import secrets
 from collections.abc import Sequence
-from typing import Any
 
-from sqlalchemy import ColumnElement, Select, delete, func, insert, select
+from sqlalchemy import ColumnElement, Select, delete, func, insert, null, select
 from sqlalchemy.orm import Session
 
 from skills.db import in_parts, now
@@ -23,6 +22,7 @@ from skills.db.models import (
     DemonstrationOutcome,
     ErasedInterval,
     Erasure,
+    LastUsed,
     LooseChunks,
     MeasuredShape,
     Plan,
@@ -38,7 +38,6 @@ from skills.db.models import (
     StoredRecording,
     StoredRewardMap,
     Surgeon,
-    UsedNumber,
 )
 from skills.db.row_visibility import EVERYBODYS
 from skills.db.service_tables import Job, record_event
@@ -53,6 +52,7 @@ from skills.library.releases import withdraw_resting_on
 from skills.library.sweep import delete_jobs
 from skills.remedies import Action, Remedy
 
+INTERVAL = ["recording_row", "surgeon_row", "start_s", "end_s"]
 ACTIVE = Job.state.in_(NOT_ENDED)
 Dropped = list[tuple[int, int]]  # rows and attempts of jobs that had not ended, so that the engine can cancel them
 
@@ -88,20 +88,10 @@ def erase_surgeon(session: Session, slug: str, actor: str) -> Dropped:
 def _forget_name(session: Session, surgeon: Surgeon) -> None:
     """Leave intervals without a name in the recordings that stay, so that what the surgeon refused stays refused."""
     named, gone = RecordingSurgeon, ErasedInterval
-    theirs = session.scalars(select(named.recording_row).where(named.surgeon_row == surgeon.row)).all()
-    intervals = select(gone.recording_row, gone.start_s, gone.end_s).where(gone.surgeon_row == surgeon.row)
-    _mark(session, None, [*((row, None, None) for row in theirs), *session.execute(intervals)])
-    for of in (named, gone):
+    for of, start_s, end_s in ((named, null(), null()), (gone, gone.start_s, gone.end_s)):
+        theirs = select(of.recording_row, null(), start_s, end_s).where(of.surgeon_row == surgeon.row)
+        session.execute(insert(ErasedInterval).from_select(INTERVAL, theirs))
         session.execute(delete(of).where(of.surgeon_row == surgeon.row), **UNSYNCHRONISED)
-
-
-def _mark(session: Session, surgeon_row: int | None, intervals: Sequence[Any]) -> None:
-    values = [
-        {"recording_row": row, "surgeon_row": surgeon_row, "start_s": start_s, "end_s": end_s}
-        for row, start_s, end_s in intervals
-    ]
-    if values:
-        session.execute(insert(ErasedInterval), values)
 
 
 def erased_with(session: Session, surgeon: Surgeon, demo: Demonstration | None = None) -> list[int]:
@@ -221,9 +211,7 @@ def _erase(session: Session, which: ColumnElement[bool], surgeon: Surgeon, recor
     Long lists of rows are not bound as parameters at once: a statement has a limited number of them.
     """
     announce(session)
-    seconds = select(Demonstration.recording_row, Demonstration.start_s, Demonstration.end_s).where(which)
-    intervals = session.execute(seconds).all()
-    recordings = recordings | {row for row, _, _ in intervals}
+    recordings = recordings | {*session.scalars(select(Demonstration.recording_row).where(which))}
     policies = session.scalars(_resting_on(which)).all()
     demos = select(Demonstration.row).where(which)
     # Every cached row with distances of the suture type may hold one from an erased demonstration. Shapes alone, of
@@ -236,7 +224,7 @@ def _erase(session: Session, which: ColumnElement[bool], surgeon: Surgeon, recor
         by = PolicyVersion
         numbers = select(by.surgeon_row, by.suture, func.max(by.version)).where(by.row.in_(some))
         used = numbers.group_by(by.surgeon_row, by.suture)
-        session.execute(insert(UsedNumber).from_select(["surgeon_row", "suture", "last"], used))
+        session.execute(insert(LastUsed).from_select(["surgeon_row", "suture", "last"], used))
         plans = select(Plan.row).where(Plan.policy_row.in_(some))
         playbacks = select(StoredPlayback.row).where(StoredPlayback.plan_row.in_(plans))
         # From the leaves to the roots, because of the foreign keys.
@@ -252,17 +240,16 @@ def _erase(session: Session, which: ColumnElement[bool], surgeon: Surgeon, recor
             session.execute(statement, **UNSYNCHRONISED)
     for of in (StoredRewardMap, DemonstrationOutcome):
         session.execute(delete(of).where(of.demonstration_row.in_(demos)), **UNSYNCHRONISED)
-    session.execute(delete(Demonstration).where(which), **UNSYNCHRONISED)
-    kept: set[int] = set()
+    mine = Demonstration
+    seconds = select(mine.recording_row, mine.surgeon_row, mine.start_s, mine.end_s).where(which)
+    session.execute(insert(ErasedInterval).from_select(INTERVAL, seconds))  # deleted with a recording that is unused
+    session.execute(delete(mine).where(which), **UNSYNCHRONISED)
     for some in in_parts(sorted(recordings)):
         cut = select(Demonstration.recording_row).where(Demonstration.recording_row.in_(some))
         others = select(RecordingSurgeon.recording_row).where(
             RecordingSurgeon.recording_row.in_(some), RecordingSurgeon.surgeon_row != surgeon.row
         )
-        still = {*session.scalars(cut), *session.scalars(others)}
-        _delete_recordings(session, sorted({*some} - still))
-        kept |= still
-    _mark(session, surgeon.row, [one for one in intervals if one.recording_row in kept])
+        _delete_recordings(session, sorted({*some} - {*session.scalars(cut)} - {*session.scalars(others)}))
 
 
 def _delete_recordings(session: Session, rows: Sequence[int]) -> None:

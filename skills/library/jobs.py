@@ -26,6 +26,7 @@ from skills.db.service_tables import ErasedSurgeon, Job, StyleToRetrain, record_
 from skills.db.session import Database
 from skills.errors import Conflict, NotFound, TooMany
 from skills.library import locks
+from skills.library.consent import require
 from skills.library.releases import Outcome, is_served
 from skills.packing import canonical, sha256
 from skills.remedies import Action, Remedy
@@ -281,16 +282,20 @@ def find_live(session: Session, kind: str, request: Mapping[str, object]) -> Job
 def while_running(database: Database, row: int, attempt: int) -> Database:
     """Return a database that a job writes to: each transaction is refused once the job does not run at this attempt.
 
-    Erasing deletes the jobs whose result would bring back what was erased, so they end here too.
+    Erasing deletes the jobs whose result would bring back what was erased, so they end here too. All work on one
+    surgeon's motion is training: it is refused once the consent does not cover that.
     """
     mine = (Job.row == row, Job.attempt == attempt, Job.state == "running")
 
     def check(session: Session) -> None:
-        if session.scalar(select(Job.row).where(*mine)) is None:
+        if (job := session.scalar(select(Job).where(*mine))) is None:
             raise Conflict("The job was cancelled while it ran, or something that it uses was erased.")
+        if (surgeon := session.get(Surgeon, job.surgeon_row or 0)) is not None:
+            require(surgeon, "training")
 
     with database.reading() as session:
         names = names_of(session, row)
+        check(session)
     return database.on_condition(check, [locks.job(row)] if names is None else names)
 
 

@@ -46,7 +46,8 @@ from skills.library import playbacks
 from skills.library.catalogue import find_surgeon, find_suture_type
 from skills.library.integrity import covered, learnt, shares
 from skills.library.policies import learnt_from
-from skills.library.recordings import Teller, stored_recording
+from skills.library.recorded import shown_recording
+from skills.library.recordings import Teller
 from skills.library.releases import is_served, served
 
 RECENT = 500  # jobs in the quantiles of durations: enough for a meaningful 99th percentile
@@ -186,7 +187,7 @@ def moves_to_goal(policy: Policy, reaches: NDArray[np.bool_]) -> NDArray[np.int6
 
 def traces_of(database: Database, recording_sha256: str, tell: Teller) -> dict[str, Any]:
     """Return the signals of a stored recording's arms, jaws and clutch over time."""
-    recording = stored_recording(database, recording_sha256, tell).recording
+    recording = shown_recording(database, recording_sha256, tell).recording
     return {"duration_s": recording.duration_s, "arms": [_arm(recording, arm) for arm in recording.arms]}
 
 

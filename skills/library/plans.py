@@ -429,9 +429,18 @@ def motion_of(session: Session, plan_sha256: str) -> SuturePlan:
         Conflict: The surgeon's consent does not cover training (any more).
         Corrupt: It does not match its digest.
     """
+    return planned(followed_plan(session, plan_sha256))
+
+
+def followed_plan(session: Session, plan_sha256: str) -> Plan:
+    """Return a plan by its digest, whose motion is shown or played.
+
+    Raises:
+        Conflict: The surgeon's consent does not cover training (any more).
+    """
     plan = find_plan(session, plan_sha256)
     policies.followable(plan.policy)
-    return planned(plan)
+    return plan
 
 
 def find_plan(session: Session, plan_sha256: str) -> Plan:

@@ -28,7 +28,7 @@ from skills.db.packed import digest
 from skills.db.service_tables import Job, record_event
 from skills.db.session import Database
 from skills.errors import Conflict, NotDrawnYet
-from skills.library import jobs, releases
+from skills.library import jobs, policies, releases
 from skills.library.arm_errors import stated_errors
 from skills.library.integrity import find_by_digest, learnt, planned
 from skills.library.jobs import PICTURES, PicturesRequest, PlaybackRequest
@@ -210,8 +210,10 @@ def request_playback(
 
     Raises:
         BadPlan: Its frame is not the arm's base, so the simulator would place it wrongly.
+        Conflict: The surgeon's consent does not cover training.
     """
     plan = find_plan(session, plan_sha256)
+    policies.followable(plan.policy)
     check_frame(plan.about["frame"])
     request = playback_request(plan.sha256, settings, errors)
     return jobs.ask(session, "playback", request, plan.policy.surgeon, actor)
@@ -278,6 +280,17 @@ def check_playback(
 def find_playback(session: Session, playback_sha256: str) -> StoredPlayback:
     """Return a playback by its digest."""
     return find_by_digest(session, StoredPlayback, playback_sha256, "playback", Remedy(Action.ADD_PLAYBACK))
+
+
+def shown_playback(session: Session, playback_sha256: str) -> StoredPlayback:
+    """Return a playback by its digest, whose motion is shown.
+
+    Raises:
+        Conflict: The surgeon's consent does not cover training (any more).
+    """
+    playback = find_playback(session, playback_sha256)
+    policies.followable(playback.plan.policy)
+    return playback
 
 
 def headline_of(playback: StoredPlayback, settings: Settings) -> dict[str, Any]:

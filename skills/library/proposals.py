@@ -26,7 +26,8 @@ from skills.db.session import Database
 from skills.errors import Conflict, NotFound
 from skills.formats.reader_process import MOST
 from skills.library.catalogue import find_surgeon, find_suture_type
-from skills.library.recordings import Teller, find_recording, stored_recording
+from skills.library.recorded import shown_recording
+from skills.library.recordings import Teller, find_recording
 from skills.remedies import Action, Remedy
 from skills.schemas import ProposalDecision, ProposalState
 
@@ -166,7 +167,7 @@ def _proposals_in(session: Session, recordings: Sequence[Any]) -> Iterator[Propo
         owners[row].add(owner)  # null: somebody who was erased
     known = {*chain.from_iterable(owners.values()), *(demo.surgeon_row for some in demos.values() for demo in some)}
     called = select(Surgeon.row, Surgeon.slug).where(Surgeon.row.in_(known - {None}))
-    slugs = {one.row: one.slug for one in session.execute(called)}
+    slugs: dict[int | None, str] = {one.row: one.slug for one in session.execute(called)}
     all_marks = session.scalars(select(marked).where(marked.recording_row.in_(rows)).order_by(marked.row))
     marks = {(one.recording_row, one.number): one for one in all_marks}  # the newest of each
     for one in recordings:
@@ -244,7 +245,7 @@ def paths_of(database: Database, recording: str, tell: Teller) -> list[list[list
     """Return the path of the tip in each proposal of a recording, at most `POINTS` points of it in mm, for pictures."""
     with database.reading() as session:
         segments = find_recording(session, recording).about["segments"]
-    told = stored_recording(database, recording, tell).recording
+    told = shown_recording(database, recording, tell).recording
     motions = {arm: told.motion_of(arm=arm) for arm in {one["arm"] for one in segments}}
     paths = []
     for one in segments:

@@ -16,8 +16,11 @@ from sqlalchemy.orm import Session
 from skills.db import in_parts
 from skills.db.models import Demonstration, ErasedInterval, RecordingSurgeon, StoredRecording, Surgeon
 from skills.db.row_visibility import EVERYBODYS
+from skills.db.session import Database
 from skills.errors import Conflict
+from skills.formats.reader_process import Told
 from skills.library import consent
+from skills.library.recordings import Teller, find_recording, stored_recording
 
 # Bare tables, because a surgeon whom the caller may not see has to consent too.
 _DEMOS, _NAMED, _ERASED = (
@@ -56,9 +59,8 @@ class SurgeonsRecorded(NamedTuple):
             if surgeon.row in known:
                 consent.require(surgeon, use)
         if not self.may(use):
-            raise Conflict(
-                f"The recording shows another surgeon whose consent does not cover {use}, or who was erased."
-            )
+            covers = f"whose consent does not cover {consent.CALLED[use]}, or who was erased"
+            raise Conflict(f"The recording shows {'another' if known else 'a'} surgeon {covers}.")
 
 
 def episodes_of(demonstrations: Sequence[int], *, whole: bool) -> Iterator[Select[Any]]:
@@ -70,10 +72,31 @@ def episodes_of(demonstrations: Sequence[int], *, whole: bool) -> Iterator[Selec
 
 def in_recording(session: Session, recording: StoredRecording) -> SurgeonsRecorded:
     """Return who is recorded in a whole recording."""
-    values: dict[str, Any] = {"recording_row": recording.row, "surgeon_row": 0}
-    values |= {"start_s": 0.0, "end_s": 0.0, "whole": True}
-    columns: list[ColumnElement[Any]] = [literal(value).label(name) for name, value in values.items()]
+    values = {"recording_row": recording.row, "surgeon_row": 0, "start_s": 0.0, "end_s": 0.0, "whole": True}
+    columns: list[Any] = [literal(value).label(name) for name, value in values.items()]
     return recorded_in(session, [select(*columns)])
+
+
+def recording_for(session: Session, recording_sha256: str, use: consent.Use) -> StoredRecording:
+    """Return a recording whose motion is used.
+
+    Raises:
+        Conflict: Somebody in it does not allow the use.
+    """
+    recording = find_recording(session, recording_sha256)
+    in_recording(session, recording).require(use)
+    return recording
+
+
+def shown_recording(database: Database, recording_sha256: str, tell: Teller) -> Told:
+    """Return what is read of a stored recording, to be shown; everybody in it is asked after it was read.
+
+    It raises the errors of `recording_for`, and of `skills.library.recordings.stored_recording`.
+    """
+    told = stored_recording(database, recording_sha256, tell)
+    with database.reading() as session:
+        recording_for(session, recording_sha256, "any")
+    return told
 
 
 def recorded_in(session: Session, episodes: Episodes) -> SurgeonsRecorded:

@@ -21,6 +21,7 @@ from skills.learning.certificate import NearLimits, OddsLimits
 from skills.learning.policy import LEARNER_VERSION, describe_learner
 from skills.library import jobs, locks
 from skills.library.catalogue import find_surgeon, find_suture_type
+from skills.library.consent import require
 from skills.library.demos import newest_demos
 from skills.library.jobs import BATCH, KEPT, PART, PartRequest, RequestedJob, RetrainingRequest, did_nothing
 from skills.library.policies import Kept, Recipe, in_pieces, kept_of, learner_kept, recipes_of
@@ -72,7 +73,8 @@ def request_retraining(
 
     Raises:
         NotFound: The surgeon or the suture type is unknown.
-        Conflict: There is no demonstration that may be learnt from, or the surgeon was erased meanwhile.
+        Conflict: There is no demonstration that may be learnt from, the consent of the only surgeon does not cover
+            training, or this surgeon was erased meanwhile.
         BadSettings: With the learner's settings going round in circles pays more than arriving.
         LearnerNotInstalled: The learner needs a library that is not installed.
     """
@@ -114,6 +116,8 @@ def choose_styles(
     """
     learner = learner_to_train(batch.chosen)
     who = None if batch.surgeon is None else find_surgeon(session, batch.surgeon)
+    if who is not None:
+        require(who, "training")
     what = None if batch.suture is None else find_suture_type(session, batch.suture)
     demos = _newest_demos(session, who, what)
     if not demos:

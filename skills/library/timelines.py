@@ -2,7 +2,7 @@
 
 A timeline is computed at each request and stored nowhere; what takes long, the decoding of a recording, is cached with
 the recording (`skills.library.recordings`). What may be seen is what a reader may see of the same resource in another
-form: the path of a demonstration, the trajectory of a plan. A file of it is an export.
+form: the path of a demonstration, the trajectory of a plan. A file of a recorded motion is an export.
 """
 
 from collections.abc import Sequence
@@ -21,10 +21,10 @@ from skills.db.models import (
 from skills.db.session import Database
 from skills.errors import NotFound
 from skills.library import policies
-from skills.library.demos import find_demo
+from skills.library.demos import demo_for, find_demo
 from skills.library.plans import find_plan, motion_of, trajectory_of
 from skills.library.policies import poses_of
-from skills.library.recorded import episodes_of, in_recording, recorded_in
+from skills.library.recorded import recording_for, shown_recording
 from skills.library.recordings import Teller, find_recording, stored_recording
 from skills.verification.timeline import (
     Timeline,
@@ -43,16 +43,19 @@ def timeline_of(database: Database, source: Source, sha256: str, tell: Teller) -
 
     Raises:
         NotFound: There is no such resource, or the policy version has no pose style.
-        Conflict: The surgeon's consent does not cover training, for a policy version or a plan.
+        Conflict: The surgeon's consent does not cover training, for a policy version or a plan, or somebody in these
+            seconds of a recording allows no use.
         Corrupt: What is stored does not match its digest.
     """
     if source == "recordings":
-        return timeline_of_recording(stored_recording(database, sha256, tell).recording)
+        return timeline_of_recording(shown_recording(database, sha256, tell).recording)
     if source == "demos":
         with database.reading() as session:
-            found = find_demo(session, sha256)
-            demo, recording = found.demo, found.recording.sha256
-        return timeline_of_demo(stored_recording(database, recording, tell).recording, demo)
+            recording = find_demo(session, sha256).recording.sha256
+        told = stored_recording(database, recording, tell)
+        with database.reading() as session:
+            demo = demo_for(session, sha256, "any").demo
+        return timeline_of_demo(told.recording, demo)
     if source == "policy-versions":
         with database.reading() as session:
             poses = poses_of(policies.followable(policies.find_by_digest(session, sha256)))
@@ -75,10 +78,9 @@ def check_export(session: Session, source: Source, sha256: str) -> None:
         Conflict: Somebody in these seconds of the recording does not allow an export.
     """
     if source == "demos":
-        demo = find_demo(session, sha256)
-        recorded_in(session, episodes_of([demo.row], whole=False)).require("export", {demo.surgeon_row})
+        demo_for(session, sha256, "export")
     if source == "recordings":
-        in_recording(session, find_recording(session, sha256)).require("export")
+        recording_for(session, sha256, "export")
 
 
 class TimelineLink(NamedTuple):

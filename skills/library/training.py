@@ -21,13 +21,13 @@ from skills.db.changes import announce
 from skills.db.models import (
     SUCCESS,
     Demonstration,
+    LastUsed,
     PolicyDemonstration,
     PolicyVersion,
     StoredPoses,
     StoredRecording,
     StoredRewardMap,
     Surgeon,
-    UsedNumber,
     newest_mark,
 )
 from skills.db.packed import Sealed, seal, unpack_as
@@ -85,7 +85,7 @@ from skills.settings import Settings
 
 # Statements executed for every style, built once: building one takes as long as executing it.
 _VERSIONS, _DEMOS, _SURGEONS = (cast(Table, one.__table__) for one in (PolicyVersion, Demonstration, Surgeon))
-_OF_STYLE, _USED = _VERSIONS.alias("of_style"), cast(Table, UsedNumber.__table__)
+_OF_STYLE, _USED = _VERSIONS.alias("of_style"), cast(Table, LastUsed.__table__)
 STANDING = (
     select(
         _DEMOS.c.row,

@@ -150,7 +150,7 @@ def test_an_erased_surgeon_is_nowhere_in_the_files(service: Service):
     rows.pop("history_tiles", None)  # there is one for every 256 leaves
     # heron uploaded the same bytes
     shared = dict.fromkeys(["recordings", "recording_chunks", "recording_uploads", "parsed_recordings"], 1)
-    shared["parsed_chunks"] = 1
+    shared |= {"parsed_chunks": 1, "erased_intervals": 1}
     assert rows == {"surgeons": 1, "erasures": 1, "demonstrations": 1, "reward_maps": 1} | shared
     assert service.client.demo_recording(service.client.demos("heron")[0]["id"]) == data
 

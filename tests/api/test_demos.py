@@ -219,7 +219,7 @@ def test_erasing_a_demonstration_takes_what_was_learnt_from_it(trained: Service)
     trained.client.withdraw_demo(trained.client.demos()[0]["id"], erase=True)
     left = {table: rows for table, rows in trained.counts().items() if rows}
     left.pop("history_tiles", None)  # there is one for every 256 leaves
-    assert set(left) == {"surgeons", "suture_types", "events", "history", "history_checkpoints"}
+    assert set(left) == {"surgeons", "suture_types", "events", "history", "history_checkpoints", "used_numbers"}
     again = trained.client.add_demo(cases.hand_off(), media_type=CSV, **KESTREL)
     assert again["state"] == "active"
 

@@ -257,7 +257,8 @@ def test_a_policy_learnt_again_after_an_erasure_gets_its_own_dates(trained: Serv
     after = trained.client.policy(**KESTREL)
     assert (after["sha256"], trained.counts()["releases"]) == (before["sha256"], rows)
     assert after["released_at"] > before["released_at"]
-    assert trained.http.get(f"{POLICY}/versions/1").json()["created_at"] == after["created_at"] > before["created_at"]
+    assert (before["version"], after["version"]) == (1, 2)
+    assert trained.http.get(f"{POLICY}/versions/2").json()["created_at"] == after["created_at"] > before["created_at"]
 
 
 def test_a_verified_policy_is_served_by_digest_and_a_damaged_one_refused(trained: Service):

@@ -13,13 +13,13 @@ from skills.db.models import (
     DemonstrationOutcome,
     ErasedInterval,
     Erasure,
+    LastUsed,
     MeasuredShape,
     ProposalMark,
     RecordingSurgeon,
     StoredCalibration,
     StoredPictures,
     StoredPlayback,
-    UsedNumber,
 )
 from skills.db.session import Database
 from skills.library.keys import Lasts, create_key, sign_in
@@ -100,7 +100,7 @@ def fill(database: Database) -> None:
         session.add(service_tables.DatasetChunk(dataset_row=dataset.row, number=0, data=b"0"))
         session.add(Erasure(salt="0" * 64, digest="0" * 64))
         session.add(ErasedInterval(recording_row=demo.recording_row, surgeon_row=demo.surgeon_row))
-        session.add(UsedNumber(surgeon_row=demo.surgeon_row, suture=cases.SUTURE, last=7))
+        session.add(LastUsed(surgeon_row=demo.surgeon_row, suture=cases.SUTURE, last=7))
         session.add(RecordingSurgeon(recording_row=demo.recording_row, surgeon_row=demo.surgeon_row))
         shape = Measured(np.zeros((STATES, 3)), np.array([1]), np.array([0.0]), np.array([0.0]))
         session.add(MeasuredShape(demonstration_row=demo.row, version=1, measured=shape))

@@ -215,7 +215,8 @@ def test_a_surgeon_erased_while_the_style_is_learnt_leaves_nothing(database: Dat
     interrupted(monkeypatch, erase)
     with database.writing() as session:
         session.get_one(Job, job.row).state = "running"
-    library.perform_job(database, job.row, job.attempt, Settings(database_url=database.url))
+    with pytest.raises(Conflict, match="was erased"):
+        library.perform_job(database, job.row, job.attempt, Settings(database_url=database.url))
     assert set(counts(database)) == {"suture_types", "events", "erasures"}
 
 

@@ -238,8 +238,12 @@ def start_it_over(session: Session, job: Job) -> None:
     session.execute(update(Job).where(Job.row == job.row).values(attempt=job.attempt + 1))
 
 
+def allow_nothing(session: Session, job: Job) -> None:
+    put_surgeon(session, session.get_one(Surgeon, job.surgeon_row).slug, {"consent": {"uses": []}}, "test")
+
+
 STORED = (Demonstration, ParsedRecording, PolicyVersion, Release, Plan, StoredPlayback, Event)
-ENDINGS = (erase_its_demo, erase_its_surgeon, cancel_it, start_it_over)
+ENDINGS = (erase_its_demo, erase_its_surgeon, cancel_it, start_it_over, allow_nothing)
 
 
 def ended_before(last: int, database: Database, job: Job, ending: Callable[[Session, Job], None]) -> bool:

@@ -101,9 +101,7 @@ def test_erasing_leaves_what_was_there_before_and_nothing_else(database: Databas
     sweep_erased(database)
     left = rows(database)
     assert [numbers[1:] for numbers in left["used_numbers"]] == [(1, cases.SUTURE, 7)]
-    with_osprey["used_numbers"] = before["used_numbers"] = left[
-        "used_numbers"
-    ]  # so that no version is the seventh again
+    with_osprey["used_numbers"] = before["used_numbers"] = left["used_numbers"]  # no version is a seventh again
     assert left == with_osprey
 
     with database.writing() as session:

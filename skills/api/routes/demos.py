@@ -235,20 +235,21 @@ def get_demo_recording(
     return Stream(stored_pieces(read, refuse, sha256, request.app.state.downloads), media_type, headers)
 
 
-@router.get("/demos/{demo}/path", dependencies=[needs("reader")], **gives(DemoPath, 404))
+@router.get("/demos/{demo}/path", dependencies=[needs("reader")], **gives(DemoPath, 404, 409))
 def get_path(demo: Digest, db: Db, give: Giving) -> Response:
     """Return a demonstration's states in the grid and its motion as recorded."""
     with db.reading() as session:
-        row = demos.find_demo(session, demo)
-        return give(path_json(row))
+        return give(path_json(demos.demo_for(session, demo, "any")))
 
 
-@router.get("/demos/{demo}/report", dependencies=[needs("reader")], **gives(Demonstration, 404, 415, as_well=(HTML,)))
+@router.get(
+    "/demos/{demo}/report", dependencies=[needs("reader")], **gives(Demonstration, 404, 409, 415, as_well=(HTML,))
+)
 def get_report(demo: Digest, db: Db, give: Giving, accept: Accept = "*/*") -> Response:
     """Return a demonstration's quality report, with advice: JSON, or with `Accept: text/html` a page."""
     as_page = wants_page(accept, "A report")
     with db.reading() as session:
-        row = demos.find_demo(session, demo)
+        row = demos.demo_for(session, demo, "any") if as_page else demos.find_demo(session, demo)
         about, report = demo_json(row), demos.full_report(row)
         if as_page:
             page = give.bytes(report_page(about, report, row.demo, row.path).encode(), HTML)
@@ -257,11 +258,11 @@ def get_report(demo: Digest, db: Db, give: Giving, accept: Accept = "*/*") -> Re
         return give(about | {"report": report})
 
 
-@router.get("/demos/{demo}/reward-map", dependencies=[needs("reader")], **gives(RewardMap, 404))
+@router.get("/demos/{demo}/reward-map", dependencies=[needs("reader")], **gives(RewardMap, 404, 409))
 def get_reward_map(demo: Digest, db: Db, give: Giving) -> Response:
     """Return the rewards of Algorithm 1 for a demonstration, without the states whose reward is `other`."""
     with db.reading() as session:
-        row = demos.find_demo(session, demo)
+        row = demos.demo_for(session, demo, "any")
         kept = session.scalars(select(StoredRewardMap).where(StoredRewardMap.demonstration_row == row.row)).one()
         return give(reward_map_json(row, kept))
 

@@ -19,8 +19,8 @@ from skills.formats import MEDIA_TYPES, SUFFIXES
 from skills.kinematics import INSTRUMENTS
 from skills.library import jobs, overview, policies, releases, retraining, scores
 from skills.library.catalogue import list_surgeons
-from skills.library.demos import find_demo
-from skills.library.plans import find_plan, hands_over, plan_in_words
+from skills.library.demos import demo_for, find_demo
+from skills.library.plans import find_plan, followed_plan, hands_over, plan_in_words
 from skills.library.playbacks import headline_of
 from skills.library.recordings import find_recording
 from skills.library.releases import outcomes_of
@@ -52,6 +52,8 @@ class PageRoute(APIRoute):
             try:
                 return await answer(request)
             except LOST as lost:
+                if request.headers.get("accept") == JSON:  # a script of a page, which shows the reason itself
+                    raise
                 status = next((code for kind, code in STATUS.items() if isinstance(lost, kind)), 404)
                 said = lost.words() if isinstance(lost, errors.SkillsError) else "There is no page at this address."
                 return render(
@@ -132,14 +134,14 @@ def _chosen(session: Session, whole: overview.WholeStyle, version: int | None) -
 def view_version(surgeon: Slug, suture: Slug, version: Version, caller: Asking, db: Db) -> Response:
     """Return the data of a version's 3-D view."""
     with db.reading() as session:
-        return _json(overview.view_of_version(policies.find_version(session, surgeon, suture, version)))
+        return _json(overview.view_of_version(policies.choose(session, surgeon, suture, version)))
 
 
 @router.get("/pages/demos/{demo}/view", dependencies=[needs("reader")])
 def view_demo(demo: Digest, caller: Asking, db: Db) -> Response:
     """Return the data of a demonstration's 3-D view."""
     with db.reading() as session:
-        return _json(overview.view_of_demo(session, find_demo(session, demo)))
+        return _json(overview.view_of_demo(session, demo_for(session, demo, "any")))
 
 
 @router.get("/pages/demos/{demo}/score", dependencies=[needs("reader")])
@@ -282,7 +284,7 @@ def _assumed_psm_m(goal_mm: list[float]) -> dict[str, str]:
 def show_plan(plan: Digest, request: Request, caller: Asking, db: Db, settings: Configured) -> Response:
     """Show a plan with its playbacks."""
     with db.reading() as session:
-        found = find_plan(session, plan)
+        found = followed_plan(session, plan)
         refusal = refusal_of_bag(session, found, settings)
         return render(
             request,

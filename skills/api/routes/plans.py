@@ -45,7 +45,7 @@ from skills.formats.replay_bag import rows_of_pass
 from skills.library import locks, overview, plans, playbacks
 from skills.library.jobs import QUEUED, did_nothing
 from skills.library.plans import find_suture_points, map_style, motion_of, plan_json, plan_summary_json, trajectory_of
-from skills.library.playbacks import find_playback, playback_json
+from skills.library.playbacks import find_playback, playback_json, shown_playback
 from skills.library.replay import compare_with_plan, conditions_of, replay_bag
 from skills.library.timelines import Source, check_export, chosen, motion_named, timeline_of
 from skills.planning.plan import MAX_PASSES
@@ -70,7 +70,7 @@ from skills.verification.playback import Pictures
 router = router_of(route_class=Strict, tags=["plans"], max_body_size=MEBIBYTE)
 
 
-@router.post("/plans", dependencies=[needs("trainer")], **makes(Plan, 404, 410))
+@router.post("/plans", dependencies=[needs("trainer")], **makes(Plan, 404, 409, 410))
 def make_plan(body: PlanIn, db: Db, actor: Actor) -> Response:
     """Stack a style's grid world at suture points."""
     row, created = plans.plan_sutures(db, body, actor)
@@ -87,11 +87,11 @@ def list_plans(db: Db, give: Giving, limit: Limit = 50, cursor: RowCursor = None
         return give.page(written, limit, found[-1][0].row if found else None)
 
 
-@router.get("/plans/{plan}", dependencies=[needs("reader")], **gives(Plan, 404))
+@router.get("/plans/{plan}", dependencies=[needs("reader")], **gives(Plan, 404, 409))
 def get_plan(plan: Digest, db: Db, give: Giving) -> Response:
-    """Return a plan."""
+    """Return a plan with its paths, while the surgeon's consent covers training."""
     with db.reading() as session:
-        return give(plan_json(plans.find_plan(session, plan)))
+        return give(plan_json(plans.followed_plan(session, plan)))
 
 
 @router.post("/reach", dependencies=[needs("trainer")], **says(Reach, 404, 409, 410))
@@ -105,7 +105,7 @@ def map_reach(body: ReachIn, db: Db) -> Response:
     return say(map_style(db, body).model_dump(mode="json"))
 
 
-@router.post("/playbacks", dependencies=[needs("trainer"), room_for_a_job], **starts_job(404))
+@router.post("/playbacks", dependencies=[needs("trainer"), room_for_a_job], **starts_job(404, 409))
 def play(body: PlaybackIn, db: Db, jobs: Jobs, actor: Actor, settings: Configured) -> Response:
     """Request the playback of a plan in the simulator."""
     with db.reading() as session:
@@ -195,7 +195,7 @@ def get_trajectory(
     return given
 
 
-@trajectory_router.get("/plans/{plan}/comparison", dependencies=[needs("reader")], **gives(Comparison, 404))
+@trajectory_router.get("/plans/{plan}/comparison", dependencies=[needs("reader")], **gives(Comparison, 404, 409))
 def compare(
     plan: Digest, demo: Annotated[str, Query(pattern=DIGEST)], db: Db, give: Giving, pass_index: OnePass = 0
 ) -> Response:
@@ -263,14 +263,14 @@ PNG, GIF, MP4 = "image/png", "image/gif", "video/mp4"
 
 def _given(kind: str) -> dict[str, Any]:
     """Describe a picture route; plain bytes are a second media type, for generated clients that know no other."""
-    return gives_file((BYTES, kind), 404)
+    return gives_file((BYTES, kind), 404, 409)
 
 
 @picture_router.get("/picture.png", dependencies=[needs("reader")], **_given(PNG))
 def get_picture(playback: Digest, db: Db, give: Giving, accept: Accept = "*/*") -> Response:
     """Return a still picture of the playback: the scene with all passes."""
     with db.reading() as session:
-        return give.bytes(find_playback(session, playback).measured.picture_png, as_asked(accept, PNG))
+        return give.bytes(shown_playback(session, playback).measured.picture_png, as_asked(accept, PNG))
 
 
 @picture_router.get("/animation.mp4", dependencies=[needs("reader")], **_given(MP4))
@@ -297,7 +297,7 @@ def get_clearance_plot(playback: Digest, db: Db, give: Giving, accept: Accept = 
     return give.bytes(_drawn(db, playback, lambda drawn: drawn.clearance_png), as_asked(accept, PNG))
 
 
-@picture_router.post("/pictures", dependencies=[needs("trainer"), room_for_a_job], **starts_job(404))
+@picture_router.post("/pictures", dependencies=[needs("trainer"), room_for_a_job], **starts_job(404, 409))
 def draw_pictures(playback: Digest, db: Db, actor: Actor) -> Response:
     """Request the film and the plots; every new playback has requested them already, so this returns that job.
 
@@ -306,13 +306,13 @@ def draw_pictures(playback: Digest, db: Db, actor: Actor) -> Response:
     with db.reading() as session:
         surgeon = find_playback(session, playback).plan.policy.surgeon.slug
     with db.writing([locks.surgeon(surgeon)]) as session:
-        job, new = playbacks.request_pictures(session, find_playback(session, playback), actor)
+        job, new = playbacks.request_pictures(session, shown_playback(session, playback), actor)
         return accepted(session, job, QUEUED if new else did_nothing(job))
 
 
 def _drawn(db: Database, playback: str, which: Callable[[Pictures], bytes]) -> bytes:
     with db.reading() as session:
-        return which(playbacks.find_pictures(session, find_playback(session, playback)))
+        return which(playbacks.find_pictures(session, shown_playback(session, playback)))
 
 
 timeline_router = router_of(tags=["timelines"], max_body_size=MEBIBYTE)
@@ -331,7 +331,7 @@ def get_timeline(source: Source, digest: Digest, db: Db, tell: Tell, give: Givin
 
     At most 200 rows a second and 24,000 in all. `Accept: application/vnd.mcap` returns an MCAP file for viewers such as
     Foxglove, which is not for execution. 409: the surgeon's consent does not cover training, for a policy version or a
-    plan, or an export, for the file of a recording or a demonstration.
+    plan, or an export, for the file of a recording or a demonstration; or somebody recorded allows no use.
     """
     mcap = _is_mcap(accept)
     if mcap:

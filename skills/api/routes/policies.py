@@ -423,7 +423,7 @@ card_router = router_of(tags=["policies"], max_body_size=MEBIBYTE)
 @card_router.get(
     "/policies/{surgeon}/{suture}/versions/{version}/card",
     dependencies=[needs("reader")],
-    **gives(PolicyCard, 404, 410, 415, as_well=(HTML,)),
+    **gives(PolicyCard, 404, 409, 410, 415, as_well=(HTML,)),
 )
 def get_policy_card(
     surgeon: Slug, suture: Slug, version: Version, db: Db, accept: Accept = "*/*", if_none_match: Condition = None
@@ -433,7 +433,8 @@ def get_policy_card(
     It states whether the version is released now and what rests on it, so its ETag changes with these.
     """
     as_page = wants_page(accept, "A policy card")
-    card = _card(db, lambda session: policies.find_version(session, surgeon, suture, version))
+    find = policies.choose if as_page else policies.find_version
+    card = _card(db, lambda session: find(session, surgeon, suture, version))
     return _answer(card, as_page, if_none_match)
 
 
@@ -457,14 +458,16 @@ def get_policy_card_signature(surgeon: Slug, suture: Slug, version: Version, db:
 @card_router.get(
     "/policy-versions/{policy}/card",
     dependencies=[needs("reader")],
-    **gives(PolicyCard, 404, 415, as_well=(HTML,)),
+    **gives(PolicyCard, 404, 409, 415, as_well=(HTML,)),
 )
 def get_policy_version_card(
     policy: Digest, db: Db, accept: Accept = "*/*", if_none_match: Condition = None
 ) -> Response:
     """Return the policy card of a version by the digest under which it is cited."""
     as_page = wants_page(accept, "A policy card")
-    return _answer(_card(db, lambda session: policies.find_by_digest(session, policy)), as_page, if_none_match)
+    seen = policies.followable if as_page else lambda version: version
+    card = _card(db, lambda session: seen(policies.find_by_digest(session, policy)))
+    return _answer(card, as_page, if_none_match)
 
 
 def _card(db: Database, find: Callable[[Session], PolicyVersion]) -> Card:
