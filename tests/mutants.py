@@ -381,7 +381,8 @@ GUARDS = (
         "skills/api/authorisation.py", 22,
         ("tests/api/test_authorisation.py", "tests/api/test_roles.py", "tests/api/test_seen.py"),
     ),
-    Guard("skills/library/consent.py", 18, ("tests/library/test_consent.py",)),
+    Guard("skills/library/consent.py", 18, ("tests/library/test_consent.py", "tests/api/test_uses.py")),
+    Guard("skills/library/recorded.py", 14, ("tests/library/test_recorded.py",)),
     Guard(
         "skills/api/policy_cache.py", 14,
         ("tests/api/test_policy_cache.py", *(f"tests/api/test_served.py::test_{name}" for name in (
@@ -394,7 +395,7 @@ GUARDS = (
     Guard(
         "skills/library/erasure.py", 30,
         ("tests/library/test_erasing.py", "tests/library/test_sweep.py", "tests/api/test_deleting_recordings.py",
-         "tests/library/test_parsed.py", "tests/library/test_what_remains.py", TOLD),
+         "tests/library/test_parsed.py", "tests/library/test_what_remains.py", "tests/library/test_recorded.py", TOLD),
     ),
     Guard("skills/library/sweep.py", 14, ("tests/library/test_sweep.py", "tests/library/test_what_remains.py")),
     Guard(

@@ -313,6 +313,8 @@ def test_a_batch_trains_styles_names_failures_and_sets_the_exit_code(skills) -> 
         put_surgeon(session, "wren", {"consent": {"uses": [], "until": None}}, "test")
     database.close()
     code, said = skills("retrain", "--surgeon", "wren", "--release")
+    assert (code, "does not cover training" in said, "failed" in said) == (1, True, False), said
+    code, said = skills("retrain", "--suture", "simple-running")
     assert (code, "1 failed" in said, "does not cover training" in said) == (1, True, True), said
 
 

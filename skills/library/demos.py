@@ -308,8 +308,19 @@ def find_demo(session: Session, demo_sha256: str) -> Demonstration:
     return find_by_digest(session, Demonstration, demo_sha256, "demonstration", Remedy(Action.LIST_DEMOS))
 
 
+def shown_demo(session: Session, demo_sha256: str) -> Demonstration:
+    """Return a demonstration whose own motion is shown.
+
+    Raises:
+        Conflict: Its surgeon allows no use.
+    """
+    demo = find_demo(session, demo_sha256)
+    consent.require(demo.surgeon, "any")
+    return demo
+
+
 def demo_for(session: Session, demo_sha256: str, use: consent.Use) -> Demonstration:
-    """Return a demonstration whose motion is used.
+    """Return a demonstration whose seconds of the recording are used, with all that is recorded in them.
 
     Raises:
         Conflict: Somebody in these seconds of the recording does not allow the use.

@@ -33,7 +33,7 @@ from skills.formats.verify import EXECUTOR, PLAN, POLICY, README, SIGNATURE, VER
 from skills.learning.evaluation import TIE_BREAK, dtw
 from skills.library import consent, policies, proofs, releases
 from skills.library.arm_errors import stated_errors
-from skills.library.demos import demo_for
+from skills.library.demos import shown_demo
 from skills.library.integrity import learnt, learnt_in, planned
 from skills.library.plans import describe_plan, find_plan, followed_plan, plan_in_words, trajectory_of
 from skills.library.playbacks import (
@@ -74,7 +74,7 @@ def compare_with_plan(session: Session, plan_sha256: str, demo_sha256: str, pass
         Conflict: The consent does not cover training, for the plan, or any use, for the demonstration.
         BadPlan: The plan has no such pass, or the recording is of another arm or in another frame.
     """
-    of_plan, of_demo = followed_plan(session, plan_sha256), demo_for(session, demo_sha256, "any")
+    of_plan, of_demo = followed_plan(session, plan_sha256), shown_demo(session, demo_sha256)
     plan, demo = planned(of_plan), of_demo.demo
     if (plan.arm, plan.frame) != (demo.arm, demo.frame):
         raise BadPlan(

@@ -152,7 +152,9 @@ def test_an_erased_surgeon_is_nowhere_in_the_files(service: Service):
     shared = dict.fromkeys(["recordings", "recording_chunks", "recording_uploads", "parsed_recordings"], 1)
     shared |= {"parsed_chunks": 1, "erased_intervals": 1}
     assert rows == {"surgeons": 1, "erasures": 1, "demonstrations": 1, "reward_maps": 1} | shared
-    assert service.client.demo_recording(service.client.demos("heron")[0]["id"]) == data
+    (demo,) = service.client.demos("heron")
+    assert service.client.get_json(f"/demos/{demo['id']}/path")["recorded_mm"]
+    assert "who was erased" in assert_problem(service.http.get(f"/demos/{demo['id']}/recording"), 409)["detail"]
 
 
 def everything(service: Service) -> bytes:

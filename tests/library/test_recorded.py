@@ -14,12 +14,12 @@ from skills.formats.reader_process import read_told
 from skills.library.backup import back_up, erasures_of, restore
 from skills.library.catalogue import put_surgeon
 from skills.library.datasets import request_dataset
-from skills.library.demos import exported_chunk, exported_recording, find_demo
+from skills.library.demos import exported_chunk, exported_recording, find_demo, shown_demo
 from skills.library.erasure import erase_demo, erase_surgeon
 from skills.library.proposals import find_proposal
 from skills.library.recordings import store_recording
 from skills.library.scores import score
-from skills.library.timelines import check_export
+from skills.library.timelines import Source, check_export, timeline_of
 from skills.library.whose import recognise_recording
 from skills.schemas.requests import DatasetIn, ScoreIn
 from tests import backends
@@ -74,6 +74,21 @@ OF_ALL = {"bytes", "a chunk", "timeline of all", "dataset of all"}
 OF_ITS_SECONDS = {"timeline", "dataset"}
 
 
+def shown(database: Database, demo: str) -> set[str]:
+    """Return what a reader sees: a demonstration's own motion, its seconds with both arms, and its whole recording."""
+    recording = recording_of(database, demo)
+    found = set()
+    resources: tuple[tuple[Source, str], ...] = (("demos", demo), ("recordings", recording))
+    for source, sha256 in resources:
+        try:
+            timeline_of(database, source, sha256, read_told)
+            found.add(source)
+        except Conflict:
+            continue
+    with database.reading() as session:
+        return {*found, *(["path"] if shown_demo(session, demo) else [])}
+
+
 def shut(database: Database, demo: str) -> set[str]:
     return {name for name, opened in doors(database, demo).items() if not opened}
 
@@ -90,8 +105,12 @@ def test_a_surgeon_named_at_the_upload_is_asked_at_every_door(database: Database
     demo = add(database, session_of())
     name_wren(database, demo)
     assert shut(database, demo) == set()
+    assert shown(database, demo) == {"path", "demos", "recordings"}
+    agree(database, "wren", {"uses": ["atlas"], "until": None})
+    assert shown(database, demo) == {"path", "demos", "recordings"}
     agree(database, "wren", NOTHING)
     assert shut(database, demo) == OF_ALL | OF_ITS_SECONDS
+    assert shown(database, demo) == {"path"}
 
 
 def test_a_surgeon_of_other_seconds_is_asked_for_the_whole(database: Database) -> None:
@@ -122,6 +141,7 @@ def test_erasing_a_surgeon_leaves_their_seconds_for_no_use(database: Database, a
     agree(database, "wren", NOTHING)
     with database.writing() as session:
         erase_surgeon(session, "wren", "test")
+    assert shown(database, demo) == ({"path"} if at_once else {"path", "demos"})
     assert shut(database, demo) == OF_ALL | (OF_ITS_SECONDS if at_once else set())
 
 

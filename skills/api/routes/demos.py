@@ -239,7 +239,7 @@ def get_demo_recording(
 def get_path(demo: Digest, db: Db, give: Giving) -> Response:
     """Return a demonstration's states in the grid and its motion as recorded."""
     with db.reading() as session:
-        return give(path_json(demos.demo_for(session, demo, "any")))
+        return give(path_json(demos.shown_demo(session, demo)))
 
 
 @router.get(
@@ -249,7 +249,7 @@ def get_report(demo: Digest, db: Db, give: Giving, accept: Accept = "*/*") -> Re
     """Return a demonstration's quality report, with advice: JSON, or with `Accept: text/html` a page."""
     as_page = wants_page(accept, "A report")
     with db.reading() as session:
-        row = demos.demo_for(session, demo, "any") if as_page else demos.find_demo(session, demo)
+        row = demos.shown_demo(session, demo) if as_page else demos.find_demo(session, demo)
         about, report = demo_json(row), demos.full_report(row)
         if as_page:
             page = give.bytes(report_page(about, report, row.demo, row.path).encode(), HTML)
@@ -262,7 +262,7 @@ def get_report(demo: Digest, db: Db, give: Giving, accept: Accept = "*/*") -> Re
 def get_reward_map(demo: Digest, db: Db, give: Giving) -> Response:
     """Return the rewards of Algorithm 1 for a demonstration, without the states whose reward is `other`."""
     with db.reading() as session:
-        row = demos.demo_for(session, demo, "any")
+        row = demos.shown_demo(session, demo)
         kept = session.scalars(select(StoredRewardMap).where(StoredRewardMap.demonstration_row == row.row)).one()
         return give(reward_map_json(row, kept))
 

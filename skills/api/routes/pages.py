@@ -19,7 +19,7 @@ from skills.formats import MEDIA_TYPES, SUFFIXES
 from skills.kinematics import INSTRUMENTS
 from skills.library import jobs, overview, policies, releases, retraining, scores
 from skills.library.catalogue import list_surgeons
-from skills.library.demos import demo_for, find_demo
+from skills.library.demos import find_demo, shown_demo
 from skills.library.plans import find_plan, followed_plan, hands_over, plan_in_words
 from skills.library.playbacks import headline_of
 from skills.library.recordings import find_recording
@@ -141,7 +141,7 @@ def view_version(surgeon: Slug, suture: Slug, version: Version, caller: Asking, 
 def view_demo(demo: Digest, caller: Asking, db: Db) -> Response:
     """Return the data of a demonstration's 3-D view."""
     with db.reading() as session:
-        return _json(overview.view_of_demo(session, demo_for(session, demo, "any")))
+        return _json(overview.view_of_demo(session, shown_demo(session, demo)))
 
 
 @router.get("/pages/demos/{demo}/score", dependencies=[needs("reader")])
