@@ -96,7 +96,7 @@ def fill(database: Database) -> None:
         session.add(service_tables.DatasetChunk(dataset_row=dataset.row, number=0, data=b"0"))
         session.add(Erasure(salt="0" * 64, digest="0" * 64))
         session.add(RecordingSurgeon(recording_row=demo.recording_row, surgeon_row=demo.surgeon_row))
-        shape = Measured(np.zeros((STATES, 3)), np.array([1]), np.array([0.0]), np.array([0.0]))
+        shape = Measured(np.zeros((STATES, 3)), np.array([1]), np.array([0.0]), np.array([0.0]), np.ones(3))
         session.add(MeasuredShape(demonstration_row=demo.row, version=1, measured=shape))
         key, _ = create_key(session, "ada", "reader", "test", surgeons=["kestrel"])
         sign_in(session, key.id, Lasts(60.0, 600.0))
