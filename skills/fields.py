@@ -47,17 +47,8 @@ _ATTRIBUTE = re.compile(r"^ {4}(\w+): (.*(?:\n {8,}.*)*)", re.MULTILINE)
 
 def schema(cls: type[T]) -> type[T]:
     """Make a dataclass the schema of its JSON: every field is required, and described as in the docstring."""
-    return _schema(cls, defaults_required=True)
-
-
-def stored_schema(cls: type[T]) -> type[T]:
-    """Make a dataclass the schema of stored JSON: older versions did not store the fields that have a default."""
-    return _schema(cls, defaults_required=False)
-
-
-def _schema(cls: type[T], *, defaults_required: bool) -> type[T]:
     cls.__pydantic_config__ = ConfigDict(  # type: ignore[attr-defined]
-        json_schema_serialization_defaults_required=defaults_required,
+        json_schema_serialization_defaults_required=True,
         json_schema_extra=lambda json: _describe(json, cls),
     )
     return cls

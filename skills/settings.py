@@ -24,10 +24,9 @@ LOOPBACK = ("localhost", "127.0.0.1", "[::1]")
 
 
 def _data_folder() -> Path:
-    """Return the folder of the default database; versions before 0.2.0 took the one in the home folder always."""
-    before, within = Path.home() / ".local" / "share" / "suture-skills", Path(os.environ.get("XDG_DATA_HOME", ""))
-    named = within / "suture-skills" if within.is_absolute() else before
-    return before if (before / DATABASE).exists() and not (named / DATABASE).exists() else named
+    """Return the folder of the default database."""
+    within = Path(os.environ.get("XDG_DATA_HOME", ""))
+    return (within if within.is_absolute() else Path.home() / ".local" / "share") / "suture-skills"
 
 
 def _cores() -> int:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from pydantic import TypeAdapter
 
-from skills.fields import Count, Point, as_json, computed_field, schema, stored_schema
+from skills.fields import Count, Point, as_json, computed_field, schema
 
 
 @schema
@@ -40,14 +40,6 @@ class Knot(Stitch):
     throws: int
 
 
-@stored_schema
-@dataclass(frozen=True, kw_only=True)
-class StoredKnot(Knot):
-    """A knot as it was stored."""
-
-    surgeon: str | None = None
-
-
 def described(kind: type) -> dict:
     return TypeAdapter(kind).json_schema(mode="serialization")
 
@@ -55,11 +47,6 @@ def described(kind: type) -> dict:
 def test_every_field_and_sent_property_is_required_whatever_its_default():
     assert set(described(Stitch)["required"]) == {"entry_mm", "bites", "counted"}
     assert not any({"default", "readOnly"} & {*one} for one in described(Stitch)["properties"].values())
-
-
-def test_a_field_with_a_default_may_be_missing_in_stored_json():
-    assert set(described(StoredKnot)["required"]) == {"entry_mm", "counted", "throws"}
-    assert TypeAdapter(StoredKnot).validate_python({"entry_mm": [1, 2, 3], "throws": 2}).surgeon is None
 
 
 def test_fields_are_described_by_the_docstrings_of_the_class_and_its_bases():

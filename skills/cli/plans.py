@@ -254,11 +254,9 @@ def play(
         out.print(playback.headline.text, markup=False, soft_wrap=True)
         for under in playback.report.doubt.under:
             least = min(one.succeeds.lower for one in under.passes)
-            named = (
-                f"{under.errors.name}: {under.errors.in_words}" if under.errors else f"tips {under.tip_error_mm} mm off"
-            )
             out.print(
-                f"{named}; every pass succeeds with a probability of at least {least:.3f} (95 %)",
+                f"{under.errors.name}: {under.errors.in_words}; every pass succeeds with a probability of at least "
+                f"{least:.3f} (95 %)",
                 markup=False,
                 soft_wrap=True,
             )

@@ -350,8 +350,6 @@ def policy_pose_style(surgeon: Surgeon, suture: Suture, as_json: AsJson = False)
 
 def _share(coverage: "Coverage") -> str:
     """Return how much of the demonstration a version follows from its starts, in words."""
-    if coverage.mean_share is None or coverage.median_share is None:
-        return "not known for this version; train again to know it"
     return (
         f"{coverage.mean_share:.0%} of the demonstration from a start on average, median {coverage.median_share:.0%}; "
         f"{coverage.starts_goal_alone} of {coverage.n_states} starts see the goal alone"

@@ -116,9 +116,8 @@ class Jobs(Connection):
         """
         asked = {"surgeon": surgeon, "suture": suture, "seed": seed, "release": release}
         how = None if combine is None else {"kind": combine}
-        of = None if outcomes == "success" else outcomes  # left out, so that an older service accepts the rest
-        asked |= given({"demos": demos, "combine": how, "learner": learner, "outcomes": of, "depth_along": depth_along})
-        asked |= given({"scene": scene, "scene_costs": scene_costs})
+        asked |= given({"demos": demos, "combine": how, "learner": learner, "depth_along": depth_along})
+        asked |= given({"outcomes": outcomes, "scene": scene, "scene_costs": scene_costs})
         return await self._ask(Job, "POST", at("trainings"), asked, harmless=not release)
 
     @call
@@ -539,10 +538,9 @@ def rebuilt(about: dict[str, Any], arrays: bytes, demo: dict[str, Any]) -> "Lear
         policy = _policy(about, arrays, demo)
         manifest = {name: value for name, value in about.items() if name not in OF_THE_VERSION}
         whole = policy_identity(manifest, policy) == about["sha256"]
-        actions = about[table_name(about, "actions")]
-        live = about.get(table_name(about, "live_actions"))  # an older service has none
+        actions, live = about[table_name(about, "actions")], about.get(table_name(about, "live_actions"))
         told = about.get("format", 1) in FORMATS and (actions is None or actions == policy.table().tolist())
-        told = told and (live is None or live == live_actions_of(policy))
+        told = told and live == live_actions_of(policy)
     except Exception as error:  # data of another kind can raise any class
         raise Corrupt("This version of the client cannot verify the received policy; update the client.") from error
     if not (whole and told):

@@ -202,14 +202,14 @@ class Measured:
         others: Numbers that identify the others, shape (K,).
         apart_mm: Distance from each, with the size taken into account, shape (K,).
         apart_scaled: The same for scaled shapes, in units of the distance from start to goal, shape (K,).
-        signature: The result of `skills.comparison.recognition.signature_of`, with its NaN; None: of an older version.
+        signature: The result of `skills.comparison.recognition.signature_of`, with its NaN.
     """
 
     shape_mm: Floats | None
     others: Ints
     apart_mm: Floats
     apart_scaled: Floats
-    signature: Floats | None = None
+    signature: Floats
 
     def __post_init__(self) -> None:
         count = len(self.others)

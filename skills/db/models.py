@@ -38,14 +38,14 @@ from skills.gridworld.grid import GridPath, GridWorld
 from skills.gridworld.reward import RewardLevels, RewardMap
 from skills.gridworld.scene import Box, Capsule, Scene, SceneCosts, Surroundings, Tissue
 from skills.learning.certificate import Coverage
-from skills.learning.dynamic_programming import ShortestWay, ValueIteration
+from skills.learning.dynamic_programming import ShortestWay
 from skills.learning.networks import Network
 from skills.learning.policy import LEARNERS, Policy
 from skills.learning.pose_style import PosePath
-from skills.learning.q_learning import PhaseQLearning, Training
+from skills.learning.q_learning import Training
 from skills.learning.tube import CertifiedPoses
 from skills.learning.tube_certificate import TubeCertificate, TubeLimits
-from skills.packing import added_later, few_numbers
+from skills.packing import few_numbers
 from skills.planning.handoff import OtherArm, PsmM
 from skills.planning.motion_laws import Pose, Poses
 from skills.planning.path_fit import Hand
@@ -58,37 +58,8 @@ stored(SuturePoint, Pass, Pause, Partner, PsmM, Hand, Pose, Departure)
 stored(PosePath, PartnerMotion, TubeLimits, TubeCertificate)
 stored(Trajectory, OtherArm, Poses)
 stored(Surroundings, Scene, SceneCosts, Box, Capsule, Tissue)
-# Left out of the serialised value while they hold their default, so that the digests of older values stay the same.
-added_later(GridPath, "hysteresis")
-added_later(Policy, "network")
-added_later(Policy, "ties")
-added_later(Policy, "surroundings")
-added_later(Measured, "signature")
-added_later(Demo, "pauses")
-added_later(Demo, "partner")
-added_later(Partner, "base_mm")
-added_later(Partner, "base_xyzw")
-added_later(Partner, "instrument")
-added_later(PosePath, "turn_share")
-added_later(PosePath, "partner")
-added_later(PartnerMotion, "jaw_rad")
-added_later(CertifiedPoses, "scene")  # never stored: the policy has the scene
-added_later(CertifiedPoses, "partner_scene")  # likewise
-added_later(PhaseQLearning, "slip")
-added_later(ValueIteration, "slip")
-added_later(PhaseQLearning, "join_share")
-added_later(ValueIteration, "join_share")
-added_later(Coverage, "share")
+# A field that is added to one of these after 0.3.0 is released is registered here, with `skills.packing.added_later`.
 few_numbers(Coverage, "share")  # one for each waypoint
-added_later(Coverage, "finishing")
-added_later(Coverage, "touching")
-added_later(Pass, "hand")
-added_later(Pass, "taking")
-added_later(PsmM, "taken_mm")
-added_later(PsmM, "taken_xyzw")
-added_later(SuturePlan, "a2")
-added_later(SuturePlan, "departure")
-added_later(SuturePlan, "scene")
 few_numbers(Policy, "q")  # some 130 different values in 200,000 places: stored as a palette
 
 
@@ -309,7 +280,7 @@ class Demonstration(Base):
     start_s: Mapped[float]
     end_s: Mapped[float]
     session: Mapped[str | None]
-    hysteresis: Mapped[float]  # cells; 0 in rows stored before the setting existed
+    hysteresis: Mapped[float]  # cells
     demo: Mapped[Demo] = mapped_column(Packed(Demo), deferred=True)
     path: Mapped[GridPath] = mapped_column(Packed(GridPath), deferred=True)
     report: Mapped[dict[str, Any]]
@@ -420,8 +391,7 @@ class PolicyVersion(Base):
 class StoredPoses(Base):
     """The pose style of a policy version: the poses of its demonstrations' hands, and the certificate of their tube.
 
-    A version of before has none until an equal training is requested again, and one whose demonstrations have no
-    orientation has none at all.
+    A version whose demonstrations have no orientation has none.
     """
 
     __tablename__ = "pose_styles"

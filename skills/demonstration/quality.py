@@ -33,7 +33,7 @@ from skills.demonstration.movement import (
     spectral_arc_length,
 )
 from skills.demonstration.segments import arrival
-from skills.fields import Count, Fraction, Point, stored_schema
+from skills.fields import Count, Fraction, Point, schema
 from skills.quaternions import INVERSE, angle_of, multiplied, unit
 
 IDLE_MM_S = 1.0
@@ -44,10 +44,10 @@ CALM_LDLJ = -12.0  # our even synthetic surgeons have -5 to -11, the hesitant on
 NEGLIGIBLE_RAD = 0.35
 
 
-@stored_schema
+@schema
 @dataclass(frozen=True, kw_only=True)
 class MotionReport:
-    """The measures of a demonstration's motion, and advice in words; None also if an older version did not measure it.
+    """The measures of a demonstration's motion, and advice in words.
 
     Attributes:
         duration_s: Time from the first sample to the last.
@@ -81,16 +81,16 @@ class MotionReport:
     extent_mm: Point
     speed_median_mm_s: float
     speed_peak_mm_s: float
-    jerk_rms_mm_s3: float | None = None
-    log_dimensionless_jerk: float | None = None
-    spectral_arc_length: float | None = None
+    jerk_rms_mm_s3: float | None
+    log_dimensionless_jerk: float | None
+    spectral_arc_length: float | None
     clutch_presses: Count
-    clutched_s: float | None = None
-    undriven_s: float | None = None
+    clutched_s: float
+    undriven_s: float
     idle_share: Fraction
-    a1_s: float | None = None
-    a1_orientation_change_rad: float | None = None
-    a1_turn_negligible: bool | None = None
+    a1_s: float
+    a1_orientation_change_rad: float | None
+    a1_turn_negligible: bool | None
     orientation_change_rad: float | None
     advice: tuple[str, ...]
 

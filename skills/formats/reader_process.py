@@ -100,12 +100,9 @@ def tell(recording: Recording) -> Told:
 def about_recording(recording: Recording, proposed: Sequence[Segment]) -> dict[str, Any]:
     """Return the description of a recording for clients: its contents, its quality and the proposed hand-offs.
 
-    Each list that the recording could make arbitrarily long is limited to `MOST` entries. Counts of dropped and of
-    equal samples, setpoints and identifications are only present if there are any, so that all other descriptions are
-    those of version 0.1.0.
+    Each list that the recording could make arbitrarily long is limited to `MOST` entries.
     """
-    dropped = [asdict(one) for one in _dropped(recording)[:MOST]]
-    about: dict[str, Any] = {
+    return {
         "duration_s": recording.duration_s,
         "notes": dict(recording.notes),
         "topics": [as_json(topic) for topic in recording.topics],
@@ -130,13 +127,11 @@ def about_recording(recording: Recording, proposed: Sequence[Segment]) -> dict[s
             if len(signal.values)
         ],
         "left_out": [asdict(described.LeftOut(topic, why)) for topic, why in recording.left_out[:MOST]],
+        "dropped": [asdict(one) for one in _dropped(recording)[:MOST]],
+        "setpoints": [asdict(one) for one in _setpoints(recording)[:MOST]],
         "base_frames": [as_json(base) for base in base_frames(recording)],
+        "identifications": [as_json(one) for one in recording.identifications],
     }
-    if recording.identifications:
-        about["identifications"] = [as_json(one) for one in recording.identifications]
-    if setpoints := _setpoints(recording)[:MOST]:
-        about["setpoints"] = [asdict(one) for one in setpoints]
-    return about | ({"dropped": dropped} if dropped else {})
 
 
 def _setpoints(recording: Recording) -> list[described.Setpoints]:
@@ -153,7 +148,7 @@ def _dropped(recording: Recording) -> list[described.Dropped]:
 
 
 def _quality(motion: Motion) -> dict[str, Any]:
-    steps_ns, equal = np.diff(motion.stamps_ns), equal_samples(motion.tip_mm, motion.rotation_xyzw)
+    steps_ns = np.diff(motion.stamps_ns)
     quality = described.Quality(
         arm=motion.arm,
         topic=motion.topic,
@@ -161,9 +156,9 @@ def _quality(motion: Motion) -> dict[str, Any]:
         rate_hz=1e9 / float(np.median(steps_ns)) if len(steps_ns) else None,
         longest_gap_s=float(steps_ns.max(initial=0)) / 1e9,
         extent_mm=np.ptp(motion.tip_mm, axis=0).tolist(),
-        equal_samples=equal,
+        equal_samples=equal_samples(motion.tip_mm, motion.rotation_xyzw),
     )
-    return {name: value for name, value in asdict(quality).items() if name != "equal_samples" or value}
+    return asdict(quality)
 
 
 def _label(recording: Recording, label: Label) -> described.Label:

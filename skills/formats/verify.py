@@ -39,7 +39,7 @@ from skills.transparency import PublicKey, Statement, read_envelope, read_notes
 PLAN, VERDICT, POLICY, README = "plan.json", "verdict.json", "policy.json", "README.txt"
 EXECUTOR = "executor.json"  # the timetable
 PAPERS = (PLAN, VERDICT, POLICY, README, EXECUTOR)
-SIGNATURE = "signature.dsse"  # a bag of an older version has none
+SIGNATURE = "signature.dsse"
 BOUND = ("plan", "verdict", "policy", "trajectory")  # digests in the signed statement
 SAMPLES_LIMIT = 2_000_000  # per arm: 200 passes of 50 s at 200 Hz
 FORM_MM, FORM_RAD = 1e-6, 1e-6  # round-off is 1e-13; a joint that is off by a millionth of its range is found
@@ -131,7 +131,7 @@ def _check_signature(archive: Archive, sums: dict[str, str], key: PublicKey | No
     covered = {name: digest for name, digest in sums.items() if name != SIGNATURE}
     if SIGNATURE not in sums:
         if key is not None:
-            raise BadBag(f"The bag has no {SIGNATURE}: it is of an older version, or it was removed. Export it again.")
+            raise BadBag(f"The bag has no {SIGNATURE}: it was removed. Export it again.")
         return f"UNSIGNED: it has no {SIGNATURE}, and anybody could have written it.", None
     try:
         envelope = read_envelope(archive.text(SIGNATURE).encode())
@@ -196,7 +196,7 @@ def _check_papers(plan: dict[str, Any], verdict: dict[str, Any], policy: dict[st
 def _check_timetable(paper: dict[str, Any], plan: dict[str, Any], motions: list[ArmMotion]) -> None:
     """Check that the timetable is this plan's, and that both arms have a setpoint at every one of its stamps.
 
-    Of a bag in which jaws move also that they are as stated when they have moved, each after the one before.
+    And that jaws are as stated when they have moved, each after the one before.
     """
     try:
         parts = [part for one in paper["passes"] for part in one["phases"]]
@@ -212,13 +212,13 @@ def _check_timetable(paper: dict[str, Any], plan: dict[str, Any], motions: list[
 
 
 def _in_order(jaws: list[dict[str, Any]], motions: list[ArmMotion]) -> bool:
-    """Return whether the jaws move one after the other to the stated angles; a bag of before moves none."""
-    timed, arms = [one for one in jaws if "to_ns" in one], {motion.name: motion for motion in motions}
-    for one in timed:
+    """Return whether the jaws move one after the other to the stated angles."""
+    arms = {motion.name: motion for motion in motions}
+    for one in jaws:
         at = arms[one["arm"]].stamps_ns == one["to_ns"]
         if not (at.any() and (arms[one["arm"]].jaw_rad[at] == one["jaw_rad"]).all()):
             return False
-    return all(first["to_ns"] <= second["from_ns"] for first, second in pairwise(timed))
+    return all(first["to_ns"] <= second["from_ns"] for first, second in pairwise(jaws))
 
 
 # ---- one arm ----------------------------------------------------------------------------------------------------
@@ -475,14 +475,12 @@ def _check_roles(motions: list[ArmMotion], plan: dict[str, Any]) -> None:
 def _check_judged(motion: ArmMotion, report: dict[str, Any]) -> None:
     """Check the accelerations, and that the joints' ranges, speeds and accelerations are those that were judged.
 
-    A single pass must stay within those of the whole plan. Reports of older versions have none.
+    A single pass must stay within those of the whole plan.
     """
     joints = _in_mm(motion.joints)
     all_one = np.zeros(len(joints), np.int64)  # as the verdict has it: neither arm may jump between passes
     speed, acceleration = joint_ratios(joints, all_one, motion.rate_hz, motion.instrument)
     _first("accelerates beyond its limit", motion, acceleration <= SPEED_RATIO)
-    if report.get("arms") is None:
-        return
     try:
         (said,) = [one["joints"] for one in report["arms"] if one["name"] == motion.role]
         judged = np.array([[joint[name] for joint in said] for name in JUDGED], dtype=np.float64)

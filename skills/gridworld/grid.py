@@ -19,7 +19,7 @@ from skills.arrays import Floats, Ints, frozen, xyz
 from skills.demonstration.demonstration import Demo
 from skills.demonstration.quality import times_in_words
 from skills.errors import BadPath, BadSettings, EmptyPath, NeverLeavesGoal, OutsideGrid
-from skills.fields import Count, Fraction, Point, stored_schema
+from skills.fields import Count, Fraction, Point, schema
 from skills.gridworld import paper
 
 MOVES = frozen([(a, b, c) for a in (-1, 0, 1) for b in (-1, 0, 1) for c in (-1, 0, 1)], np.int64, (27, 3), "moves")
@@ -374,7 +374,7 @@ def _first(inside: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]) -> int:
 # ---- the loss of discretisation ------------------------------------------------------------------------------------
 
 
-@stored_schema
+@schema
 @dataclass(frozen=True, kw_only=True)
 class PathReport:
     """The measures of a demonstration's path through its grid world.
@@ -394,11 +394,11 @@ class PathReport:
     path_states: Count
     revisits: Count
     bridged_cells: Count
-    returns: Count | None = None
+    returns: Count
     discretisation_rmse_mm: Point
-    discretisation_rmse_3d_mm: float | None = None
-    outside_paper_grid_share: Fraction | None = None
-    advised_hysteresis: float | None = None
+    discretisation_rmse_3d_mm: float
+    outside_paper_grid_share: Fraction
+    advised_hysteresis: float | None
     advice: tuple[str, ...]
 
 

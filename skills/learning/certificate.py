@@ -46,15 +46,14 @@ class Coverage:
         reaches: The policy reaches the goal.
         joins_nearest: The policy joins the demonstration in the fewest moves (Chebyshev) that its joining rule allows,
             and then follows it.
-        share: The share of the demonstration that the policy follows, see `shares_of`; None in a coverage that was
-            stored before shares were computed.
+        share: The share of the demonstration that the policy follows, see `shares_of`.
         finishing: In a scene, the probability that a pass with the learnt slip finishes; None without a scene.
         touching: In a scene, the probability that it touches the scene; None without a scene.
     """
 
     reaches: NDArray[np.bool_]
     joins_nearest: NDArray[np.bool_]
-    share: Floats | None = None
+    share: Floats
     finishing: Floats | None = None
     touching: Floats | None = None
 

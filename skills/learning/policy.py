@@ -53,17 +53,12 @@ def describe_learner(learner: Learner) -> dict[str, Any]:
 
 
 def describe_settings(learner: Learner) -> dict[str, Any]:
-    """Return the settings of a learner as JSON; the joining rule is left out where it is the nearest waypoint.
-
-    So a training by that rule has the identity that it had before there was another one.
+    """Return the settings of a learner as JSON.
 
     Args:
         learner: The learner.
     """
-    settings = {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(learner).items()}
-    if not learner.join_share:
-        settings.pop("join_share", None)
-    return settings
+    return {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(learner).items()}
 
 
 def learner_of(described: dict[str, Any]) -> Learner:

@@ -219,7 +219,6 @@ class CertifiedPoses:
 def certified_poses(
     demos: Sequence[Demo],
     at: int = 0,
-    turn_share: float | None = None,
     partners: Sequence[PartnerMotion | None] | None = None,
 ) -> CertifiedPoses | None:
     """Learn the poses of a style, and certify the tube around them with the default limits.
@@ -227,7 +226,6 @@ def certified_poses(
     Args:
         demos: Demonstrations of one arm in one frame.
         at: The index of the one at whose start and goal pose the motion lies.
-        turn_share: The share of their mean turn in the motion; default: the one that `learn_pose_style` chooses.
         partners: The other arm along each demonstration; it is in the motion if every one has it, of the same arm. It
             has no part in the certificate.
 
@@ -243,7 +241,6 @@ def certified_poses(
         return None
     arms = {None if one is None else one.arm for one in partners or ()}
     style = learn_pose_style(demos, partners if len(arms) == 1 and None not in arms else None)
-    style = style if turn_share is None else replace(style, turn_share=turn_share)
     assert place is not None and place.rotation_xyzw is not None, "checked above, and by `learn_pose_style`"
     path = style.between(place.tip_mm[0], place.rotation_xyzw[0], place.tip_mm[-1], place.rotation_xyzw[-1])
     return CertifiedPoses(place.arm, style.frame, path, certify_tube(path, TubeLimits()), place.partner)

@@ -44,7 +44,6 @@ from skills.schemas import DemoOutcome
 
 Told = Callable[[str], None]  # progress callback; its argument is the name of the table or step
 ERASURES = "suture-skills erasures 2"
-ERASURES_1 = "suture-skills erasures 1"  # erased surgeons and demonstrations only, as pairs; still read
 # Events that end something permanently, with the name of their list. Releases end by being superseded as well.
 ENDS = {
     ("erase", "demonstration"): "demonstrations",
@@ -303,9 +302,9 @@ def read_erasures(source: str) -> Erasures:
     try:
         said = json.loads(Path(source).read_bytes())
         content = said["erasures"]
-        if said["sha256"] != sha256(canonical(content)):
+        if said["format"] != ERASURES or said["sha256"] != sha256(canonical(content)):
             raise ValueError
-        return {ERASURES: _read, ERASURES_1: _read_1}[said["format"]](content)
+        return _read(content)
     except (ValueError, KeyError, TypeError) as error:
         raise Corrupt("This is not a list of erasures, or it was changed; use another copy of it.") from error
 
@@ -315,16 +314,8 @@ def _read(content: dict[str, Any]) -> Erasures:
         frozenset((salt, digest, datetime.fromisoformat(at)) for salt, digest, at in content["surgeons"]),
         {kind: {name: datetime.fromisoformat(at) for name, at in content[kind].items()} for kind in ENDS.values()},
         {who: (datetime.fromisoformat(at), consent) for who, (at, consent) in content["consents"].items()},
-        # A list of an older version has none.
-        {demo: (datetime.fromisoformat(at), outcome) for demo, (at, outcome) in content.get("outcomes", {}).items()},
-        {(subject, suture): last for subject, suture, last in content.get("numbers", ())},
-    )
-
-
-def _read_1(content: dict[str, Any]) -> Erasures:
-    return Erasures(
-        frozenset((salt, digest, datetime.fromisoformat(at)) for salt, digest, at in content["surgeons"]),
-        {"demonstrations": {name: datetime.fromisoformat(at) for name, at in sorted(content["demonstrations"])}},
+        {demo: (datetime.fromisoformat(at), outcome) for demo, (at, outcome) in content["outcomes"].items()},
+        {(subject, suture): last for subject, suture, last in content["numbers"]},
     )
 
 

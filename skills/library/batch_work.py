@@ -155,19 +155,14 @@ class _Batch:
             "demos": [*demos],
             "learner": learner_kept(shared, style.rule, style.there),
             "learner_version": shared["learner_version"],
+            "gate": shared["gate"],
+            "poses": shared["poses"],
+            "near": shared["near"],
             "seed": shared["seed"],
             "release": shared["release"],
         }
-        if "gate" in shared:
-            request["gate"] = shared["gate"]
-        if "poses" in shared:
-            request["poses"] = shared["poses"]
-        if "near" in shared:
-            request["near"] = shared["near"]
         if style.there is not None:
-            request["surroundings"] = style.there.surroundings
-            if "odds" in shared:
-                request["odds"] = shared["odds"]
+            request |= {"surroundings": style.there.surroundings, "odds": shared["odds"]}
         if how is not None:
             request["combine"] = {"kind": how.kind}
         return request
@@ -422,7 +417,7 @@ def figures(version: int, sha256: str, manifest: dict[str, Any]) -> PolicyFigure
         dtw_total_mm=metrics["dtw_total_mm"],
         exact_share=metrics["exact_states"] / metrics["path_states"],
         reaching_share=coverage["starts_reaching_goal"] / coverage["n_states"],
-        mean_share=coverage.get("mean_share"),
+        mean_share=coverage["mean_share"],
     )
 
 
@@ -444,7 +439,7 @@ def _worse(released: PolicyFigures, trained: PolicyFigures, fit: FitOnTheSame) -
     if not not_worse(fit):
         on = f"on the same {len(fit.demos)} demonstrations" if len(fit.demos) != 1 else "on the same demonstration"
         yield f"DTW {shown_mm(fit.trained_mm)} mm against {shown_mm(fit.released_mm)} {on}"
-    if not (trained.rests_on or 0) >= (released.rests_on or 0):
+    if not trained.rests_on >= released.rests_on:
         yield f"it was learnt from {trained.rests_on} of them, the released one from {released.rests_on}"
     if not trained.exact_share >= released.exact_share:
         yield f"{trained.exact_share:.1%} of the path exact against {released.exact_share:.1%}"
@@ -452,7 +447,7 @@ def _worse(released: PolicyFigures, trained: PolicyFigures, fit: FitOnTheSame) -
         yield f"{trained.reaching_share:.1%} of starts reach the goal against {released.reaching_share:.1%}"
     # Beside another demonstration a share of another path says nothing.
     before, after = released.mean_share, trained.mean_share
-    if released.demos == trained.demos and before is not None and after is not None and not after >= before:
+    if released.demos == trained.demos and not after >= before:
         yield f"a start follows {after:.1%} of the demonstration on average against {before:.1%}"
 
 

@@ -44,7 +44,7 @@ from skills.scoring.validation import BOOTSTRAPS, NOTHING, PERMUTATIONS, refusal
 
 NAMED = 5  # the most trials that an error names
 LIBRARIES = ("scipy", "numpy")  # the libraries that compute the numbers
-VERSION = 2  # of what is stored; the first one rated hand-offs, or one arm, and is not used any more
+VERSION = 2  # of what is stored; a calibration of another version is not used
 
 
 @dataclass(frozen=True)
@@ -163,14 +163,14 @@ def newest(session: Session) -> StoredCalibration | None:
 
 
 def read_calibration(stored: StoredCalibration) -> SkillModel | None:
-    """Return the model of a calibration; None for one of an older version, which is not used.
+    """Return the model of a calibration; None for one of another version, which is not used.
 
     Raises:
         Corrupt: It does not match its digest, or its numbers are no model.
     """
     if sha256(canonical(stored.about)) != stored.sha256:
         raise Corrupt("The stored calibration is damaged.", Remedy(Action.CALIBRATE))
-    if stored.about.get("version") != VERSION:
+    if stored.about["version"] != VERSION:
         return None
     try:
         model = from_numbers(stored.about["model"])

@@ -234,12 +234,13 @@ def ties(rule: dict[str, Any] | None) -> str:
     )
 
 
-def coverage(counts: StartCounts, starts: int, mean_share: float, median_share: float, goal_alone: int) -> str:
+def coverage(counts: StartCounts, stated: dict[str, Any]) -> str:
     """Return the sentences on how much of the demonstration the starts follow, and how many reach the goal and how."""
-    reach = counts.follow + counts.reach_otherwise
+    reach, starts = counts.follow + counts.reach_otherwise, stated["n_states"]
     share = (
-        f"From a start the policy follows {mean_share:.0%} of the demonstration's moves on average, in the median "
-        f"{median_share:.0%}; from {goal_alone} of {starts} starts it goes to the goal alone."
+        f"From a start the policy follows {stated['mean_share']:.0%} of the demonstration's moves on average, in the "
+        f"median {stated['median_share']:.0%}; from {stated['starts_goal_alone']} of {starts} starts it goes to the "
+        "goal alone."
     )
     if counts.follow == starts:
         return (
@@ -304,23 +305,12 @@ def domain(phases: int) -> str:
 
 def joint_limits(manifest: dict[str, Any], turned: bool) -> str:
     """Return the sentences on the check of the demonstrated pass against the arm's joint limits."""
-    frame, certificate = manifest["frame"], manifest["grid_certificate"]
+    frame = manifest["frame"]
     if not frame.endswith("_base"):
         return f"Not checked: the frame {frame} is not the base of the arm."
     tool = "as demonstrated" if turned else "assumed to point straight down, because the wrist was not recorded"
     arm = f"a PSM with instrument {manifest['instrument']}, its tool {tool}"
-    if "driven" not in certificate:
-        found = (
-            "positions outside, if any, are among the reasons against a release"
-            if certificate["refused_because"]
-            else "all are within"
-        )
-        return (
-            f"The centres of the {manifest['metrics']['path_states']} cells of the demonstrated pass were checked "
-            f"in closed form against the limits of {arm}: {found}. The path that a plan fits to the recording "
-            "within these cells was not checked, nor were positions that are reached from other starts."
-        )
-    driven = certificate["driven"]
+    driven = manifest["grid_certificate"]["driven"]
     if driven is None:
         return "Not checked: the demonstrated pass cannot be driven."
     what = (

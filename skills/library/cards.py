@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
@@ -39,7 +38,7 @@ from skills.library import consent, releases
 from skills.library.catalogue import find_suture_type
 from skills.library.demos import full_report
 from skills.library.inspection import AGREES
-from skills.library.integrity import covered, learnt, shares, what_identifies
+from skills.library.integrity import covered, learnt, what_identifies
 from skills.library.policies import combined_of, learnt_from
 from skills.remedies import Action, Remedy
 from skills.schemas import PolicyName
@@ -110,8 +109,7 @@ def card_of(session: Session, version: PolicyVersion) -> Card:
     recordings = {one.recording.row: one.recording for one in demonstrations}.values()
     # First, so that no fact is taken from a damaged row.
     _refuse_damaged([*recordings, *demonstrations, *rewards, version, *released])
-    coverage = replace(covered(version), share=shares(version))
-    demo, combined = learnt_from(version), _combined(version)
+    coverage, demo, combined = covered(version), learnt_from(version), _combined(version)
     facts = PolicyCard.model_construct(  # not validated, which would add fields to an older certificate
         format=FORMAT,
         written_by=f"suture-skills {__version__}",
@@ -302,18 +300,15 @@ def _coverage(version: PolicyVersion, coverage: Coverage) -> CardCoverage:
     layers = tuple(StartLayer(*counts) for counts in zip(z_mm, *sums, strict=True))
     follow, reach_otherwise, do_not_reach = map(sum, sums)
     counts = StartCounts(follow=follow, reach_otherwise=reach_otherwise, do_not_reach=do_not_reach)
-    share = shares(version)
-    mean, median = float(share.mean()), float(np.median(share))
-    alone = int(np.count_nonzero(coverage.reaches & (share == 0)))
+    stated = version.manifest["coverage"]
     scene, settings = version.manifest.get("scene"), version.manifest["settings"]
     there = [] if scene is None else [words.in_scene(scene, settings["slip"])]
-    followed = {"mean_share": mean, "median_share": median, "starts_goal_alone": alone}
     return CardCoverage(
-        **version.manifest["coverage"] | followed,  # an older version has none in its manifest
+        **stated,
         **vars(counts),
         shares=StartShares(**{name: count / grid.n_states for name, count in vars(counts).items()}),
         layers=layers,
-        in_words=" ".join([words.coverage(counts, grid.n_states, mean, median, alone), *there]),
+        in_words=" ".join([words.coverage(counts, stated), *there]),
     )
 
 

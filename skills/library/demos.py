@@ -56,7 +56,6 @@ from skills.schemas.recordings import DemoReport
 from skills.schemas.requests import DemoIn
 
 EQUAL_SHARE = 0.1  # ours: an arm that rests on exact encoder values for a tenth of the time is no reason for advice
-COUNTED_LATER = ("backward_stamps", "equal_samples")  # counts that version 0.1.0 did not make
 # The actions of the events that mark an outcome.
 MARKS: dict[DemoOutcome, str] = {
     "success": "mark-success",
@@ -186,17 +185,15 @@ def report_on(demo: Demo, path: GridPath, duplicate_stamps: int, backward_stamps
         ),
     }
     report = DemoReport(**vars(of_motion) | vars(of_path) | more)
-    # Counts of nothing are left out, so that a report of sound stamps is the one that version 0.1.0 stored.
-    counted = {name: value for name, value in as_json(report).items() if value or name not in COUNTED_LATER}
-    written: dict[str, Any] = json.loads(canonical(counted))
+    written: dict[str, Any] = json.loads(canonical(as_json(report)))
     return written  # canonical JSON and back: the same value as when it is read from the database
 
 
 def full_report(demonstration: Demonstration) -> dict[str, Any]:
-    """Measure a stored demonstration again: reports stored by older versions have fewer measurements."""
+    """Measure a stored demonstration again, because no digest covers its stored report."""
     about, topic = demonstration.recording.about, demonstration.topic
     duplicates = next((m["duplicate_stamps"] for m in about["motions"] if m["topic"] == topic), 0)
-    backward = next((one["backward_stamps"] for one in about.get("dropped", ()) if one["topic"] == topic), 0)
+    backward = next((one["backward_stamps"] for one in about["dropped"] if one["topic"] == topic), 0)
     return report_on(demonstration.demo, demonstration.path, duplicates, backward)
 
 
@@ -463,7 +460,7 @@ def _mark(
 def demo_json(row: Demonstration, taken: TakenSegment | None = None) -> dict[str, Any]:
     """Return a demonstration's JSON, with the part of the recording that was taken by this call, else as stored."""
     report = dict(row.report)
-    stored = report.pop("segment", None)  # older rows have none
+    stored = report.pop("segment")
     return {
         "id": row.sha256,
         "sha256": row.sha256,

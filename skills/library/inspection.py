@@ -439,11 +439,8 @@ def _policy(row: PolicyVersion) -> Why:
 def _poses(row: StoredPoses) -> Why:
     poses = posed(row)
     own = replace(poses.path, partner=None)  # the other arm's motion is in recordings alone: `relearning.learn_again`
-    for turn_share in (None, 1.0):  # pose styles of before have the whole turn of their demonstrations
-        again = poses_of_demonstrations(row.policy, turn_share)
-        if again is not None and alike(own, again.path) and poses.frame == again.frame:
-            break
-    else:
+    again = poses_of_demonstrations(row.policy)
+    if again is None or not alike(own, again.path) or poses.frame != again.frame:
         yield "it differs from the poses of its version's demonstrations"
 
 
@@ -465,9 +462,9 @@ def _plan(row: Plan) -> Why:
 def _playback(row: StoredPlayback) -> Why:
     if sha256(canonical([row.plan.sha256, row.report])) != row.sha256:
         yield "it does not match the digest of plan and verdict"
-    if row.feasible != row.report.get("feasible"):
+    if row.feasible != row.report["feasible"]:
         yield "its flag `feasible` contradicts its report"
-    if digest(row.measured.trajectory) != row.report.get("trajectory"):
+    if digest(row.measured.trajectory) != row.report["trajectory"]:
         yield "its motion is not the one that was judged"
 
 

@@ -15,7 +15,6 @@ from typing import Any, TypeVar
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from skills.arrays import Floats
 from skills.db.changes import WeightedCache
 from skills.db.models import Demonstration, Plan, PolicyVersion, StoredPlayback, StoredPoses, StoredRecording
 from skills.db.packed import digest
@@ -24,7 +23,7 @@ from skills.demonstration.demonstration import Demo
 from skills.errors import AmbiguousDigest, Corrupt, NotFound
 from skills.gridworld.grid import GridPath
 from skills.gridworld.scene import Scene
-from skills.learning.certificate import Coverage, finishes, shares_of
+from skills.learning.certificate import Coverage
 from skills.learning.policy import Policy
 from skills.learning.tube import CertifiedPoses, clear_tube
 from skills.packing import canonical, sha256
@@ -137,18 +136,6 @@ def covered(version: PolicyVersion) -> Coverage:
     return coverage
 
 
-def shares(version: PolicyVersion) -> Floats:
-    """Return the share of the demonstration that each start of a version follows, (n_states,).
-
-    An older version has none stored; then they are computed from its verified policy.
-    """
-    stored = covered(version).share
-    if stored is not None:
-        return stored
-    policy = learnt(version)
-    return shares_of(policy, finishes(policy))
-
-
 def planned(plan: Plan) -> SuturePlan:
     """Return a stored plan, after verifying it against its digest.
 
@@ -167,20 +154,17 @@ def demo_identity(recording_sha256: str, surgeon: str, suture: str, demo: Demo, 
 
 def what_identifies(recording_sha256: str, surgeon: str, suture: str, demo: Demo, path: GridPath) -> dict[str, Any]:
     """Return the JSON of which a demonstration's digest is computed."""
-    identity: dict[str, Any] = {
+    return {
         "recording": recording_sha256,
         "surgeon": surgeon,
         "suture": suture,
         "arm": demo.arm,
         "topic": demo.topic,
         "segment_s": [demo.start_s, demo.end_s],
+        "left_out": [asdict(pause) for pause in demo.pauses],
         "grid": asdict(path.grid),
+        "hysteresis": path.hysteresis,
     }
-    if demo.pauses:  # older versions kept the samples of the pauses, so the same segment is another demonstration
-        identity["left_out"] = [asdict(pause) for pause in demo.pauses]
-    if path.hysteresis:  # left out when 0, so that older demonstrations keep their digests
-        identity["hysteresis"] = path.hysteresis
-    return identity
 
 
 def policy_identity(manifest: dict[str, Any], policy: Policy) -> str:

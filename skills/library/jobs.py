@@ -150,11 +150,6 @@ JOBS_WAIT_S = 10.0  # the `Retry-After` of `TooMany`: some trainings later
 KEPT = "kept"  # `joins` of a batch in which each style keeps the joining rule of the policy that it serves
 
 
-def with_rule(learner: dict[str, Any], join_share: float | None) -> dict[str, Any]:
-    """Return the JSON of a learner with a joining rule; None leaves it as it is."""
-    return learner if join_share is None else learner | {"join_share": join_share}
-
-
 class TrainingRequest(TypedDict):
     """The request of a training's job, all defaults resolved; its digest is the identity of the training."""
 
@@ -163,16 +158,16 @@ class TrainingRequest(TypedDict):
     demos: list[str]
     learner: dict[str, Any]
     learner_version: int
-    gate: NotRequired[int]  # requests of older versions have none
-    poses: NotRequired[int]  # likewise
-    near: NotRequired[dict[str, float]]  # of the gate, where it is not the default
+    gate: int
+    poses: int
+    near: dict[str, float]  # of the gate
     seed: int
     release: bool
     combine: NotRequired[dict[str, str]]  # of several demonstrations
     outcomes: NotRequired[str]  # "any": of any outcome; otherwise left out
     depth_along: NotRequired[list[float]]  # in a frame that is not the base of the arm
     surroundings: NotRequired[dict[str, Any]]  # the scene and its costs
-    odds: NotRequired[dict[str, float]]  # of the gate in a scene, where it is not the default
+    odds: NotRequired[dict[str, float]]  # of the gate in a scene
 
 
 class RetrainingRequest(TypedDict):
@@ -183,11 +178,11 @@ class RetrainingRequest(TypedDict):
     only_stale: bool
     learner: dict[str, Any]
     learner_version: int
-    gate: NotRequired[int]
-    poses: NotRequired[int]
-    near: NotRequired[dict[str, float]]
-    odds: NotRequired[dict[str, float]]
-    joins: NotRequired[str]  # `KEPT`; left out where the request names a learner, and in older batches
+    gate: int
+    poses: int
+    near: dict[str, float]
+    odds: dict[str, float]
+    joins: str | None  # `KEPT`; None where the request names a learner
     seed: int
     release: bool
     styles: NotRequired[int]
@@ -203,15 +198,12 @@ class PartRequest(TypedDict):
 
 
 class PlaybackRequest(TypedDict):
-    """The request of a playback's job: the plan's digest, and the stated errors of the arms to judge it under.
-
-    A job that an older version queued states none, and is judged under those of the installation.
-    """
+    """The request of a playback's job: the plan's digest, and the stated errors of the arms to judge it under."""
 
     plan: str
     check_version: int
-    errors: NotRequired[dict[str, Any]]
-    stated_by: NotRequired[Literal["request", "installation"]]
+    errors: dict[str, Any]
+    stated_by: Literal["request", "installation"]
 
 
 class PicturesRequest(TypedDict):

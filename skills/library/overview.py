@@ -44,7 +44,7 @@ from skills.gridworld.reward import RewardMap, sparse_reward
 from skills.learning.policy import Policy
 from skills.library import playbacks
 from skills.library.catalogue import find_surgeon, find_suture_type
-from skills.library.integrity import covered, learnt, shares
+from skills.library.integrity import covered, learnt
 from skills.library.policies import learnt_from
 from skills.library.recorded import shown_recording
 from skills.library.recordings import Teller
@@ -162,7 +162,7 @@ def view_of_version(version: PolicyVersion) -> dict[str, Any]:
             "reaches": coverage.reaches[shown].tolist(),
             "nearest": coverage.joins_nearest[shown].tolist(),
             "moves": moves[shown].tolist(),
-            "share": _rounded(shares(version)[shown]),
+            "share": _rounded(coverage.share[shown]),
         },
     }
 
@@ -241,11 +241,11 @@ _Row = tuple[int, str]  # a style: the surgeon's row and the suture type's slug
 
 @dataclass(frozen=True)
 class Shown:
-    """The part of a version's manifest that a tile shows; the share is None where an older version did not state it."""
+    """The part of a version's manifest that a tile shows."""
 
     grid_shape: tuple[int, int, int]
     waypoints: Sequence[int]
-    mean_share: float | None
+    mean_share: float
     dtw_total_mm: float
 
 

@@ -357,16 +357,16 @@ def _describe_psm_m(psm_m: PsmM) -> dict[str, Any]:
 
 def hands_over(about: dict[str, Any]) -> bool:
     """Return whether a described plan has a hand-off: A2 towards PSM_M."""
-    return about.get("psm_m") is not None
+    return about["psm_m"] is not None
 
 
 def plan_in_words(about: dict[str, Any]) -> str:
     """Return the sentences on the motions of a described plan, and on those that it leaves out."""
-    return " ".join([_moves_in_words(about), *_hand_in_words(about), _scene_in_words(about.get("scene"))])
+    return " ".join([_moves_in_words(about), *_hand_in_words(about), _scene_in_words(about["scene"])])
 
 
 def _scene_in_words(scene: dict[str, Any] | None) -> str:
-    """Return the sentences on the scene of a described plan, also of an older one, which has none."""
+    """Return the sentences on the scene of a described plan; None: it has none."""
     if scene is None:
         return "Tissue: not given, so nothing is checked against it, and this motion is not exported."
     if scene["scene"].get("tissue") is None:
@@ -379,14 +379,12 @@ def _scene_in_words(scene: dict[str, Any] | None) -> str:
 
 
 def _hand_in_words(about: dict[str, Any]) -> list[str]:
-    """Return the sentences on what is the surgeon's; none for a plan of a version that did not state it."""
-    if "departure" not in about:
-        return []
+    """Return the sentences on what is the surgeon's."""
     held, departure, tempo = about["orientation"], about["departure"], about["trajectory"]["tempo"]
     if held == "recorded":
         words = ["The jaw turns as the surgeon's."]
     elif departure is None:
-        words = ["The jaw is held: no orientation was recorded." if held != "demonstrated" else "The jaw is held."]
+        words = ["The jaw is held: no orientation was recorded."]
     else:
         words = [
             f"The jaw is held: it departs from the surgeon's by up to {departure['deg']:.1f} degrees, and the needle's "
@@ -418,7 +416,7 @@ def _moves_in_words(about: dict[str, Any]) -> str:
 
 def psm_m_moves(about: dict[str, Any]) -> bool:
     """Return whether a described plan moves PSM_M too; its base must be known for that."""
-    return hands_over(about) and about["trajectory"].get("psm_m_moves") is True
+    return hands_over(about) and about["trajectory"]["psm_m_moves"] is True
 
 
 def motion_of(session: Session, plan_sha256: str) -> SuturePlan:

@@ -58,7 +58,7 @@ def headline(about: dict[str, Any], report: dict[str, Any], *, errors: ArmErrors
         errors: The errors that the installation states now; a playback whose request stated its own keeps those.
         lower_bound: The value that the lower bound of the entire plan's probability has to reach for the level `good`.
     """
-    feasible = report.get("feasible") is True
+    feasible = report["feasible"] is True
     try:
         under = judged_under(report, errors)
     except Conflict as unjudged:
@@ -71,7 +71,7 @@ def headline(about: dict[str, Any], report: dict[str, Any], *, errors: ArmErrors
     level = _level(about, feasible, whole, lower_bound)
     word = _word(about, feasible, level)
     exact = f"feasible in an exact simulation{odds}"
-    verdict = exact if feasible else report.get("failure_in_words") or "the simulator found it so."
+    verdict = exact if feasible else report["failure_in_words"]
     return {
         "level": level,
         "word": word,
@@ -90,16 +90,13 @@ def judged_under(report: dict[str, Any], errors: ArmErrors) -> dict[str, Any]:
     These are the errors of the playback's request, or else those that the installation states now.
 
     Raises:
-        Conflict: The first judge made the verdict, without those errors; or the installation states others since.
+        Conflict: The verdict is of another version of the checks or of the judge; or the installation states other
+            errors since.
     """
-    doubted = report.get("doubt") or {}
-    if not (doubted.get("version", 1) >= JUDGE_VERSION and doubted.get("under")):
-        raise Conflict(
-            "How often this plan succeeds was judged by an older version, which had other errors, jaws or tissue; "
-            "play it again."
-        )
-    stated: dict[str, Any] = doubted["under"][0]
-    if report.get("stated_by") != "request" and stated["errors"] != asdict(errors):
+    if (report["check_version"], report["doubt"]["version"]) != (CHECK_VERSION, JUDGE_VERSION):
+        raise Conflict("This plan was judged by another version of the checks; play it again.")
+    stated: dict[str, Any] = report["doubt"]["under"][0]
+    if report["stated_by"] != "request" and stated["errors"] != asdict(errors):
         raise Conflict(
             f"This plan was judged with {errors_in_words(stated['errors']['name'])}, which the installation stated "
             f"then; now it states {errors_in_words(errors.name)}. Play it again."
@@ -109,15 +106,14 @@ def judged_under(report: dict[str, Any], errors: ArmErrors) -> dict[str, Any]:
 
 def costs_most(report: dict[str, Any]) -> str | None:
     """Return the sentence on the error that costs the most; None where no error was judged by itself."""
-    doubted = report.get("doubt") or {}
-    costs = doubted.get("costs") or []
-    if not costs:
+    doubted = report["doubt"]
+    if not (costs := doubted["costs"]):
         return None
     first, whole = costs[0], doubted["under"][0]["plan"]
-    if whole["count"] == whole.get("of"):
+    if whole["count"] == whole["of"]:
         return "No error by itself lowers this."
     if first["without"]["count"] <= whole["count"]:
-        shift_mm = doubted.get("settings", {}).get("suture_point_mm")
+        shift_mm = doubted["settings"]["suture_point_mm"]
         beside = f"the suture point's shift of up to {shift_mm:g} mm along each axis, or " if shift_mm else ""
         return (
             f"Without any single error of the arms it is not more: the rest is lost by {beside}several errors together."
@@ -241,15 +237,16 @@ def check_playback(
     with database.reading() as session:
         stored = find_plan(session, request["plan"])
         plan, policy = planned(stored), {"version": stored.policy.version, "sha256": stored.policy.sha256}
-        followed, demo = learnt(stored.policy), None if plan.path == "cell centres" else hand_of(stored.policy)
+        followed, demo = learnt(stored.policy), hand_of(stored.policy)
     check_frame(plan.frame)
     trajectory = trajectory_of(plan)
     measured = play(trajectory, timeout_s=settings.playback_timeout_s, memory_bytes=settings.playback_memory_bytes)
-    errors = ArmErrors(**request["errors"]) if "errors" in request else stated_errors(settings.arm_errors)
+    errors = ArmErrors(**request["errors"])
     verdict = judge_plan(plan, trajectory, measured, policy=followed, demo=demo, errors=errors)
     report = _finite(asdict(verdict.report)) | {
         "doubt": _finite(asdict(verdict.doubt)),
-        "stated_by": request.get("stated_by", "installation"),
+        "stated_by": request["stated_by"],
+        "check_version": request["check_version"],
         "failure_in_words": verdict.failure_in_words,
         "scene": None if verdict.scene is None else _finite(asdict(verdict.scene)),
         "tissue": "not given" if plan.scene is None or plan.scene.tissue is None else "judged",

@@ -35,7 +35,7 @@ from skills.library import consent, integrity, releases
 from skills.library.catalogue import find_surgeon, find_suture_type
 from skills.library.demos import find_demo, newest_demos
 from skills.library.integrity import covered, learnt, posed
-from skills.library.jobs import KEPT, RetrainingRequest, with_rule
+from skills.library.jobs import KEPT, RetrainingRequest
 from skills.library.releases import is_served
 from skills.remedies import Action, Remedy
 from skills.schemas import policies as described
@@ -175,8 +175,6 @@ def followable(policy: PolicyVersion) -> PolicyVersion:
 def policy_json(policy: PolicyVersion, release: Release | None) -> dict[str, Any]:
     """Return the JSON of a policy version (`schemas.policies.Policy`), with its actions but without a link to arrays.
 
-    An older version is described as it was, and a smaller one too: a client of before verifies every field.
-
     Args:
         policy: The version.
         release: Its release; None: as a version of the style's history.
@@ -185,7 +183,7 @@ def policy_json(policy: PolicyVersion, release: Release | None) -> dict[str, Any
         Corrupt: The stored values do not match the version's digest.
     """
     actions = actions_of(learnt(policy))
-    live = None if covered(policy).share is None else live_actions_of(learnt(policy))
+    live = live_actions_of(learnt(policy))
     return {
         "version": policy.version,
         "sha256": policy.sha256,
@@ -240,24 +238,19 @@ def live_actions_of(policy: Policy) -> list[dict[str, list[int]]] | None:
 def arrays_of(version: PolicyVersion) -> bytes:
     """Return a policy's arrays as the bytes of an .npz, Q values and confidence on the certified domain only.
 
-    The grid is in it, so that the file alone runs the policy (docs/running.md), but not in that of a version which was
-    learnt before there were shares: its bytes stay the same. If the policy has a network, `network`
+    The grid is in it, so that the file alone runs the policy (docs/running.md). If the policy has a network, `network`
     holds the bytes of its safetensors file. By another joining rule than the nearest waypoint there are `format` and
     `joins`, (n_states,), the phase after starting in a state or moving onto it in phase 0; and `action` is called
     `action_joining`, see `table_name`. If it was learnt in a scene, `finishing` and `touching`, (n_states,), are the
     odds of each start.
     """
     policy, coverage, manifest = learnt(version), covered(version), version.manifest
-    domain = policy.domain
+    domain, grid = policy.domain, policy.path.grid
     kept = domain.certified
     out = io.BytesIO()
     learnt_too: dict[str, Any] = {}
     if policy.network is not None:
         learnt_too["network"] = np.frombuffer(policy.network.tensors, np.uint8)
-    if coverage.share is not None:  # an older version is served as it was
-        grid = policy.path.grid
-        learnt_too |= {"share": coverage.share, "origin_mm": np.array(grid.origin_mm)}
-        learnt_too |= {"cell_mm": np.float64(grid.cell_mm), "shape": np.array(grid.shape, np.int64)}
     if coverage.finishing is not None and coverage.touching is not None:
         learnt_too |= {"finishing": coverage.finishing, "touching": coverage.touching}
     if "joining" in manifest:
@@ -273,6 +266,10 @@ def arrays_of(version: PolicyVersion) -> bytes:
         waypoints=policy.path.states,
         reaches_goal=coverage.reaches,
         joins_nearest=coverage.joins_nearest,
+        share=coverage.share,
+        origin_mm=np.array(grid.origin_mm),
+        cell_mm=np.float64(grid.cell_mm),
+        shape=np.array(grid.shape, np.int64),
         finished=np.int8(FINISHED),
         outside=np.int8(OUTSIDE),
         **learnt_too,
@@ -452,7 +449,7 @@ def kept_of(session: Session, surgeons: Collection[int] | None = None) -> Kept:
     for who, suture, text in in_pieces(session, query):
         about = orjson.loads(text)
         scene, settings = about.get("scene"), about["settings"]
-        if (share := settings.get("join_share")) is not None:
+        if share := settings.get("join_share"):
             kept.rules[who, suture] = share
         if scene is not None:
             surroundings = {name: scene[name] for name in ("scene", "costs")}
@@ -476,9 +473,10 @@ def learner_kept(asked: RetrainingRequest, rule: float | None, there: LearntIn |
         rule: The joining rule of the policy that the style serves; None: the nearest waypoint.
         there: The scene that this policy was learnt in; None: none.
     """
-    if asked.get("joins") != KEPT:
+    if asked["joins"] != KEPT:
         return asked["learner"]
-    return with_rule(asked["learner"], rule) if there is None else there.learner
+    by_rule = asked["learner"] if rule is None else asked["learner"] | {"join_share": rule}
+    return by_rule if there is None else there.learner
 
 
 def refuse_unlike(demonstrations: Sequence[Demonstration]) -> None:
@@ -551,8 +549,8 @@ def poses_of(version: PolicyVersion) -> CertifiedPoses:
     """Return the pose style of a policy version, verified.
 
     Raises:
-        NotFound: It has none, with the reason: it is older than pose styles, its demonstrations have no orientation, or
-            the certificate of the tube does not hold, in the scene of the version or in any.
+        NotFound: It has none, with the reason: its demonstrations have no orientation, or the certificate of the tube
+            does not hold, in the scene of the version or in any.
         Corrupt: The stored one does not match its digest.
     """
     if version.poses is None:
@@ -578,32 +576,21 @@ def has_poses(version: PolicyVersion) -> bool:
 
 def _absent(version: PolicyVersion) -> NotFound:
     """Return the error that a version has no pose style, with the reason."""
-    surgeon, suture = version.surgeon.slug, version.suture
     without = [one.sha256[:12] for one in version.demonstrations if one.demo.rotation_xyzw is None]
-    if without:
-        return NotFound(
-            f"Version {version.version} has no pose style, because its demonstration {', '.join(without)} has no "
-            "orientation; record poses, and train from them."
-        )
     return NotFound(
-        f"Version {version.version} has no pose style: it was trained before there were any.",
-        Remedy(Action.TRAIN, surgeon=surgeon, suture=suture),
+        f"Version {version.version} has no pose style, because its demonstration {', '.join(without)} has no "
+        "orientation; record poses, and train from them."
     )
 
 
-def poses_of_demonstrations(version: PolicyVersion, turn_share: float | None = None) -> CertifiedPoses | None:
+def poses_of_demonstrations(version: PolicyVersion) -> CertifiedPoses | None:
     """Compute the pose style of a policy version from its demonstrations, without the other arm's motion.
 
-    Args:
-        version: The version.
-        turn_share: The share of the demonstrations' mean turn; default: the one that `learn_pose_style` chooses.
-
-    Returns:
-        It; None if a demonstration has no orientation.
+    None if a demonstration has no orientation.
     """
     demos, combined = version.demonstrations, version.manifest.get("combined")
     at = 0 if combined is None else [one.sha256 for one in demos].index(combined["at"])
-    return certified_poses([one.demo for one in demos], at, turn_share)
+    return certified_poses([one.demo for one in demos], at)
 
 
 def pose_style_json(version: PolicyVersion, poses: CertifiedPoses) -> dict[str, Any]:

@@ -81,7 +81,7 @@ def compute_again(database: Database, row: int) -> Again:
 def learn_again(database: Database, row: int, recordings: "StoredRecordings", settings: Settings) -> Again:
     """Cut the demonstrations of a version out of their recordings again, learn from them, and compare the result.
 
-    The other arm's motion in its pose style is compared too. A pose style of before has none, and stays without.
+    The other arm's motion in its pose style is compared too.
 
     Args:
         database: The database, without restriction.
@@ -114,7 +114,7 @@ def learn_again(database: Database, row: int, recordings: "StoredRecordings", se
         found[at] = replace(found[at], demo=seal(demo).packed, reward=seal(reward).packed, partners=(partner,))
     made = learn_style(stored.lesson(found), stored.request, settings)
     differing += stored.differing(made, numbers_only=bool(gate))
-    if beside is not None and not alike(beside, _beside(made)):
+    if not alike(beside, _beside(made)):
         differing.append(BESIDE)
     return Again(tuple(differing), None if gate is None else f"{gate}, only its values were compared")
 
@@ -230,12 +230,10 @@ def request_of(manifest: dict[str, Any], policy: Policy) -> TrainingRequest:
         "learner_version": LEARNER_VERSION,
         "gate": GATE_VERSION,
         "poses": POSES_VERSION,
+        "near": _limits(NearLimits, manifest["grid_certificate"]["near"]),
         "seed": manifest["seed"],
         "release": False,
     }
-    near = manifest["grid_certificate"].get("near")
-    if near is not None:
-        request["near"] = _limits(NearLimits, near)
     if "combined" in manifest:
         request["combine"] = {"kind": manifest["combined"]["kind"]}
     if "outcomes" in manifest:
@@ -253,7 +251,7 @@ def _limits(of: type[NearLimits] | type[OddsLimits], said: dict[str, Any]) -> di
 
 
 def _other_gate(version: PolicyVersion) -> str | None:
-    gate = version.manifest["grid_certificate"].get("gate", 0)
+    gate = version.manifest["grid_certificate"]["gate"]
     return None if gate == GATE_VERSION else f"checked by another release gate (version {gate}, now {GATE_VERSION})"
 
 

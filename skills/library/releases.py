@@ -251,15 +251,12 @@ def serves(session: Session, policy: PolicyVersion) -> bool:
 
 
 def shares_served(session: Session, suture: str) -> dict[str, float]:
-    """Return the mean share of the demonstration that the starts of each served policy follow, by surgeon.
-
-    Versions of before shares were computed are left out.
-    """
+    """Return the mean share of the demonstration that the starts of each served policy follow, by surgeon."""
     share = PolicyVersion.manifest["coverage", "mean_share"]
     query = select(Surgeon.slug, share).select_from(Release).join(Surgeon, Surgeon.row == Release.surgeon_row)
     query = query.join(PolicyVersion, PolicyVersion.row == Release.policy_row)
     found = session.execute(query.where(Release.suture == suture, is_served()))
-    return {surgeon: mean for surgeon, mean in found if mean is not None}
+    return {surgeon: float(mean) for surgeon, mean in found}
 
 
 def is_served() -> ColumnElement[bool]:
@@ -320,12 +317,9 @@ def release(
 
 
 def _held(policy: PolicyVersion, constant_turn_deg: float) -> list[str]:
-    """Return the reason against a version whose joint limits were checked with the jaw held, though it was turned.
-
-    Older versions were checked so, and state no orientation.
-    """
-    driven = policy.manifest["grid_certificate"].get("driven")
-    if driven is None or driven.get("orientation") == "recorded":
+    """Return the reason against a version whose joint limits were checked with the jaw held, though it was turned."""
+    driven = policy.manifest["grid_certificate"]["driven"]
+    if driven is None or driven["orientation"] == "recorded":
         return []
     found = [departure_of(one.demo) for one in policy.demonstrations]
     turn_deg = max((one.deg for one in found if one is not None), default=0.0)
@@ -479,7 +473,7 @@ def _outcome(job: Job, style: Style | None, served: dict[Style, dict[str, Any]],
     now, result = served.get(style), job.result
     if result is not None:
         was = {"was_released": result["released"]}
-        asked = job.request.get("release", False)
+        asked = job.request["release"]
         released, because = _standing(result["sha256"], now, refused.get(style[0]), asked, was | result)
         result = result | was | {"released": released} | because
     return Outcome(now, result)

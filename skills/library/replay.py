@@ -46,7 +46,7 @@ from skills.library.playbacks import (
 from skills.library.policies import learnt_from
 from skills.packing import canonical, sha256
 from skills.planning.handoff import JAW_CLOSED_RAD
-from skills.planning.plan import CONSTANT_TURN_DEG, SuturePlan, departure_of
+from skills.planning.plan import CONSTANT_TURN_DEG, SuturePlan
 from skills.planning.trajectory import Trajectory
 from skills.remedies import Action, Remedy
 from skills.settings import Settings
@@ -217,8 +217,7 @@ def cleared(
         Conflict: Consent does not cover training and export; the plan has no hand-off, and `handoff` is not "none"; it
             states no tissue; its orientation is constant where the surgeon's turned by more than allowed; the
             demonstration was withdrawn; another policy than the plan's is released, or none; the plan was not played,
-            its verdict is of an older version, which did not judge the arms' outer bodies or did not compare the motion
-            with what was asked; it is not feasible, or not certain enough.
+            or its verdict is of another version of the checks; it is not feasible, or not certain enough.
         Corrupt: The stored verdict does not match its digest, or the release is not as the history has it.
     """
     policy = plan.policy
@@ -231,7 +230,7 @@ def cleared(
             "This plan states no tissue, so nothing was compared with it: tissue: not given.",
             Remedy(Action.NAME_TISSUE),
         )
-    _check_departure(planned(plan), plan, constant_turn_deg)
+    _check_departure(planned(plan), constant_turn_deg)
     for what in policy.objections:
         raise Conflict(f"The demonstration that this plan depends on {what}; plan with another policy.")
     served = releases.standing(session, policy.surgeon_row, policy.suture)
@@ -252,15 +251,6 @@ def cleared(
     if not (played.feasible and played.report["feasible"] is True):
         raise Conflict(
             f"The simulator found this plan infeasible: {played.report['failure_in_words']} Change the plan."
-        )
-    if played.report.get("bodies") is None:
-        raise Conflict(
-            "The arms' outer bodies were not judged when this plan was played.", Remedy(Action.PLAY, plan=plan.sha256)
-        )
-    if played.report.get("intent") is None:
-        raise Conflict(
-            "An older version played this plan and did not compare the motion with what was asked.",
-            Remedy(Action.PLAY, plan=plan.sha256),
         )
     check_doubt(played.report, errors=errors, lower_bound=lower_bound)
     return played
@@ -284,17 +274,15 @@ def refusal_of_bag(session: Session, plan: Plan, settings: Settings) -> Conflict
     return None
 
 
-def _check_departure(planned: SuturePlan, plan: Plan, constant_turn_deg: float) -> None:
+def _check_departure(planned: SuturePlan, constant_turn_deg: float) -> None:
     """Refuse a plan that holds the jaw where the surgeon turned it.
 
     Raises:
-        Conflict: The departure exceeds the limit; also that of a plan of an older version, which did not state it.
+        Conflict: The departure exceeds the limit.
     """
     if planned.orientation == "recorded":
         return
     departs = planned.departure
-    if departs is None and planned.orientation == "demonstrated" and planned.passes[0].hand is None:
-        departs = departure_of(learnt_from(plan.policy))
     # negated, so that NaN fails
     if departs is not None and not departs.deg <= constant_turn_deg:
         raise Conflict(

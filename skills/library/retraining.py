@@ -132,15 +132,12 @@ def choose_styles(
         "learner_version": LEARNER_VERSION,
         "gate": GATE_VERSION,
         "poses": POSES_VERSION,
+        "near": asdict(near or NearLimits()),
+        "odds": asdict(odds or OddsLimits()),
+        "joins": KEPT if batch.chosen is None else None,
         "seed": 0,
         "release": batch.release,
     }
-    if near is not None and near != NearLimits():
-        asked["near"] = asdict(near)
-    if odds is not None and odds != OddsLimits():
-        asked["odds"] = asdict(odds)
-    if batch.chosen is None:
-        asked["joins"] = KEPT
     kept = kept_of(session, None if who is None else [who.row])
     if batch.chosen is not None:
         kept.rules.clear()
@@ -176,15 +173,14 @@ def _made_of(
     demo: "_Newest",
     recipes: dict[tuple[int, str], Recipe],
     kept: Kept,
-) -> str | list[Any]:
-    """Return the digest of a style's newest demonstration, or the combination, digests, rule and scene of others."""
+) -> list[Any]:
+    """Return the combination of a style, the digests of its newest demonstrations, its rule and its scene."""
     style = demo.surgeon_row, demo.suture
-    recipe, rule = recipes.get(style), [kept.rules[style]] if style in kept.rules else []
-    there = [sha256(canonical(kept.scenes[style].surroundings))] if style in kept.scenes else []
-    if recipe is None:
-        return [demo.sha256, *rule, *there] if rule or there else demo.sha256
-    newest = newest_demos(session, demo.surgeon_row, demo.suture, recipe.demos)
-    return [recipe.how.kind, *(one.sha256 for one in newest), *rule, *there]
+    kind, demos, there = None, [demo.sha256], kept.scenes.get(style)
+    if (recipe := recipes.get(style)) is not None:
+        kind, newest = recipe.how.kind, newest_demos(session, demo.surgeon_row, demo.suture, recipe.demos)
+        demos = [one.sha256 for one in newest]
+    return [kind, demos, kept.rules.get(style), None if there is None else there.surroundings]
 
 
 def _did_nothing(session: Session, job: Job) -> str:
@@ -231,13 +227,11 @@ def _reasons(
     """Return, by demonstration, why its style's newest version is stale; an empty list if it is up to date.
 
     It is up to date if it was learnt from this demonstration with these settings and this learner, in the scene of the
-    served version, not refused by an older gate, and checked with the same limits at the near starts. A version from
-    before there were such limits passed the gate of its time, and is up to date.
+    served version, not refused by an older gate, and checked with the same limits at the near starts.
     """
     of = PolicyVersion
     last = select(func.max(of.version).label("version"), of.surgeon_row, of.suture).group_by(of.surgeon_row, of.suture)
     newest = last.where(*_styles(of, surgeon, suture)).subquery()
-    limits, chances = asdict(NearLimits(**asked.get("near", {}))), asdict(OddsLimits(**asked.get("odds", {})))
     query = select(of.surgeon_row, of.suture, of.releasable, cast(of.manifest, Text)).join(
         newest,
         (of.surgeon_row == newest.c.surgeon_row) & (of.suture == newest.c.suture) & (of.version == newest.c.version),
@@ -250,7 +244,6 @@ def _reasons(
             continue
         about = orjson.loads(text)
         scene, certificate = about.get("scene") or {}, about["grid_certificate"]
-        odds, near = scene.get("near"), certificate.get("near")
         there = kept.scenes.get((who, what))
         learner = learner_kept(asked, kept.rules.get((who, what)), there)
         settings = {name: value for name, value in learner.items() if name != "kind"}
@@ -261,9 +254,9 @@ def _reasons(
             "another scene": place != ((there.sha256, there.surroundings["costs"]) if there else (None, None)),
             "other settings": how != (learner["kind"], settings, asked["seed"]),
             "a newer learner": about["learner_version"] != asked["learner_version"],
-            "refused by an older gate": not releasable and certificate.get("gate") != asked["gate"],
-            "other limits at the near starts": (near is not None and not limits.items() <= near.items())
-            or (odds is not None and not chances.items() <= odds.items()),
+            "refused by an older gate": not releasable and certificate["gate"] != asked["gate"],
+            "other limits at the near starts": not asked["near"].items() <= certificate["near"].items()
+            or (bool(scene) and not asked["odds"].items() <= scene["near"].items()),
         }
         reasons[demo.row] = [reason for reason, holds in found.items() if holds]
     return reasons

@@ -451,8 +451,8 @@ def _skill(database: Database, recording: StoredRecording, task: str | None, tel
     model = calibrations.read_calibration(stored)
     if model is None:
         return unrated(
-            "Not rated: the stored calibration belongs to an older version, which rated single hand-offs or arms, and "
-            "it is not used any more. The operator of this installation can calibrate it again, on rated trials."
+            "Not rated: the stored calibration belongs to another version, and is not used. The operator of this "
+            "installation can calibrate it again, on rated trials."
         )
     named = task or (model.tasks[0] if len(model.tasks) == 1 else None)
     if named not in model.tasks:

@@ -17,7 +17,6 @@ from sqlalchemy import LargeBinary, Result, Table, bindparam, func, insert, sele
 from sqlalchemy.orm import Session
 
 from skills.comparison.combining import Combining, followed
-from skills.db.changes import announce
 from skills.db.models import (
     SUCCESS,
     Demonstration,
@@ -108,7 +107,6 @@ STANDING = (
 KNOWN = select(_VERSIONS.c.sha256, _VERSIONS.c.row, _VERSIONS.c.version).where(
     _VERSIONS.c.sha256.in_(bindparam("digests", expanding=True))
 )
-HAVE_POSES = select(StoredPoses.policy_row).where(StoredPoses.policy_row.in_(bindparam("policies", expanding=True)))
 ADD = insert(_VERSIONS).returning(_VERSIONS.c.sha256, _VERSIONS.c.row, _VERSIONS.c.version)
 ERASED = "A demonstration was erased while the training used it."
 ANY = "any"  # `outcomes` of a training from demonstrations of any outcome
@@ -179,16 +177,15 @@ def training_request(
         "learner_version": LEARNER_VERSION,
         "gate": GATE_VERSION,
         "poses": POSES_VERSION,
+        "near": asdict(near or NearLimits()),
         "seed": training.seed,
         "release": training.release,
     }
-    if len(chosen) > 1:  # left out for one demonstration, so that equal trainings of older versions keep their identity
+    if len(chosen) > 1:
         request["combine"] = {"kind": (training.combining or BEST).kind}
     elif training.combining is not None:
         raise BadInput("A single demonstration is not combined; name several in `demos`, or omit `combine`.")
-    if near is not None and near != NearLimits():  # left out otherwise, for the same reason
-        request["near"] = asdict(near)
-    if any_outcome:  # left out otherwise, for the same reason
+    if any_outcome:
         request["outcomes"] = ANY
     if training.depth_along is not None:
         _refuse_depth_along(training.depth_along, learner, chosen[-1].frame)
@@ -200,8 +197,7 @@ def training_request(
         for demo in chosen:
             refuse_unfit(surroundings.scene, demo.path, demo.frame)
         request["surroundings"] = surroundings.as_json()
-        if odds is not None and odds != OddsLimits():
-            request["odds"] = asdict(odds)
+        request["odds"] = asdict(odds or OddsLimits())
     elif training.scene_costs is not None:
         raise BadInput("scene_costs are costs of a scene; give the scene too, or omit them.")
     return request, who
@@ -456,15 +452,14 @@ def certified(lesson: Lesson, request: TrainingRequest, demo: Demo, policy: Poli
     poses = certified_poses(shown, lesson.at, partners=lesson.partners)
     numbers, coverage = seal(policy), seal(covered)
     driven, undriven = driven_or_refused(policy, demo)
-    assert covered.share is not None, "a new certificate has the shares"
-    limits = NearLimits(**request.get("near", {}))
+    limits = NearLimits(**request["near"])
     near = near_starts(policy, covered.share, limits)
-    chances = None if in_scene is None else near_odds(policy, covered, limits, OddsLimits(**request.get("odds", {})))
+    chances = None if in_scene is None else near_odds(policy, covered, limits, OddsLimits(**request["odds"]))
     refused_because = [*refusals(policy, certificate, near, chances), *undriven]
     manifest = describe_policy(policy, certificate, near, coverage.digest, demo, request, refused_because, driven)
     if policy.surroundings is not None and in_scene is not None and chances is not None:
         manifest["scene"] = describe_scene(policy.surroundings, in_scene, chances)
-    if lesson.combined is not None:  # left out for one demonstration, so that older digests stay the same
+    if lesson.combined is not None:
         manifest["combined"] = lesson.combined
     if request.get("outcomes") == ANY:  # left out otherwise: then none of them is marked recovery or failure
         manifest["outcomes"] = [*lesson.outcomes]
@@ -509,27 +504,20 @@ def store_styles(session: Session, learnt: Sequence[Learnt]) -> list[Stored | Sk
         values = [_version(one, max(of.last or 0, of.used or 0) + 1) for one, of in zip(new, of_style, strict=True)]
         known |= _stored(session.execute(ADD, values))
         record_events(session, "worker", "train", "policy-version", [(one.sha256, one.lesson.surgeon) for one in new])
-    _store_poses(session, [one for one in learnt if refused[one.sha256] is None], known)
     rests_on = [
         {"policy_row": known[one.sha256].row, "demonstration_row": other} for one in new for other in one.lesson.others
     ]
     if rests_on:
         session.execute(insert(PolicyDemonstration), rests_on)
-    return [refused[one.sha256] or known[one.sha256] for one in learnt]
-
-
-def _store_poses(session: Session, learnt: Sequence[Learnt], known: dict[str, Stored]) -> None:
-    """Store the pose styles of versions that have none yet, also of a version that an older code stored."""
-    made = {known[one.sha256].row: (one.sha256, one.poses) for one in learnt if one.poses is not None}
-    there = session.scalars(HAVE_POSES, {"policies": [*made]}).all()
-    values = [
-        {"policy_row": row, "sha256": poses_identity_of(policy, poses.digest), "poses": poses.packed}
-        for row, (policy, poses) in made.items()
-        if row not in there
+    poses = [
+        {"policy_row": known[one.sha256].row, "poses": one.poses.packed}
+        | {"sha256": poses_identity_of(one.sha256, one.poses.digest)}
+        for one in new
+        if one.poses is not None
     ]
-    if values:
-        session.execute(insert(StoredPoses), values)
-        announce(session)  # the version may be served already
+    if poses:
+        session.execute(insert(StoredPoses), poses)
+    return [refused[one.sha256] or known[one.sha256] for one in learnt]
 
 
 def _stored(found: Result[Any]) -> dict[str, Stored]:
@@ -639,9 +627,9 @@ def describe_policy(
                 note=CERTIFICATE_NOTE,
             )
         ),
-        **({} if wandered is None else {"rollouts": as_json(wandered)}),  # left out on the grid: older digests
+        **({} if wandered is None else {"rollouts": as_json(wandered)}),
         **joining_of(policy),
-        **({} if policy.ties is None else {"ties": as_json(policy.ties)}),  # left out as before there was a rule
+        **({} if policy.ties is None else {"ties": as_json(policy.ties)}),
     }
 
 

@@ -491,7 +491,7 @@ def jaw_recorded(hand: Hand | None) -> bool:
     """Return whether a pass has the angles of the surgeon's jaw.
 
     Args:
-        hand: The hand along the pass; None in plans of older versions.
+        hand: The hand along the pass; None in a plan without a demonstration.
     """
     return hand is not None and hand.jaw_rad is not None
 

@@ -101,7 +101,7 @@ class Pass:
             if that is not a centre, and the states' centres.
         rotation: The jaw's [n o a] at the start of A1, shape (3, 3); held, unless the hand turns it.
         target_rotation: Target of the turn in A2, shape (3, 3), or None if PSM_M's approach is not known.
-        hand: Orientation, jaw and tempo of A1; None: the jaw held, at an even tempo, as in plans of older versions.
+        hand: Orientation, jaw and tempo of A1; None: the jaw held, at an even tempo.
         taking: The recorded pose in which PSM_M takes the needle; None: that of the paper's A2.
     """
 
@@ -503,7 +503,7 @@ class DrivenPass:
         nearest_limit: The joint that comes nearest to its limit on the path, or goes furthest beyond it.
         cell_centres_beyond: Number of centres of the path's cells that are beyond the limits: a rollout contains those
             centres, but a plan does not drive them if its path is fitted.
-        orientation: As in `SuturePlan`; "demonstrated" also in older certificates, which held the jaw.
+        orientation: As in `SuturePlan`.
     """
 
     path: PathKind
@@ -512,7 +512,7 @@ class DrivenPass:
     beyond: Count
     nearest_limit: NearestLimit
     cell_centres_beyond: Count
-    orientation: Orientation = "demonstrated"
+    orientation: Orientation
 
 
 def driven_pass(policy: Policy, demo: Demo) -> DrivenPass:

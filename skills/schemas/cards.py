@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from skills.fields import Count, Fraction, Point, Sha256, Slug, schema, stored_schema
+from skills.fields import Count, Fraction, Point, Sha256, Slug, schema
 from skills.gridworld.reward import RewardLevels
 from skills.schemas import DemoOutcome, Given, Grid, PolicyName
 from skills.schemas.policies import Combined, Coverage, GridCertificate, TrainingFigures
@@ -190,7 +190,7 @@ class StartShares(Given):
     do_not_reach: Fraction
 
 
-@stored_schema
+@schema
 @dataclass(frozen=True, kw_only=True)
 class CardCoverage(StartCounts, Coverage):
     """The starts from which the goal is reached, out of `n_states`.
@@ -290,4 +290,4 @@ class PolicyCard(Given):
     limits: CardLimits
     lineage: CardLineage
     citation: Citation
-    history: CardHistory | None = Field(default=None, description="Null in the cards of older versions.")
+    history: CardHistory

@@ -170,7 +170,7 @@ class Consistency(Given):
     mean_share: Fraction | None = Field(
         default=None,
         description="Mean share of the demonstration that the starts of the served policy follow; null where none is "
-        "served, or one of before shares were computed.",
+        "served.",
     )
 
 

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, StrictBool, StrictInt
 
-from skills.fields import Count, Point, Quaternion, Sha256, Slug, stored_schema
+from skills.fields import Count, Point, Quaternion, Sha256, Slug, schema
 from skills.gridworld.scene import Scene
 from skills.kinematics import INSTRUMENTS, JAW_TIP_MM
 from skills.planning.handoff import Enters
@@ -254,7 +254,7 @@ class Reach(Given):
     in_words: str
 
 
-@stored_schema
+@schema
 @dataclass(frozen=True, kw_only=True)
 class Verdict(PlaybackReport):
     """The verdict and its figures; peak ratios and margins are PSM_A's, `arms` has all joints.
@@ -267,8 +267,9 @@ class Verdict(PlaybackReport):
         policy: The policy version that the plan follows.
         frame: Frame of the plan.
         scene: Distances from the plan's scene; null: it has none, so nothing was compared with tissue.
-        tissue: Whether the motion was compared with tissue; null in older verdicts.
-        stated_by: Source of the errors of the arms, the playback's request or the installation; null in older verdicts.
+        tissue: Whether the motion was compared with tissue.
+        stated_by: Source of the errors of the arms, the playback's request or the installation.
+        check_version: Version of the checks; a bag is given only of the present one.
     """
 
     failure_in_words: str | None
@@ -277,9 +278,10 @@ class Verdict(PlaybackReport):
     trajectory: Sha256
     policy: PolicyName
     frame: str
-    scene: SceneReport | None = None
-    tissue: Literal["judged", "not given"] | None = None
-    stated_by: Literal["request", "installation"] | None = None
+    scene: SceneReport | None
+    tissue: Literal["judged", "not given"]
+    stated_by: Literal["request", "installation"]
+    check_version: Count
 
 
 class Sources(Given):

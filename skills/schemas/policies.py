@@ -7,7 +7,7 @@ from typing import Any, Literal
 from pydantic import Field
 
 from skills.demonstration.partner import Partner
-from skills.fields import Count, Fraction, Point, Quaternion, Sha256, Slug, schema, stored_schema
+from skills.fields import Count, Fraction, Point, Quaternion, Sha256, Slug, schema
 from skills.gridworld.reward import RewardLevels
 from skills.gridworld.scene import Scene, SceneCosts
 from skills.learning.certificate import NearOdds, NearStarts
@@ -49,27 +49,27 @@ class Job(Given):
     ended_at: datetime | None
 
 
-@stored_schema
+@schema
 @dataclass(frozen=True, kw_only=True)
 class PolicyFigures:
     """A policy version, and the figures of its agreement with its demonstrations.
 
     Attributes:
-        rests_on: Number of demonstrations that it was learnt from; null in an older batch.
+        rests_on: Number of demonstrations that it was learnt from.
         dtw_total_mm: Distance from the path that it was learnt from.
         exact_share: Share of the path's states.
         reaching_share: Share of all states.
-        mean_share: Mean share of the demonstration that its starts follow; null in an older batch or version.
+        mean_share: Mean share of the demonstration that its starts follow.
     """
 
     version: VersionNumber
     sha256: Sha256
     demos: tuple[Sha256, ...]
-    rests_on: Count | None = None
+    rests_on: Count
     dtw_total_mm: float
     exact_share: Fraction
     reaching_share: Fraction
-    mean_share: Fraction | None = None
+    mean_share: Fraction
 
 
 @schema
@@ -88,14 +88,14 @@ class FitOnTheSame:
     trained_mm: float | None
 
 
-@stored_schema
+@schema
 @dataclass(frozen=True, kw_only=True)
 class StoredComparison:
     """A new policy version compared with the released one, as it is stored.
 
     Attributes:
         released: The released version; null if nothing was released.
-        on_the_same: Both on the same demonstrations; null where nothing was released, and in an older batch.
+        on_the_same: Both on the same demonstrations; null where nothing was released.
         worse_because: The figures in which the new version is worse.
         now_released: Whether the trained version is what the style serves now.
         not_released_because: Why a requested release is not in force.
@@ -104,13 +104,13 @@ class StoredComparison:
     released: PolicyFigures | None
     trained: PolicyFigures
     same_demonstration: bool | None
-    on_the_same: FitOnTheSame | None = None
+    on_the_same: FitOnTheSame | None
     worse_because: tuple[str, ...]
     now_released: bool
     not_released_because: str | None
 
 
-@stored_schema
+@schema
 @dataclass(frozen=True, kw_only=True)
 class StyleComparison(StoredComparison):
     """A new policy version compared with the released one, both on the same demonstrations.
@@ -120,8 +120,8 @@ class StyleComparison(StoredComparison):
         remedy: What to do about a release that is not in force.
     """
 
-    was_released: bool = False
-    remedy: str | None = None
+    was_released: bool
+    remedy: str | None
 
 
 class RetrainedStyle(Given):
@@ -155,7 +155,7 @@ class Retraining(Job, Page[RetrainedStyle]):
     styles: StyleCounts
 
 
-@stored_schema
+@schema
 @dataclass(frozen=True, kw_only=True)
 class Coverage:
     """How much of the demonstration the policy follows from its starts; the map itself is among the arrays.
@@ -169,48 +169,48 @@ class Coverage:
             joining rule allows.
         n_states: Number of states, each of them a start.
         sha256: Digest of the map.
-        mean_share: Mean of the shares; null where an older version did not compute it.
-        median_share: Median of the shares; null as `mean_share`.
-        starts_goal_alone: Number of starts that reach the goal with a share of 0; null as `mean_share`.
+        mean_share: Mean of the shares.
+        median_share: Median of the shares.
+        starts_goal_alone: Number of starts that reach the goal with a share of 0.
     """
 
     starts_reaching_goal: Count
     starts_joining_nearest: Count
     n_states: Count
     sha256: Sha256
-    mean_share: Fraction | None = None
-    median_share: Fraction | None = None
-    starts_goal_alone: Count | None = None
+    mean_share: Fraction
+    median_share: Fraction
+    starts_goal_alone: Count
 
 
-@stored_schema
+@schema
 @dataclass(frozen=True, kw_only=True)
 class GridCertificate:
     """The checks on the grid before a release; they do not cover the arm's accuracy.
 
     Attributes:
         states_checked: Number of states (phase and cell) whose action was compared with exact values.
-        states_finishing: Number of them from which the policy finishes; null in a certificate of an older version.
+        states_finishing: Number of them from which the policy finishes.
         suboptimal_actions: Number of them whose action is worse than the best one.
         actions_off_rule: Number of them whose action is not the one that the policy's rule (`ties`) selects of the best
-            ones; null without a rule, and in an older certificate.
+            ones; null without a rule.
         demonstration_reproduced: The rollout from the demonstrated start is the demonstration.
         refused_because: The reasons against a release.
-        gate: The gate's version; null in an older certificate, which asked the centres of cells.
-        near: The starts near the demonstrated one; null in an older certificate.
-        driven: The pass as the arm drives it; null where joint limits cannot be checked, and in an older certificate.
+        gate: The gate's version.
+        near: The starts near the demonstrated one.
+        driven: The pass as the arm drives it; null where joint limits cannot be checked.
         note: The scope of the certificate.
     """
 
     states_checked: Count
-    states_finishing: Count | None = None
+    states_finishing: Count
     suboptimal_actions: Count
-    actions_off_rule: Count | None = None
+    actions_off_rule: Count | None
     demonstration_reproduced: bool
     refused_because: tuple[str, ...]
-    gate: int | None = None
-    near: NearStarts | None = None
-    driven: DrivenPass | None = None
+    gate: int
+    near: NearStarts
+    driven: DrivenPass | None
     note: str
 
 

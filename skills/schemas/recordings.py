@@ -11,7 +11,7 @@ from skills.demonstration.partner import Partner
 from skills.demonstration.quality import MotionReport
 from skills.demonstration.recording import BaseFrame, Column, Format, Topic
 from skills.demonstration.segments import Segment, TakenSegment
-from skills.fields import Count, Fraction, Point, Quaternion, Sha256, Slug, schema, stored_schema
+from skills.fields import Count, Fraction, Point, Quaternion, Sha256, Slug, schema
 from skills.gridworld.grid import PathReport
 from skills.gridworld.reward import RewardLevels
 from skills.schemas import ChosenGrid, DemoOutcome, Given, ProposalState
@@ -29,14 +29,14 @@ class Motion:
     duplicate_stamps: Count
 
 
-@stored_schema
+@schema
 @dataclass(frozen=True)
 class Quality:
     """The recording quality of a motion.
 
     Attributes:
         equal_samples: Samples that repeat the pose of the sample before to the last bit, as they do where a recorder is
-            faster than its source; 0 also where an older version did not count them.
+            faster than its source.
     """
 
     arm: str
@@ -45,7 +45,7 @@ class Quality:
     rate_hz: float | None
     longest_gap_s: float
     extent_mm: Point
-    equal_samples: Count = 0
+    equal_samples: Count
 
 
 @schema
@@ -170,16 +170,10 @@ class Described(Given):
     following: list[Following]
     scales: list[Scale]
     left_out: list[LeftOut]
-    dropped: list[Dropped] = Field(
-        default=[], description="Topics with samples whose stamps went back; older versions refused these recordings."
-    )
-    setpoints: list[Setpoints] = Field(
-        default=[], description="Commanded poses and jaws; nothing is learnt from them, and older versions read none."
-    )
+    dropped: list[Dropped] = Field(description="Topics with samples whose stamps went back.")
+    setpoints: list[Setpoints] = Field(description="Commanded poses and jaws; nothing is learnt from them.")
     base_frames: list[BaseFrame]
-    identifications: list[ArmIdentification] = Field(
-        default=[], description="What joints recorded beside poses show; empty of one that an older version stored."
-    )
+    identifications: list[ArmIdentification] = Field(description="What joints recorded beside poses show.")
 
 
 class Recording(Described):
@@ -232,7 +226,7 @@ class RecordingSummary(Given):
     created_at: datetime
 
 
-@stored_schema
+@schema
 @dataclass(frozen=True)
 class PreviewedQuality:
     """The quality of a motion; durations and rate are null where the samples have no times.
@@ -247,7 +241,7 @@ class PreviewedQuality:
     rate_hz: float | None
     longest_gap_s: float | None
     extent_mm: Point
-    equal_samples: Count = 0
+    equal_samples: Count
 
 
 class RecordingPreview(Described):
@@ -290,26 +284,25 @@ class SuturePoints(Given):
     points: tuple[SuturePoint, ...]
 
 
-@stored_schema
+@schema
 @dataclass(frozen=True, kw_only=True)
 class DemoReport(PathReport, MotionReport):
-    """Measurements of a demonstration, and advice; null for a measurement that an older version did not make.
+    """Measurements of a demonstration, and advice.
 
     Attributes:
         duplicate_stamps: Samples of the entire recorded motion that carried the stamp of the sample before.
         backward_stamps: Samples of the entire recorded motion that were dropped because their stamp went back.
-        equal_samples: Samples of the demonstration that repeat the pose of the sample before to the last bit; 0 also
-            where an older version did not count them.
+        equal_samples: Samples of the demonstration that repeat the pose of the sample before to the last bit.
         grid: The grid world of its path.
         partner: The arm that takes the needle; null if it was not recorded.
         advice: Sentences to the surgeon.
     """
 
-    duplicate_stamps: Count | None = None
-    backward_stamps: Count = 0
-    equal_samples: Count = 0
+    duplicate_stamps: Count
+    backward_stamps: Count
+    equal_samples: Count
     grid: ChosenGrid
-    partner: Partner | None = None
+    partner: Partner | None
 
 
 class DatasetEpisode(Given):
@@ -340,9 +333,7 @@ class Demonstration(Given):
     instrument: str
     start_s: float
     end_s: float
-    segment: TakenSegment | None = Field(
-        default=None, description="Which part of the recording was taken; null of one that an older version stored."
-    )
+    segment: TakenSegment = Field(description="Which part of the recording was taken.")
     session: Slug | None
     hysteresis: float = Field(description="Cells.")
     state: Literal["active", "withdrawn"]

@@ -13,7 +13,7 @@ import numpy as np
 
 from skills.arrays import Flags
 from skills.errors import BadSettings
-from skills.fields import Count, Figure, Fraction, Point, schema, stored_schema
+from skills.fields import Count, Figure, Fraction, Point, schema
 from skills.learning.slip import wilson
 from skills.planning.handoff import OPEN_RAD
 from skills.verification.arm_errors import ArmErrors
@@ -109,7 +109,7 @@ class PassDoubt:
     faults: Faults
 
 
-@stored_schema
+@schema
 @dataclass(frozen=True)
 class DoubtUnder:
     """A plan under some errors of the arms: every pass, and all of them one after another.
@@ -117,13 +117,13 @@ class DoubtUnder:
     Attributes:
         plan: The whole plan.
         passes: Each pass.
-        errors: The errors; null in verdicts of the first judge.
-        tip_error_mm: Mean length of each arm's offset, in verdicts of the first judge, which knew no other error.
+        errors: The errors.
+        tip_error_mm: Not used any more; null.
     """
 
     plan: Probability
     passes: tuple[PassDoubt, ...]
-    errors: ArmErrors | None = None
+    errors: ArmErrors
     tip_error_mm: float | None = None
 
 
@@ -141,7 +141,7 @@ class Cost:
     without: Probability
 
 
-@stored_schema
+@schema
 @dataclass(frozen=True)
 class Doubt:
     """The result as plain numbers: the same for the same trajectory, pad, errors, settings and seed on every machine.
@@ -156,7 +156,7 @@ class Doubt:
         settings: The errors beside those of the arms.
         limits: The playback's limits.
         costs: The errors that the stated ones consist of, the one that costs the most first.
-        version: Version of the judge; verdicts of the first one do not state it.
+        version: Version of the judge.
         pad_normal: Unit direction out of the pad.
     """
 

@@ -108,7 +108,7 @@ class SceneReport:
         seen_within_mm: Greater distances are not distinguished.
         looks: Number of samples at which distances were computed.
         nearest: The least distance of each arm from each part within `seen_within_mm`, the least first.
-        bodies: Whether the arms' outer bodies were compared too; false in older reports.
+        bodies: Whether the arms' outer bodies were compared too.
         needle_at_least_mm: Lower bound on the needle's distance from the tissue where it is judged, negative inside;
             null if there is no tissue, or it never came within `seen_within_mm`.
     """
@@ -118,8 +118,8 @@ class SceneReport:
     seen_within_mm: float
     looks: Count
     nearest: tuple[NearestToScene, ...]
-    bodies: bool = False
-    needle_at_least_mm: Figure = None
+    bodies: bool
+    needle_at_least_mm: Figure
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ evidence of the hardware's accuracy. PSM_M is in the kinematic pass alone.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from math import inf
 
 import numpy as np
@@ -141,9 +141,8 @@ class PlaybackReport:
     range, and the peak ratios are PSM_A's; `arms` has every joint of both. `clearance_pad_mm` is of either arm. Between
     two measurements a pair of links can have come nearer by `moved_between_looks_mm`, which the gates take into
     account. `peak_effort_ratio` is over the complete servo pass, `peak_contact_effort_ratio` over the samples in which
-    the arm touches the pad. `bodies` compares the arms' outer bodies; null: not judged, as in older verdicts. `intent`
-    has the greatest deviation of each kind from what was asked; null: not compared with it, as in those. `means` has
-    for each check the means by which it is decided; null in older verdicts.
+    the arm touches the pad. `bodies` compares the arms' outer bodies. `intent` has the greatest deviation of each kind
+    from what was asked; null: not compared with it. `means` has for each check the means by which it is decided.
     """
 
     feasible: bool
@@ -183,9 +182,9 @@ class PlaybackReport:
     engine: str
     files: Mapping[str, Sha256]
     settings: Limits
-    bodies: BodiesReport | None = field(default=None, kw_only=True)
-    intent: tuple[Mismatch, ...] | None = field(default=None, kw_only=True)
-    means: Mapping[str, str] | None = field(default=None, kw_only=True)
+    bodies: BodiesReport
+    intent: tuple[Mismatch, ...] | None
+    means: Mapping[str, str]
 
     def _repr_html_(self) -> str:
         beyond = [one.kind for one in self.intent or () if one.value is None or not one.value <= one.limit]

@@ -211,7 +211,7 @@ def test_what_value_iteration_finds_is_released_without_a_move_of_the_arm(traine
     assert (policy["version"], policy["learner"], policy["settings"]) == (
         2,
         "value-iteration",
-        {"gamma": 0.1, "slip": 0.0},
+        {"gamma": 0.1, "slip": 0.0, "join_share": 0.0},
     )
     assert (policy["training"]["steps"], policy["training"]["settled"]) == (0, True)
     assert policy["actions"] == trained.client.policy(**KESTREL, version=1)["actions"]
@@ -220,7 +220,7 @@ def test_what_value_iteration_finds_is_released_without_a_move_of_the_arm(traine
 def test_a_slip_policy_is_released_if_exact_and_refused_if_sampled(trained: Service):
     result = trained.train(learner={"kind": "value-iteration", "slip": 0.1}, release=True)["result"]
     assert result["released"]
-    assert trained.client.policy(**KESTREL)["settings"] == {"gamma": 0.1, "slip": 0.1}
+    assert trained.client.policy(**KESTREL)["settings"] == {"gamma": 0.1, "slip": 0.1, "join_share": 0.0}
     sampled = {"kind": "phase-q-learning", "slip": 0.1, "alpha": 0.1, "max_sweeps": 50}
     result = trained.train(learner=sampled, release=True)["result"]
     assert not result["released"]

@@ -108,7 +108,7 @@ def test_a_table_that_needs_no_answers_is_stored_as_before(here: Service):
     with here.database.reading() as session:
         row = session.scalars(select(StoredRecording)).one()
     assert row.reading == {"rate_hz": None, "frame": None}
-    assert not {"dropped", "columns", "timed"} & set(row.about)
+    assert not {"columns", "timed"} & set(row.about)
 
 
 def test_both_arms_of_an_ee_csv_are_stored_and_one_is_cut(here: Service):

@@ -177,7 +177,7 @@ def test_without_any_use_each_operation_answers_as_the_table_says(service: Servi
                 getattr(said, "text", said),
             )
     service.client.put_surgeon("kestrel", skill_level="expert", consent=NO_USE)
-    keep_signed(service.database, None)
+    keep_signed(service.database)
     wrong = {}
     for row in WALKED:
         said = ask(service, row, ids)

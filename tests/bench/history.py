@@ -76,7 +76,7 @@ def compare(table: Table, name: str, works: list[Callable[[], object]], database
                 before = _processor_s(servers)
                 works[which]()
                 used[which].append(_processor_s(servers) - before)
-            sign_history(databases[which], None)
+            sign_history(databases[which])
             pair[which] = (time.perf_counter() - began) / WRITES_OF_ROUND
         took.append(pair)
     with_it, without = np.median(took[1:], axis=0)

@@ -87,15 +87,17 @@ def test_nothing_that_is_said_of_it_can_be_changed(fetched: Fetched, of: int):
 
 def test_no_live_action_of_a_large_policy_can_be_changed(fetched: Fetched, monkeypatch: pytest.MonkeyPatch):
     about, arrays, demo = fetched
+    policy = rebuilt(about, arrays, demo)
     monkeypatch.setattr(policies, "MAX_JSON_ACTIONS", 0)
-    live = policies.live_actions_of(rebuilt(about, arrays, demo))
+    live = policies.live_actions_of(policy)
     large = about | {"actions": None, "live_actions": live}
     rebuilt(large, arrays, demo)
     for path in (("live_actions", 1, "low", 0), ("live_actions", 1, "size", 2), ("live_actions", 2, "actions", 7)):
         with pytest.raises(Corrupt):
             rebuilt(changed(large, path), arrays, demo)
-    with pytest.raises(Corrupt):
-        rebuilt(large | {"live_actions": (live or [])[:-1]}, arrays, demo)
+    for none in ({"live_actions": (live or [])[:-1]}, {"live_actions": None}):
+        with pytest.raises(Corrupt):
+            rebuilt(large | none, arrays, demo)
 
 
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])

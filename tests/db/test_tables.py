@@ -102,7 +102,7 @@ def fill(database: Database) -> None:
         session.add(ErasedInterval(recording_row=demo.recording_row, surgeon_row=demo.surgeon_row))
         session.add(LastUsed(surgeon_row=demo.surgeon_row, suture=cases.SUTURE, last=7))
         session.add(RecordingSurgeon(recording_row=demo.recording_row, surgeon_row=demo.surgeon_row))
-        shape = Measured(np.zeros((STATES, 3)), np.array([1]), np.array([0.0]), np.array([0.0]))
+        shape = Measured(np.zeros((STATES, 3)), np.array([1]), np.array([0.0]), np.array([0.0]), np.ones(3))
         session.add(MeasuredShape(demonstration_row=demo.row, version=1, measured=shape))
         key, _ = create_key(session, "ada", "reader", "test", surgeons=["kestrel"])
         sign_in(session, key.id, Lasts(60.0, 600.0))

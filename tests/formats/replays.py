@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from skills.formats.replay_bag import ArmMotion, arms_of, folder_of, seal, timetable
-from skills.formats.verify import check_bag
+from skills.formats.verify import JUDGED, check_bag
 from skills.kinematics import forward, quaternion_of
 from skills.packing import canonical, sha256
 from skills.planning.handoff import OtherArm
-from skills.planning.trajectory import A1, A2, Trajectory
+from skills.planning.trajectory import A1, A2, Trajectory, joint_ratios
 
 RATE_HZ = 200.0
 FRAME = "PSM2_base"
@@ -54,6 +54,21 @@ def trajectory(*, other: bool = True) -> Trajectory:
     )
 
 
+def judged(made: Trajectory) -> list[dict[str, Any]]:
+    """Return the figures of the joints in a verdict on a motion."""
+    moving = {"PSM_A": (made.joints, made.instrument)}
+    if made.psm_m is not None:
+        moving["PSM_M"] = (made.psm_m.joints, made.psm_m.instrument)
+    arms = []
+    for name, (joints, instrument) in moving.items():
+        ratios = joint_ratios(joints, np.zeros(len(joints), int), made.rate_hz, instrument)
+        rows = zip(
+            *(one.tolist() for one in (joints.min(0), joints.max(0), *(each.max(0) for each in ratios))), strict=True
+        )
+        arms.append({"name": name, "joints": [dict(zip(JUDGED, row, strict=True)) for row in rows]})
+    return arms
+
+
 def papers(made: Trajectory, **changes: Any) -> dict[str, bytes]:
     """Return the documents of a plan with this trajectory, with no more than is checked."""
     ends = made.tip_mm[made.last_samples].tolist()
@@ -67,7 +82,7 @@ def papers(made: Trajectory, **changes: Any) -> dict[str, bytes]:
         "passes": [{"path_mm": [end]} for end in ends],
         "psm_m": {"base_mm": [160.0, 20.0, 20.0], "instrument": "420006"} if made.psm_m else None,
     } | changes.get("plan", {})
-    report = {"feasible": True, "samples": len(made)} | changes.get("report", {})
+    report = {"feasible": True, "samples": len(made), "arms": judged(made)} | changes.get("report", {})
     verdict = {
         "sha256": sha256(canonical([plan["sha256"], report])),
         "plan": plan["sha256"],

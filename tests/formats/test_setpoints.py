@@ -312,7 +312,7 @@ def test_setpoints_pass_between_processes_unchanged():
 
 
 def test_setpoints_are_described_where_there_are_any():
-    assert "setpoints" not in tell(recording()).about
+    assert tell(recording()).about["setpoints"] == []
     assert tell(whole()).about["setpoints"] == [
         {"arm": "PSM2", "topic": TIP, "frame": "PSM2_base", "samples": 10},
         {"arm": "PSM2", "topic": "/PSM2/setpoint_cp", "frame": "ECM", "samples": 10},

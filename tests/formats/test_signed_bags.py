@@ -19,12 +19,12 @@ import pytest
 
 from skills.errors import BadBag, BadSignature, SkillsError
 from skills.formats.replay_bag import arms_of, folder_of, seal, timetable
-from skills.formats.verify import JUDGED, SIGNATURE, check_bag
+from skills.formats.verify import SIGNATURE, check_bag
 from skills.kinematics import forward, quaternion_of
 from skills.packing import canonical, sha256
-from skills.planning.trajectory import A1, A2, Trajectory, joint_ratios
+from skills.planning.trajectory import A1, A2, Trajectory
 from skills.transparency import Checkpoint, PublicKey, SigningKey, Tree, attest, read_envelope
-from tests.formats.replays import FRAME, members, papers
+from tests.formats.replays import FRAME, judged, members, papers
 from tests.formats.replays import trajectory as short
 from tests.independent_history import check_envelope
 
@@ -61,21 +61,6 @@ PASSES = np.repeat([0, 1], EACH)
 PHASES = np.tile(np.repeat([A1, A2], [EACH - 50, 50]), 2)
 STAMPS_S = np.arange(2 * EACH) / RATE_HZ + PASSES * 1.0
 BESIDE: Any = short().psm_m
-
-
-def judged(made: Trajectory) -> list[dict[str, Any]]:
-    """Return the figures of the joints in a verdict on a motion."""
-    moving = {"PSM_A": (made.joints, made.instrument)}
-    if made.psm_m is not None:
-        moving["PSM_M"] = (made.psm_m.joints, made.psm_m.instrument)
-    arms = []
-    for name, (joints, instrument) in moving.items():
-        ratios = joint_ratios(joints, np.zeros(len(joints), int), made.rate_hz, instrument)
-        rows = zip(
-            *(one.tolist() for one in (joints.min(0), joints.max(0), *(each.max(0) for each in ratios))), strict=True
-        )
-        arms.append({"name": name, "joints": [dict(zip(JUDGED, row, strict=True)) for row in rows]})
-    return arms
 
 
 def bag_of(made: Trajectory, arm: str = "PSM2", **changes: Any) -> Files:
@@ -197,7 +182,7 @@ CHANGES: dict[str, Callable[[], Files]] = {
     "half as fast": lambda: bag_of(moved(JOINTS, stamps_s=2 * STAMPS_S)),
     "the passes exchanged": lambda: bag_of(moved(np.roll(JOINTS, EACH, axis=0))),
     "another instrument": lambda: bag_of(moved(JOINTS, instrument="420006")),
-    "the verdict swapped": lambda: edited("verdict.json", report={"feasible": True, "trajectory": "6" * 64}),
+    "the verdict swapped": lambda: edited("verdict.json", report=REPORT | {"trajectory": "6" * 64}),
     "the verdict surer": lambda: edited("verdict.json", report=REPORT | {"doubt": {"under": []}}),
     "the policy's limits removed": lambda: edited("policy.json", limits=""),
     "the plan's words changed": lambda: edited("plan.json", in_words="It is safe near a person."),

@@ -291,9 +291,8 @@ def test_a_path_that_ends_beside_its_start_fails_and_the_remedy_mends_it():
 # ---- storage -------------------------------------------------------------------------------------------------------
 
 
-def test_the_json_of_a_learner_states_the_joining_rule_unless_nearest():
-    assert "join_share" not in describe_learner(PhaseQLearning())
-    assert "join_share" not in describe_learner(ValueIteration())
+def test_the_json_of_a_learner_states_its_joining_rule():
+    assert describe_learner(PhaseQLearning())["join_share"] == describe_learner(ValueIteration())["join_share"] == 0
     described = describe_learner(ValueIteration(join_share=0.5))
     assert described["join_share"] == 0.5
     assert learner_of(described) == ValueIteration(join_share=0.5)

@@ -14,7 +14,16 @@ from sqlalchemy.exc import DatabaseError
 from skills.db.models import StoredCalibration
 from skills.db.session import Database
 from skills.errors import BadInput, Corrupt, NotAQuaternion, NotFinite, UnreadableRecording
-from skills.library.calibrations import Rated, accepted, calibrate_on, keep, newest, read_calibration, read_cohort
+from skills.library.calibrations import (
+    VERSION,
+    Rated,
+    accepted,
+    calibrate_on,
+    keep,
+    newest,
+    read_calibration,
+    read_cohort,
+)
 from skills.library.inspection import inspect_installation
 from skills.packing import canonical, sha256
 from skills.scoring.calibration import as_numbers, held_out, rank_correlations
@@ -250,7 +259,8 @@ def test_one_rated_task_of_two_is_enough_to_be_kept(
         assert keep(session, both, "test")[1]
 
 
-OLD = {  # as the first version stored it, shortened
+OLD = {  # shortened
+    "version": VERSION - 1,
     "model": {"figures": ["duration_s"], "centre": [10.0], "scale": [2.0], "rating": 18.0, "rating_weights": [-3.0]},
     "data": {"task": "Suturing", "of": "hand-off"},
     "validated": {"all_figures": {"rho": 0.9}},

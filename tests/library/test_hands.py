@@ -132,10 +132,10 @@ def test_a_plan_of_several_follows_their_pose_style(database: Database):
 @pytest.mark.parametrize(
     ("turns_deg", "driven", "limit_deg", "refused"),
     [
-        ([None], {}, 0.0, False),
-        ([12.0], {}, 12.0, False),
-        ([12.0], {}, 11.9, True),
-        ([None, 3.0, 12.0], {"orientation": "constant"}, 11.9, True),
+        ([None], {"orientation": "demonstrated"}, 0.0, False),
+        ([12.0], {"orientation": "demonstrated"}, 12.0, False),
+        ([12.0], {"orientation": "demonstrated"}, 11.9, True),
+        ([None, 3.0, 12.0], {"orientation": "demonstrated"}, 11.9, True),
         ([12.0, 90.0], {"orientation": "recorded"}, 0.0, False),
         ([90.0], None, 0.0, False),
     ],

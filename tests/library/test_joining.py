@@ -6,7 +6,7 @@ from math import nan
 import numpy as np
 import pytest
 
-from skills.db.packed import digest, seal, unpack_as
+from skills.db.packed import seal, unpack_as
 from skills.errors import Conflict
 from skills.gridworld.grid import PAPER_GRID, GridPath
 from skills.gridworld.reward import sparse_reward
@@ -14,7 +14,7 @@ from skills.learning.certificate import Coverage, NearLimits, NearStarts, certif
 from skills.learning.policy import Policy, learn_tabular
 from skills.learning.q_learning import CellQLearning, PhaseQLearning
 from skills.library import releases
-from skills.library.integrity import learnt, shares
+from skills.library.integrity import covered, learnt
 from skills.library.releases import refusals
 from skills.library.retraining import request_retraining
 from skills.library.training import near_limits, request_training
@@ -94,11 +94,11 @@ def test_a_manifest_states_shares_and_by_another_rule_format_and_table(database)
         with database.reading() as session:
             stored = session.merge(version)
             share, said = coverage(learnt(stored)).share, stored.manifest["coverage"]
-            assert shares(stored).tolist() == share.tolist()
+            assert covered(stored).share.tolist() == share.tolist()
         assert (said["mean_share"], said["median_share"]) == (share.mean(), np.median(share))
         assert said["starts_goal_alone"] == (share == 0).sum()
     assert not {"format", "joining"} & set(nearest.manifest)
-    assert "join_share" not in nearest.manifest["settings"]
+    assert nearest.manifest["settings"]["join_share"] == 0
     assert half.manifest["format"] == 2
     waypoints = half.manifest["waypoints"]
     joined = half.manifest["joining"]
@@ -119,11 +119,11 @@ def test_a_batch_keeps_the_rule_of_each_style_unless_it_names_a_learner(database
     finish(database, job)
     kept = {style.demonstration.surgeon.slug: style.policy for style in styles_of(database, job)}
     assert kept["kestrel"].sha256 == half.sha256, "the same version, by its rule"
-    assert "join_share" not in kept["osprey"].manifest["settings"]
+    assert kept["osprey"].manifest["settings"]["join_share"] == 0
     named = ask_retraining(database, learner=PhaseQLearning(), release=True)
     finish(database, named)
     (style,) = [one for one in styles_of(database, named) if one.demonstration.surgeon.slug == "kestrel"]
-    assert "join_share" not in style.policy.manifest["settings"]
+    assert style.policy.manifest["settings"]["join_share"] == 0
     assert any("of the demonstration on average" in why for why in style.comparison["worse_because"])
     assert not style.comparison["now_released"]
 
@@ -134,12 +134,9 @@ def finish(database, job):
 
 
 @pytest.mark.parametrize("learner", [PhaseQLearning(), CellQLearning()])
-def test_a_coverage_of_an_older_version_is_read_and_keeps_its_bytes(learner):
+def test_a_coverage_and_a_policy_by_a_rule_are_read_back(learner):
     policy = learn_tabular(sparse_reward(GridPath(PAPER_GRID, np.array([0, 1, 2]))), learner)
     new = coverage(policy)
-    old = Coverage(new.reaches, new.joins_nearest)
-    assert unpack_as(Coverage, seal(old).packed).share is None
     assert unpack_as(Coverage, seal(new).packed).share.tolist() == new.share.tolist()
-    assert digest(old) != digest(new)
     by_rule = learn_tabular(sparse_reward(policy.path), HALF)
     assert unpack_as(Policy, seal(by_rule).packed).learner == HALF

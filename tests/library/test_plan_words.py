@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from skills.library.plans import hands_over, plan_in_words
-from skills.library.playbacks import costs_most, headline
+from skills.library.playbacks import CHECK_VERSION, costs_most, headline
 from skills.verification.arm_errors import CALIBRATED, UNCALIBRATED
 from skills.verification.monte_carlo import doubt
 from skills.verification.probabilities import JUDGE_VERSION, DoubtSettings
@@ -17,10 +17,14 @@ from tests.verification.test_monte_carlo import PSM_M as OTHER_ARM
 NAN = float("nan")
 PSM_M = {"approach": [-1.0, 0.0, 0.0]}
 TISSUE = {"scene": {"tissue": {"height_mm": -140.0}}}
+NOW = {"check_version": CHECK_VERSION, "stated_by": "installation"}
+SHIFT = {"suture_point_mm": 5.0}
 
 
 def about(passes: int = 5, psm_m: dict[str, Any] | None = None, moves: bool = False) -> dict[str, Any]:
-    return {"arm": "PSM1", "passes": [{}] * passes, "psm_m": psm_m, "trajectory": {"psm_m_moves": moves}}
+    motion = {"psm_m_moves": moves, "tempo": None}
+    hand = {"orientation": "recorded", "departure": None, "a2": None, "scene": None}
+    return {"arm": "PSM1", "passes": [{}] * passes, "psm_m": psm_m, "trajectory": motion} | hand
 
 
 FULL = about(psm_m=PSM_M, moves=True)
@@ -32,8 +36,8 @@ def told(of: dict[str, Any], lower: float | None, count: int = 990, feasible: ob
     passes = [{"faults": {"place": 0, "arms": 0, "pad": 0}}]
     under = [{"errors": asdict(CALIBRATED), "plan": whole, "passes": passes}]
     cost = {"error": "registration_deg", "without": {"count": count + 4, "probability": count / 1000 + 0.004}}
-    judged = {"version": JUDGE_VERSION, "under": under, "costs": [cost]}
-    report = {"feasible": feasible, "failure_in_words": "Pass 0, A1, sample 3: no.", "doubt": judged}
+    judged = {"version": JUDGE_VERSION, "under": under, "costs": [cost], "settings": SHIFT}
+    report = NOW | {"feasible": feasible, "failure_in_words": "Pass 0, A1, sample 3: no.", "doubt": judged}
     return headline(of, report, errors=CALIBRATED, lower_bound=0.95)
 
 
@@ -117,7 +121,7 @@ def test_odds_count_what_was_judged_and_name_what_was_not(trajectory, pad_top_mm
     found = doubt(
         trajectory, approach_m=OTHER_ARM.approach, pad_top_mm=pad_top_mm, errors=UNCALIBRATED, settings=settings
     )
-    report = {"feasible": True, "doubt": json.loads(json.dumps(asdict(found)))}
+    report = NOW | {"feasible": True, "doubt": json.loads(json.dumps(asdict(found)))}
     line = headline(FULL if counts == "hand-over" else about(1), report, errors=UNCALIBRATED, lower_bound=0.95)
     always = "how exactly the tip meets its points"
     assert (line["counts"], line["not_judged"]) == (counts, [*left_out, always])
@@ -133,7 +137,7 @@ def test_without_a_hand_off_no_error_is_said_to_cost_success():
     passes = [{"faults": {"reach": 0, "limits": 0, "pad": 0, "arms": None, "place": None}}]
     under = {"errors": asdict(CALIBRATED), "plan": whole | {"count": 15, "probability": 0.75}, "passes": passes}
     cost = {"error": "tip_bias_mm", "without": whole}
-    report = {"feasible": True, "doubt": {"version": JUDGE_VERSION, "under": [under], "costs": [cost]}}
+    report = NOW | {"feasible": True, "doubt": {"version": JUDGE_VERSION, "under": [under], "costs": [cost]}}
     line = headline(about(1), report, errors=CALIBRATED, lower_bound=0.95)
     assert line["costs_most"].endswith("without it 100.0 % of the worlds stay clear.")
 
@@ -165,18 +169,23 @@ def test_what_lowers_a_probability_is_named_also_if_it_is_no_arm_error(count, wi
 
 def test_an_error_that_was_not_judged_is_said_and_not_good():
     whole = {"count": 999, "of": 1000, "probability": 0.999, "lower": 0.99, "upper": 1.0}
-    first_judge = {"under": [{"tip_error_mm": 0.65, "plan": whole}]}
     under = {"errors": asdict(CALIBRATED), "plan": whole, "passes": []}
     other = {"version": JUDGE_VERSION, "under": [under], "costs": []}
-    for doubted, words in (
-        (None, "older version"),
-        (first_judge, "judged by an older version, which had other errors, jaws or tissue; play it again."),
-        (other, "with the errors of a calibrated arm, which the installation stated then; now it states the errors"),
+    another = "judged by another version of the checks; play it again."
+    for doubted, check, words in (
+        (other | {"version": JUDGE_VERSION - 1}, CHECK_VERSION, another),
+        (other, CHECK_VERSION - 1, another),
+        (
+            other,
+            CHECK_VERSION,
+            "with the errors of a calibrated arm, which the installation stated then; now it states",
+        ),
     ):
-        line = headline(FULL, {"feasible": True, "doubt": doubted}, errors=UNCALIBRATED, lower_bound=0.95)
+        report = NOW | {"feasible": True, "doubt": doubted, "check_version": check}
+        line = headline(FULL, report, errors=UNCALIBRATED, lower_bound=0.95)
         assert (line["level"], line["probability"], line["costs_most"]) == ("caution", None, None)
         assert words in line["text"]
     line = headline(
-        FULL, {"feasible": True, "doubt": other, "stated_by": "request"}, errors=UNCALIBRATED, lower_bound=0.95
+        FULL, NOW | {"feasible": True, "doubt": other, "stated_by": "request"}, errors=UNCALIBRATED, lower_bound=0.95
     )
     assert (line["level"], line["errors"]) == ("good", "calibrated")

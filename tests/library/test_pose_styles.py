@@ -1,6 +1,5 @@
 """Pose styles stored with policy versions: made at training, verified, erased, backed up, and refused with a reason."""
 
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,6 @@ from skills.errors import Busy, Corrupt, NotFound
 from skills.formats import write_mcap
 from skills.formats.reader_process import read_told
 from skills.learning.pose_style import PHASES
-from skills.learning.tube import certified_poses
 from skills.library import training
 from skills.library.backup import back_up, restore
 from skills.library.batch_work import retrain_part
@@ -28,7 +26,7 @@ from skills.library.demos import withdraw_demo
 from skills.library.erasure import erase_demo
 from skills.library.inspection import HISTORY, inspect_installation
 from skills.library.policies import poses_of
-from skills.remedies import Action, Remedy
+from skills.remedies import Remedy
 from skills.settings import Settings
 from tests import backends
 from tests.library import cases
@@ -146,22 +144,6 @@ def test_several_demonstrations_give_one_pose_style_at_one_place(database: Datab
     assert wrong(database) == []
 
 
-@pytest.mark.parametrize("older", [True, False])
-def test_poses_of_before_keep_the_whole_turn_and_verify(
-    database: Database, monkeypatch: pytest.MonkeyPatch, older: bool
-):
-    cases.add_surgeon(database)
-    demos = [add(database, turning(k, detour_deg=aside)) for k, aside in enumerate((15.0, -20.0, 0.5))]
-    with monkeypatch.context() as patched:
-        if older:
-            patched.setattr(training, "certified_poses", partial(certified_poses, turn_share=1.0))
-        version = cases.train(database, demos=[one.sha256 for one in demos])
-    with database.reading() as session:
-        version = session.get_one(PolicyVersion, version.row)
-        assert (poses_of(version).path.turn_share == 1.0) == older
-    assert wrong(database) == []
-
-
 def test_a_batch_stores_pose_styles_too(database: Database):
     cases.add_surgeon(database)
     add(database, turning())
@@ -177,22 +159,6 @@ def test_a_demonstration_without_orientation_has_no_pose_style(database: Databas
         poses_of(session.get_one(PolicyVersion, version.row))
     assert not any(isinstance(one, Remedy) for one in refused.value.remedies)
     assert wrong(database) == []
-
-
-def test_an_older_version_gets_its_pose_style_by_an_equal_training(database: Database, monkeypatch: pytest.MonkeyPatch):
-    cases.add_surgeon(database)
-    add(database, turning())
-    with monkeypatch.context() as older:
-        older.setattr(training, "POSES_VERSION", 0)
-        older.setattr(training, "certified_poses", lambda *_, **__: None)
-        version = cases.train(database, release=True)
-    with database.reading() as session, pytest.raises(NotFound, match="before there were any") as refused:
-        poses_of(session.get_one(PolicyVersion, version.row))
-    assert Remedy(Action.TRAIN, surgeon="kestrel", suture=cases.SUTURE) in refused.value.remedies
-    again = cases.train(database, release=True)
-    assert (again.row, again.sha256) == (version.row, version.sha256)
-    with database.reading() as session:
-        assert poses_of(session.get_one(PolicyVersion, version.row)).tube.holds
 
 
 def test_a_motion_too_quick_for_its_tube_is_not_served(database: Database):
@@ -320,22 +286,6 @@ def test_a_recording_that_was_erased_meanwhile_is_named(database: Database):
         erase_demo(session, demo.sha256, "test")
     with pytest.raises(NotFound, match=r"A demonstration was erased while the training used it\."):
         training.with_partners(database, read, read_told)
-
-
-def test_a_pose_style_of_before_keeps_its_bytes_at_an_equal_training(
-    database: Database, monkeypatch: pytest.MonkeyPatch
-):
-    cases.add_surgeon(database)
-    add_both(database)
-    with monkeypatch.context() as older:
-        older.setattr(training, "POSES_VERSION", 2)
-        older.setattr(training, "with_partners", lambda _database, lessons, _tell: [*lessons])
-        version = cases.train(database, release=True)
-    before = rows_of(database)
-    assert beside(database, version) is None
-    assert cases.train(database, release=True).row == version.row
-    assert (rows_of(database), wrong(database)) == (before, [])
-    assert beside(database, cases.train(database, seed=2)) is not None  # another version has it
 
 
 @pytest.mark.nightly  # by day tests/library/test_backup.py counts every table

@@ -1,7 +1,7 @@
 """`skills verify --relearn`: certificates and policies computed again agree, and consistent changes are named."""
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from skills.db.packed import digest
 from skills.db.session import Database
 from skills.errors import NotFound
 from skills.formats.reader_process import read_told
+from skills.learning.certificate import NearLimits
 from skills.learning.dynamic_programming import ValueIteration
 from skills.learning.networks import Network
 from skills.learning.policy import LEARNER_VERSION
@@ -174,7 +175,7 @@ def test_another_motion_of_the_other_arm_with_its_digest_is_named(tmp_path: Path
 
 def _request(manifest: dict[str, Any]) -> dict[str, Any]:
     names = ("surgeon", "suture", "demos", "seed", "learner_version")
-    return {name: manifest[name] for name in names} | {"gate": GATE_VERSION}
+    return {name: manifest[name] for name in names} | {"gate": GATE_VERSION, "near": asdict(NearLimits())}
 
 
 def test_a_demonstration_other_than_its_recording_is_named(database):
@@ -207,7 +208,7 @@ def test_of_an_older_gate_only_the_values_are_compared(database):
     with database.reading() as session:
         version = session.get_one(PolicyVersion, 1)
         policy, manifest = version.learnt, version.manifest
-    certificate = {name: value for name, value in manifest["grid_certificate"].items() if name not in ("gate", "near")}
+    certificate = manifest["grid_certificate"] | {"gate": GATE_VERSION - 1}
     rewritten(database, 1, policy, manifest | {"grid_certificate": certificate})
     part = parts(database)[RELEARNT]
     assert part.wrong == []

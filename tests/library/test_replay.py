@@ -22,6 +22,7 @@ from skills.library.catalogue import find_surgeon, put_surgeon
 from skills.library.demos import withdraw_demo
 from skills.library.history import newest_checkpoint, sign_history
 from skills.library.plans import find_plan, plan_in_words, plan_sutures, trajectory_of
+from skills.library.playbacks import CHECK_VERSION
 from skills.library.policies import find_version
 from skills.library.replay import check_doubt, cleared, replay_bag
 from skills.packing import canonical, sha256
@@ -30,7 +31,9 @@ from skills.planning.trajectory import Trajectory
 from skills.schemas.plans import PlanIn
 from skills.transparency import PublicKey, read_notes
 from skills.verification.arm_errors import CALIBRATED, UNCALIBRATED, ArmErrors
+from skills.verification.clearance import psm_m_poses
 from skills.verification.probabilities import JUDGE_VERSION
+from skills.verification.verdict import judge
 from tests.independent_history import check_envelope
 from tests.library import cases
 from tests.library.attacks import tampering
@@ -45,13 +48,16 @@ def judged(database: Database, plan: Plan, *, feasible: bool = True, digest: str
     words = None if feasible else "Pass 0, A1, sample 3 (0.015 s): clearance to the pad is -2 mm, the limit is 1."
     with database.reading() as session:
         trajectory = trajectory_of(find_plan(session, plan.sha256).plan)
-    judged_all = {"bodies": {"arms": []}, "intent": []}
-    told = {"feasible": feasible, "failure_in_words": words, "trajectory": digest_of(trajectory)} | judged_all
-    report = told | doubt(0.97) | more
+    measured = ideal_playback(trajectory)
+    if trajectory.psm_m is not None:
+        tip_mm, apart_mm = psm_m_poses(trajectory, measured.looked_at)[0], np.full((len(trajectory), 24), 5.0)
+        measured = replace(measured, psm_m_tip_mm=tip_mm, clearances_mm=apart_mm)
+    arms = {"arms": [asdict(one) for one in judge(measured, trajectory).arms]}
+    told = {"feasible": feasible, "failure_in_words": words, "trajectory": digest_of(trajectory)}
+    report = json.loads(canonical(told | arms | doubt(0.97) | more))
     identity = digest or sha256(canonical([plan.sha256, report]))
     with database.writing() as session:
         row = find_plan(session, plan.sha256)
-        measured = ideal_playback(trajectory)
         session.add(StoredPlayback(sha256=identity, plan=row, feasible=feasible, report=report, measured=measured))
     return identity
 
@@ -59,23 +65,16 @@ def judged(database: Database, plan: Plan, *, feasible: bool = True, digest: str
 def doubt(*lower: float | None, errors: ArmErrors = UNCALIBRATED, stated_by: str = "installation") -> dict[str, Any]:
     faults = {"place": None, "arms": None, "pad": 0}  # of a plan without a hand-off
     passes = [{"succeeds": {"count": 990, "of": 1000, "lower": bound}, "faults": faults} for bound in lower]
-    under = [{"errors": asdict(errors), "passes": passes, "plan": {"count": 700}}]
+    under = [{"errors": asdict(errors), "passes": passes, "plan": {"count": 700, "of": 1000}}]
     without = {"count": 880, "probability": 0.88}
     costs = [{"error": "registration_mm", "without": without}]
-    return {"doubt": {"version": JUDGE_VERSION, "under": under, "costs": costs}, "stated_by": stated_by}
+    judged = {"version": JUDGE_VERSION, "under": under, "costs": costs}
+    return {"doubt": judged, "stated_by": stated_by, "check_version": CHECK_VERSION}
 
 
-def of_the_first_judge(lower: float) -> dict[str, Any]:
-    """Return a stored verdict as the judge wrote it that knew tip errors alone."""
-    succeeds = {"count": 990, "of": 1000, "probability": 0.99, "lower": lower, "upper": 1.0}
-    under = [{"tip_error_mm": mm, "plan": succeeds, "passes": [{"succeeds": succeeds}]} for mm in (0.65, 3.0)]
-    return {"doubt": {"seed": 0, "under": under, "settings": {"tip_errors_mm": [0.65, 3.0]}}}
-
-
-def of_the_second_judge(lower: float) -> dict[str, Any]:
-    """Return a stored verdict of the judge that had PSM_M's jaw open throughout."""
+def of_another_judge(lower: float, version: int) -> dict[str, Any]:
     judged = doubt(lower)
-    return judged | {"doubt": judged["doubt"] | {"version": 2}}
+    return judged | {"doubt": judged["doubt"] | {"version": version}}
 
 
 def gate(database: Database, plan: Plan, **asked: Any) -> str:
@@ -117,10 +116,10 @@ def test_a_plan_is_cleared_by_its_own_newest_feasible_playback(database: Databas
         gate(database, plan)
 
 
-def test_a_verdict_that_knows_nothing_of_the_intent_opens_no_bag(database: Database, plan: Plan):
-    """Those of older versions compared the trajectory with itself; they stay readable."""
-    judged(database, plan, intent=None)
-    with pytest.raises(Conflict, match="did not compare the motion with what was asked"):
+@pytest.mark.parametrize("other", [CHECK_VERSION - 1, CHECK_VERSION + 1])
+def test_a_verdict_of_another_version_of_the_checks_opens_no_bag(database: Database, plan: Plan, other: int):
+    judged(database, plan, check_version=other)
+    with pytest.raises(Conflict, match="judged by another version of the checks; play it again"):
         gate(database, plan)
     judged(database, plan)
     gate(database, plan)
@@ -159,14 +158,6 @@ def test_tissue_is_stated_once_and_in_millimetres(database: Database, plan: Plan
         cases.add_plan(database, scene={"frame": "PSM_base", "tissue": level})
     with pytest.raises(BadPlan, match=r"seems to be in metres. Give -170 mm"):
         cases.add_plan(database, tissue_mm=-0.17)
-
-
-def test_a_verdict_of_a_version_that_judged_no_bodies_opens_no_bag(database: Database, plan: Plan):
-    judged(database, plan, bodies=None)
-    with pytest.raises(Conflict, match=r"outer bodies were not judged when this plan was played. Play it"):
-        gate(database, plan)
-    judged(database, plan)
-    gate(database, plan)
 
 
 def test_only_a_plan_that_follows_the_released_policy_is_replayed(database: Database, plan: Plan):
@@ -242,11 +233,9 @@ def test_consent_that_is_withdrawn_while_a_bag_is_composed_is_seen(
         (doubt(0.95, stated_by="request"), {"errors": CALIBRATED}, None),
         (doubt(0.85, stated_by="request", errors=CALIBRATED), {}, "With the errors of a calibrated arm a pass"),
         (doubt(), {}, "only nan"),
-        (of_the_first_judge(0.99), {}, "judged by an older version, which had other errors, jaws or tissue; play it"),
-        (of_the_second_judge(0.99), {}, "judged by an older version"),
-        (of_the_first_judge(0.99), {"errors": CALIBRATED}, "older version"),
-        ({"doubt": None}, {}, "older version"),
-        ({}, {}, "older version"),
+        (of_another_judge(0.99, JUDGE_VERSION - 1), {}, "judged by another version of the checks; play it again"),
+        (of_another_judge(0.99, JUDGE_VERSION + 1), {}, "judged by another version"),
+        (doubt(0.99) | {"check_version": CHECK_VERSION - 1}, {}, "judged by another version"),
     ],
 )
 def test_the_least_certain_pass_has_to_reach_the_lower_bound(report, asked, words):

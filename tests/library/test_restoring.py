@@ -3,7 +3,7 @@
 import json
 import time
 from collections.abc import Callable, Iterator
-from datetime import UTC, datetime, timedelta
+from datetime import timedelta
 from functools import partialmethod
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from skills.db import now
 from skills.db.models import Demonstration, PolicyVersion, Release, StoredRecording
 from skills.db.service_tables import Key
 from skills.db.session import Database
-from skills.errors import BadSettings, NotFound
+from skills.errors import BadSettings, Corrupt, NotFound
 from skills.library.backup import back_up, keep_erasures, read_erasures, restore
 from skills.library.catalogue import find_surgeon, put_surgeon
 from skills.library.demos import mark_demo, withdraw_demo
@@ -25,7 +25,6 @@ from skills.library.keys import create_key, revoke_key
 from skills.library.policies import policy_of
 from skills.library.recordings import store_recording
 from skills.library.releases import release, withdraw
-from skills.packing import canonical, sha256
 from skills.serving import keeping_erasures
 from skills.settings import Settings
 from tests import backends
@@ -212,7 +211,7 @@ def test_a_consent_that_was_narrowed_stays_narrow_and_none_is_widened(
         assert (surgeon.consent, surgeon.protocol) == (left, "IRB 1")
 
 
-def test_the_list_names_nobody_and_the_first_format_is_still_read(database: Database, tmp_path: Path):
+def test_the_list_names_nobody_and_another_format_is_refused(database: Database, tmp_path: Path):
     demo = cases.add_demo(database).sha256
     with database.writing() as session:
         put_surgeon(session, "canary-7f3a91", {"consent": BOTH}, "test")
@@ -222,18 +221,10 @@ def test_the_list_names_nobody_and_the_first_format_is_still_read(database: Data
     listed = keep_erasures(database, tmp_path / "list.json")
     assert "canary" not in (tmp_path / "list.json").read_text()
     assert read_erasures(str(tmp_path / "list.json")) == listed
-    content = {
-        "surgeons": [["0" * 64, "1" * 64, "2026-01-01T00:00:00Z"]],
-        "demonstrations": [["ab" * 32, "2026-01-01T00:00:00Z"]],
-    }
-    about = {"format": "suture-skills erasures 1", "erasures": content, "sha256": sha256(canonical(content))}
+    about = json.loads((tmp_path / "list.json").read_text()) | {"format": "suture-skills erasures 1"}
     (tmp_path / "first.json").write_text(json.dumps(about))
-    first = read_erasures(str(tmp_path / "first.json"))
-    moment = datetime(2026, 1, 1, tzinfo=UTC)
-    assert (first.surgeons, first.demos) == (frozenset({("0" * 64, "1" * 64, moment)}), {"ab" * 32})
-    both = keep_erasures(database, tmp_path / "first.json")
-    assert both == listed | first == read_erasures(str(tmp_path / "first.json"))
-    assert both.demos == {demo, "ab" * 32}
+    with pytest.raises(Corrupt, match="not a list of erasures"):
+        read_erasures(str(tmp_path / "first.json"))
 
 
 def test_the_service_keeps_the_list_up_while_it_runs(database: Database, tmp_path: Path):

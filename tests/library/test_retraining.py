@@ -235,14 +235,26 @@ def test_a_worse_version_is_kept_and_not_released(database: Database):
 
 
 FIGURES = PolicyFigures(
-    version=1, sha256="a", demos=("a", "b"), rests_on=2, dtw_total_mm=0.0, exact_share=0.9, reaching_share=0.95
+    version=1,
+    sha256="a",
+    demos=("a", "b"),
+    rests_on=2,
+    dtw_total_mm=0.0,
+    exact_share=0.9,
+    reaching_share=0.95,
+    mean_share=0.8,
 )
 SAME = FitOnTheSame(("a",), 10.0, 10.0)
 
 
 @pytest.mark.parametrize(
     ("name", "equal", "better", "worse"),
-    [("rests_on", 2, 3, 1), ("exact_share", 0.9, 1.0, 0.8), ("reaching_share", 0.95, 1.0, 0.9)],
+    [
+        ("rests_on", 2, 3, 1),
+        ("exact_share", 0.9, 1.0, 0.8),
+        ("reaching_share", 0.95, 1.0, 0.9),
+        ("mean_share", 0.8, 0.9, 0.7),
+    ],
 )
 def test_worse_is_what_is_worse_in_one_figure_or_no_number(name: str, equal: float, better: float, worse: float):
     for value, reasons in ((equal, 0), (better, 0), (worse, 1), (math.nan, 1)):

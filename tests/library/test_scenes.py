@@ -189,7 +189,7 @@ def test_a_batch_keeps_the_scene_of_a_style_and_its_learner(database):
     assert style.policy.manifest["learner"] == "phase-q-learning"
 
 
-def test_values_of_before_keep_their_digests_and_a_scene_has_its_own():
+def test_a_policy_in_a_scene_has_a_digest_of_its_own_and_is_read_back():
     path = GridPath(GridWorld((0.0, 0.0, 0.0), 5.0, (3, 1, 1)), np.array([1, 2]))
     policy = learn_in_scene(sparse_reward(path), ValueIteration(gamma=0.9), hazards_of(Scene("base"), path, "base"))
     bare = replace(policy, surroundings=None)

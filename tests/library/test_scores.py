@@ -305,7 +305,7 @@ def test_a_calibration_of_an_older_version_is_not_used(database: Database, trial
     with database.writing() as session:
         session.add(StoredCalibration(sha256=sha256(canonical(OLD)), about=OLD))
     (said,) = scored(database, **trial).skill.words
-    assert "older version" in said and "calibrate it again" in said
+    assert "another version" in said and "calibrate it again" in said
 
 
 def test_without_the_consent_of_all_in_a_recording_it_is_not_rated(database: Database) -> None:

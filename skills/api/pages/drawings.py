@@ -405,7 +405,6 @@ def block_of(path: GridPath) -> int:
 def _tiles(coverage: Coverage, path: GridPath) -> tuple[NDArray[np.int8], int]:
     """Classify the starts by `KINDS`: tiles, shape (X, Y, Z), each as its worst start; and the cells per side."""
     block, shape = block_of(path), path.grid.shape
-    assert coverage.share is not None, "a card computes those of an older version"
     followed = np.select([coverage.share == 0, coverage.share < HALF], [KINDS.index("alone"), KINDS.index("part")], 4)
     kinds = np.where(coverage.reaches, np.where(coverage.joins_nearest, followed, 1), 0).astype(np.int8).reshape(shape)
     for axis, side in enumerate(shape):
