@@ -288,7 +288,6 @@ def not_checked(scene: dict[str, Any] | None) -> list[str]:
     return [
         "Thread, needle and the arm's body: in the scene the tip alone was checked, between the centres of cells.",
         "Any other scene: with the tissue elsewhere, or the pass at another place, the odds do not hold.",
-        "The pose style beside it: it knows no scene, nor do the next pose at a pose and sessions.",
         *NOT_CHECKED[1:],
     ]
 
