@@ -120,7 +120,8 @@ def demo_add(
     from skills.client import Problem
 
     part = proposal if segment is None else part_of(segment)
-    with service() as client, ready_one(path, episode, column, tool) as (file, progress, sent_columns):
+    table = column, rate_hz, frame, unit, decimal, table_arm, instrument
+    with service() as client, ready_one(path, episode, tool, *table) as (file, how):
 
         def add(part: "Part") -> "Demonstration":
             return client.add_demo(
@@ -138,14 +139,7 @@ def demo_add(
                 session=session,
                 outcome=outcome,
                 outcome_reason=reason,
-                rate_hz=rate_hz,
-                frame=frame,
-                column=sent_columns,
-                unit=unit,
-                decimal=decimal,
-                table_arm=table_arm,
-                instrument=instrument,
-                progress=progress,
+                **how,
             )
 
         try:

@@ -211,11 +211,14 @@ def ready_episode(
         yield file, sending
 
 
+TABLE = ("rate_hz", "frame", "unit", "decimal", "table_arm", "instrument")
+
+
 @contextmanager
 def ready_one(
-    path: Path, episode: str | None, column: list[str] | None, tool: Sequence[str] | None
-) -> Iterator[tuple[Path, "Progress", list[str] | None]]:
-    """Yield the file to upload for a path, the callback for progress, and the columns that the service is to map.
+    path: Path, episode: str | None, tool: Sequence[str] | None, column: list[str] | None, *table: Any
+) -> Iterator[tuple[Path, dict[str, Any]]]:
+    """Yield the file to upload for a path, and the named arguments of its upload: `TABLE`, columns and progress.
 
     The path is a recording, or a dataset with the episode; in the episode's file the columns are mapped already.
     """
@@ -225,12 +228,12 @@ def ready_one(
         if dataset is None:
             _refuse_statements(path, episode, tool)
             with ready(path) as (file, progress):
-                yield file, progress, column
+                yield file, {**dict(zip(TABLE, table, strict=True)), "column": column, "progress": progress}
             return
         if episode == "all":
             raise BadInput("Name one episode: a demonstration is of one.")
         with ready_episode(dataset, choose_episodes(dataset, episode)[0], column, tool) as (file, progress):
-            yield file, progress, None
+            yield file, {**dict(zip(TABLE, table, strict=True)), "column": None, "progress": progress}
 
 
 def _refuse_statements(path: Path, *given: object) -> None:
@@ -275,19 +278,9 @@ def recording_add(
     if episode == "all":
         _add_all(path, frame, column, tool, surgeon, as_json)
         return
-    with service() as client, ready_one(path, episode, column, tool) as (file, progress, sent_columns):
-        stored = client.add_recording(
-            file,
-            rate_hz=rate_hz,
-            frame=frame,
-            column=sent_columns,
-            unit=unit,
-            decimal=decimal,
-            table_arm=table_arm,
-            instrument=instrument,
-            surgeon=surgeon,
-            progress=progress,
-        )
+    table = column, rate_hz, frame, unit, decimal, table_arm, instrument
+    with service() as client, ready_one(path, episode, tool, *table) as (file, how):
+        stored = client.add_recording(file, surgeon=surgeon, **how)
     _tell(stored, as_json)
 
 
@@ -307,18 +300,9 @@ def recording_preview(
     as_json: AsJson = False,
 ) -> None:
     """Show what would be understood of a recording, above all of a table; nothing is stored."""
-    with service() as client, ready_one(path, episode, column, tool) as (file, progress, sent_columns):
-        seen = client.preview_recording(
-            file,
-            rate_hz=rate_hz,
-            frame=frame,
-            column=sent_columns,
-            unit=unit,
-            decimal=decimal,
-            table_arm=table_arm,
-            instrument=instrument,
-            progress=progress,
-        )
+    table = column, rate_hz, frame, unit, decimal, table_arm, instrument
+    with service() as client, ready_one(path, episode, tool, *table) as (file, how):
+        seen = client.preview_recording(file, **how)
     if as_json:
         print_json(seen)
         return
@@ -525,10 +509,10 @@ def _words(options: dict[str, Any]) -> Iterator[str]:
 
 
 def _understood(client: "Client", path: Path, options: dict[str, Any]) -> Row:
-    how = {option: one for option, one in options.items() if option not in ("episode", "column", "tool")}
+    stated = [options.get(option) for option in ("episode", "tool", "column", *TABLE)]
     try:
-        with ready_one(path, options.get("episode"), options.get("column"), options.get("tool")) as (file, _, columns):
-            seen = client.preview_recording(file, column=columns, **how)
+        with ready_one(path, *stated) as (file, how):
+            seen = client.preview_recording(file, **how | {"progress": None})
     except SkillsError as error:
         return {"format": path.suffix[1:], "refused": first_sentence(error)}
     samples = dict.fromkeys(str(motion.samples) for motion in seen.motions)

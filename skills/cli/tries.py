@@ -139,19 +139,9 @@ def try_bag(
     teller = _Teller(context, as_json)
     with _place(folder, teller) as settings, connect(settings, workers=1) as client:
         _ensure_surgeon(client, surgeon)
-        with ready_one(path, episode, column, tool) as (file, progress, sent_columns):
-            stored = client.add_recording(
-                file,
-                rate_hz=rate_hz,
-                frame=frame,
-                column=sent_columns,
-                unit=unit,
-                decimal=decimal,
-                table_arm=table_arm,
-                instrument=instrument,
-                surgeon=surgeon,
-                progress=progress,
-            )
+        table = column, rate_hz, frame, unit, decimal, table_arm, instrument
+        with ready_one(path, episode, tool, *table) as (file, how):
+            stored = client.add_recording(file, surgeon=surgeon, **how)
         while True:
             job = _tried(client, teller, client.try_recording(stored.sha256, surgeon, suture, **asked))
             answers = teller.ask(job) if on_terminal() and not as_json else {}
