@@ -16,6 +16,7 @@ from skills.demonstration.demonstration import Demo
 from skills.errors import Conflict
 from skills.gridworld.domain import Domain
 from skills.gridworld.reward import RewardMap
+from skills.learning.certificate import NearLimits
 from skills.learning.dynamic_programming import Mdp, exact_q
 from skills.learning.evaluation import SpaceRollouts
 from skills.learning.networks import DDPG, DQN, Deep, Network, network_q
@@ -45,7 +46,7 @@ def store(service: Service, learner: Deep, network: Network | None = None) -> Po
     demo = service.client.add_demo(cases.hand_off(), media_type=CSV, **KESTREL)
     request = {
         **KESTREL, "demos": [demo["sha256"]], "learner": describe_learner(learner),
-        "learner_version": LEARNER_VERSION, "seed": 0, "release": False,
+        "learner_version": LEARNER_VERSION, "seed": 0, "release": False, "near": asdict(NearLimits()),
     }  # fmt: skip
     with service.database.reading() as session:
         (lesson,) = lessons(session, [find_demo(session, demo["sha256"]).row])
