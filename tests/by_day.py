@@ -51,6 +51,8 @@ ON_BOTH = {
     "test_what_the_service_wrote_is_whole_and_signed",
     "test_signing_and_writing_do_not_wait_for_each_other",
     "test_a_row_written_past_the_service_is_not_logged_for_its_author",
+    "test_an_older_copy_that_was_put_back_is_not_served",
+    "test_another_key_serves_and_writes_nothing",
     "test_columns_added_to_every_logged_table_keep_every_history",
     # backups that are restored
     "test_a_demonstration_erased_after_the_backup_leaves_nothing_served",

@@ -370,6 +370,12 @@ GUARDS = (
          "_clearance_gates", "_handing_over"),
     ),
     Guard(
+        "skills/library/history.py", 12,
+        ("tests/api/test_edited_rows.py", "tests/api/test_rollback.py", "tests/library/test_history.py"),
+        ("edited_rows", "refuse_edited", "_is_signed", "covered_leaf", "is_right", "keep_signed"),
+    ),
+    Guard("skills/db/kept_heads.py", 8, ("tests/api/test_rollback.py", "tests/library/test_history.py")),
+    Guard(
         "skills/library/releases.py", 33,
         ("tests/library/test_release_gate.py", "tests/library/test_joining.py", "tests/library/test_scenes.py",
          "tests/api/test_policies.py::test_a_demo_in_a_frame_other_than_the_arms_base_is_not_released",
