@@ -185,7 +185,7 @@ class History:
         self._engine = engine
         self.key_file = key_file
         self.heads_file = heads_file or heads_beside(key_file, engine.url)
-        self.refused: NotReady | None = None  # why nothing of the database is served or written, see `compare`
+        self._why: tuple[Any, ...] = ()  # nothing is served or written
         self._agreed: tuple[str | None, Note | None] | None = None  # the newest checkpoint, and the kept head
         self._seal: Seal | None = None
         self._origin: str | None = None
@@ -214,6 +214,11 @@ class History:
             self._origin = None if first is None else first.partition("\n")[0]
         return self._origin
 
+    @property
+    def refused(self) -> NotReady | None:
+        """Why nothing of the database is served or written, see `compare`; a new error, without an old traceback."""
+        return NotReady(*self._why) if self._why else None
+
     def kept_head(self) -> Note | None:
         """Return the head that was kept last; None if none was.
 
@@ -223,7 +228,7 @@ class History:
         try:
             return last_head(self.heads_file)
         except NotReady as refused:
-            self.refused = refused
+            self._why = (refused.message, *refused.remedies)
             raise
 
     def kept_heads(self, origin: str) -> list[Note]:
@@ -252,9 +257,9 @@ class History:
         try:
             self._refuse_another(connection, newest, kept)
         except NotReady as refused:
-            self.refused, self._agreed = refused, None
+            self._why, self._agreed = (refused.message, *refused.remedies), None
             raise
-        self.refused, self._agreed = None, (newest, kept)
+        self._why, self._agreed = (), (newest, kept)
 
     def _refuse_another(self, connection: Connection, newest: str | None, kept: Note | None) -> None:
         """Refuse the database; the message names no path, for it is also given to callers without a key."""
@@ -319,8 +324,8 @@ class History:
             if origin is None:
                 raise NotReady(*REMOVED)
             self._seal = self.key.seal_of(origin)
-        if self.refused is not None:
-            raise self.refused
+        if (refused := self.refused) is not None:
+            raise refused
         for leaf in leaves:
             leaf["seal"] = self._seal.of(leaf["entry"].encode())
         add_leaves(connection, leaves)
@@ -339,8 +344,8 @@ class History:
             return
         had_one = self.kept_head() is not None or connection.scalar(select(LEAVES.c.row).limit(1)) is not None
         if had_one and any(True for table in logged().values() for _ in table.pages(connection)):
-            self.refused = NotReady(*REMOVED)
-            raise self.refused
+            self._why = REMOVED
+            raise NotReady(*REMOVED)
         self.sign_empty(connection)
         at = rfc3339(now())
         for table in logged().values():

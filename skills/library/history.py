@@ -102,8 +102,7 @@ def is_right(database: Database) -> bool:
         database.compare_history()
     except NotReady as refused:
         if before is None:
-            files = database.history.key_file, database.history.heads_file
-            log.critical("Nothing is served or written (%s, %s). %s", *files, refused)
+            log.critical("Nothing is served or written (%s). %s", database.history.heads_file, refused)
         return False
     return True
 

@@ -10,11 +10,12 @@ import pytest
 from hypothesis import HealthCheck, Phase, seed, settings
 from hypothesis.stateful import run_state_machine_as_test
 from sqlalchemy import delete, insert, select
+from sqlalchemy.orm import Session
 
 from skills import library
 from skills.comparison.distances import Measured
 from skills.db.history import History
-from skills.db.models import Demonstration, MeasuredShape
+from skills.db.models import Demonstration, ErasedInterval, MeasuredShape, RecordingSurgeon, Surgeon
 from skills.db.packed import pack
 from skills.db.session import Database
 from skills.library import atlas, backup, erasure, locks, proposals, training
@@ -199,18 +200,18 @@ def keep_without_looking(database: Database, measured: Mapping[int, Measured]) -
             session.execute(insert(MeasuredShape), kept)
 
 
+def forget_without_a_trace(session: Session, surgeon: Surgeon) -> None:
+    """Delete what names an erased surgeon, and leave nothing that says that somebody is in these recordings."""
+    for of in (RecordingSurgeon, ErasedInterval):
+        session.execute(delete(of).where(of.surgeon_row == surgeon.row))
+
+
 PUT_BACK: dict[str, tuple[object, str, Callable[..., object], str]] = {
     "a_repeated_training_releases_nothing": (
         training,
         "_release_again",
         lambda *_: "Nothing.",
         "a_training_is_asked_for_again_after_a_withdrawal",
-    ),
-    "consent_that_ends_while_a_style_is_learnt_is_not_seen": (
-        training,
-        "refusal",
-        lambda *_: None,
-        "consent_ends_while_a_style_is_learnt",
     ),
     "a_restore_withdraws_nothing_again": (
         backup,
@@ -232,8 +233,8 @@ PUT_BACK: dict[str, tuple[object, str, Callable[..., object], str]] = {
     ),
     "an_erased_surgeons_refusal_is_forgotten": (
         erasure,
-        "_mark",
-        lambda *_: None,
+        "_forget_name",
+        forget_without_a_trace,
         "a_refusing_surgeon_whom_an_upload_names_is_erased",
     ),
     "an_older_copy_is_served": (History, "compare", lambda *_: None, "an_older_copy_is_put_back"),
