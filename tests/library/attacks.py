@@ -169,6 +169,8 @@ def _other(value: Any, rng: random.Random, name: str) -> Any:
         case None:
             if name.endswith("_at"):
                 return now()
-            return {"changed": True} if name in ("consent", "result") else 1 if name == "surgeon_row" else "changed"
+            if name in ("surgeon_row", "start_s", "end_s"):
+                return 1
+            return {"changed": True} if name in ("consent", "result") else "changed"
         case _:
             return value + timedelta(microseconds=rng.choice((1, 86_400_000_000)))

@@ -590,7 +590,7 @@ def test_tiles_are_written_as_they_fill_and_every_change_of_one_is_found(databas
 
 def test_no_proof_is_given_from_tiles_or_leaves_that_were_changed(database: Database):
     cases.add_demo(database)
-    add_cranes(database, 350)  # the newest leaves stand behind the last whole tile
+    add_cranes(database, 330)  # the newest leaves stand behind the last whole tile
     cases.train(database, release=True)
     sign_history(database)
     asked = ("kestrel", cases.SUTURE, now())
