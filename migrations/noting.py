@@ -1,7 +1,7 @@
 """The triggers by which a logged table notes its changed rows, for the migrations.
 
-A migration that adds a logged column calls `note_changes` for its table again, and names the column in `ADDED` of
-`skills.db.logged_rows` with the value that it gives to the rows that there are.
+A migration after the baseline that adds a logged column calls `note_changes` for its table again, and names the column
+in `ADDED` of `skills.db.logged_rows` with the value that it gives to the rows that there are.
 """
 
 from collections.abc import Sequence

@@ -18,7 +18,8 @@ from typing import Any
 
 from sqlalchemy import create_engine, make_url, text
 
-from skills.db.session import Database, upgrade
+from skills.db.revisions import upgrade
+from skills.db.session import Database
 from tests.leftovers import shared
 from tests.needs import need
 from tests.waiting import until

@@ -167,7 +167,7 @@ def shared_statements() -> Iterator[None]:
         return create_engine(*about, execution_options={"compiled_cache": statements}, **how)
 
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr("skills.db.session.create_engine", sharing)
+        patched.setattr("skills.db.engines.create_engine", sharing)
         for dialect in (PGDialect_psycopg, SQLiteDialect_pysqlite):
             patched.setattr(dialect, "__eq__", lambda one, other: type(one) is type(other))
             patched.setattr(dialect, "__hash__", lambda one: hash(type(one)))
@@ -181,7 +181,7 @@ def shared_tables() -> Iterator[None]:
     That takes half of a restore; `tests/migrations` migrates.
     """
     from skills.db import dump
-    from skills.db.session import revision_of, revisions
+    from skills.db.revisions import revision_of, revisions
     from tests import backends
 
     migrate = dump.upgrade

@@ -121,13 +121,13 @@ def full_disk(folder: Path) -> Iterator[None]:
     event.remove(Engine, "connect", limit)
 
 
-def newer_database(folder: Path) -> Iterator[None]:
-    """Write a database that a newer version has migrated."""
+def other_database(folder: Path) -> Iterator[None]:
+    """Write a database that another version has made."""
     url = backends.fresh("sqlite", folder)
-    shutil.move(url.removeprefix("sqlite:///"), folder / "newer.sqlite")
+    shutil.move(url.removeprefix("sqlite:///"), folder / "other.sqlite")
     import sqlite3
 
-    with closing(sqlite3.connect(folder / "newer.sqlite")) as connection:
+    with closing(sqlite3.connect(folder / "other.sqlite")) as connection:
         connection.execute("UPDATE alembic_version SET version_num = '9999'")
         connection.commit()
     yield
@@ -298,8 +298,8 @@ MISTAKES = [
     Mistake("a file that is not a database", "surgeon list", env={"SKILLS_DATABASE_URL": "sqlite:///notes.txt"}),
     Mistake("a folder for a database", "surgeon list", env={"SKILLS_DATABASE_URL": "sqlite:///nothing-in-it"}),
     Mistake(
-        "a database of a newer version", "surgeon list",
-        env={"SKILLS_DATABASE_URL": "sqlite:///newer.sqlite"}, around=newer_database,
+        "a database of another version", "surgeon list",
+        env={"SKILLS_DATABASE_URL": "sqlite:///other.sqlite"}, around=other_database,
     ),
     Mistake(
         "PostgreSQL that does not run", "surgeon list",

@@ -29,7 +29,8 @@ from sqlalchemy.pool import QueuePool
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from skills import __version__
-from skills.db.session import Database, revisions
+from skills.db.revisions import revisions
+from skills.db.session import Database
 from skills.errors import SkillsError
 from skills.library.overview import Condition, condition_of, count_jobs
 from skills.logs import request_id, told

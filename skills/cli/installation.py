@@ -397,7 +397,7 @@ def _there(name: str) -> tuple[list[dict[str, str]], tuple[str, ...] | None]:
 
 def _without_password(source: str) -> str:
     """Return the name of a file, or the URL of a database without its password."""
-    from skills.db.session import parse_url
+    from skills.db.engines import parse_url
 
     return parse_url(source).render_as_string(hide_password=True) if "://" in source else source
 

@@ -23,8 +23,8 @@ from sqlalchemy import Column, Connection, MetaData, Table, insert, select, text
 from skills.db import Base, now, rfc3339
 from skills.db.logged_rows import KINDS, kind_of
 from skills.db.models import ParsedChunk, ParsedRecording
+from skills.db.revisions import revision_of, revisions, upgrade
 from skills.db.service_tables import Executor, SignIn
-from skills.db.session import revision_of, revisions, upgrade
 from skills.db.tiles import Tile
 from skills.errors import Conflict, Corrupt, UnknownFormat
 from skills.remedies import Action, Remedy
@@ -174,7 +174,10 @@ def check(file: IO[bytes]) -> Manifest:
     except (KeyError, TypeError, ValueError) as error:
         raise UnknownFormat("This zip file is not a backup of suture-skills that this version can read.") from error
     if manifest.schema not in revisions():
-        raise Conflict(f"The backup was written by a newer version ({manifest.code}); restore it with that one.")
+        raise Conflict(
+            f"The backup was written by another version ({manifest.code}, its tables are at {manifest.schema}); "
+            "restore it with that one."
+        )
     return manifest
 
 

@@ -63,7 +63,7 @@ from skills.errors import BadSettings, Corrupt, NotReady
 from skills.remedies import Action, Remedy
 from skills.transparency import HASH_BYTES, Checkpoint, Note, Seal, SigningKey, Tree, leaf_hash, read_notes
 
-ADD, CHANGE, REMOVE, FOUND = "add", "change", "remove", "found"
+ADD, CHANGE, REMOVE = "add", "change", "remove"
 SCHEMA = "schema"  # the name under which triggers, indexes and constraints are logged as if they were rows
 SALT_BYTES = 32
 SIGNED_AT_ONCE = 1000  # leaves in one transaction, some 50 ms
@@ -333,30 +333,18 @@ class History:
     # ---- beginning, migrations and restorations
 
     def begin(self, connection: Connection) -> None:
-        """Begin a history, if there is none: make a key, and log every row and the schema as they are found.
+        """Begin a history, if there is none: make a key, and log the schema.
 
         Raises:
-            NotReady: There are rows, and there was a history: to log them as found would vouch for them.
+            NotReady: There are rows, so there was a history: to log them as found would vouch for them.
         """
-        self._origin = self._seal = None  # of a history that a downgrade may have dropped
         connection.info[NOTING] = True
         if not inspect(connection).has_table(LEAVES.name) or self.origin(connection) is not None:
             return
-        had_one = self.kept_head() is not None or connection.scalar(select(LEAVES.c.row).limit(1)) is not None
-        if had_one and any(True for table in logged().values() for _ in table.pages(connection)):
+        if any(True for table in logged().values() for _ in table.pages(connection)):
             self._why = REMOVED
             raise NotReady(*REMOVED)
         self.sign_empty(connection)
-        at = rfc3339(now())
-        for table in logged().values():
-            for page in table.pages(connection):
-                self._write(
-                    connection,
-                    [
-                        new_leaf(table.raw.name, FOUND, at, table.key_of(row), digested(table.columns, row))
-                        for row in page
-                    ],
-                )
         take_notes(connection)
         self.log_schema(connection)
 

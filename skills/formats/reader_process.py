@@ -51,7 +51,7 @@ from skills.sandbox import ProcessLimits
 from skills.sandbox.forked import ForkServer, Turns
 from skills.schemas import recordings as described
 
-READER_VERSION = 2  # raised when equal bytes give another `Told`, so that cached ones are decoded again
+READER_VERSION = 1  # raised when equal bytes give another `Told`, so that cached ones are decoded again
 MOST = 200  # entries of each list of unlimited length; `counts` has the full numbers of segments and labels
 
 

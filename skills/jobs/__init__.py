@@ -29,7 +29,8 @@ from sqlalchemy.dialects import plugins
 from sqlalchemy.engine import URL, CreateEnginePlugin, make_url
 from sqlalchemy.engine import Engine as Connections
 
-from skills.db.session import make_private, write_ahead
+from skills.db.disk import make_private
+from skills.db.engines import write_ahead
 from skills.library.jobs import EXPORT, PART, PICTURES
 from skills.settings import Settings
 

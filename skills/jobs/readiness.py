@@ -21,8 +21,9 @@ from skills.comparison._kernels import warp_pairs_compiled
 from skills.compiled import check_kept, kept_in, make_ready
 from skills.db import now
 from skills.db.models import SutureType
+from skills.db.revisions import revision_of, revisions
 from skills.db.service_tables import Executor
-from skills.db.session import Database, revision_of, revisions
+from skills.db.session import Database
 from skills.errors import NotReady, SkillsError
 from skills.formats.mcap._kernels import follow_compiled
 from skills.gridworld.grid import GridPath, GridWorld
@@ -103,7 +104,7 @@ def _try_database(database: Database) -> None:
     if revision is None:
         raise NotReady("The database has no tables yet.", Remedy(Action.MIGRATE))
     if revision not in revisions():
-        raise NotReady("The database has a newer version; update the code of this process.")
+        raise NotReady("The database is of another version; use the code that made it, or name another database.")
     if revision != revisions()[0]:
         raise NotReady("The database has an older version.", Remedy(Action.MIGRATE))
 

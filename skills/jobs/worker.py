@@ -26,8 +26,9 @@ from dbos import DBOS
 from sqlalchemy import select
 
 from skills import logs
+from skills.db.revisions import refuse_other_tables
 from skills.db.service_tables import Job
-from skills.db.session import Database, refuse_other_tables
+from skills.db.session import Database
 from skills.errors import SkillsError
 from skills.jobs import BATCHES, JOBS, POLLING_S, QUEUES, configuration, connect
 from skills.jobs.workflows import Leases, Perform, Watch, Work, register

@@ -43,7 +43,7 @@ from skills.packing import canonical, sha256
 from skills.schemas import DemoOutcome
 
 Told = Callable[[str], None]  # progress callback; its argument is the name of the table or step
-ERASURES = "suture-skills erasures 2"
+ERASURES = "suture-skills erasures 1"
 # Events that end something permanently, with the name of their list. Releases end by being superseded as well.
 ENDS = {
     ("erase", "demonstration"): "demonstrations",

@@ -44,7 +44,7 @@ from skills.scoring.validation import BOOTSTRAPS, NOTHING, PERMUTATIONS, refusal
 
 NAMED = 5  # the most trials that an error names
 LIBRARIES = ("scipy", "numpy")  # the libraries that compute the numbers
-VERSION = 2  # of what is stored; a calibration of another version is not used
+VERSION = 1  # of what is stored; a calibration of another version is not used
 
 
 @dataclass(frozen=True)

@@ -38,8 +38,9 @@ from skills.db.models import (
     Surgeon,
 )
 from skills.db.packed import Packed, digest
+from skills.db.revisions import revision_of, revisions
 from skills.db.service_tables import DatasetChunk, ErasedSurgeon, Job, StoredDataset
-from skills.db.session import Database, revision_of, revisions
+from skills.db.session import Database
 from skills.errors import Busy, Corrupt, NotFound, SkillsError
 from skills.formats.reader_process import READER_VERSION, read_told
 from skills.gridworld.reward import sparse_reward

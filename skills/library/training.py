@@ -110,8 +110,8 @@ KNOWN = select(_VERSIONS.c.sha256, _VERSIONS.c.row, _VERSIONS.c.version).where(
 ADD = insert(_VERSIONS).returning(_VERSIONS.c.sha256, _VERSIONS.c.row, _VERSIONS.c.version)
 ERASED = "A demonstration was erased while the training used it."
 ANY = "any"  # `outcomes` of a training from demonstrations of any outcome
-POSES_VERSION = 3  # part of a training's identity: raise it when equal demonstrations give another pose style
-GATE_VERSION = 4  # part of a training's identity: raise it when the gate's result for an equal policy changes
+POSES_VERSION = 1  # part of a training's identity: raise it when equal demonstrations give another pose style
+GATE_VERSION = 1  # part of a training's identity: raise it when the gate's result for an equal policy changes
 CERTIFICATE_NOTE = (
     "Checked on the grid: every greedy action against exact dynamic programming, and every start by following it; "
     "the demonstrated pass as it is driven (`driven.path`) against the arm's joint limits in closed form. It says "

@@ -21,7 +21,7 @@ from skills.verification.gates import Limits
 
 # 1: tip errors alone, stated as a mean length. 2: PSM_M's jaw open throughout, fingers touch in the last sample alone,
 # sloping tissue level.
-JUDGE_VERSION = 3
+JUDGE_VERSION = 1
 UPWARDS = (0.0, 0.0, 1.0)
 ON_THE_WAY, AT_THE_END = ("reach", "limits", "pad", "arms", "bodies"), ("place", "angle")
 NEEDLE = "needle"  # of a `Cost`: the needle's angle in the jaws, which is no error of the arms

@@ -129,11 +129,7 @@ def damage_folder(settings: Settings) -> None:
     database_file(settings).mkdir()
 
 
-def damage_older(settings: Settings) -> None:
-    statement(settings, "UPDATE alembic_version SET version_num = '0001'")
-
-
-def damage_newer(settings: Settings) -> None:
+def damage_other_version(settings: Settings) -> None:
     statement(settings, "UPDATE alembic_version SET version_num = '9999'")
 
 
@@ -174,8 +170,7 @@ def statement(settings: Settings, *statements: str) -> None:
         (damage_replaced, "The database cannot be read and written"),
         (damage_empty, "has no tables yet. Ask the operator of the service to migrate"),
         (damage_folder, "The database does not exist"),
-        (damage_older, "has an older version. Ask the operator of the service to migrate"),
-        (damage_newer, "has a newer version; update the code"),
+        (damage_other_version, "is of another version; use the code that made it"),
         (damage_tables, "The database cannot be read and written"),
         (damage_engine_missing, "The job engine's database does not exist"),
         (damage_engine_replaced, "The job engine's database cannot be used"),

@@ -18,10 +18,12 @@ from starlette.testclient import TestClient
 
 from skills import serving
 from skills.api.app import create_app
+from skills.db import engines
 from skills.db import session as sessions
+from skills.db.disk import EXIT_CODE, make_private
 from skills.db.models import SutureType
 from skills.db.service_tables import Executor
-from skills.db.session import EXIT_CODE, Database, make_private
+from skills.db.session import Database
 from skills.errors import BadSettings, Busy, DatabaseUnusable, StorageFull
 from skills.jobs import prepare
 from skills.settings import Settings
@@ -183,7 +185,7 @@ def test_more_transactions_than_connections_wait_and_then_raise_busy(database: D
     crowded = Database(database.url, patience_ms=200)
     try:
         with ExitStack() as at_once:
-            for _ in range(sessions.AT_ONCE):
+            for _ in range(engines.AT_ONCE):
                 at_once.enter_context(crowded.reading()).execute(text("SELECT 1"))
             with pytest.raises(Busy, match="is overloaded"), crowded.reading() as session:
                 session.execute(text("SELECT 1"))

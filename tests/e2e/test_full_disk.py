@@ -14,7 +14,7 @@ from pathlib import Path
 import httpx2 as httpx
 import pytest
 
-from skills.db.session import EXIT_CODE
+from skills.db.disk import EXIT_CODE
 from skills.serving import environment
 from tests.api.service import CSV, KESTREL, assert_problem
 from tests.e2e.conftest import WORKER, Service, running

@@ -18,9 +18,10 @@ import httpx2 as httpx
 import pytest
 from sqlalchemy import create_engine, select, text
 
+from skills.db.engines import RESTART_S
 from skills.db.models import Demonstration, PolicyVersion
 from skills.db.service_tables import Event, Executor, Job
-from skills.db.session import RESTART_S, Database
+from skills.db.session import Database
 from skills.errors import Busy
 from skills.packing import sha256
 from tests.backends import new_server, start

@@ -6,14 +6,15 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
-from alembic import command
 from sqlalchemy import Column, Integer, MetaData, String, inspect, text, update
 from sqlalchemy.exc import DatabaseError
 
-from skills.db import Base, now, session
+from skills.db import Base, now
+from skills.db import revisions as revisions_module
 from skills.db.history import LEAVES, latest_leaves
 from skills.db.logged_rows import ADDED, Logged, logged, united
-from skills.db.session import Database, revisions
+from skills.db.revisions import revisions, upgrade
+from skills.db.session import Database
 from skills.library.backup import NOTHING, back_up, restore
 from skills.library.history import newest_checkpoint, sign_history
 from skills.library.proofs import head_over, served_json
@@ -23,7 +24,6 @@ from tests.independent_history import check_disclosed
 from tests.library import cases
 from tests.library.attacks import found, tampering
 from tests.library.test_history import wrong_in
-from tests.migrations.test_migrations import go
 
 BEFORE = {"remark": None, "count": 7}  # the new columns, with their value in the rows that there were
 MIGRATION = """
@@ -72,10 +72,10 @@ def widen(patch: pytest.MonkeyPatch, folder: Path) -> None:
             copied.append_column(Column("count", Integer, nullable=False, server_default="7"))
             patch.setitem(ADDED, table.name, BEFORE)
     patch.setattr(Base, "metadata", tables)
-    shutil.copytree(session.MIGRATIONS, folder / "migrations", ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(revisions_module.MIGRATIONS, folder / "migrations", ignore=shutil.ignore_patterns("__pycache__"))
     script = MIGRATION.format(after=revisions()[0], frozen=FROZEN, withdrawable=WITHDRAWABLE)
     (folder / "migrations" / "versions" / "9999_every_table.py").write_text(script)
-    patch.setattr(session, "MIGRATIONS", folder / "migrations")
+    patch.setattr(revisions_module, "MIGRATIONS", folder / "migrations")
     _forget()
 
 
@@ -181,7 +181,8 @@ def test_a_column_that_no_migration_declares_is_named(database: Database, wideni
 
 def test_every_column_that_a_migration_added_is_declared(tmp_path: Path):
     with closing(Database(backends.blank("sqlite", tmp_path))) as database:
-        go(database, command.upgrade, "0016")  # which begins the history
+        with database.engine.execution_options(writes=True).begin() as connection:
+            upgrade(connection, revisions()[-1])
         before = columns_of(database)
         database.migrate()
         now = columns_of(database)

@@ -10,7 +10,6 @@ from datetime import timedelta
 from pathlib import Path
 
 import pytest
-from alembic import command
 from sqlalchemy import Connection, func, insert, null, select, text, update
 from sqlalchemy.orm import Session
 
@@ -38,7 +37,6 @@ from tests.db.test_tables import FROZEN, WITHDRAWABLE, fill
 from tests.independent_history import check_disclosed, check_inclusion
 from tests.library import cases
 from tests.library.attacks import cover_up, found, random_edit, sign_again, tampering
-from tests.migrations.test_migrations import go
 
 SURGEONS = logged()["surgeons"].raw
 
@@ -607,18 +605,6 @@ def test_no_proof_is_given_from_tiles_or_leaves_that_were_changed(database: Data
             connection.exec_driver_sql(edit.format(blob=BLOB[connection.dialect.name]))
             with pytest.raises(Corrupt, match="proves nothing"):
                 served_json(session, database.history, *asked)
-
-
-def test_tiles_of_an_older_database_are_written_by_its_migration(database: Database):
-    add_cranes(database, 300)
-    sign_history(database)
-    with database.reading() as session:
-        before = session.execute(TILES_IN_ORDER).all()
-    go(database, command.downgrade, "0016")
-    database.migrate()
-    with database.reading() as session:
-        assert session.execute(TILES_IN_ORDER).all() == before
-    assert len(before) >= 1 and wrong_in(database) == []
 
 
 def test_changes_of_a_row_follow_each_other_in_the_history(database: Database):

@@ -221,7 +221,7 @@ def test_the_list_names_nobody_and_another_format_is_refused(database: Database,
     listed = keep_erasures(database, tmp_path / "list.json")
     assert "canary" not in (tmp_path / "list.json").read_text()
     assert read_erasures(str(tmp_path / "list.json")) == listed
-    about = json.loads((tmp_path / "list.json").read_text()) | {"format": "suture-skills erasures 1"}
+    about = json.loads((tmp_path / "list.json").read_text()) | {"format": "suture-skills erasures 2"}
     (tmp_path / "first.json").write_text(json.dumps(about))
     with pytest.raises(Corrupt, match="not a list of erasures"):
         read_erasures(str(tmp_path / "first.json"))

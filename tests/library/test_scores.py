@@ -248,7 +248,7 @@ def calibration(*tasks: str, **judged: Any) -> dict[str, Any]:
         name: np.repeat(value, len(tasks), axis=0) for name, value in vars(one).items() if isinstance(value, np.ndarray)
     }
     return {
-        "version": 2,
+        "version": 1,
         "model": as_numbers(SkillModel(**vars(one) | arrays | {"tasks": tasks})),
         "validated": {"tasks": dict.fromkeys(tasks, JUDGED | judged), "mean": JUDGED},
     }

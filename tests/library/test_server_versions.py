@@ -22,9 +22,9 @@ CHANGES = [
     ("ALTER TABLE calibrations ALTER COLUMN sha256 TYPE varchar(65)", "schema table calibrations"),
     ("ALTER TABLE jobs ALTER COLUMN kind SET DEFAULT 'training'", "schema table jobs"),
     ("ALTER TABLE jobs ADD COLUMN extra text", "schema table jobs"),
-    ("ALTER TABLE jobs DROP CONSTRAINT ck_jobs_ck_jobs_state, ADD CONSTRAINT ck_jobs_ck_jobs_state CHECK "
+    ("ALTER TABLE jobs DROP CONSTRAINT ck_jobs_state, ADD CONSTRAINT ck_jobs_state CHECK "
      "(state IN ('queued', 'running', 'succeeded', 'failed', 'cancelled', 'gone'))",
-     "schema constraint jobs ck_jobs_ck_jobs_state"),
+     "schema constraint jobs ck_jobs_state"),
     ("ALTER TABLE releases DISABLE TRIGGER releases_append_only", "schema trigger releases releases_append_only"),
     ("DROP INDEX uq_jobs_identity_live", "schema index uq_jobs_identity_live"),
     ("CREATE OR REPLACE FUNCTION skills_append_only() RETURNS trigger LANGUAGE plpgsql AS "

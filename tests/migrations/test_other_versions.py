@@ -20,7 +20,7 @@ from tests.library import cases
 from tests.migrations.test_migrations import tables
 from tests.waiting import END_S
 
-REFUSED = "This database was written by a newer version of suture-skills"
+REFUSED = "This database was made by another version of suture-skills"
 
 
 @pytest.fixture(params=backends.BACKENDS)
@@ -41,7 +41,7 @@ def test_code_that_is_older_than_the_tables_says_so_everywhere(database: Databas
     with serving(database.url) as service:
         become_newer(database)  # as a newer version does while this one runs
         said = assert_problem(service.http.get("/readyz"), 503, "not-ready")["detail"]
-        assert said == "The database has a newer version; update the code of this process."
+        assert said == "The database is of another version; use the code that made it, or name another database."
     before = rows(database)
     place = {"SKILLS_DATABASE_URL": database.url, "SKILLS_PORT": "0"}
     told = (
