@@ -37,8 +37,8 @@ from skills.compiled import check_wanted
 from skills.db.session import Database
 from skills.errors import BadSettings, SkillsError
 from skills.jobs.readiness import align_once, warm_up
-from skills.library.backup import keep_erasures, keep_up_erasures
-from skills.library.keys import refuse_without_keys
+from skills.library.operation.backup import keep_erasures, keep_up_erasures
+from skills.library.people.keys import refuse_without_keys
 from skills.remedies import Action, Remedy
 from skills.samples import load_samples
 from skills.sandbox.forked import layers_held, refuse_uncontained

@@ -95,7 +95,7 @@ def shared_fork_server(reading_server: "ForkServer") -> Iterator[object]:
     It reads a small file once: most of the tests upload the same hand-off.
     """
     from skills.api import app as application
-    from skills.library import recordings
+    from skills.library.recordings import recordings
 
     own = application.confined_reader
     read: dict[tuple[object, ...], Any] = {}
@@ -219,7 +219,7 @@ def shared_document() -> Iterator[None]:
 @pytest.fixture(scope="module", autouse=True)
 def forgotten() -> None:
     """Let no file of tests find in this process's caches the settings or the policies of another."""
-    from skills.library import integrity
+    from skills.library.operation import integrity
 
     settings.cache_clear()
     integrity.forget(integrity.remembered())

@@ -22,7 +22,18 @@ PURE = ("demonstration", "gridworld", "learning", "planning", "verification", "c
 PURE_BEFORE = ("style",)  # the one room of the theory until it was divided
 LONGEST_TEST_NAME = 70
 # A noun of the service is a module in each of these, and its class a row, a value and the schema of both.
-LAYERS = ("db", "library", "schemas", "api", "api/routes", "client", "cli", "verification")
+FOLDERS = ("people", "recordings", "policies", "plans", "comparison", "operation")  # of the library, one for each noun
+LAYERS = (
+    "db",
+    "schemas",
+    "api",
+    "api/routes",
+    "client",
+    "cli",
+    "comparison",
+    "verification",
+    *(f"library/{n}" for n in FOLDERS),
+)
 NOUNS = {
     "Demonstration": "row, schema",
     "Job": "row, schema",

@@ -28,8 +28,8 @@ from typer.testing import CliRunner
 from skills.api.app import create_app
 from skills.cli import app
 from skills.db.session import Database
-from skills.library.backup import back_up
-from skills.library.keys import create_key
+from skills.library.operation.backup import back_up
+from skills.library.people.keys import create_key
 from skills.seeds.recordings import sample_recordings
 from skills.settings import Settings, settings
 from tests import backends

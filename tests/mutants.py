@@ -356,7 +356,7 @@ GUARDS = (
          "tests/library/test_joining.py", "tests/library/test_scenes.py", "tests/library/test_release_gate.py"),
     ),
     Guard(
-        "skills/library/training.py", 6,
+        "skills/library/policies/training.py", 6,
         ("tests/library/test_release_gate.py", "tests/library/test_joining.py", "tests/library/test_library.py",
          "tests/library/test_outcomes.py"),
         ("_refusal", "_version"),
@@ -370,13 +370,13 @@ GUARDS = (
          "_clearance_gates", "_handing_over"),
     ),
     Guard(
-        "skills/library/history.py", 12,
+        "skills/library/operation/history.py", 12,
         ("tests/api/test_edited_rows.py", "tests/api/test_rollback.py", "tests/library/test_history.py"),
         ("edited_rows", "refuse_edited", "_is_signed", "covered_leaf", "is_right", "keep_signed"),
     ),
     Guard("skills/db/kept_heads.py", 8, ("tests/api/test_rollback.py", "tests/library/test_history.py")),
     Guard(
-        "skills/library/releases.py", 33,
+        "skills/library/policies/releases.py", 33,
         ("tests/library/test_release_gate.py", "tests/library/test_joining.py", "tests/library/test_scenes.py",
          "tests/api/test_policies.py::test_a_demo_in_a_frame_other_than_the_arms_base_is_not_released",
          "tests/api/test_policies.py::test_after_a_withdrawal_nothing_older_comes_back_by_itself",
@@ -387,8 +387,8 @@ GUARDS = (
         "skills/api/authorisation.py", 22,
         ("tests/api/test_authorisation.py", "tests/api/test_roles.py", "tests/api/test_seen.py"),
     ),
-    Guard("skills/library/consent.py", 18, ("tests/library/test_consent.py", "tests/api/test_uses.py")),
-    Guard("skills/library/recorded.py", 14, ("tests/library/test_recorded.py",)),
+    Guard("skills/library/people/consent.py", 18, ("tests/library/test_consent.py", "tests/api/test_uses.py")),
+    Guard("skills/library/people/recorded.py", 14, ("tests/library/test_recorded.py",)),
     Guard(
         "skills/api/policy_cache.py", 14,
         ("tests/api/test_policy_cache.py", *(f"tests/api/test_served.py::test_{name}" for name in (
@@ -399,17 +399,20 @@ GUARDS = (
         ))),
     ),
     Guard(
-        "skills/library/erasure.py", 30,
+        "skills/library/people/erasure.py", 30,
         ("tests/library/test_erasing.py", "tests/library/test_sweep.py", "tests/api/test_deleting_recordings.py",
          "tests/library/test_parsed.py", "tests/library/test_what_remains.py", "tests/library/test_recorded.py", TOLD),
     ),
-    Guard("skills/library/sweep.py", 14, ("tests/library/test_sweep.py", "tests/library/test_what_remains.py")),
     Guard(
-        "skills/library/proofs.py", 12, ("tests/api/test_signatures.py",), ("head_over", "first_head", "sign_files"),
+        "skills/library/operation/sweep.py", 14, ("tests/library/test_sweep.py", "tests/library/test_what_remains.py"),
     ),
-    Guard("skills/library/relearning.py", 16, ("tests/library/test_relearning.py",)),
     Guard(
-        "skills/library/backup.py", 20, ("tests/library/test_restoring.py", "tests/library/test_backup.py"),
+        "skills/library/operation/proofs.py", 12, ("tests/api/test_signatures.py",),
+        ("head_over", "first_head", "sign_files"),
+    ),
+    Guard("skills/library/policies/relearning.py", 16, ("tests/library/test_relearning.py",)),
+    Guard(
+        "skills/library/operation/backup.py", 20, ("tests/library/test_restoring.py", "tests/library/test_backup.py"),
         ("Erasures", "_latest", "_knows", "_later", "_listed", "_in_order", "_end_again", "_mark_again", "_here",
          "_narrow", "_both"),
     ),
@@ -426,7 +429,7 @@ GUARDS = (
 # By file and name (`Mutant.name`): why nobody can tell the mutant from the code.
 EQUIVALENT: dict[tuple[str, str], str] = {
     (
-        "skills/library/sweep.py",
+        "skills/library/operation/sweep.py",
         "_sweep_ended: return None  # parts of a batch that has not ended so long ago",
     ): "the last of the conditions of a loop, for which None ends it as False does",
     (
@@ -434,11 +437,11 @@ EQUIVALENT: dict[tuple[str, str], str] = {
         "figures_of: ticks=np.append(2.0, np.diff(trajectory.stamps_s) * trajectory.rate_hz),",
     ): "the first sample has none before it; its gate asks for 1 or more, and reports the number nowhere",
     (
-        "skills/library/erasure.py",
+        "skills/library/people/erasure.py",
         "erase_surgeon: salt = secrets.token_hex(33)",
     ): "a salt is random and kept beside its digest; one byte more recognises the same pseudonym",
     (
-        "skills/library/erasure.py",
+        "skills/library/people/erasure.py",
         "_delete_recordings: size = select(func.coalesce(func.sum(StoredRecording.size_bytes), 1))"
         ".where(StoredRecording.row.in_(rows))",
     ): "of no recording; 1 is no more than AT_ONCE_BYTES either, and there is nothing to delete",

@@ -21,7 +21,7 @@ from skills.formats import read_recording, write_mcap
 from skills.formats.lerobot.cut import find_dataset
 from skills.formats.lerobot.writer import AboutDataset, ExportedEpisode, dataset_files
 from skills.gridworld.scene import Scene
-from skills.library.catalogue import put_surgeon
+from skills.library.people.catalogue import put_surgeon
 from skills.seeds.recordings import sample_recordings
 from skills.settings import Settings, settings
 from skills.simulation import film

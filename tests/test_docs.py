@@ -156,7 +156,7 @@ def test_the_statements_of_the_pages_are_accepted() -> None:
 
 def test_the_labels_of_the_surgeons_page_are_on_the_pages_of_the_service() -> None:
     """The steps themselves are done in a browser by `tests/e2e/test_page.py`, in six clicks."""
-    pages = [*(ROOT / "skills/api/pages").rglob("*.*"), ROOT / "skills/library/tries.py"]
+    pages = [*(ROOT / "skills/api/pages").rglob("*.*"), ROOT / "skills/library/plans/tries.py"]
     shown = "\n".join(page.read_text() for page in pages if page.suffix in (".html", ".js", ".py")).lower()
     page = (ROOT / "docs/surgeon.md").read_text()
     labels = [re.sub(r" (\d+|of 0.6 mm)$", "", label) for label in re.findall(r"(?<!\*)\*([A-Z][^*]+)\*", page)]

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from skills.cli import app
 from skills.cli.shell import connect
-from skills.library.keys import LADDER
+from skills.library.people.keys import LADDER
 from skills.settings import Settings, settings
 from tests.api.service import copy_of_trained
 from tests.e2e.conftest import Service

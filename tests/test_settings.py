@@ -7,7 +7,7 @@ from pydantic import ValidationError
 
 from skills.db.session import Database
 from skills.errors import BadSettings, Conflict
-from skills.library.keys import create_key
+from skills.library.people.keys import create_key
 from skills.serving import refuse_keyless, serve
 from skills.settings import Settings, settings
 from tests import backends

@@ -38,7 +38,7 @@ def bare(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
     monkeypatch.setattr("skills.serving.working", cases.working)
-    monkeypatch.setattr("skills.library.playbacks.request_pictures", lambda *_: None)  # nobody looks at the film
+    monkeypatch.setattr("skills.library.plans.playbacks.request_pictures", lambda *_: None)  # nobody looks at the film
     monkeypatch.setattr(out, "width", WIDTH)
     place(tmp_path)
     monkeypatch.chdir(tmp_path)

@@ -26,8 +26,16 @@ from tests.library import cases
 
 PACKAGE = str(Path(skills.__file__).parent)
 COMMON = ("errors", "remedies", "settings", "logs", "arrays", "fields", "packing", "compiled", "kinematics")
-COMMON += ("db/", "client/", "api/app", "jobs/__init__", "library/catalogue.py", "library/keys.py", "library/locks.py")
-COMMON += ("library/history.py", "transparency.py")  # what is written is logged, whoever writes it
+COMMON += (
+    "db/",
+    "client/",
+    "api/app",
+    "jobs/__init__",
+    "library/people/catalogue.py",
+    "library/people/keys.py",
+    "library/operation/locks.py",
+)
+COMMON += ("library/operation/history.py", "transparency.py")  # what is written is logged, whoever writes it
 PERIODIC = ("forget_erased", "forget_gone")  # part of no request, and a slow walk has them
 STARTING = ("confined_reader", "stated_errors")  # called once at the start of the service
 

@@ -25,10 +25,10 @@ from skills.api.sessions import Sessions
 from skills.db.session import Database
 from skills.errors import NotReady, SkillsError
 from skills.jobs import Engine
-from skills.library.arm_errors import stated_errors
-from skills.library.catalogue import seed_catalogue
-from skills.library.history import keep_signed
-from skills.library.recordings import confined_reader
+from skills.library.operation.history import keep_signed
+from skills.library.people.catalogue import seed_catalogue
+from skills.library.plans.arm_errors import stated_errors
+from skills.library.recordings.recordings import confined_reader
 from skills.logs import request_id
 from skills.settings import Settings
 

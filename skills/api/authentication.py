@@ -14,7 +14,7 @@ The permissions that a route needs are declared in its decorator (`skills.api.au
 Each limit is a token bucket: it holds the amount that may be used at once and is refilled at a constant rate. The
 buckets are in memory: they are full again after a restart, and several processes behind one address would each allow
 the full rate; `skills serve` is one process. Jobs are counted in the database, for all processes together
-(`skills.library.jobs.refuse_too_many`).
+(`skills.library.operation.jobs.refuse_too_many`).
 """
 
 import asyncio
@@ -40,7 +40,8 @@ from skills.db.changes import WeightedCache
 from skills.db.history import History
 from skills.db.session import Database
 from skills.errors import Busy, NotAllowed, NotSignedIn, SkillsError, TooMany, WrongHost
-from skills.library.keys import (
+from skills.library.operation.locks import SIGN_INS
+from skills.library.people.keys import (
     SHAPE,
     Holder,
     Lasts,
@@ -52,7 +53,6 @@ from skills.library.keys import (
     note_use,
     signed_in,
 )
-from skills.library.locks import SIGN_INS
 from skills.remedies import Action, Remedy
 from skills.settings import Settings
 

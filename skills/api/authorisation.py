@@ -14,7 +14,7 @@ from fastapi.requests import HTTPConnection
 
 from skills.db.row_visibility import Only
 from skills.errors import NotAllowed, NotFound, NotSignedIn
-from skills.library.keys import LADDER
+from skills.library.people.keys import LADDER
 from skills.remedies import Action, Remedy
 from skills.settings import Role
 

@@ -23,8 +23,8 @@ from skills.db.session import Database
 from skills.errors import TooLarge, TooSlow, UnknownFormat, UnreadableRecording
 from skills.formats import BYTES, MEDIA_TYPES, media_type_of
 from skills.jobs import Engine
-from skills.library.jobs import refuse_too_many
-from skills.library.recordings import Reader, Teller, Upload, check_digest
+from skills.library.operation.jobs import refuse_too_many
+from skills.library.recordings.recordings import Reader, Teller, Upload, check_digest
 from skills.schemas.requests import DIGEST, SLUG
 from skills.settings import Settings
 

@@ -22,10 +22,13 @@ from skills.api.responses import KEPT_BYTES, Body, Encoded, answer, negotiate
 from skills.db.changes import Unasked, WeightedCache, changes_of
 from skills.db.session import Database
 from skills.errors import Busy, SkillsError, UnknownFormat
-from skills.library import consent, integrity, neighbours, policies
-from skills.library.history import is_right, sign_history
-from skills.library.proofs import first_head
-from skills.library.releases import STANDS
+from skills.library.comparison import neighbours
+from skills.library.operation import integrity
+from skills.library.operation.history import is_right, sign_history
+from skills.library.operation.proofs import first_head
+from skills.library.people import consent
+from skills.library.policies import versions
+from skills.library.policies.releases import STANDS
 
 Style = tuple[str, str, str]  # surgeon, suture type, and media type of the response, or `POSES`, or `SIGNATURE`
 
@@ -134,7 +137,7 @@ class PolicyCache:
             known = self._known.get(key)
             if known is not None and release is not None and known.release == tuple(release) and not known.over:
                 return Known(known.body, known.release, known.last_day, None)
-            served = policies.policy_of(session, surgeon, suture)
+            served = versions.policy_of(session, surgeon, suture)
             assert release is not None, "both look at the same state"
             if media_type == SIGNATURE:
                 rows = [("releases", served.release.row), ("policy_versions", served.policy.row)]
@@ -163,7 +166,7 @@ class PolicyCache:
         if not here:
             return
         with self._database.reading() as session:
-            gone = policies.missing(session, here)
+            gone = versions.missing(session, here)
         integrity.forget(gone)
         self._encoded.forget(gone)
         self._known.forget([key for key, known in self._known.items() if known.release[-1] in gone])

@@ -43,8 +43,9 @@ from skills.db.session import Database
 from skills.errors import Busy, SkillsError, TooMany
 from skills.fields import as_json
 from skills.learning.tube import CertifiedPoses, next_pose
-from skills.library import consent, releases
-from skills.library.policies import next_json, policy_of, poses_of
+from skills.library.people import consent
+from skills.library.policies import releases
+from skills.library.policies.versions import next_json, policy_of, poses_of
 from skills.schemas.requests import PoseIn
 from skills.settings import Settings
 

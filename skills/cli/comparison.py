@@ -292,7 +292,7 @@ def calibrate(
     better than chance and than the duration alone.
     """
     from skills.db.session import Database
-    from skills.library.calibrations import calibrate_on, keep, read_cohort
+    from skills.library.comparison.calibrations import calibrate_on, keep, read_cohort
     from skills.scoring.validation import check_permutations
     from skills.serving import prepare
     from skills.settings import settings
@@ -382,7 +382,7 @@ def _tell_model(about: dict[str, Any]) -> None:
     """Print the weights of each task, and which tasks are rated."""
     from rich.table import Table
 
-    from skills.library.calibrations import accepted
+    from skills.library.comparison.calibrations import accepted
     from skills.scoring.calibration import from_numbers
     from skills.scoring.features import TRIAL_KIND_OF
     from skills.scoring.validation import level_refusals, refusals

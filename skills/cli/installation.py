@@ -120,7 +120,7 @@ def seed(
 def backup(to: Annotated[Path, typer.Argument(help="A new file.", dir_okay=False)], as_json: AsJson = False) -> None:
     """Write everything that is stored into one file, while the service goes on working."""
     from skills.db.session import Database
-    from skills.library.backup import back_up
+    from skills.library.operation.backup import back_up
     from skills.settings import settings
 
     with closing(Database(settings().database_url)) as database, _telling("backing up") as told, files():
@@ -144,7 +144,7 @@ def restore(
     """
     from skills.db.session import Database
     from skills.jobs.readiness import refuse_left_over
-    from skills.library import backup as library
+    from skills.library.operation import backup as library
     from skills.settings import settings
 
     with files():
@@ -180,7 +180,7 @@ def accept_rollback(erasures: Lists = None, as_json: AsJson = False) -> None:
     """
     from skills.db.session import Database
     from skills.jobs.readiness import refuse_left_over
-    from skills.library import backup as library
+    from skills.library.operation import backup as library
     from skills.settings import settings
 
     with files():
@@ -198,7 +198,7 @@ def accept_rollback(erasures: Lists = None, as_json: AsJson = False) -> None:
 
 def _listed_in(given: list[str] | None) -> tuple[list[str], "Erasures"]:
     """Return the lists of erasures to apply, by default the file of the settings, and their union."""
-    from skills.library import backup as library
+    from skills.library.operation import backup as library
     from skills.settings import settings
 
     kept, listed = settings().erasures_file, library.NOTHING
@@ -227,7 +227,7 @@ def erasures(
 ) -> None:
     """Write the digests of everything that a restored backup must not bring back, for `skills restore --erasures`."""
     from skills.db.session import Database
-    from skills.library.backup import keep_erasures
+    from skills.library.operation.backup import keep_erasures
     from skills.settings import settings
 
     with closing(Database(settings().database_url)) as database, files():
@@ -281,9 +281,9 @@ def verify(
         _say("\n".join(lines), as_json, whole=True, checked=lines)
         return
     from skills.db.session import Database
-    from skills.library.history import keep_signed
-    from skills.library.inspection import inspect_installation
-    from skills.library.recordings import confined_reader
+    from skills.library.operation.history import keep_signed
+    from skills.library.operation.inspection import inspect_installation
+    from skills.library.recordings.recordings import confined_reader
     from skills.settings import settings
     from skills.transparency import read_notes
 
@@ -419,8 +419,8 @@ def _telling(doing: str) -> Iterator[Callable[[str], None]]:
 
 if TYPE_CHECKING:
     from skills.db.session import Database
-    from skills.library.backup import Erasures
-    from skills.library.inspection import Checked
+    from skills.library.operation.backup import Erasures
+    from skills.library.operation.inspection import Checked
 
 key_commands = typer.Typer()
 keys = typer.Typer(no_args_is_help=True, help="Keys: callers and their roles.")
@@ -441,7 +441,7 @@ def create(
 ) -> None:
     """Create a key, and print its secret, which is shown only this once."""
     from skills.db import now
-    from skills.library.keys import about_key, create_key
+    from skills.library.people.keys import about_key, create_key
 
     with _database() as database, database.writing() as session:
         expires_at = None if days is None else now() + timedelta(days=days)
@@ -458,7 +458,7 @@ def create(
 @refusing
 def list_all(as_json: AsJson = False) -> None:
     """List all keys, including those that were revoked or have expired; secrets are not stored."""
-    from skills.library.keys import about_key, list_keys
+    from skills.library.people.keys import about_key, list_keys
 
     with _database() as database, database.reading() as session:
         found = [about_key(key) for key in list_keys(session)]
@@ -471,7 +471,7 @@ def revoke(
     key: Annotated[str, typer.Argument(help="Its id: the eight characters after skills_.")], as_json: AsJson = False
 ) -> None:
     """Revoke a key: within a second every service of this installation refuses it."""
-    from skills.library.keys import about_key, revoke_key
+    from skills.library.people.keys import about_key, revoke_key
 
     with _database() as database, database.writing() as session:
         about = about_key(revoke_key(session, key, "local"))
@@ -488,7 +488,7 @@ def _database() -> Iterator["Database"]:
         database.migrate()
         yield database
         if (file := settings().erasures_file) is not None:
-            from skills.library.backup import keep_up_erasures
+            from skills.library.operation.backup import keep_up_erasures
 
             keep_up_erasures(database, file)
 

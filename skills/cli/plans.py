@@ -270,7 +270,7 @@ def stated_errors_of(errors: str | None) -> Any:
     Raises:
         BadInput: The file cannot be read, or does not have the errors of an arm.
     """
-    from skills.library.arm_errors import stated_errors
+    from skills.library.plans.arm_errors import stated_errors
 
     if errors is None or errors in ("calibrated", "uncalibrated"):
         return errors
@@ -335,7 +335,7 @@ def calibrate(
     from rich.table import Table
 
     from skills.fields import as_json as plain
-    from skills.library.arm_errors import read_measured
+    from skills.library.plans.arm_errors import read_measured
     from skills.packing import canonical
     from skills.verification.arm_errors import calibrate_arm
     from skills.verification.arm_slip import measure_slip

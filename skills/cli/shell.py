@@ -98,7 +98,7 @@ def _stored(listing: str) -> list[str]:
     if settings().server or (file != url and not Path(file).is_file()):
         return []
     from skills.db.session import Database
-    from skills.library import catalogue
+    from skills.library.people import catalogue
 
     with closing(Database(url, patience_ms=int(LIMIT_S * 1000))) as database, database.reading() as session:
         return [row.slug for row in getattr(catalogue, listing)(session, MOST, None)]
@@ -296,7 +296,7 @@ def connect(settings: "Settings", *, workers: int = 0) -> Iterator["Client"]:
     from starlette.testclient import TestClient
 
     from skills.api.app import create_app
-    from skills.library.backup import keep_up_erasures
+    from skills.library.operation.backup import keep_up_erasures
     from skills.serving import working
 
     app = create_app(settings)

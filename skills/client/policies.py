@@ -531,8 +531,8 @@ def rebuilt(about: dict[str, Any], arrays: bytes, demo: dict[str, Any]) -> "Lear
     Raises:
         Corrupt: It does not match its digest.
     """
-    from skills.library.integrity import policy_identity  # here, because the library is slow to import
-    from skills.library.policies import live_actions_of, table_name
+    from skills.library.operation.integrity import policy_identity  # here, because the library is slow to import
+    from skills.library.policies.versions import live_actions_of, table_name
 
     try:
         policy = _policy(about, arrays, demo)

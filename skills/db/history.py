@@ -8,7 +8,8 @@ Triggers note the key of every row that a transaction adds, changes or removes, 
     seal      a MAC of the entry by the signing key, which is not in the database: a process of the service wrote it
 
 When a row is deleted, its leaves lose salt, digests and key. Their entries stay, and reveal nothing that could be
-guessed, so all proofs stay valid. `skills.library.history` numbers the leaves, signs the tree and verifies all of it.
+guessed, so all proofs stay valid. `skills.library.operation.history` numbers the leaves, signs the tree and verifies
+all of it.
 
 `skills.db.logged_rows` names the logged tables and columns.
 """

@@ -181,7 +181,7 @@ class LooseChunks(Base):
 
 
 class ParsedRecording(Base):
-    """A cache of a recording's content as it was read from its bytes (`skills.library.recordings`).
+    """A cache of a recording's content as it was read from its bytes (`skills.library.recordings.recordings`).
 
     A row may be deleted at any time; the bytes are then decoded again. `version` is the `READER_VERSION` that read it;
     rows of another version are not used.

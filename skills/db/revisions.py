@@ -1,7 +1,7 @@
 """The revision of a database's tables, and the migrations that bring them to this version.
 
 Alembic runs the migrations and is imported only for them: to check that tables are up to date, as every start does,
-does not need it. A migration is in a file named after its revision, "0002_what_it_does.py"; revisions are ordered by
+does not need it. A migration is in a file that begins with its revision, as 0001 does; revisions are ordered by
 number.
 
 Until a version is released the baseline migration is edited in place, and values are stored in other forms from one

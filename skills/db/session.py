@@ -9,8 +9,8 @@ PostgreSQL there are locks of two granularities, as Gray et al. ("Granularity of
 1975) describe them: `writing()` locks the whole database, alone; `writing(names)` shares the database with others of
 its kind, and locks the named things, in an order that is the same for all. So two transactions wait for each other if
 they name the same thing, or if one of them names nothing; and none of them can deadlock with another over these locks.
-A transaction that names things may only rely on what is under these names (`skills.library.locks`), and must be short,
-because one that locks everything waits for it, and later ones wait for that.
+A transaction that names things may only rely on what is under these names (`skills.library.operation.locks`), and must
+be short, because one that locks everything waits for it, and later ones wait for that.
 
 Nothing is retried here except connecting, before any statement was sent. A caller that loses the database during a
 transaction gets `Busy`, and does not know whether its changes were committed. It may repeat the request: uploads, jobs
@@ -102,8 +102,8 @@ class Database:
         What it has changed is added to the history at its end.
 
         Args:
-            names: What it changes or relies on, see `skills.library.locks`: transactions with a common name run one
-                after the other. None: everything. No names: changes that are decided by a single statement each.
+            names: What it changes or relies on, see `skills.library.operation.locks`: transactions with a common name
+                run one after the other. None: everything. No names: changes that are decided by one statement each.
         """
         check, further = self._condition
         locks = True if names is None else tuple(sorted({lock_number(name) for name in (*names, *further)}))

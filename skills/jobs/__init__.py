@@ -31,7 +31,7 @@ from sqlalchemy.engine import Engine as Connections
 
 from skills.db.disk import make_private
 from skills.db.engines import write_ahead
-from skills.library.jobs import EXPORT, PART, PICTURES
+from skills.library.operation.jobs import EXPORT, PART, PICTURES
 from skills.settings import Settings
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ APPLICATION = "suture-skills"
 JOBS, BATCHES, ASIDE = "jobs", "batches", "aside"
 # Concurrent jobs of each queue in a worker process, so that no queue blocks another. The engine stores these limits in
 # its database for all workers, so they are constants, not settings; the load of a machine is set by its number of
-# workers. Two parts of batches: one is learnt while the next one is already there (`library.batch_work`).
+# workers. Two parts of batches: one is learnt while the next one is already there (`library.policies.batches`).
 QUEUES = {JOBS: 2, BATCHES: 2, ASIDE: 1}
 WORKFLOW = "perform_job"
 STEPS = "1"  # the engine's "application version": change it if and only if the sequence of steps in `workflows` changes

@@ -32,7 +32,7 @@ from skills.db.session import Database
 from skills.errors import SkillsError
 from skills.jobs import BATCHES, JOBS, POLLING_S, QUEUES, configuration, connect
 from skills.jobs.workflows import Leases, Perform, Watch, Work, register
-from skills.library.sweep import SteadyClock, sweep
+from skills.library.operation.sweep import SteadyClock, sweep
 from skills.logs import job_id, told
 from skills.sandbox.forked import refuse_uncontained
 from skills.settings import Settings
@@ -102,7 +102,7 @@ def run_worker(settings: Settings, *, parent: int | None = None, perform: Perfor
 
     Args:
         parent: Process id of the parent; the worker stops when that process has exited. None: no such check.
-        perform: Callback that performs a job; `skills.library.perform_job` by default.
+        perform: Callback that performs a job; `skills.library.perform.perform_job` by default.
 
     Raises:
         Conflict: The database has not been migrated to this version, or is of a newer one.
@@ -175,7 +175,7 @@ def _keep_verified(watch: Watch, every_s: float) -> None:
 def _library() -> Perform:
     """Return the library's `perform_job`, and start the warm-up for it."""
     from skills.jobs.readiness import learn_once, warm_up  # imported late, because they import everything else
-    from skills.library import perform_job
+    from skills.library.perform import perform_job
 
     warm_up(learn_once)
     return perform_job

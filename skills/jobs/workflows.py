@@ -25,9 +25,9 @@ from skills.db.service_tables import LONGEST_REASON, Executor, Job
 from skills.db.session import Database
 from skills.errors import Busy, SkillsError
 from skills.jobs import JOBS, QUEUES, STEPS, WORKFLOW, drop, tell, workflow_id
-from skills.library import locks
-from skills.library.history import NAMED, Verified, keep_signed, verify_history
-from skills.library.jobs import ACTIVE, BATCH, PART, UNSYNCHRONISED, end_part, names_of
+from skills.library.operation import locks
+from skills.library.operation.history import NAMED, Verified, keep_signed, verify_history
+from skills.library.operation.jobs import ACTIVE, BATCH, PART, UNSYNCHRONISED, end_part, names_of
 from skills.settings import Settings
 
 FIRST_PAUSE_S = 0.2

@@ -4,8 +4,8 @@
 - `given`: responses. Their parts are in `recordings`, `policies` and `comparison`, their common base and types of
   fields are here. A part that is a value of the domain is declared there, as a dataclass with `skills.fields.schema`.
 
-The library writes the JSON of a response, next to the use case of its noun (`plan_json` in `library/plans.py`). Rows
-store most of it as it was computed, so an older row is answered as it was, and not forced into today's fields.
+The library writes the JSON of a response, next to the use case of its noun (`plan_json` in `library/plans/plans.py`).
+Rows store most of it as it was computed.
 
 Lengths are mm; the frame of a position is in a field of its own.
 """

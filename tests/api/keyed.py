@@ -8,7 +8,7 @@ from typing import Any
 import httpx2 as httpx
 from fastapi.routing import iter_route_contexts
 
-from skills.library.keys import create_key
+from skills.library.people.keys import create_key
 from skills.seeds.recordings import sample_recordings
 from tests import backends
 from tests.api.service import CSV, GOAL_MM, KESTREL, MCAP, Service, serving

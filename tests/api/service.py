@@ -15,7 +15,7 @@ from skills.api.app import create_app
 from skills.client import Client, Retrying
 from skills.db import Base
 from skills.db.service_tables import Job
-from skills.library.jobs import BATCH, PART
+from skills.library.operation.jobs import BATCH, PART
 from skills.settings import Settings
 from tests import backends
 from tests.api.conformance import conformance

@@ -10,8 +10,8 @@ import pytest
 from skills.api.pages import drawings
 from skills.comparison.distances import STATES
 from skills.comparison.recognition import NUMBERS
-from skills.library.atlas import _compare, _told
-from skills.library.members import Member
+from skills.library.comparison.atlas import _compare, _told
+from skills.library.comparison.members import Member
 from skills.schemas.comparison import Atlas, LeftOutOfAtlas
 from tests import backends
 from tests.api.keyed import As, key

@@ -15,8 +15,8 @@ from sqlalchemy import text
 from skills.api.pages import drawings
 from skills.api.responses import json_of
 from skills.db.session import Database
-from skills.library.cards import card_of as card_of_version
-from skills.library.policies import find_version
+from skills.library.policies.cards import card_of as card_of_version
+from skills.library.policies.versions import find_version
 from skills.packing import sha256
 from skills.schemas.given import PolicyCard
 from tests import backends

@@ -10,7 +10,7 @@ import pytest
 
 from skills.api.authentication import REMEMBERED_S
 from skills.api.responses import NPZ
-from skills.library import consent
+from skills.library.people import consent
 from tests import backends
 from tests.api.keyed import As, copy_of_told, key
 from tests.api.service import CSV, GOAL_MM, KESTREL, POLICY, Service, assert_problem, serving

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from skills.db.changes import WeightedCache
-from skills.library import integrity
+from skills.library.operation import integrity
 from tests.api.service import CSV, KESTREL, POLICY, Service, assert_problem
 from tests.library import cases
 

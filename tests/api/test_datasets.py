@@ -13,7 +13,7 @@ from skills.client import Problem
 from skills.errors import BadInput, Conflict
 from skills.formats import write_mcap
 from skills.formats.lerobot import check_dataset
-from skills.library import datasets
+from skills.library.recordings import datasets
 from tests.api.keyed import As, key
 from tests.api.service import KESTREL, MCAP, Service, assert_problem
 from tests.library import exports

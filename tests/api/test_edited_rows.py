@@ -9,8 +9,8 @@ from sqlalchemy import text
 from skills.api.authentication import COOKIE
 from skills.db import now, rfc3339
 from skills.jobs.workflows import Leases, Watch
-from skills.library.history import sign_history
-from skills.library.keys import digest_of
+from skills.library.operation.history import sign_history
+from skills.library.people.keys import digest_of
 from tests import backends
 from tests.api.keyed import As, key
 from tests.api.service import KESTREL, POLICY, Service, assert_problem, copy_of_trained, serving

@@ -16,7 +16,7 @@ from sqlalchemy import event, text
 
 from skills.api.app import ALWAYS
 from skills.api.authentication import BAD_AT_ONCE, COOKIE, PROXY_SECRET, Bucket, Gate
-from skills.library.keys import revoke_key
+from skills.library.people.keys import revoke_key
 from tests import backends
 from tests.api.keyed import As, copy_of_told, key, routes
 from tests.api.service import CSV, KESTREL, Service, assert_problem, serving

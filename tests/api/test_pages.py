@@ -15,11 +15,11 @@ from skills.api.pages import BORROWED, assets, build, number, share, size
 from skills.db.models import Demonstration, Plan, PolicyVersion, StoredRecording
 from skills.db.service_tables import Job
 from skills.learning.policy import rollout_from
-from skills.library.catalogue import put_surgeon
-from skills.library.consent import may
-from skills.library.integrity import covered, learnt
-from skills.library.overview import MOST, matrix, moves_to_goal
-from skills.library.policies import find_version
+from skills.library.operation.integrity import covered, learnt
+from skills.library.operation.overview import MOST, matrix, moves_to_goal
+from skills.library.people.catalogue import put_surgeon
+from skills.library.people.consent import may
+from skills.library.policies.versions import find_version
 from tests import backends
 from tests.api.keyed import As, copy_of_told, key
 from tests.api.service import CSV, KESTREL, Service, assert_problem, serving

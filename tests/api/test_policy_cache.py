@@ -6,9 +6,10 @@ import pytest
 
 from skills.api.policy_cache import LONGEST, Known, _asked
 from skills.api.responses import JSON, NPZ
-from skills.library import consent, integrity
-from skills.library.catalogue import find_surgeon, put_surgeon
-from skills.library.releases import withdraw_all
+from skills.library.operation import integrity
+from skills.library.people import consent
+from skills.library.people.catalogue import find_surgeon, put_surgeon
+from skills.library.policies.releases import withdraw_all
 from tests.api.service import KESTREL, POLICY, Service
 from tests.api.test_served import read_and_kept, seeing
 

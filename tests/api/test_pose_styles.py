@@ -10,8 +10,8 @@ import pytest
 
 from skills.client import Problem
 from skills.learning.pose_style import PHASES
-from skills.library.keys import create_key
-from skills.library.policies import FORMAT
+from skills.library.people.keys import create_key
+from skills.library.policies.versions import FORMAT
 from skills.schemas.policies import NextPose, PoseStyle
 from tests import backends
 from tests.api.posed import of_both_arms, of_pose_style

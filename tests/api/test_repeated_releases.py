@@ -7,8 +7,8 @@ import pytest
 
 from skills.client import Client, Retrying
 from skills.client.connection import NotReached
-from skills.library import releases
-from skills.library.policies import list_versions
+from skills.library.policies import releases
+from skills.library.policies.versions import list_versions
 from tests.api.service import CSV, KESTREL, POLICY, Service, assert_problem
 from tests.library import cases
 from tests.library.styles import add_styles

@@ -3,7 +3,7 @@
 import pytest
 
 from skills.client import Problem
-from skills.library.catalogue import put_surgeon
+from skills.library.people.catalogue import put_surgeon
 from tests.api.service import KESTREL, Service, assert_problem
 from tests.library.styles import add_styles
 

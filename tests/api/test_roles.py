@@ -11,7 +11,7 @@ from skills.api.authentication import is_open
 from skills.api.authorisation import Needs
 from skills.db import now
 from skills.db.service_tables import Key
-from skills.library.keys import LADDER, revoke_key
+from skills.library.people.keys import LADDER, revoke_key
 from tests import backends
 from tests.api.keyed import As, key, routes
 from tests.api.service import Service, serving

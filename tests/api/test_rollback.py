@@ -12,10 +12,10 @@ from skills.db.history import CHECKPOINTS
 from skills.db.service_tables import Event
 from skills.db.session import Database
 from skills.errors import Conflict, NotReady
-from skills.library.backup import accept_rollback, back_up, erasures_of, restore
-from skills.library.catalogue import find_surgeon, put_surgeon
-from skills.library.history import Verified, keep_signed, sign_history, verify_history
-from skills.library.releases import withdraw
+from skills.library.operation.backup import accept_rollback, back_up, erasures_of, restore
+from skills.library.operation.history import Verified, keep_signed, sign_history, verify_history
+from skills.library.people.catalogue import find_surgeon, put_surgeon
+from skills.library.policies.releases import withdraw
 from skills.settings import Settings
 from skills.transparency import SigningKey, read_notes
 from tests import backends

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from skills.library.calibrations import calibrate_on, keep, read_cohort
+from skills.library.comparison.calibrations import calibrate_on, keep, read_cohort
 from skills.seeds.recordings import sample_recordings
 from tests import backends
 from tests.api.keyed import As, key

@@ -11,8 +11,8 @@ from skills.api.authentication import is_open
 from skills.db import Base
 from skills.db.row_visibility import OF_NOBODY, Only
 from skills.db.service_tables import Job
-from skills.library.jobs import to_tell
-from skills.library.keys import held, list_keys
+from skills.library.operation.jobs import to_tell
+from skills.library.people.keys import held, list_keys
 from tests.api.keyed import HERON, As, copy_of_told, key, routes
 from tests.api.service import CSV, GOAL_MM, KESTREL, Service, serving
 from tests.library import cases

@@ -18,9 +18,9 @@ from skills.api.responses import JSON, NPZ, Body, negotiate
 from skills.db.changes import APPLICATION, BOUND_S, WeightedCache
 from skills.db.session import Database
 from skills.errors import UnknownFormat
-from skills.library import integrity
-from skills.library.catalogue import put_surgeon
-from skills.library.keys import create_key
+from skills.library.operation import integrity
+from skills.library.people.catalogue import put_surgeon
+from skills.library.people.keys import create_key
 from tests import backends
 from tests.api.processes import learn_two_versions, server
 from tests.api.service import CSV, KESTREL, POLICY, Service, assert_problem, serving

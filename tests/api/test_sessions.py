@@ -30,11 +30,11 @@ from skills.api.sessions import (
     WITHDRAWN,
 )
 from skills.errors import Busy
-from skills.library.catalogue import put_surgeon
-from skills.library.erasure import erase_surgeon
-from skills.library.keys import create_key, revoke_key
-from skills.library.policies import find_version
-from skills.library.releases import release
+from skills.library.people.catalogue import put_surgeon
+from skills.library.people.erasure import erase_surgeon
+from skills.library.people.keys import create_key, revoke_key
+from skills.library.policies.releases import release
+from skills.library.policies.versions import find_version
 from tests import backends
 from tests.api.posed import of_both_arms, of_pose_style
 from tests.api.service import KESTREL, POLICY, Service, serving

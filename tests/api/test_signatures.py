@@ -6,8 +6,8 @@ from typing import Any
 import pytest
 
 from skills.errors import Busy
-from skills.library import proofs
-from skills.library.catalogue import find_surgeon, put_surgeon
+from skills.library.operation import proofs
+from skills.library.people.catalogue import find_surgeon, put_surgeon
 from skills.transparency import SigningKey
 from tests.api.service import KESTREL, POLICY, Service, assert_problem
 from tests.independent_history import check_envelope, root_in

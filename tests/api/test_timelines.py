@@ -83,7 +83,7 @@ def test_an_unknown_motion_is_not_found_also_beside_another(told: Service):
 
 
 def test_every_motion_can_be_played_beside_another_however_many_there_are(told: Service, monkeypatch):
-    monkeypatch.setattr("skills.library.timelines.MOST_CHOICES", 1)
+    monkeypatch.setattr("skills.library.recordings.timelines.MOST_CHOICES", 1)
     every = digests(told)
     demos = [one["id"] for one in told.client.demos()]
     assert len(demos) == 2

@@ -12,7 +12,7 @@ from starlette.testclient import WebSocketDenialResponse
 
 from skills.db import now, rfc3339
 from skills.formats import write_mcap
-from skills.library.history import keep_signed
+from skills.library.operation.history import keep_signed
 from tests.api.keyed import copy_of_told, routes
 from tests.api.service import GOAL_MM, KESTREL, MCAP, Service, serving
 from tests.library import cases, exports

@@ -13,7 +13,7 @@ import uvicorn
 from sqlalchemy import event
 
 from skills.db.session import Database
-from skills.library.keys import create_key, revoke_key
+from skills.library.people.keys import create_key, revoke_key
 from tests import backends
 from tests.api.service import Service
 from tests.library import cases

@@ -19,7 +19,7 @@ from skills.db import now
 from skills.db.models import Demonstration, StoredRecording, Surgeon
 from skills.db.packed import pack
 from skills.db.session import Database
-from skills.library.atlas import atlas_of
+from skills.library.comparison.atlas import atlas_of
 from skills.packing import sha256
 from tests import backends
 from tests.comparison.cohort import Cohort, cohort

@@ -34,11 +34,11 @@ from skills.jobs import Engine
 from skills.learning.certificate import Certificate, Coverage, certify
 from skills.learning.policy import LEARNER_VERSION, describe_learner, learn_tabular
 from skills.learning.q_learning import PhaseQLearning
-from skills.library.catalogue import put_surgeon, seed_catalogue
-from skills.library.demos import upload_demo
-from skills.library.jobs import PART, to_tell
-from skills.library.retraining import request_retraining
-from skills.library.training import Lesson, learn_style, lessons
+from skills.library.operation.jobs import PART, to_tell
+from skills.library.people.catalogue import put_surgeon, seed_catalogue
+from skills.library.policies.retraining import request_retraining
+from skills.library.policies.training import Lesson, learn_style, lessons
+from skills.library.recordings.demos import upload_demo
 from skills.schemas.requests import DemoIn, RetrainingIn
 from skills.serving import environment
 from skills.settings import Settings

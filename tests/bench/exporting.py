@@ -28,7 +28,7 @@ import json, sys, time
 from pathlib import Path
 from skills.db.session import Database
 from skills.jobs.workflows import Work
-from skills.library import perform_job
+from skills.library.perform import perform_job
 from skills.settings import Settings
 
 def peak_mib():

@@ -16,7 +16,7 @@ from rich.table import Table
 from sqlalchemy import text
 
 from skills.db.session import Database
-from skills.library.history import sign_history
+from skills.library.operation.history import sign_history
 from tests import backends
 from tests.bench.writers import synced
 from tests.library import cases

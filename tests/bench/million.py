@@ -21,9 +21,9 @@ from starlette.testclient import TestClient
 from skills.db import Base
 from skills.db.packed import Packed
 from skills.db.session import Database
-from skills.library.erasure import erase_surgeon
-from skills.library.retraining import request_retraining
-from skills.library.sweep import sweep_erased
+from skills.library.operation.sweep import sweep_erased
+from skills.library.people.erasure import erase_surgeon
+from skills.library.policies.retraining import request_retraining
 from skills.schemas.requests import RetrainingIn
 from tests import backends
 from tests.api.service import Service

@@ -20,8 +20,8 @@ from skills.db import now
 from skills.db.models import Demonstration, MeasuredShape, StoredRecording, Surgeon
 from skills.db.packed import pack
 from skills.db.session import Database
-from skills.library.catalogue import put_surgeon
-from skills.library.neighbours import nearest_to
+from skills.library.comparison.neighbours import nearest_to
+from skills.library.people.catalogue import put_surgeon
 from skills.packing import sha256
 from tests import backends
 from tests.bench import recognition

@@ -10,7 +10,7 @@ from rich.table import Table
 
 from skills.arrays import xyz
 from skills.gridworld.scene import Scene, Tissue
-from skills.library.plans import trajectory_of
+from skills.library.plans.plans import trajectory_of
 from skills.planning.handoff import HOLDING_RAD, PsmM
 from skills.planning.plan import SuturePoint, stack
 from skills.planning.trajectory import Trajectory, joint_ratios, time_parametrise

@@ -19,11 +19,14 @@ from skills.db.models import Demonstration
 from skills.db.service_tables import Job
 from skills.db.session import Database
 from skills.jobs.workflows import Leases, Watch
-from skills.library import catalogue, demos, jobs, policies
-from skills.library.jobs import BATCH
-from skills.library.overview import condition_of, count_jobs
-from skills.library.retraining import choose_styles, list_styles
-from skills.library.training import request_training
+from skills.library.operation import jobs
+from skills.library.operation.jobs import BATCH
+from skills.library.operation.overview import condition_of, count_jobs
+from skills.library.people import catalogue
+from skills.library.policies import versions
+from skills.library.policies.retraining import choose_styles, list_styles
+from skills.library.policies.training import request_training
+from skills.library.recordings import demos
 from skills.schemas.requests import RetrainingIn, TrainingIn
 from tests import backends
 from tests.api.service import serving
@@ -137,7 +140,7 @@ def newest(session: Session, style: Style) -> Demonstration | None:
 
 
 def encoded(session: Session, style: Style, media_type: str) -> object:
-    served = policies.policy_of(session, *style)
+    served = versions.policy_of(session, *style)
     return Encoded().policy(served.policy, served.release, media_type)
 
 
@@ -156,9 +159,9 @@ CALLS: dict[str, Call] = {
     "demonstrations of a style": lambda s, style: demos.list_demos(s, PAGE, None, *style),
     "the newest of a style": newest,
     "a demonstration by its digest": lambda s, style: demos.find_demo(s, newest(s, style).sha256),
-    "what is served, the first page": lambda s, _: policies.list_served(s, PAGE, None),
-    "what is served, the last page": lambda s, _: policies.list_served(s, PAGE, FEW * SUTURES - PAGE),
-    "a style's versions": lambda s, style: policies.list_versions(s, *style, PAGE),
+    "what is served, the first page": lambda s, _: versions.list_served(s, PAGE, None),
+    "what is served, the last page": lambda s, _: versions.list_served(s, PAGE, FEW * SUTURES - PAGE),
+    "a style's versions": lambda s, style: versions.list_versions(s, *style, PAGE),
     "a released policy, read and verified": lambda s, style: encoded(s, style, JSON),
     "its arrays": lambda s, style: encoded(s, style, NPZ),
     "a training asked for": lambda s, style: request_training(

@@ -20,8 +20,8 @@ from rich.table import Table
 
 from skills.db.session import Database
 from skills.learning.tube import next_pose
-from skills.library import releases
-from skills.library.policies import policy_of, poses_of
+from skills.library.policies import releases
+from skills.library.policies.versions import policy_of, poses_of
 from skills.serving import environment
 from skills.settings import Settings
 from tests import backends

@@ -18,7 +18,7 @@ from rich.table import Table
 from sqlalchemy import text
 
 from skills.db.session import Database
-from skills.library.history import sign_history
+from skills.library.operation.history import sign_history
 from skills.serving import environment
 from skills.settings import Settings
 from tests import backends

@@ -19,8 +19,8 @@ from sqlalchemy import event, text
 from sqlalchemy.orm import Session
 
 from skills.db.session import Database
-from skills.library.recordings import store_recording, tell_upload
-from skills.library.retraining import request_retraining
+from skills.library.policies.retraining import request_retraining
+from skills.library.recordings.recordings import store_recording, tell_upload
 from skills.schemas.requests import RetrainingIn
 from tests import backends
 from tests.library import cases, hospital
@@ -152,7 +152,7 @@ def upload_on(database: Database, number: int) -> Iterator[None]:
 
 def store_as(told: Any) -> Callable[..., Any]:
     """Return `store_recording` with a reader that returns a known content."""
-    from skills.library import recordings
+    from skills.library.recordings import recordings
 
     recordings._check_type = lambda _upload: None  # type: ignore[assignment]
     return lambda database, sent, actor: store_recording(database, sent, actor, lambda _file, **_how: told)

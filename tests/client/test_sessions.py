@@ -23,7 +23,7 @@ from skills.client import AsyncClient, Client, NotReached, NotUnderstood, Proble
 from skills.client.sessions import LOST
 from skills.errors import BadInput, BadSettings
 from skills.learning.tube_certificate import TubeCertificate, TubeLimits
-from skills.library.keys import create_key
+from skills.library.people.keys import create_key
 from skills.schemas.given import NextPose, SessionOpening, SessionPose
 from skills.schemas.policies import SessionLimits
 from tests import backends

@@ -16,7 +16,7 @@ from skills.db import now
 from skills.db.changes import APPLICATION, BOUND_S, Changes, Unasked, announce, changes_of
 from skills.db.service_tables import Executor, record_event
 from skills.db.session import Database
-from skills.library.releases import STANDS
+from skills.library.policies.releases import STANDS
 from tests import backends
 from tests.waiting import END_S, crowded
 

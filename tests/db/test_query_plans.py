@@ -12,8 +12,11 @@ from sqlalchemy.orm import Session
 
 from skills.db.session import Database
 from skills.jobs.workflows import Leases, Watch
-from skills.library import batch_work, catalogue, demos, jobs, policies, proposals, retraining, training
-from skills.library.overview import count_jobs, matrix, newest_job, released_styles
+from skills.library.operation import jobs
+from skills.library.operation.overview import count_jobs, matrix, newest_job, released_styles
+from skills.library.people import catalogue
+from skills.library.policies import batches, retraining, training, versions
+from skills.library.recordings import demos, proposals
 from skills.schemas.requests import RetrainingIn, TrainingIn
 from tests import backends
 from tests.library import hospital
@@ -47,7 +50,7 @@ def newest(session: Session) -> Any:
 
 
 def served(session: Session) -> Any:
-    found = policies.policy_of(session, *STYLE)
+    found = versions.policy_of(session, *STYLE)
     return found.policy.learnt, found.policy.covered, found.policy.demonstration
 
 
@@ -70,16 +73,16 @@ HOT: dict[str, Callable[[Session], object]] = {
     "proposals": lambda s: proposals.list_proposals(s, 10, None),
     "proposals, further on": lambda s: proposals.list_proposals(s, 10, 20_000, state="rejected"),
     "a demonstration": lambda s: demos.find_demo(s, newest(s).sha256),
-    "what is served": lambda s: policies.list_served(s, 10, 20),
+    "what is served": lambda s: versions.list_served(s, 10, 20),
     "a released policy": served,
-    "a style's versions": lambda s: policies.list_versions(s, *STYLE, 10, 5),
-    "a version": lambda s: policies.find_version(s, *STYLE, 1),
-    "a version by its digest": lambda s: policies.find_by_digest(s, policies.policy_of(s, *STYLE).policy.sha256),
+    "a style's versions": lambda s: versions.list_versions(s, *STYLE, 10, 5),
+    "a version": lambda s: versions.find_version(s, *STYLE, 1),
+    "a version by its digest": lambda s: versions.find_by_digest(s, versions.policy_of(s, *STYLE).policy.sha256),
     "a training": lambda s: training.request_training(s, TrainingIn(surgeon=STYLE[0], suture=STYLE[1]), "test"),
     "a surgeon's stale styles": lambda s: retraining.choose_styles(s, RetrainingIn(surgeon=STYLE[0], only_stale=True)),
     "where what was learnt stands": lambda s: s.execute(training.STANDING, {"demonstrations": [1, 2, 3]}).all(),
     "what is known already": lambda s: s.execute(training.KNOWN, {"digests": ["0" * 64, "1" * 64]}).all(),
-    "what some styles serve": lambda s: s.execute(batch_work.SERVED, {"demonstrations": [1, 2, 3]}).all(),
+    "what some styles serve": lambda s: s.execute(batches.SERVED, {"demonstrations": [1, 2, 3]}).all(),
     "jobs": lambda s: jobs.list_jobs(s, 10, 50, None),
     "jobs of a state": lambda s: jobs.list_jobs(s, 10, 50, "failed"),
     "jobs of a kind": lambda s: jobs.list_jobs(s, 10, 50, None, "playback"),
@@ -104,7 +107,7 @@ def test_what_is_asked_often_is_answered_by_an_index(filled: Database, what: str
 
 
 PAGES: dict[str, Callable[[Session, int], object]] = {
-    "what is served": lambda s, most: [policies.summary_json(one) for one in policies.list_served(s, most, 0)],
+    "what is served": lambda s, most: [versions.summary_json(one) for one in versions.list_served(s, most, 0)],
     "the styles": lambda s, most: matrix(s, limit=most),
     "the styles to plan with": released_styles,
 }

@@ -22,7 +22,7 @@ from skills.db.models import (
     StoredPlayback,
 )
 from skills.db.session import Database
-from skills.library.keys import Lasts, create_key, sign_in
+from skills.library.people.keys import Lasts, create_key, sign_in
 from skills.verification.playback import Pictures
 from tests import backends
 from tests.db.test_packed import PLAYBACK

@@ -13,7 +13,7 @@ from skills.gridworld.reward import sparse_reward
 from skills.learning.certificate import certify
 from skills.learning.networks import DDPG, DQN, TRPO
 from skills.learning.policy import rollout
-from skills.library.integrity import learnt
+from skills.library.operation.integrity import learnt
 from tests.api.conftest import service, trained  # noqa: F401 - fixtures
 from tests.api.service import KESTREL, POLICY, Service
 

@@ -22,11 +22,11 @@ from skills.learning.evaluation import SpaceRollouts
 from skills.learning.networks import DDPG, DQN, Deep, Network, network_q
 from skills.learning.policy import LEARNER_VERSION, Policy, describe_learner, rollout
 from skills.learning.q_learning import Training
-from skills.library import releases
-from skills.library.demos import find_demo
-from skills.library.inspection import inspect_installation
-from skills.library.integrity import learnt
-from skills.library.training import certified, lessons, store_style
+from skills.library.operation.inspection import inspect_installation
+from skills.library.operation.integrity import learnt
+from skills.library.policies import releases
+from skills.library.policies.training import certified, lessons, store_style
+from skills.library.recordings.demos import find_demo
 from tests.api.conftest import service  # noqa: F401 - a fixture
 from tests.api.service import CSV, GOAL_MM, KESTREL, POLICY, Service
 from tests.deep.networks import always, table_as_network

@@ -17,7 +17,7 @@ from sqlalchemy import text
 
 from skills.api.dependencies import SPOOL_BYTES
 from skills.db.session import Database
-from skills.library.erasure import erase_demo
+from skills.library.people.erasure import erase_demo
 from tests import backends
 from tests.e2e.conftest import Service
 from tests.e2e.test_keys_served import wait_until_alive

@@ -13,7 +13,7 @@ import pytest
 from skills.api.authentication import REMEMBERED_S
 from skills.client import Client
 from skills.db.session import Database
-from skills.library.keys import create_key, revoke_key
+from skills.library.people.keys import create_key, revoke_key
 from tests import backends
 from tests.api.service import serving
 from tests.e2e.conftest import Service, running

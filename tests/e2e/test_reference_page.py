@@ -9,7 +9,7 @@ from playwright.sync_api import Browser, Locator, Route, expect
 
 from skills.client import Client
 from skills.db.session import Database
-from skills.library.keys import create_key
+from skills.library.people.keys import create_key
 from tests.e2e.browsers import Watched, visiting
 from tests.e2e.conftest import Service, running
 from tests.waiting import END_S

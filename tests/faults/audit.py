@@ -25,8 +25,8 @@ from skills.db.models import Demonstration, PolicyVersion, Release, StoredRecord
 from skills.db.service_tables import Event, Job
 from skills.db.session import Database
 from skills.errors import SkillsError
-from skills.library.backup import restore
-from skills.library.inspection import inspect_installation
+from skills.library.operation.backup import restore
+from skills.library.operation.inspection import inspect_installation
 from skills.packing import sha256
 from tests.faults.ledger import Ask, Ledger, Read, Write
 from tests.library import cases

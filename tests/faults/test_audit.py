@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skills.library.backup import back_up
+from skills.library.operation.backup import back_up
 from skills.packing import sha256
 from tests.api.service import CSV, KESTREL, POLICY, Service, copy_of_trained, serving
 from tests.faults.audit import Verdict, audit, wrong_reads

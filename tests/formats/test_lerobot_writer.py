@@ -26,7 +26,7 @@ from skills.formats.lerobot.writer import (
     action_rule,
     dataset_files,
 )
-from skills.library.datasets import splits_by_surgeon
+from skills.library.recordings.datasets import splits_by_surgeon
 from tests.formats import lerobots
 
 ABOUT = AboutDataset("Sutures", ("PSM1", "PSM2"), licence="CC-BY-4.0", consent="Export, until 2030.")

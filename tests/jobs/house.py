@@ -13,7 +13,7 @@ from sqlalchemy import ColumnElement, func, select, text
 from skills.db.service_tables import Executor, Job
 from skills.db.session import Database
 from skills.jobs import Engine
-from skills.library.inspection import inspect_installation
+from skills.library.operation.inspection import inspect_installation
 from skills.serving import environment
 from skills.settings import Settings
 from tests.backends import blank, drop

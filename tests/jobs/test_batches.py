@@ -18,7 +18,7 @@ from skills.db.models import PolicyVersion
 from skills.db.service_tables import Event, Executor, Job
 from skills.db.session import Database
 from skills.learning.q_learning import CellQLearning
-from skills.library import jobs
+from skills.library.operation import jobs
 from skills.serving import environment
 from skills.settings import Settings
 from tests import backends

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from skills.jobs import JOBS, QUEUES
-from skills.library.jobs import PART
+from skills.library.operation.jobs import PART
 from tests.jobs.house import House
 from tests.waiting import crowded, until
 

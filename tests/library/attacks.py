@@ -27,7 +27,7 @@ from skills.db.history import (
 )
 from skills.db.logged_rows import CACHES, commitment_to, digests_of, logged
 from skills.db.session import Database
-from skills.library.history import Finding, Verified, verify_history
+from skills.library.operation.history import Finding, Verified, verify_history
 from skills.packing import canonical
 from skills.transparency import Note, Tree, leaf_hash, read_notes
 

@@ -19,13 +19,13 @@ from skills.formats import write_mcap
 from skills.jobs.workflows import Work
 from skills.learning.policy import describe_learner
 from skills.learning.q_learning import CellQLearning
-from skills.library import perform_job
-from skills.library.catalogue import put_surgeon, seed_catalogue
-from skills.library.demos import upload_demo
-from skills.library.jobs import BATCH
-from skills.library.plans import plan_sutures
-from skills.library.recordings import Upload
-from skills.library.training import request_training
+from skills.library.operation.jobs import BATCH
+from skills.library.people.catalogue import put_surgeon, seed_catalogue
+from skills.library.perform import perform_job
+from skills.library.plans.plans import plan_sutures
+from skills.library.policies.training import request_training
+from skills.library.recordings.demos import upload_demo
+from skills.library.recordings.recordings import Upload
 from skills.packing import sha256
 from skills.schemas.plans import PlanIn
 from skills.schemas.requests import DemoIn, TrainingIn

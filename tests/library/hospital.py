@@ -26,10 +26,10 @@ from skills.db.models import (
 from skills.db.packed import Packed, digest
 from skills.db.service_tables import Event, Job, StyleToRetrain
 from skills.db.session import Database
-from skills.library.catalogue import put_suture_type
-from skills.library.integrity import demo_identity
-from skills.library.jobs import BATCH, PART, identity_of
-from skills.library.retraining import MOST_IN_A_PART
+from skills.library.operation.integrity import demo_identity
+from skills.library.operation.jobs import BATCH, PART, identity_of
+from skills.library.people.catalogue import put_suture_type
+from skills.library.policies.retraining import MOST_IN_A_PART
 from skills.packing import canonical, sha256
 from tests.library import cases
 

@@ -9,12 +9,12 @@ from skills.db.service_tables import Job, StyleToRetrain
 from skills.db.session import Database
 from skills.formats.reader_process import read_told
 from skills.learning.policy import describe_learner
-from skills.library import demos
-from skills.library.catalogue import put_surgeon, seed_catalogue
-from skills.library.demos import Made, make_demo
-from skills.library.jobs import PART
-from skills.library.recordings import entry_of, find_recording, keep
-from skills.library.retraining import request_retraining
+from skills.library.operation.jobs import PART
+from skills.library.people.catalogue import put_surgeon, seed_catalogue
+from skills.library.policies.retraining import request_retraining
+from skills.library.recordings import demos
+from skills.library.recordings.demos import Made, make_demo
+from skills.library.recordings.recordings import entry_of, find_recording, keep
 from skills.schemas.requests import DemoIn, RetrainingIn
 from tests.library import cases
 
@@ -94,7 +94,7 @@ def damage(database: Database, demonstration: int) -> None:
         )
 
 
-def versions(database: Database) -> int:
+def count_versions(database: Database) -> int:
     """Count the policy versions."""
     return counted(database, PolicyVersion)
 

@@ -15,9 +15,9 @@ from skills.db.history import LEAVES, latest_leaves
 from skills.db.logged_rows import ADDED, Logged, logged, united
 from skills.db.revisions import revisions, upgrade
 from skills.db.session import Database
-from skills.library.backup import NOTHING, back_up, restore
-from skills.library.history import newest_checkpoint, sign_history
-from skills.library.proofs import head_over, served_json
+from skills.library.operation.backup import NOTHING, back_up, restore
+from skills.library.operation.history import newest_checkpoint, sign_history
+from skills.library.operation.proofs import head_over, served_json
 from tests import backends
 from tests.db.test_tables import FROZEN, WITHDRAWABLE, fill
 from tests.independent_history import check_disclosed

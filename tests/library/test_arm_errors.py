@@ -15,7 +15,7 @@ from skills.errors import BadInput, BadRecording, NoUsableTopic
 from skills.formats import bag_writer as messages
 from skills.formats.bag_writer import Message, write_messages
 from skills.kinematics import forward, quaternion_of
-from skills.library.arm_errors import read_measured, stated_errors
+from skills.library.plans.arm_errors import read_measured, stated_errors
 from skills.verification.arm_errors import SIZES, UNCALIBRATED, MeasuredArm, calibrate_arm, rotation_of
 from skills.verification.arm_slip import measure_slip
 from tests.formats.bags import sample_folder

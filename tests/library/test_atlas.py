@@ -15,12 +15,12 @@ from skills.db.row_visibility import Only
 from skills.db.session import Database
 from skills.errors import BadInput, BadPath, Conflict, NotFound
 from skills.learning.evaluation import dtw
-from skills.library import atlas
-from skills.library.atlas import atlas_of
-from skills.library.catalogue import put_surgeon
-from skills.library.demos import withdraw_demo
-from skills.library.erasure import erase_demo, erase_surgeon
-from skills.library.releases import withdraw
+from skills.library.comparison import atlas
+from skills.library.comparison.atlas import atlas_of
+from skills.library.people.catalogue import put_surgeon
+from skills.library.people.erasure import erase_demo, erase_surgeon
+from skills.library.policies.releases import withdraw
+from skills.library.recordings.demos import withdraw_demo
 from tests import backends
 from tests.comparison.cohort import cohort
 from tests.library import cases, cohorts

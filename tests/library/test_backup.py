@@ -14,7 +14,7 @@ from skills.db.models import Demonstration, Erasure, Surgeon
 from skills.db.service_tables import Executor, Job
 from skills.db.session import Database
 from skills.errors import Conflict, Corrupt, Erased
-from skills.library.backup import (
+from skills.library.operation.backup import (
     Erasures,
     back_up,
     erasures_of,
@@ -22,11 +22,11 @@ from skills.library.backup import (
     read_erasures,
     restore,
 )
-from skills.library.catalogue import put_surgeon
-from skills.library.demos import withdraw_demo
-from skills.library.erasure import erase_demo, erase_surgeon
-from skills.library.inspection import inspect_installation
-from skills.library.policies import policy_of
+from skills.library.operation.inspection import inspect_installation
+from skills.library.people.catalogue import put_surgeon
+from skills.library.people.erasure import erase_demo, erase_surgeon
+from skills.library.policies.versions import policy_of
+from skills.library.recordings.demos import withdraw_demo
 from tests import backends
 from tests.api.service import Service
 from tests.jobs.house import House

@@ -9,22 +9,23 @@ from sqlalchemy import func, select
 from skills.db.service_tables import Event
 from skills.db.session import Database
 from skills.jobs.workflows import Work, fail, start
-from skills.library import batch_work, perform_job, retraining
-from skills.library.catalogue import put_surgeon
-from skills.library.demos import withdraw_demo
-from skills.library.training import learn_style
+from skills.library.people.catalogue import put_surgeon
+from skills.library.perform import perform_job
+from skills.library.policies import batches, retraining
+from skills.library.policies.training import learn_style
+from skills.library.recordings.demos import withdraw_demo
 from skills.settings import Settings
 from tests.library import cases
 from tests.library.styles import (
     NO_CONSENT,
     add_styles,
     ask_retraining,
+    count_versions,
     damage,
     look,
     parts_of,
     states_of,
     styles_of,
-    versions,
 )
 
 # ---- one bad style
@@ -44,7 +45,7 @@ def test_one_bad_style_of_eight_fails_with_its_reason_and_seven_are_done(databas
     assert (batch.state, batch.progress) == ("failed", 1.0)
     assert batch.error.startswith("1 of 8 styles failed")
     assert batch.result == {"queued": 0, "done": 7, "failed": 1, "cancelled": 0}
-    assert versions(database) == 7
+    assert count_versions(database) == 7
 
 
 def test_styles_without_consent_or_valid_demo_fail_and_the_others_continue(database: Database):
@@ -83,7 +84,7 @@ def test_an_internal_failure_is_retried_and_then_only_its_style_gives_up(
             raise RuntimeError("/srv/secret")
         return learn_style(lesson, request, settings)
 
-    monkeypatch.setattr(batch_work, "learn_style", learn)
+    monkeypatch.setattr(batches, "learn_style", learn)
     work = Work(database, Settings(database_url=database.url), perform_job)
     assert not work.try_once(part.row, 1, 0)
     assert states_of(database, job) == ["done", "queued", "done", "done", "done"]
@@ -114,8 +115,8 @@ def test_a_style_at_which_its_worker_died_comes_last_the_next_time(database: Dat
             raise Death
         return learn_style(lesson, request, settings)
 
-    monkeypatch.setattr(batch_work, "learn_style", learn)
-    monkeypatch.setattr(batch_work, "TOGETHER_S", 60.0)  # on a slow machine too
+    monkeypatch.setattr(batches, "learn_style", learn)
+    monkeypatch.setattr(batches, "TOGETHER_S", 60.0)  # on a slow machine too
     for done in (0, 1, 3):  # at first it rolled back the others in its transaction
         assert start(database, part.row, 1)
         with pytest.raises(Death):
@@ -140,16 +141,16 @@ def test_a_style_refused_at_commit_does_not_roll_back_the_others(database: Datab
                 withdraw_demo(session, withdrawn, "test")
         return learn_style(lesson, request, settings)
 
-    monkeypatch.setattr(batch_work, "learn_style", learn)
+    monkeypatch.setattr(batches, "learn_style", learn)
     cases.work(database, part)
     assert states_of(database, job) == ["done", "failed", "done"]
     assert "withdrawn while the training used it" in styles_of(database, job)[1].reason
-    assert versions(database) == 2
+    assert count_versions(database) == 2
 
 
 def test_what_takes_long_is_committed_alone(database: Database, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(retraining, "FEWEST_PARTS", 1)
-    monkeypatch.setattr(batch_work, "TOGETHER_S", 0.0)
+    monkeypatch.setattr(batches, "TOGETHER_S", 0.0)
     add_styles(database, 3)
     job = ask_retraining(database)
     (part,) = parts_of(database, job)
@@ -159,7 +160,7 @@ def test_what_takes_long_is_committed_alone(database: Database, monkeypatch: pyt
         seen.append((states_of(database, job).count("done"), look(database, job).progress))
         return learn_style(lesson, request, settings)
 
-    monkeypatch.setattr(batch_work, "learn_style", learn)
+    monkeypatch.setattr(batches, "learn_style", learn)
     cases.work(database, part)
     assert [done for done, _ in seen] == [0, 1, 2]
     assert [round(progress, 6) for _, progress in seen] == [0.0, round(1 / 3, 6), round(2 / 3, 6)]
@@ -179,7 +180,7 @@ def test_a_worker_that_was_handed_two_parts_learns_one_after_the_other(
         time.sleep(0.02)  # long enough for the other thread to intervene
         return learn_style(lesson, request, settings)
 
-    monkeypatch.setattr(batch_work, "learn_style", learn)
+    monkeypatch.setattr(batches, "learn_style", learn)
     both = [Thread(target=cases.work, args=(database, part)) for part in parts_of(database, job)]
     for thread in both:
         thread.start()
@@ -205,15 +206,15 @@ def test_a_late_result_changes_nothing_and_its_worker_does_what_is_left(
         if not others:  # meanwhile another worker takes the part over, and finishes it
             others.append(lesson.row)
             with monkeypatch.context() as meanwhile:
-                meanwhile.setattr(batch_work, "learn_style", learn_style)
+                meanwhile.setattr(batches, "learn_style", learn_style)
                 perform_job(database, part.row, 1, Settings(database_url=database.url))
             ended.append(look(database, job).ended_at)
         return learn_style(lesson, request, settings)
 
-    monkeypatch.setattr(batch_work, "learn_style", learn)
+    monkeypatch.setattr(batches, "learn_style", learn)
     cases.work(database, part)
     assert states_of(database, job) == ["done"] * 3
-    assert (versions(database), look(database, job).state) == (3, "succeeded")
+    assert (count_versions(database), look(database, job).state) == (3, "succeeded")
     assert [look(database, job).ended_at] == ended
     with database.reading() as session:
         finished = select(func.count()).where(Event.action == "finish", Event.object_id == job.id)

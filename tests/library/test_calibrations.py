@@ -14,7 +14,7 @@ from sqlalchemy.exc import DatabaseError
 from skills.db.models import StoredCalibration
 from skills.db.session import Database
 from skills.errors import BadInput, Corrupt, NotAQuaternion, NotFinite, UnreadableRecording
-from skills.library.calibrations import (
+from skills.library.comparison.calibrations import (
     VERSION,
     Rated,
     accepted,
@@ -24,7 +24,7 @@ from skills.library.calibrations import (
     read_calibration,
     read_cohort,
 )
-from skills.library.inspection import inspect_installation
+from skills.library.operation.inspection import inspect_installation
 from skills.packing import canonical, sha256
 from skills.scoring.calibration import as_numbers, held_out, rank_correlations
 from skills.scoring.validation import refusals, shuffled

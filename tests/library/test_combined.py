@@ -13,17 +13,17 @@ from skills.db.session import Database
 from skills.errors import BadInput, Conflict, NotFound
 from skills.formats.reader_process import read_told
 from skills.learning.evaluation import dtw
-from skills.library import training
-from skills.library.backup import back_up, restore
-from skills.library.cards import card_of
-from skills.library.demos import upload_demo, withdraw_demo
-from skills.library.erasure import erase_demo, erase_surgeon
-from skills.library.inspection import inspect_installation, inspect_policies
-from skills.library.integrity import learnt
-from skills.library.overview import matrix
-from skills.library.plans import hand_of, trajectory_of
-from skills.library.policies import find_by_digest, learnt_from, path_of
-from skills.library.releases import release, standing
+from skills.library.operation.backup import back_up, restore
+from skills.library.operation.inspection import inspect_installation, inspect_policies
+from skills.library.operation.integrity import learnt
+from skills.library.operation.overview import matrix
+from skills.library.people.erasure import erase_demo, erase_surgeon
+from skills.library.plans.plans import hand_of, trajectory_of
+from skills.library.policies import training
+from skills.library.policies.cards import card_of
+from skills.library.policies.releases import release, standing
+from skills.library.policies.versions import find_by_digest, learnt_from, path_of
+from skills.library.recordings.demos import upload_demo, withdraw_demo
 from skills.schemas.requests import DemoIn
 from skills.settings import Settings
 from skills.verification.asked import asked_of

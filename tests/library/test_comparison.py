@@ -6,8 +6,8 @@ import pytest
 from skills.db.models import Demonstration, Plan
 from skills.db.session import Database
 from skills.errors import BadPlan, NotFound
-from skills.library.plans import find_plan, trajectory_of
-from skills.library.replay import compare_with_plan
+from skills.library.plans.plans import find_plan, trajectory_of
+from skills.library.plans.replay import compare_with_plan
 from tests.library import cases
 
 

@@ -13,13 +13,17 @@ from skills.db.service_tables import Event
 from skills.db.session import Database
 from skills.errors import Conflict, NotFound, SkillsError
 from skills.formats.reader_process import read_told
-from skills.library import atlas, batch_work, consent, overview, plans, policies, releases, retraining, scores, training
-from skills.library.catalogue import find_surgeon, put_surgeon
-from skills.library.consent import covered, may
+from skills.library.comparison import atlas, scores
+from skills.library.operation import overview
+from skills.library.people import consent
+from skills.library.people.catalogue import find_surgeon, put_surgeon
+from skills.library.people.consent import covered, may
+from skills.library.plans import plans
+from skills.library.policies import batches, releases, retraining, training, versions
 from skills.schemas.requests import ScoreIn
 from tests.library import cases
 from tests.library.cases import SUTURE
-from tests.library.styles import add_styles, ask_retraining, counted, parts_of, states_of, styles_of, versions
+from tests.library.styles import add_styles, ask_retraining, count_versions, counted, parts_of, states_of, styles_of
 
 ALL = {"uses": ["training", "export", "atlas"], "until": None}
 NO_TRAINING = {"uses": ["export", "atlas"], "until": None}
@@ -42,14 +46,14 @@ def agree(database: Database, to: dict[str, Any] | None, surgeon: str = "kestrel
 def served(database: Database) -> int | None:
     """Return the version that kestrel's style serves, None if there is none; all lists of served styles must agree."""
     with database.reading() as session:
-        listed = [one.policy.version for one in policies.list_served(session, 10, None)]
+        listed = [one.policy.version for one in versions.list_served(session, 10, None)]
         assert [one.version for one in overview.released_styles(session)] == listed
         assert overview.matrix(session).counts["released styles"] == len(listed)
         shown = overview.whole_style(session, "kestrel", SUTURE)
         assert (shown.style.state == "released", shown.served is not None) == (bool(listed), bool(listed))
         assert len(overview.matrix(session, state="released").rows) == len(listed)
         try:
-            version = policies.policy_of(session, "kestrel", SUTURE).policy.version
+            version = versions.policy_of(session, "kestrel", SUTURE).policy.version
         except NotFound:
             assert listed == []
             return None
@@ -81,7 +85,7 @@ def test_consent_withdrawn_during_training_stores_and_releases_nothing(
     ended = cases.work(database, job)
     assert ended.state == "failed"
     assert "does not cover training" in ended.error
-    assert (versions(database), counted(database, Release)) == (0, 0)
+    assert (count_versions(database), counted(database, Release)) == (0, 0)
 
 
 def test_in_a_batch_consent_withdrawn_after_its_part_began_is_seen(database: Database, monkeypatch: pytest.MonkeyPatch):
@@ -91,7 +95,7 @@ def test_in_a_batch_consent_withdrawn_after_its_part_began_is_seen(database: Dat
     job = ask_retraining(database, release=True)
     (part,) = parts_of(database, job)
     learnt: list[str] = []
-    learn = batch_work.learn_style
+    learn = batches.learn_style
 
     def withdrawing(lesson: Any, *given: Any) -> Any:
         if not learnt:
@@ -99,13 +103,13 @@ def test_in_a_batch_consent_withdrawn_after_its_part_began_is_seen(database: Dat
         learnt.append(lesson.surgeon.slug)
         return learn(lesson, *given)
 
-    monkeypatch.setattr(batch_work, "learn_style", withdrawing)
-    monkeypatch.setattr(batch_work, "TOGETHER_S", 60.0)  # on a slow machine too
+    monkeypatch.setattr(batches, "learn_style", withdrawing)
+    monkeypatch.setattr(batches, "TOGETHER_S", 60.0)  # on a slow machine too
     cases.work(database, part)
     assert states_of(database, job) == ["done"] * first + ["failed"] * (14 - first)
     assert all("'surgeon-1' does not cover training" in one.reason for one in styles_of(database, job)[first:])
     assert 0 < first < 14
-    assert (versions(database), counted(database, Release)) == (first, first)
+    assert (count_versions(database), counted(database, Release)) == (first, first)
 
 
 def test_in_a_batch_nobody_learns_from_whom_consent_was_withdrawn_before(
@@ -114,7 +118,7 @@ def test_in_a_batch_nobody_learns_from_whom_consent_was_withdrawn_before(
     monkeypatch.setattr(retraining, "FEWEST_PARTS", 1)
     styles = add_styles(database, 14)
     first = sum(surgeon == "surgeon-0" for surgeon, _ in styles)  # the others are surgeon-1's
-    monkeypatch.setattr(batch_work, "TOGETHER", first)
+    monkeypatch.setattr(batches, "TOGETHER", first)
     job = ask_retraining(database)
     (part,) = parts_of(database, job)
     learnt: list[str] = []
@@ -157,12 +161,12 @@ def test_a_release_asks(database: Database):
     cases.train(database)
     agree(database, NO_TRAINING)
     with database.writing() as session, pytest.raises(Conflict, match="does not cover training"):
-        releases.release(session, policies.find_version(session, "kestrel", SUTURE, 1), "anna")
+        releases.release(session, versions.find_version(session, "kestrel", SUTURE, 1), "anna")
     agree(database, {"uses": ["training", "export"], "until": None})
     with database.writing() as session:
-        releases.release(session, policies.find_version(session, "kestrel", SUTURE, 1), "anna")
+        releases.release(session, versions.find_version(session, "kestrel", SUTURE, 1), "anna")
     with database.reading() as session:
-        assert policies.policy_of(session, "kestrel", SUTURE).policy.version == 1
+        assert versions.policy_of(session, "kestrel", SUTURE).policy.version == 1
 
 
 def test_who_takes_consent_back_while_an_atlas_is_measured_is_not_in_it(
@@ -213,11 +217,11 @@ def test_withdrawn_consent_withdraws_releases_and_renewal_restores_none(
         withdrawn = select(Event).where(Event.action == "withdraw", Event.object_kind == "policy-version")
         assert [one.actor for one in session.scalars(withdrawn)] == ["anna", "anna"]
         with pytest.raises(NotFound, match=r"is served\. The consent of 'kestrel' does not cover training"):
-            policies.policy_of(session, "kestrel", SUTURE)
+            versions.policy_of(session, "kestrel", SUTURE)
     agree(database, ALL)
     assert served(database) is None
     with database.writing() as session:
-        releases.release(session, policies.find_version(session, "kestrel", SUTURE, 1), "anna")
+        releases.release(session, versions.find_version(session, "kestrel", SUTURE, 1), "anna")
     assert served(database) == 1
 
 
@@ -229,9 +233,9 @@ def test_consent_serves_to_the_end_of_its_last_day_and_no_longer(database: Datab
     monkeypatch.setattr(consent, "today", lambda: TODAY + timedelta(days=1))
     assert served(database) is None
     with database.reading() as session, pytest.raises(NotFound, match=f"expired on {TODAY}"):
-        policies.policy_of(session, "kestrel", SUTURE)
+        versions.policy_of(session, "kestrel", SUTURE)
     with database.writing() as session, pytest.raises(Conflict, match=f"expired on {TODAY}"):
-        releases.release(session, policies.find_version(session, "kestrel", SUTURE, version.version), "anna")
+        releases.release(session, versions.find_version(session, "kestrel", SUTURE, version.version), "anna")
     with pytest.raises(Conflict, match=f"expired on {TODAY}"):
         cases.ask_training(database, seed=3)
     with pytest.raises(SkillsError, match=f"expired on {TODAY}"):
@@ -275,7 +279,7 @@ def test_withdrawn_consent_withdraws_a_surgeons_combined_and_other_styles(databa
     cases.train(database, "heron", demos=[other.sha256], release=True)
     agree(database, NO_TRAINING)
     with database.reading() as session:
-        assert [one.policy.surgeon.slug for one in policies.list_served(session, 10, None)] == ["heron"]
+        assert [one.policy.surgeon.slug for one in versions.list_served(session, 10, None)] == ["heron"]
 
 
 @pytest.mark.parametrize("until", [None, "2999-12-31", TODAY.isoformat(), (TODAY - timedelta(days=1)).isoformat()])

@@ -14,7 +14,7 @@ from sqlalchemy import func, inspect, select
 from skills.db import dump
 from skills.db.session import Database
 from skills.errors import Conflict, Corrupt, SkillsError, UnknownFormat
-from skills.library.backup import back_up, check_backup, restore
+from skills.library.operation.backup import back_up, check_backup, restore
 from skills.packing import sha256
 from tests import backends
 from tests.library import cases

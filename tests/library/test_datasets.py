@@ -19,14 +19,15 @@ from skills.db.service_tables import DatasetDemonstration, Event, Job
 from skills.db.session import Database
 from skills.errors import BadInput, Conflict, NotFound, TooLarge
 from skills.formats.reader_process import ConfinedReader, Told
-from skills.library import consent, perform_job
-from skills.library.catalogue import find_surgeon, put_surgeon
-from skills.library.datasets import delete_dataset, export_dataset, find_dataset
-from skills.library.demos import mark_demo, withdraw_demo
-from skills.library.erasure import erase_demo, erase_surgeon
-from skills.library.inspection import inspect_installation
-from skills.library.jobs import cancel, find_job, list_jobs
-from skills.library.recordings import store_recording
+from skills.library.operation.inspection import inspect_installation
+from skills.library.operation.jobs import cancel, find_job, list_jobs
+from skills.library.people import consent
+from skills.library.people.catalogue import find_surgeon, put_surgeon
+from skills.library.people.erasure import erase_demo, erase_surgeon
+from skills.library.perform import perform_job
+from skills.library.recordings.datasets import delete_dataset, export_dataset, find_dataset
+from skills.library.recordings.demos import mark_demo, withdraw_demo
+from skills.library.recordings.recordings import store_recording
 from skills.settings import Settings
 from tests.library import cases, exports
 from tests.library.exports import PASS_S, add, ask, export, kept, members, read_episode, session_of, zip_of
@@ -293,11 +294,11 @@ def midway(monkeypatch: pytest.MonkeyPatch, happens: Callable[[], None]) -> None
         happens()
         return found
 
-    monkeypatch.setattr("skills.library.datasets._episodes", then)
+    monkeypatch.setattr("skills.library.recordings.datasets._episodes", then)
 
 
 def exports_module() -> Any:
-    from skills.library import datasets
+    from skills.library.recordings import datasets
 
     return datasets
 

@@ -15,15 +15,16 @@ from skills.db.models import Demonstration, MeasuredShape, PolicyVersion, Record
 from skills.db.service_tables import Job
 from skills.db.session import Database
 from skills.errors import Conflict, NotAllowed, NotFound
-from skills.library import atlas, sweep
-from skills.library.atlas import atlas_of
-from skills.library.backup import back_up, erasures_of, keep_up_erasures, read_erasures, restore
-from skills.library.catalogue import put_surgeon
-from skills.library.demos import add_demo, withdraw_demo
-from skills.library.erasure import delete_recording, erase_demo, erase_surgeon
-from skills.library.neighbours import nearest_to
-from skills.library.recordings import store_recording
-from skills.library.sweep import sweep_erased
+from skills.library.comparison import atlas
+from skills.library.comparison.atlas import atlas_of
+from skills.library.comparison.neighbours import nearest_to
+from skills.library.operation import sweep
+from skills.library.operation.backup import back_up, erasures_of, keep_up_erasures, read_erasures, restore
+from skills.library.operation.sweep import sweep_erased
+from skills.library.people.catalogue import put_surgeon
+from skills.library.people.erasure import delete_recording, erase_demo, erase_surgeon
+from skills.library.recordings.demos import add_demo, withdraw_demo
+from skills.library.recordings.recordings import store_recording
 from skills.schemas.requests import DemoIn
 from tests import backends
 from tests.comparison.cohort import cohort

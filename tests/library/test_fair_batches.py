@@ -9,9 +9,9 @@ import pytest
 from skills.db.models import PolicyVersion
 from skills.db.session import Database
 from skills.fields import as_json
-from skills.library import batch_work, policies, releases
-from skills.library.demos import withdraw_demo
-from skills.library.releases import fit_of_versions, not_worse
+from skills.library.policies import batches, releases, versions
+from skills.library.policies.releases import fit_of_versions, not_worse
+from skills.library.recordings.demos import withdraw_demo
 from skills.schemas.policies import FitOnTheSame
 from skills.schemas.requests import DemoIn
 from tests.library import cases
@@ -36,7 +36,7 @@ def compared(database: Database, **asked: Any) -> dict[str, Any]:
 
 def served(database: Database) -> PolicyVersion:
     with database.reading() as session:
-        return policies.policy_of(session, "kestrel", cases.SUTURE).policy
+        return versions.policy_of(session, "kestrel", cases.SUTURE).policy
 
 
 def test_a_policy_of_three_demos_is_retrained_on_the_newest_three(database: Database):
@@ -48,8 +48,8 @@ def test_a_policy_of_three_demos_is_retrained_on_the_newest_three(database: Data
     assert (comparison["released"]["rests_on"], comparison["trained"]["rests_on"]) == (3, 3)
     assert comparison["on_the_same"]["demos"] == [*three, newest]
     with database.reading() as session:
-        trained = policies.find_by_digest(session, comparison["trained"]["sha256"])
-        before = policies.find_by_digest(session, comparison["released"]["sha256"])
+        trained = versions.find_by_digest(session, comparison["trained"]["sha256"])
+        before = versions.find_by_digest(session, comparison["released"]["sha256"])
         assert trained.manifest["combined"]["kind"] == before.manifest["combined"]["kind"] == "corridor"
         found = fit_of_versions(session, before, trained)
     assert comparison["on_the_same"] == as_json(found)
@@ -89,14 +89,14 @@ def test_a_policy_of_the_newest_alone_does_not_replace_one_of_three(
 ):
     """This is a batch that was running when somebody released a policy of three."""
     three = demos(database, *SWERVES_MM)
-    commit = batch_work._commit
+    commit = batches._commit
 
     def released_before(*given: Any) -> bool:
-        monkeypatch.setattr(batch_work, "_commit", commit)
+        monkeypatch.setattr(batches, "_commit", commit)
         cases.train(database, demos=three, release=True)
         return commit(*given)
 
-    monkeypatch.setattr(batch_work, "_commit", released_before)
+    monkeypatch.setattr(batches, "_commit", released_before)
     comparison = compared(database)
     assert (comparison["released"]["rests_on"], comparison["trained"]["rests_on"]) == (3, 1)
     assert comparison["on_the_same"]["demos"] == three
@@ -113,15 +113,15 @@ def test_one_released_while_the_comparison_was_computed_is_compared_anew(
 ):
     three = demos(database, *SWERVES_MM)
     cases.train(database, demos=three[:1], release=True)
-    measure = batch_work._measured
+    measure = batches._measured
 
     def released_after(*given: Any) -> Any:
         found = measure(*given)
-        monkeypatch.setattr(batch_work, "_measured", measure)
+        monkeypatch.setattr(batches, "_measured", measure)
         cases.train(database, demos=three, release=True)
         return found
 
-    monkeypatch.setattr(batch_work, "_measured", released_after)
+    monkeypatch.setattr(batches, "_measured", released_after)
     comparison = compared(database)
     assert (comparison["released"]["rests_on"], comparison["now_released"]) == (3, False)
 
@@ -174,8 +174,8 @@ def test_the_gate_of_a_cell_policy_compares_on_the_same_demonstrations_too(datab
     cases.train(database, demos=three, release=True)
     trained = cases.train(database, demos=three[:1], learner=cases.PUBLISHED)
     with database.writing() as session:
-        version = policies.find_by_digest(session, trained.sha256)
-        found = fit_of_versions(session, policies.policy_of(session, "kestrel", cases.SUTURE).policy, version)
+        version = versions.find_by_digest(session, trained.sha256)
+        found = fit_of_versions(session, versions.policy_of(session, "kestrel", cases.SUTURE).policy, version)
         assert found.demos == tuple(three)
         with pytest.raises(releases.Conflict) as refused:
             releases.release(session, version, "test")
@@ -189,5 +189,5 @@ def test_a_demonstration_that_was_withdrawn_is_not_compared_with(database: Datab
     with database.writing() as session:
         withdraw_demo(session, three[0], "test")
     with database.reading() as session:
-        versions = [policies.find_by_digest(session, one.sha256) for one in (first, second)]
+        versions = [versions.find_by_digest(session, one.sha256) for one in (first, second)]
         assert fit_of_versions(session, *versions).demos == (three[1],)

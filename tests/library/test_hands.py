@@ -12,9 +12,9 @@ from skills.demonstration.recording import Motion, Recording
 from skills.errors import BadPlan, Conflict
 from skills.formats import write_mcap
 from skills.kinematics import POINTING_DOWN, angle_between, matrix_of, quaternion_of
-from skills.library import releases
-from skills.library.integrity import planned
-from skills.library.plans import find_plan, trajectory_of
+from skills.library.operation.integrity import planned
+from skills.library.plans.plans import find_plan, trajectory_of
+from skills.library.policies import releases
 from skills.planning.handoff import turn
 from tests.library import cases
 from tests.library.test_replay import gate, judged

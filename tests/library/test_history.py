@@ -22,14 +22,16 @@ from skills.db.service_tables import Job
 from skills.db.session import Database
 from skills.db.tiles import TILES, stored_tiles
 from skills.errors import BadSettings, Corrupt, NotReady
-from skills.library import erasure, locks, recordings, sweep
-from skills.library.catalogue import find_surgeon, put_surgeon
-from skills.library.erasure import erase_surgeon
-from skills.library.history import Verified, sign_history, verify_history
-from skills.library.inspection import inspect_installation
-from skills.library.proofs import first_head, served_json
-from skills.library.recordings import stored_recording
-from skills.library.releases import withdraw
+from skills.library.operation import locks, sweep
+from skills.library.operation.history import Verified, sign_history, verify_history
+from skills.library.operation.inspection import inspect_installation
+from skills.library.operation.proofs import first_head, served_json
+from skills.library.people import erasure
+from skills.library.people.catalogue import find_surgeon, put_surgeon
+from skills.library.people.erasure import erase_surgeon
+from skills.library.policies.releases import withdraw
+from skills.library.recordings import recordings
+from skills.library.recordings.recordings import stored_recording
 from skills.settings import Settings
 from skills.transparency import Checkpoint, SigningKey, Tree, inclusion_proof, leaf_hash, node_from, read_notes
 from tests import backends

@@ -11,9 +11,9 @@ from skills.db.models import Demonstration, ParsedChunk, RecordingChunk
 from skills.db.packed import Packed
 from skills.db.service_tables import DatasetChunk, Event
 from skills.db.session import Database
-from skills.library import inspection
-from skills.library.atlas import far_apart
-from skills.library.inspection import AGREES, WITH_OTHERS, inspect_installation, packed_values
+from skills.library.comparison.atlas import far_apart
+from skills.library.operation import inspection
+from skills.library.operation.inspection import AGREES, WITH_OTHERS, inspect_installation, packed_values
 from tests import backends
 from tests.by_day import some
 from tests.library import cases

@@ -13,11 +13,11 @@ from skills.gridworld.reward import sparse_reward
 from skills.learning.certificate import Coverage, NearLimits, NearStarts, certify, coverage
 from skills.learning.policy import Policy, learn_tabular
 from skills.learning.q_learning import CellQLearning, PhaseQLearning
-from skills.library import releases
-from skills.library.integrity import covered, learnt
-from skills.library.releases import refusals
-from skills.library.retraining import request_retraining
-from skills.library.training import near_limits, request_training
+from skills.library.operation.integrity import covered, learnt
+from skills.library.policies import releases
+from skills.library.policies.releases import refusals
+from skills.library.policies.retraining import request_retraining
+from skills.library.policies.training import near_limits, request_training
 from skills.schemas.requests import RetrainingIn, TrainingIn
 from skills.settings import Settings
 from tests.library import cases

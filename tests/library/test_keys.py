@@ -11,8 +11,8 @@ from skills.db.models import Surgeon
 from skills.db.service_tables import Key, SignIn
 from skills.db.session import Database
 from skills.errors import BadInput, Conflict, NotFound
-from skills.library.erasure import erase_surgeon
-from skills.library.keys import (
+from skills.library.people.erasure import erase_surgeon
+from skills.library.people.keys import (
     Holder,
     Lasts,
     about_key,

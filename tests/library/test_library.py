@@ -13,7 +13,6 @@ from pydantic import ValidationError
 from sqlalchemy import delete, func, select, text
 from sqlalchemy.orm import Session
 
-from skills import library
 from skills.db import Base
 from skills.db.models import ParsedRecording, PolicyVersion, StoredRecording
 from skills.db.service_tables import Event, Job
@@ -23,12 +22,14 @@ from skills.errors import Conflict, Corrupt, Erased
 from skills.gridworld.grid import PAPER_GRID, discretisation_rmse, discretize
 from skills.learning.dynamic_programming import ValueIteration
 from skills.learning.max_ent_irl import MaxEntIRL
-from skills.library import jobs, overview, releases
-from skills.library.catalogue import find_surgeon, put_surgeon, seed_catalogue
-from skills.library.demos import add_demo, find_demo, withdraw_demo
-from skills.library.erasure import erase_surgeon
-from skills.library.policies import learnt, policy_of
-from skills.library.recordings import recording_bytes, store_recording
+from skills.library import perform as library
+from skills.library.operation import jobs, overview
+from skills.library.people.catalogue import find_surgeon, put_surgeon, seed_catalogue
+from skills.library.people.erasure import erase_surgeon
+from skills.library.policies import releases
+from skills.library.policies.versions import learnt, policy_of
+from skills.library.recordings.demos import add_demo, find_demo, withdraw_demo
+from skills.library.recordings.recordings import recording_bytes, store_recording
 from skills.schemas.requests import DemoIn
 from skills.settings import Settings
 from tests import backends

@@ -15,15 +15,16 @@ from skills.db.models import Demonstration, PolicyVersion, Release, StoredRecord
 from skills.db.service_tables import Event, Job, StyleToRetrain, record_event
 from skills.db.session import Database
 from skills.errors import Conflict, Erased, NotFound
-from skills.library import jobs, locks, perform_job
-from skills.library.backup import keep_up_erasures, read_erasures
-from skills.library.catalogue import put_surgeon
-from skills.library.demos import add_demo
-from skills.library.erasure import delete_recording, erase_surgeon
-from skills.library.policies import find_version
-from skills.library.recordings import store_recording
-from skills.library.releases import release, standing
-from skills.library.training import request_training, train_style
+from skills.library.operation import jobs, locks
+from skills.library.operation.backup import keep_up_erasures, read_erasures
+from skills.library.people.catalogue import put_surgeon
+from skills.library.people.erasure import delete_recording, erase_surgeon
+from skills.library.perform import perform_job
+from skills.library.policies.releases import release, standing
+from skills.library.policies.training import request_training, train_style
+from skills.library.policies.versions import find_version
+from skills.library.recordings.demos import add_demo
+from skills.library.recordings.recordings import store_recording
 from skills.schemas.requests import DemoIn, TrainingIn
 from skills.settings import Settings
 from tests import backends
@@ -234,7 +235,7 @@ def test_a_cancelled_job_stores_nothing_that_waited_for_it(database: Database):
 
 
 def test_the_last_two_parts_of_a_batch_end_it_once(database: Database, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("skills.library.retraining.MOST_IN_A_PART", 1)
+    monkeypatch.setattr("skills.library.policies.retraining.MOST_IN_A_PART", 1)
     cases.add_surgeon(database, "osprey")
     for slug in ("kestrel", "osprey"):
         cases.add_demo(database, surgeon=slug)

@@ -14,11 +14,11 @@ from skills.db.models import Demonstration, Surgeon
 from skills.db.row_visibility import Only
 from skills.db.session import Database
 from skills.errors import BadPath, Conflict, NotFound
-from skills.library import neighbours
-from skills.library.catalogue import put_surgeon
-from skills.library.demos import withdraw_demo
-from skills.library.erasure import erase_demo, erase_surgeon
-from skills.library.neighbours import forget_gone, nearest_to
+from skills.library.comparison import neighbours
+from skills.library.comparison.neighbours import forget_gone, nearest_to
+from skills.library.people.catalogue import put_surgeon
+from skills.library.people.erasure import erase_demo, erase_surgeon
+from skills.library.recordings.demos import withdraw_demo
 from tests import backends
 from tests.comparison.cohort import cohort
 from tests.library import cases, cohorts

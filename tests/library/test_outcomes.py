@@ -15,15 +15,15 @@ from skills.db.service_tables import Event
 from skills.db.session import Database
 from skills.errors import Conflict
 from skills.formats.reader_process import read_told
-from skills.library.backup import back_up, keep_erasures, read_erasures, restore
-from skills.library.cards import card_of
-from skills.library.demos import list_demos, mark_demo, newest_demo
-from skills.library.erasure import erase_demo
-from skills.library.inspection import inspect_installation
-from skills.library.overview import matrix
-from skills.library.policies import find_by_digest
-from skills.library.releases import release, remedy, standing
-from skills.library.scores import LEAST_DEMOS, score
+from skills.library.comparison.scores import LEAST_DEMOS, score
+from skills.library.operation.backup import back_up, keep_erasures, read_erasures, restore
+from skills.library.operation.inspection import inspect_installation
+from skills.library.operation.overview import matrix
+from skills.library.people.erasure import erase_demo
+from skills.library.policies.cards import card_of
+from skills.library.policies.releases import release, remedy, standing
+from skills.library.policies.versions import find_by_digest
+from skills.library.recordings.demos import list_demos, mark_demo, newest_demo
 from skills.packing import canonical, sha256
 from skills.remedies import Action, Remedy
 from skills.schemas.requests import OutcomeIn, ScoreIn

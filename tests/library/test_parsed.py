@@ -19,13 +19,15 @@ from skills.errors import Busy, Corrupt, NotFound
 from skills.formats import media_type_of
 from skills.formats.lerobot.cut import cut_episode, episodes_of, find_dataset
 from skills.formats.reader_process import Told, read_told, tell
-from skills.library import overview, recordings, scores
-from skills.library.backup import back_up, restore
-from skills.library.catalogue import put_surgeon
-from skills.library.demos import add_demo
-from skills.library.erasure import erase_surgeon
-from skills.library.inspection import inspect_installation
-from skills.library.recordings import alike, entry_of, put_entry, store_recording, stored_recording
+from skills.library.comparison import scores
+from skills.library.operation import overview
+from skills.library.operation.backup import back_up, restore
+from skills.library.operation.inspection import inspect_installation
+from skills.library.people.catalogue import put_surgeon
+from skills.library.people.erasure import erase_surgeon
+from skills.library.recordings import recordings
+from skills.library.recordings.demos import add_demo
+from skills.library.recordings.recordings import alike, entry_of, put_entry, store_recording, stored_recording
 from skills.schemas.requests import DemoIn, Reading, ScoreIn
 from skills.seeds.recordings import sample_recordings
 from tests.by_day import some

@@ -12,11 +12,11 @@ from skills.db.models import Plan, StoredPictures, StoredPlayback
 from skills.db.service_tables import Job
 from skills.db.session import Database
 from skills.errors import NotDrawnYet, SimulationFailed
-from skills.library import playbacks
-from skills.library.erasure import erase_demo, erase_surgeon
-from skills.library.integrity import planned
-from skills.library.jobs import cancel
-from skills.library.plans import trajectory_of
+from skills.library.operation.integrity import planned
+from skills.library.operation.jobs import cancel
+from skills.library.people.erasure import erase_demo, erase_surgeon
+from skills.library.plans import playbacks
+from skills.library.plans.plans import trajectory_of
 from skills.planning.trajectory import time_parametrise
 from skills.settings import Settings
 from skills.simulation import film, pictures

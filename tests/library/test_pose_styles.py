@@ -18,14 +18,14 @@ from skills.errors import Busy, Corrupt, NotFound
 from skills.formats import write_mcap
 from skills.formats.reader_process import read_told
 from skills.learning.pose_style import PHASES
-from skills.library import training
-from skills.library.backup import back_up, restore
-from skills.library.batch_work import retrain_part
-from skills.library.catalogue import put_surgeon
-from skills.library.demos import withdraw_demo
-from skills.library.erasure import erase_demo
-from skills.library.inspection import HISTORY, inspect_installation
-from skills.library.policies import poses_of
+from skills.library.operation.backup import back_up, restore
+from skills.library.operation.inspection import HISTORY, inspect_installation
+from skills.library.people.catalogue import put_surgeon
+from skills.library.people.erasure import erase_demo
+from skills.library.policies import training
+from skills.library.policies.batches import retrain_part
+from skills.library.policies.versions import poses_of
+from skills.library.recordings.demos import withdraw_demo
 from skills.remedies import Remedy
 from skills.settings import Settings
 from tests import backends

@@ -12,11 +12,11 @@ from skills.db.row_visibility import Only
 from skills.db.session import Database
 from skills.errors import Conflict, NotFound
 from skills.formats.reader_process import read_told
-from skills.library import proposals
-from skills.library.demos import withdraw_demo
-from skills.library.erasure import delete_recording, erase_surgeon
-from skills.library.proposals import Proposal, decide, list_proposals, paths_of
-from skills.library.recordings import store_recording
+from skills.library.people.erasure import delete_recording, erase_surgeon
+from skills.library.recordings import proposals
+from skills.library.recordings.demos import withdraw_demo
+from skills.library.recordings.proposals import Proposal, decide, list_proposals, paths_of
+from skills.library.recordings.recordings import store_recording
 from skills.seeds.recordings import sample_recordings
 from tests import backends
 from tests.library import cases

@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 from skills.cli import app
 from skills.db.models import StoredCalibration
 from skills.db.session import Database
-from skills.library.calibrations import calibrate_on, read_cohort
+from skills.library.comparison.calibrations import calibrate_on, read_cohort
 from skills.scoring.validation import DURATIONS, RIVALS, refusals
 from skills.settings import settings
 from tests.needs import need

@@ -11,16 +11,16 @@ from skills.db.session import Database
 from skills.errors import Conflict
 from skills.formats import write_mcap
 from skills.formats.reader_process import read_told
-from skills.library.backup import back_up, erasures_of, restore
-from skills.library.catalogue import put_surgeon
-from skills.library.datasets import request_dataset
-from skills.library.demos import exported_chunk, exported_recording, find_demo, shown_demo
-from skills.library.erasure import erase_demo, erase_surgeon
-from skills.library.proposals import find_proposal
-from skills.library.recordings import store_recording
-from skills.library.scores import score
-from skills.library.timelines import Source, check_export, timeline_of
-from skills.library.whose import recognise_recording
+from skills.library.comparison.recognition import recognise_recording
+from skills.library.comparison.scores import score
+from skills.library.operation.backup import back_up, erasures_of, restore
+from skills.library.people.catalogue import put_surgeon
+from skills.library.people.erasure import erase_demo, erase_surgeon
+from skills.library.recordings.datasets import request_dataset
+from skills.library.recordings.demos import exported_chunk, exported_recording, find_demo, shown_demo
+from skills.library.recordings.proposals import find_proposal
+from skills.library.recordings.recordings import store_recording
+from skills.library.recordings.timelines import Source, check_export, timeline_of
 from skills.schemas.requests import DatasetIn, ScoreIn
 from tests import backends
 from tests.comparison.cohort import cohort

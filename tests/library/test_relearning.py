@@ -21,13 +21,13 @@ from skills.learning.dynamic_programming import ValueIteration
 from skills.learning.networks import Network
 from skills.learning.policy import LEARNER_VERSION
 from skills.learning.q_learning import PhaseQLearning
-from skills.library import inspection
-from skills.library.catalogue import put_surgeon
-from skills.library.demos import mark_demo
-from skills.library.inspection import Checked, inspect_policies
-from skills.library.integrity import demo_identity, policy_identity, poses_identity_of
-from skills.library.relearning import compute_again, decoded
-from skills.library.training import GATE_VERSION, certified, lessons
+from skills.library.operation import inspection
+from skills.library.operation.inspection import Checked, inspect_policies
+from skills.library.operation.integrity import demo_identity, policy_identity, poses_identity_of
+from skills.library.people.catalogue import put_surgeon
+from skills.library.policies.relearning import compute_again, decoded
+from skills.library.policies.training import GATE_VERSION, certified, lessons
+from skills.library.recordings.demos import mark_demo
 from skills.settings import Settings
 from tests import backends
 from tests.library import cases

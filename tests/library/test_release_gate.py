@@ -23,7 +23,7 @@ from skills.learning.certificate import NearLimits, certify, near_starts
 from skills.learning.dynamic_programming import ValueIteration
 from skills.learning.policy import Policy, learn_tabular
 from skills.learning.q_learning import PhaseQLearning
-from skills.library import releases, retraining, training
+from skills.library.policies import releases, retraining, training
 from tests.formats.bags import sample_folder
 from tests.gridworld.paths import learnt
 from tests.library import cases

@@ -17,14 +17,15 @@ from skills.db.session import Database
 from skills.errors import BadPlan, Conflict, Corrupt, NotFound
 from skills.formats.replay_bag import arms_of
 from skills.formats.verify import check_bag
-from skills.library import releases, replay
-from skills.library.catalogue import find_surgeon, put_surgeon
-from skills.library.demos import withdraw_demo
-from skills.library.history import newest_checkpoint, sign_history
-from skills.library.plans import find_plan, plan_in_words, plan_sutures, trajectory_of
-from skills.library.playbacks import CHECK_VERSION
-from skills.library.policies import find_version
-from skills.library.replay import check_doubt, cleared, replay_bag
+from skills.library.operation.history import newest_checkpoint, sign_history
+from skills.library.people.catalogue import find_surgeon, put_surgeon
+from skills.library.plans import replay
+from skills.library.plans.plans import find_plan, plan_in_words, plan_sutures, trajectory_of
+from skills.library.plans.playbacks import CHECK_VERSION
+from skills.library.plans.replay import check_doubt, cleared, replay_bag
+from skills.library.policies import releases
+from skills.library.policies.versions import find_version
+from skills.library.recordings.demos import withdraw_demo
 from skills.packing import canonical, sha256
 from skills.planning.plan import SuturePlan
 from skills.planning.trajectory import Trajectory

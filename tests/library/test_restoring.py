@@ -16,15 +16,15 @@ from skills.db.models import Demonstration, PolicyVersion, Release, StoredRecord
 from skills.db.service_tables import Key
 from skills.db.session import Database
 from skills.errors import BadSettings, Corrupt, NotFound
-from skills.library.backup import back_up, keep_erasures, read_erasures, restore
-from skills.library.catalogue import find_surgeon, put_surgeon
-from skills.library.demos import mark_demo, withdraw_demo
-from skills.library.erasure import delete_recording, erase_demo, erase_surgeon
-from skills.library.inspection import inspect_installation
-from skills.library.keys import create_key, revoke_key
-from skills.library.policies import policy_of
-from skills.library.recordings import store_recording
-from skills.library.releases import release, withdraw
+from skills.library.operation.backup import back_up, keep_erasures, read_erasures, restore
+from skills.library.operation.inspection import inspect_installation
+from skills.library.people.catalogue import find_surgeon, put_surgeon
+from skills.library.people.erasure import delete_recording, erase_demo, erase_surgeon
+from skills.library.people.keys import create_key, revoke_key
+from skills.library.policies.releases import release, withdraw
+from skills.library.policies.versions import policy_of
+from skills.library.recordings.demos import mark_demo, withdraw_demo
+from skills.library.recordings.recordings import store_recording
 from skills.serving import keeping_erasures
 from skills.settings import Settings
 from tests import backends

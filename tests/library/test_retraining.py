@@ -12,26 +12,27 @@ from skills.db.session import Database
 from skills.errors import Conflict, NotFound
 from skills.learning.dynamic_programming import ValueIteration
 from skills.learning.q_learning import CellQLearning
-from skills.library import batch_work, jobs, retraining
-from skills.library.batch_work import compare
-from skills.library.catalogue import put_surgeon
-from skills.library.demos import withdraw_demo
-from skills.library.erasure import erase_demo, erase_surgeon
-from skills.library.jobs import BATCH
-from skills.library.training import learn_style
+from skills.library.operation import jobs
+from skills.library.operation.jobs import BATCH
+from skills.library.people.catalogue import put_surgeon
+from skills.library.people.erasure import erase_demo, erase_surgeon
+from skills.library.policies import batches, retraining
+from skills.library.policies.batches import compare
+from skills.library.policies.training import learn_style
+from skills.library.recordings.demos import withdraw_demo
 from skills.schemas.policies import FitOnTheSame, PolicyFigures
 from tests.library import cases
 from tests.library.styles import (
     NO_CONSENT,
     add_styles,
     ask_retraining,
+    count_versions,
     counted,
     look,
     parts_of,
     retrain,
     states_of,
     styles_of,
-    versions,
 )
 
 # ---- the selection of styles
@@ -44,10 +45,10 @@ def test_all_styles_of_a_surgeon_or_of_a_suture_type_are_trained_once_each(datab
     assert (batch.state, batch.progress, batch.result["done"], batch.error) == ("succeeded", 1.0, 2, None)
     assert batch.started_at <= batch.ended_at
     retrain(database, suture=styles[0][1])  # one style of each surgeon, of which one is trained by now
-    assert versions(database) == 3
+    assert count_versions(database) == 3
     whole = retrain(database)
     assert states_of(database, whole) == ["done"] * 13
-    assert versions(database) == 13
+    assert count_versions(database) == 13
     with database.reading() as session:
         trained = session.execute(select(Event.object_id).where(Event.action == "train")).all()
         assert len(trained) == len(set(trained)) == 13
@@ -65,7 +66,7 @@ def test_a_style_in_a_batch_is_trained_as_by_a_training_of_its_own(database: Dat
     cases.add_demo(database)
     alone = cases.train(database)
     (style,) = styles_of(database, retrain(database))
-    assert (style.policy_row, versions(database)) == (alone.row, 1)
+    assert (style.policy_row, count_versions(database)) == (alone.row, 1)
     other = ValueIteration()
     (style,) = styles_of(database, retrain(database, learner=other))
     assert style.policy.version == 2
@@ -128,8 +129,8 @@ def test_a_cancelled_batch_stops_at_its_next_commit_and_drops_late_results(
     database: Database, monkeypatch: pytest.MonkeyPatch, together: int, begun: int, kept: int
 ):
     monkeypatch.setattr(retraining, "FEWEST_PARTS", 2)
-    monkeypatch.setattr(batch_work, "TOGETHER", together)
-    monkeypatch.setattr(batch_work, "TOGETHER_S", 60.0)
+    monkeypatch.setattr(batches, "TOGETHER", together)
+    monkeypatch.setattr(batches, "TOGETHER_S", 60.0)
     add_styles(database, 8)
     job = ask_retraining(database)
     learnt = []
@@ -141,10 +142,10 @@ def test_a_cancelled_batch_stops_at_its_next_commit_and_drops_late_results(
                 jobs.cancel(session, job.id, "test")
         return learn_style(lesson, request, settings)
 
-    monkeypatch.setattr(batch_work, "learn_style", learn)
+    monkeypatch.setattr(batches, "learn_style", learn)
     for part in parts_of(database, job):
         cases.work(database, part)
-    assert (len(learnt), versions(database)) == (begun, kept)
+    assert (len(learnt), count_versions(database)) == (begun, kept)
     assert states_of(database, job) == ["done"] * kept + ["cancelled"] * (8 - kept)
     batch = look(database, job)
     assert (batch.state, batch.result) == ("cancelled", None)
@@ -176,7 +177,7 @@ def test_an_erased_surgeon_leaves_batches_and_the_others_go_on(database: Databas
     with database.writing() as session:  # trained in a batch, and still erased
         erase_surgeon(session, styles[0][0], "test")
     assert counted(database, StyleToRetrain) == 0
-    assert versions(database) == 0
+    assert count_versions(database) == 0
 
 
 def test_a_batch_all_of_whose_styles_were_erased_ends(database: Database):

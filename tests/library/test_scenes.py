@@ -20,12 +20,12 @@ from skills.learning.in_scene import learn_in_scene
 from skills.learning.policy import Policy
 from skills.learning.q_learning import CellQLearning, PhaseQLearning
 from skills.learning.slip import FollowPolicy, draw_slips, follows, walk
-from skills.library import releases
-from skills.library.integrity import covered, learnt, scene_digest
-from skills.library.policies import about_rollout
-from skills.library.releases import refusals
-from skills.library.retraining import request_retraining
-from skills.library.training import odds_limits
+from skills.library.operation.integrity import covered, learnt, scene_digest
+from skills.library.policies import releases
+from skills.library.policies.releases import refusals
+from skills.library.policies.retraining import request_retraining
+from skills.library.policies.training import odds_limits
+from skills.library.policies.versions import about_rollout
 from skills.schemas.requests import RetrainingIn
 from skills.settings import Settings
 from tests.library import cases

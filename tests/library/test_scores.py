@@ -9,11 +9,11 @@ from skills.db.models import Demonstration, MeasuredShape, StoredCalibration, St
 from skills.db.session import Database
 from skills.errors import BadInput, Conflict, NotFound
 from skills.formats.reader_process import read_told
-from skills.library.calibrations import keep
-from skills.library.catalogue import put_surgeon
-from skills.library.demos import mark_demo, upload_demo, withdraw_demo
-from skills.library.recordings import store_recording
-from skills.library.scores import LEAST_DEMOS, progress, score
+from skills.library.comparison.calibrations import keep
+from skills.library.comparison.scores import LEAST_DEMOS, progress, score
+from skills.library.people.catalogue import put_surgeon
+from skills.library.recordings.demos import mark_demo, upload_demo, withdraw_demo
+from skills.library.recordings.recordings import store_recording
 from skills.packing import canonical, sha256
 from skills.schemas.comparison import Score
 from skills.schemas.requests import DemoIn, ScoreIn

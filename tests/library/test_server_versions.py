@@ -9,7 +9,7 @@ import pytest
 from sqlalchemy import Connection, create_engine, text
 
 from skills.db.session import Database
-from skills.library.history import Verified, sign_history, verify_history
+from skills.library.operation.history import Verified, sign_history, verify_history
 from tests import backends
 from tests.by_day import some
 from tests.db.test_tables import fill

@@ -23,13 +23,15 @@ from skills.db.models import (
 from skills.db.service_tables import ErasedSurgeon, Event, Job, StyleToRetrain
 from skills.db.session import Database
 from skills.errors import Busy, NotFound
-from skills.library import recordings, retraining, sweep
-from skills.library.erasure import delete_recording, erase_surgeon
-from skills.library.inspection import inspect_installation
-from skills.library.jobs import find_job, identity_of, list_jobs
-from skills.library.plans import planned, trajectory_of
-from skills.library.recordings import find_recording, recording_bytes, store_recording, stored_recording
-from skills.library.sweep import STEADY_S, SteadyClock, drop_contents, sweep_erased
+from skills.library.operation import sweep
+from skills.library.operation.inspection import inspect_installation
+from skills.library.operation.jobs import find_job, identity_of, list_jobs
+from skills.library.operation.sweep import STEADY_S, SteadyClock, drop_contents, sweep_erased
+from skills.library.people.erasure import delete_recording, erase_surgeon
+from skills.library.plans.plans import planned, trajectory_of
+from skills.library.policies import retraining
+from skills.library.recordings import recordings
+from skills.library.recordings.recordings import find_recording, recording_bytes, store_recording, stored_recording
 from skills.settings import Settings
 from skills.verification.playback import Pictures
 from tests.db.test_query_plans import noted
@@ -47,7 +49,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     for room in (recordings, sweep):
         monkeypatch.setattr(room, "CHUNK_BYTES", KIB)
         monkeypatch.setattr(room, "AT_ONCE_BYTES", KIB)
-    monkeypatch.setattr("skills.library.erasure.AT_ONCE_BYTES", KIB)
+    monkeypatch.setattr("skills.library.people.erasure.AT_ONCE_BYTES", KIB)
     monkeypatch.setattr(sweep, "JOBS_AT_ONCE", 3)
 
 
@@ -316,7 +318,7 @@ def test_a_batch_whose_request_was_interrupted_fails_and_can_be_repeated(
 
 
 def test_a_batch_cancelled_while_styles_are_added_gets_no_more(database: Database, monkeypatch: pytest.MonkeyPatch):
-    from skills.library.jobs import cancel
+    from skills.library.operation.jobs import cancel
 
     monkeypatch.setattr(retraining, "STYLES_AT_ONCE", 1)
     cases.add_surgeon(database, "osprey")

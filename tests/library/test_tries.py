@@ -20,12 +20,13 @@ from skills.errors import BadSettings, Conflict, NotFound
 from skills.formats import read_recording, write_mcap
 from skills.gridworld.grid import GridWorld, choose_grid
 from skills.jobs.workflows import Work
-from skills.library import jobs, perform_job
-from skills.library.catalogue import put_surgeon
-from skills.library.demos import add_demo
-from skills.library.erasure import erase_demo, erase_surgeon
-from skills.library.recordings import store_recording
-from skills.library.tries import CELLS_MM, choose_cells, request_try
+from skills.library.operation import jobs
+from skills.library.people.catalogue import put_surgeon
+from skills.library.people.erasure import erase_demo, erase_surgeon
+from skills.library.perform import perform_job
+from skills.library.plans.tries import CELLS_MM, choose_cells, request_try
+from skills.library.recordings.demos import add_demo
+from skills.library.recordings.recordings import store_recording
 from skills.schemas.requests import DemoIn
 from skills.schemas.tries import LOSS_MM, TryIn
 from skills.seeds.recordings import sample_recordings

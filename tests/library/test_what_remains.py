@@ -11,14 +11,15 @@ from skills.db.models import Base, Erasure, Plan, StoredPictures, Surgeon
 from skills.db.service_tables import Event, Job
 from skills.db.session import Database
 from skills.learning.max_ent_irl import MaxEntIRL
-from skills.library import erasure, sweep
-from skills.library.demos import mark_demo
-from skills.library.erasure import erase_demo, erase_surgeon
-from skills.library.plans import planned, trajectory_of
-from skills.library.proposals import decide
-from skills.library.recordings import store_recording
-from skills.library.sweep import sweep_erased
-from skills.library.training import request_training
+from skills.library.operation import sweep
+from skills.library.operation.sweep import sweep_erased
+from skills.library.people import erasure
+from skills.library.people.erasure import erase_demo, erase_surgeon
+from skills.library.plans.plans import planned, trajectory_of
+from skills.library.policies.training import request_training
+from skills.library.recordings.demos import mark_demo
+from skills.library.recordings.proposals import decide
+from skills.library.recordings.recordings import store_recording
 from skills.schemas.requests import TrainingIn
 from skills.verification.playback import Pictures
 from tests.library import cases, exports

@@ -7,8 +7,8 @@ from skills.db.models import Demonstration
 from skills.db.session import Database
 from skills.errors import BadInput, Conflict, NotFound
 from skills.formats.reader_process import read_told
-from skills.library.catalogue import put_surgeon
-from skills.library.whose import recognise_recording
+from skills.library.comparison.recognition import recognise_recording
+from skills.library.people.catalogue import put_surgeon
 from skills.schemas.comparison import RecognisedRecording
 from tests.comparison.cohort import cohort
 from tests.library import cases, cohorts

@@ -26,9 +26,9 @@ from skills.formats.reader_process import read_told
 from skills.learning.dynamic_programming import ValueIteration
 from skills.learning.max_ent_irl import MaxEntIRL
 from skills.learning.q_learning import CellQLearning, PhaseQLearning
-from skills.library.integrity import learnt, planned, posed, scene_digest
-from skills.library.plans import trajectory_of
-from skills.library.playbacks import request_playback
+from skills.library.operation.integrity import learnt, planned, posed, scene_digest
+from skills.library.plans.plans import trajectory_of
+from skills.library.plans.playbacks import request_playback
 from skills.packing import canonical, sha256
 from skills.seeds.recordings import sample_recordings
 from skills.settings import Settings

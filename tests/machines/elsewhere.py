@@ -11,9 +11,9 @@ from pathlib import Path
 
 from skills.db.session import Database
 from skills.formats.reader_process import read_told
-from skills.library.inspection import inspect_installation, inspect_policies
-from skills.library.playbacks import request_playback
-from skills.library.replay import replay_bag
+from skills.library.operation.inspection import inspect_installation, inspect_policies
+from skills.library.plans.playbacks import request_playback
+from skills.library.plans.replay import replay_bag
 from skills.packing import sha256
 from skills.settings import Settings
 from skills.verification.arm_errors import UNCALIBRATED

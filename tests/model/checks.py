@@ -16,7 +16,7 @@ from skills.db.packed import Packed
 from skills.demonstration.demonstration import cut_demo
 from skills.demonstration.segments import Segment, propose_by_arm
 from skills.formats import Recording, read_recording
-from skills.library.jobs import PART
+from skills.library.operation.jobs import PART
 from skills.packing import sha256
 from tests.api.service import Service
 from tests.library import cases

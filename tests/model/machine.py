@@ -30,11 +30,11 @@ from skills.db.service_tables import Job as JobRow
 from skills.db.session import Database
 from skills.errors import NotFound, SkillsError
 from skills.jobs.workflows import Work
-from skills.library import perform_job
-from skills.library.atlas import atlas_of
-from skills.library.backup import accept_rollback, back_up, keep_erasures, read_erasures, restore
-from skills.library.history import Verified, sign_history, verify_history
-from skills.library.jobs import BATCH, PART
+from skills.library.comparison.atlas import atlas_of
+from skills.library.operation.backup import accept_rollback, back_up, keep_erasures, read_erasures, restore
+from skills.library.operation.history import Verified, sign_history, verify_history
+from skills.library.operation.jobs import BATCH, PART
+from skills.library.perform import perform_job
 from skills.packing import sha256
 from skills.settings import Settings
 from skills.transparency import SigningKey

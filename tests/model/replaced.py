@@ -24,8 +24,9 @@ from skills.db.session import Database
 from skills.demonstration.demonstration import Recording
 from skills.formats import read_recording
 from skills.formats.reader_process import read_told
-from skills.library import retraining, tries
-from skills.library.keys import create_key
+from skills.library.people.keys import create_key
+from skills.library.plans import tries
+from skills.library.policies import retraining
 from skills.settings import Settings
 from tests import backends
 

@@ -21,8 +21,8 @@ from skills.db.models import Plan, PolicyVersion
 from skills.db.session import Database
 from skills.errors import SkillsError
 from skills.formats.reader_process import read_told
-from skills.library.relearning import StoredRecordings, learn_again
-from skills.library.replay import replay_bag
+from skills.library.plans.replay import replay_bag
+from skills.library.policies.relearning import StoredRecordings, learn_again
 from skills.settings import Settings
 from skills.verification.arm_errors import UNCALIBRATED
 from tests.model.replaced import Clock

@@ -18,7 +18,11 @@ from skills.db.history import History
 from skills.db.models import Demonstration, ErasedInterval, MeasuredShape, RecordingSurgeon, Surgeon
 from skills.db.packed import pack
 from skills.db.session import Database
-from skills.library import atlas, backup, erasure, locks, proposals, training
+from skills.library.comparison import atlas
+from skills.library.operation import backup, locks
+from skills.library.people import erasure
+from skills.library.policies import training
+from skills.library.recordings import proposals
 from tests import backends
 from tests.by_day import some
 from tests.library import cases

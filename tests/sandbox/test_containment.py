@@ -16,7 +16,7 @@ from skills import serving
 from skills.cli import app
 from skills.errors import BadSettings, Busy
 from skills.jobs.worker import run_worker
-from skills.library.recordings import confined_reader
+from skills.library.recordings.recordings import confined_reader
 from skills.sandbox import forked
 from skills.sandbox.containment import LAYERS
 from skills.sandbox.forked import ForkServer, layers_held, refuse_uncontained

@@ -15,10 +15,10 @@ from skills.db.models import Plan, StoredPlayback
 from skills.db.session import Database
 from skills.errors import BadPlan, SimulationFailed, Unreachable
 from skills.kinematics import POINTING_DOWN, forward, inverse, matrix_of, quaternion_of
-from skills.library import releases
-from skills.library.catalogue import find_surgeon
-from skills.library.demos import upload_demo
-from skills.library.playbacks import find_playback, request_playback, standing_of
+from skills.library.people.catalogue import find_surgeon
+from skills.library.plans.playbacks import find_playback, request_playback, standing_of
+from skills.library.policies import releases
+from skills.library.recordings.demos import upload_demo
 from skills.packing import canonical
 from skills.planning import handoff
 from skills.planning.handoff import OtherArm

@@ -26,8 +26,8 @@ from markupsafe import Markup
 from skills.api.authorisation import Caller, Role
 from skills.errors import UnknownFormat
 from skills.formats import READABLE
-from skills.library.overview import StyleState
-from skills.library.playbacks import error_called
+from skills.library.operation.overview import StyleState
+from skills.library.plans.playbacks import error_called
 
 HTML = "text/html"
 JSON = "application/json"

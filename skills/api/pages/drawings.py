@@ -32,7 +32,7 @@ from skills.demonstration.quality import pieces_of, times_in_words
 from skills.gridworld import paper
 from skills.gridworld.grid import GridPath, discretisation_rmse
 from skills.learning.certificate import Coverage
-from skills.library.cards import Card
+from skills.library.policies.cards import Card
 from skills.schemas.comparison import CurvePoint
 from skills.schemas.given import Atlas
 from skills.scoring.deviation import Deviation
@@ -198,8 +198,8 @@ def report_page(about: Mapping[str, Any], report: Report, demo: Demo, path: Grid
     """Return the HTML of the quality report to the surgeon: advice, path, speed and figures.
 
     Args:
-        about: The demonstration's JSON (`skills.library.demos.demo_json`).
-        report: The report (`skills.library.demos.full_report`).
+        about: The demonstration's JSON (`skills.library.recordings.demos.demo_json`).
+        report: The report (`skills.library.recordings.demos.full_report`).
         demo: The demonstration.
         path: Its path in its grid.
     """

@@ -8,10 +8,11 @@ from skills.api.authorisation import needs
 from skills.api.dependencies import Actor, Db, Jobs, Limit, RowCursor, Slug, SlugCursor, Strict
 from skills.api.openapi import ends, gives, gives_page, makes, router_of, says
 from skills.api.responses import Condition, Giving, refuse_changed, say, stored
-from skills.library import catalogue, erasure, locks
-from skills.library.catalogue import surgeon_json, suture_json
-from skills.library.keys import about_key, create_key, list_keys, revoke_key
-from skills.library.sweep import drop_contents, sweep_erased
+from skills.library.operation import locks
+from skills.library.operation.sweep import drop_contents, sweep_erased
+from skills.library.people import catalogue, erasure
+from skills.library.people.catalogue import surgeon_json, suture_json
+from skills.library.people.keys import about_key, create_key, list_keys, revoke_key
 from skills.schemas import SkillLevel
 from skills.schemas.given import Key, NewKey, Page, Surgeon, SutureType
 from skills.schemas.requests import KEY, LINE, KeyIn, SurgeonIn, SutureTypeIn

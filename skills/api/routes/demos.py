@@ -46,16 +46,19 @@ from skills.api.routes.policies import Accept
 from skills.db.models import StoredRewardMap
 from skills.errors import BadInput, Conflict, NotFound
 from skills.formats import BYTES, MEDIA_TYPES
-from skills.library import datasets, demos, erasure, locks, overview, proposals, recordings, scores
-from skills.library.atlas import CONFOUNDED, DISTANCE, MOST, SESSIONS, atlas_of, atlases
-from skills.library.catalogue import find_surgeon, find_suture_type
-from skills.library.demos import demo_json, path_json, reward_map_json
-from skills.library.jobs import QUEUED, did_nothing
-from skills.library.neighbours import nearest_to
-from skills.library.proposals import proposal_json
-from skills.library.recordings import find_recording, recording_json
-from skills.library.sweep import drop_contents, sweep_erased
-from skills.library.whose import recognise_recording
+from skills.library.comparison import scores
+from skills.library.comparison.atlas import CONFOUNDED, DISTANCE, MOST, SESSIONS, atlas_of, atlases
+from skills.library.comparison.neighbours import nearest_to
+from skills.library.comparison.recognition import recognise_recording
+from skills.library.operation import locks, overview
+from skills.library.operation.jobs import QUEUED, did_nothing
+from skills.library.operation.sweep import drop_contents, sweep_erased
+from skills.library.people import erasure
+from skills.library.people.catalogue import find_surgeon, find_suture_type
+from skills.library.recordings import datasets, demos, proposals, recordings
+from skills.library.recordings.demos import demo_json, path_json, reward_map_json
+from skills.library.recordings.proposals import proposal_json
+from skills.library.recordings.recordings import find_recording, recording_json
 from skills.schemas import OutcomeAsked, ProposalState
 from skills.schemas.given import (
     Atlas,

@@ -17,14 +17,16 @@ from skills.api.responses import JSON
 from skills.api.routes.policies import JobId, Version
 from skills.formats import MEDIA_TYPES, SUFFIXES
 from skills.kinematics import INSTRUMENTS
-from skills.library import jobs, overview, policies, releases, retraining, scores
-from skills.library.catalogue import list_surgeons
-from skills.library.demos import find_demo, shown_demo
-from skills.library.plans import find_plan, followed_plan, hands_over, plan_in_words
-from skills.library.playbacks import headline_of
-from skills.library.recordings import find_recording
-from skills.library.releases import outcomes_of
-from skills.library.replay import refusal_of_bag
+from skills.library.comparison import scores
+from skills.library.operation import jobs, overview
+from skills.library.people.catalogue import list_surgeons
+from skills.library.plans.plans import find_plan, followed_plan, hands_over, plan_in_words
+from skills.library.plans.playbacks import headline_of
+from skills.library.plans.replay import refusal_of_bag
+from skills.library.policies import releases, retraining, versions
+from skills.library.policies.releases import outcomes_of
+from skills.library.recordings.demos import find_demo, shown_demo
+from skills.library.recordings.recordings import find_recording
 from skills.planning.handoff import Enters
 from skills.remedies import Door
 from skills.schemas.requests import DIGEST, ScoreIn
@@ -116,7 +118,7 @@ def show_style(
     with db.reading() as session:
         whole = overview.whole_style(session, surgeon, suture)
         shown = _chosen(session, whole, version)
-        other = None if beside is None else policies.find_version(session, surgeon, suture, beside)
+        other = None if beside is None else versions.find_version(session, surgeon, suture, beside)
         most = overview.MOST_LISTED
         return render(request, "style.html", caller, whole=whole, shown=shown, other=other, most=most)
 
@@ -124,7 +126,7 @@ def show_style(
 def _chosen(session: Session, whole: overview.WholeStyle, version: int | None) -> Any:
     """Return the version to show: the requested one, else the served one, else the newest."""
     if version is not None:
-        return policies.find_version(session, whole.surgeon.slug, whole.suture.slug, version)
+        return versions.find_version(session, whole.surgeon.slug, whole.suture.slug, version)
     if whole.served is not None:
         return whole.served.policy
     return whole.versions[0] if whole.versions else None
@@ -134,7 +136,7 @@ def _chosen(session: Session, whole: overview.WholeStyle, version: int | None) -
 def view_version(surgeon: Slug, suture: Slug, version: Version, caller: Asking, db: Db) -> Response:
     """Return the data of a version's 3-D view."""
     with db.reading() as session:
-        return _json(overview.view_of_version(policies.choose(session, surgeon, suture, version)))
+        return _json(overview.view_of_version(versions.choose(session, surgeon, suture, version)))
 
 
 @router.get("/pages/demos/{demo}/view", dependencies=[needs("reader")])
@@ -255,9 +257,9 @@ def show_plan_editor(
         released = overview.released_styles(session)
         policy = None
         if surgeon is not None and suture is not None:
-            policy = policies.choose(session, surgeon, suture, version)
+            policy = versions.choose(session, surgeon, suture, version)
         elif released:
-            policy = policies.choose(session, released[0].surgeon, released[0].suture, released[0].version)
+            policy = versions.choose(session, released[0].surgeon, released[0].suture, released[0].version)
         return render(
             request,
             "plan_editor.html",

@@ -42,12 +42,20 @@ from skills.fields import as_json
 from skills.formats import BYTES, MCAP
 from skills.formats.bag_writer import timeline_mcap
 from skills.formats.replay_bag import rows_of_pass
-from skills.library import locks, overview, plans, playbacks
-from skills.library.jobs import QUEUED, did_nothing
-from skills.library.plans import find_suture_points, map_style, motion_of, plan_json, plan_summary_json, trajectory_of
-from skills.library.playbacks import find_playback, playback_json, shown_playback
-from skills.library.replay import compare_with_plan, conditions_of, replay_bag
-from skills.library.timelines import Source, check_export, chosen, motion_named, timeline_of
+from skills.library.operation import locks, overview
+from skills.library.operation.jobs import QUEUED, did_nothing
+from skills.library.plans import plans, playbacks
+from skills.library.plans.plans import (
+    find_suture_points,
+    map_style,
+    motion_of,
+    plan_json,
+    plan_summary_json,
+    trajectory_of,
+)
+from skills.library.plans.playbacks import find_playback, playback_json, shown_playback
+from skills.library.plans.replay import compare_with_plan, conditions_of, replay_bag
+from skills.library.recordings.timelines import Source, check_export, chosen, motion_named, timeline_of
 from skills.planning.plan import MAX_PASSES
 from skills.planning.trajectory import Trajectory
 from skills.schemas.given import Page, SuturePoints

@@ -50,18 +50,19 @@ from skills.db.models import PolicyVersion
 from skills.db.session import Database
 from skills.errors import PreconditionFailed
 from skills.learning.policy import next_step
-from skills.library import jobs as asked
-from skills.library import locks, policies, releases
-from skills.library.cards import Card, card_of
-from skills.library.catalogue import find_surgeon, find_suture_type
-from skills.library.integrity import learnt
-from skills.library.jobs import PART, count, job_json, to_tell
-from skills.library.policies import about_next, poses_of, summary_json, version_json
-from skills.library.proofs import head_over, sign_files
-from skills.library.releases import outcomes_of, outcomes_of_styles
-from skills.library.retraining import find_retraining, list_styles, request_retraining, retrained_json
-from skills.library.training import near_limits, odds_limits, request_training
-from skills.library.tries import request_try
+from skills.library.operation import jobs as asked
+from skills.library.operation import locks
+from skills.library.operation.integrity import learnt
+from skills.library.operation.jobs import PART, count, job_json, to_tell
+from skills.library.operation.proofs import head_over, sign_files
+from skills.library.people.catalogue import find_surgeon, find_suture_type
+from skills.library.plans.tries import request_try
+from skills.library.policies import releases, versions
+from skills.library.policies.cards import Card, card_of
+from skills.library.policies.releases import outcomes_of, outcomes_of_styles
+from skills.library.policies.retraining import find_retraining, list_styles, request_retraining, retrained_json
+from skills.library.policies.training import near_limits, odds_limits, request_training
+from skills.library.policies.versions import about_next, poses_of, summary_json, version_json
 from skills.schemas.given import (
     Job,
     NextPose,
@@ -229,7 +230,7 @@ def list_policies(
 ) -> Response:
     """List the styles that serve a policy."""
     with db.reading() as session:
-        found = policies.list_served(session, limit, cursor, surgeon, suture)
+        found = versions.list_served(session, limit, cursor, surgeon, suture)
         return give.page([summary_json(one) for one in found], limit, found[-1].row if found else None)
 
 
@@ -291,7 +292,7 @@ def list_versions(
 ) -> Response:
     """List the versions of a style, the newest first."""
     with db.reading() as session:
-        found = policies.list_versions(session, surgeon, suture, limit, cursor)
+        found = versions.list_versions(session, surgeon, suture, limit, cursor)
         return give.page([version_json(row) for row in found], limit, found[-1].version if found else None)
 
 
@@ -313,7 +314,7 @@ def get_version(
     """Return one version of a style, released or not, while the surgeon's consent covers training."""
     encoded: Encoded = request.app.state.encoded
     with db.reading() as session:
-        policy = policies.followable(policies.find_version(session, surgeon, suture, version))
+        policy = versions.followable(versions.find_version(session, surgeon, suture, version))
         return answer(encoded.policy(policy, None, accept), if_none_match, if_match)
 
 
@@ -331,7 +332,7 @@ def get_policy_version(
     """Return a policy version by the digest under which it is cited, while the surgeon's consent covers training."""
     encoded: Encoded = request.app.state.encoded
     with db.reading() as session:
-        found = policies.followable(policies.find_by_digest(session, policy))
+        found = versions.followable(versions.find_by_digest(session, policy))
         return answer(encoded.policy(found, None, accept), if_none_match, if_match)
 
 
@@ -356,7 +357,7 @@ def release(
     """
     encoded: Encoded = request.app.state.encoded
     with db.writing([locks.surgeon(surgeon)]) as session:
-        policy = policies.find_version(session, surgeon, suture, version)
+        policy = versions.find_version(session, surgeon, suture, version)
         if if_match is not None:
             _refuse_overtaken(session, encoded, surgeon, suture, if_match)
         released = releases.release(session, policy, actor, constant_turn_deg=settings.constant_turn_deg)
@@ -381,7 +382,7 @@ def withdraw(surgeon: Slug, suture: Slug, db: Db, request: Request, actor: Actor
 def roll_out(surgeon: Slug, suture: Slug, body: RolloutIn, db: Db) -> Response:
     """Follow the policy from a position to the goal."""
     with db.reading() as session:
-        found = policies.about_rollout(policies.choose(session, surgeon, suture, body.version), body.start_mm)
+        found = versions.about_rollout(versions.choose(session, surgeon, suture, body.version), body.start_mm)
         return say(found.model_dump(mode="json"))
 
 
@@ -389,7 +390,7 @@ def roll_out(surgeon: Slug, suture: Slug, body: RolloutIn, db: Db) -> Response:
 def next_action(surgeon: Slug, suture: Slug, body: NextIn, db: Db) -> Response:
     """Return the policy's next action at a position, or the next pose of the pose style at a pose; nothing moves."""
     with db.reading() as session:
-        policy = policies.policy_of(session, surgeon, suture).policy
+        policy = versions.policy_of(session, surgeon, suture).policy
         if body.rotation_xyzw is not None:
             poses = poses_of(policy)
             found = about_next(policy, poses, body.position_mm, body.rotation_xyzw, body.phase)
@@ -412,7 +413,7 @@ def _refuse_overtaken(session: Session, encoded: Encoded, surgeon: str, suture: 
     Raises:
         PreconditionFailed: Another one is released now.
     """
-    served = policies.policy_of(session, surgeon, suture)
+    served = versions.policy_of(session, surgeon, suture)
     if not names(if_match, encoded.policy(served.policy, served.release, JSON).etag):
         raise PreconditionFailed("Another policy is released now; read it, then repeat the request.")
 
@@ -433,7 +434,7 @@ def get_policy_card(
     It states whether the version is released now and what rests on it, so its ETag changes with these.
     """
     as_page = wants_page(accept, "A policy card")
-    find = policies.choose if as_page else policies.find_version
+    find = versions.choose if as_page else versions.find_version
     card = _card(db, lambda session: find(session, surgeon, suture, version))
     return _answer(card, as_page, if_none_match)
 
@@ -445,7 +446,7 @@ def get_policy_card(
 )
 def get_policy_card_signature(surgeon: Slug, suture: Slug, version: Version, db: Db, give: Giving) -> Response:
     """Return this service's signature of the policy card of a version as it is now: of its JSON and of its page."""
-    card = _card(db, lambda session: policies.find_version(session, surgeon, suture, version))
+    card = _card(db, lambda session: versions.find_version(session, surgeon, suture, version))
     assert card.facts.history is not None
     (head,) = read_notes(card.facts.history.note)
     files = {"card.json": _content(card, as_page=False), "card.html": _content(card, as_page=True)}
@@ -465,8 +466,8 @@ def get_policy_version_card(
 ) -> Response:
     """Return the policy card of a version by the digest under which it is cited."""
     as_page = wants_page(accept, "A policy card")
-    seen = policies.followable if as_page else lambda version: version
-    card = _card(db, lambda session: seen(policies.find_by_digest(session, policy)))
+    seen = versions.followable if as_page else lambda version: version
+    card = _card(db, lambda session: seen(versions.find_by_digest(session, policy)))
     return _answer(card, as_page, if_none_match)
 
 

@@ -1,0 +1,1 @@
+"""The atlas, nearest neighbours, recognition, scores, and calibrations of skill."""

@@ -1,0 +1,1 @@
+"""Jobs, history, backups, inspection, and the sweep."""

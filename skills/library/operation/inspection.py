@@ -1,0 +1,495 @@
+"""Inspection of an installation: the schema, every stored value and digest, and the references between rows.
+
+    Database --inspect_installation--> Checked, part by part
+
+Tables and their packed values are taken from the models, so a new table is checked without being named here. The input
+of a row's digest differs from table to table: `AGREES` has a check for each. Cached contents of recordings are compared
+with their bytes, decoded again; policies with their certificates, computed again, and on request with themselves,
+learnt again (`skills.library.policies.relearning`). Rows are named by table and number, never by a pseudonym. Nothing
+is changed, and transactions are short, so that other users are not blocked.
+"""
+
+import hashlib
+import secrets
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
+
+from sqlalchemy import Column, ColumnElement, ForeignKey, Table, case, exists, func, select, text, tuple_
+from sqlalchemy.orm import Mapper, Session, defer, object_session
+
+from skills.db import Base
+from skills.db.models import (
+    Demonstration,
+    LooseChunks,
+    ParsedChunk,
+    ParsedRecording,
+    Plan,
+    PolicyVersion,
+    RecordingChunk,
+    Release,
+    StoredCalibration,
+    StoredPlayback,
+    StoredPoses,
+    StoredRecording,
+    StoredRewardMap,
+    Surgeon,
+)
+from skills.db.packed import Packed, digest
+from skills.db.revisions import revision_of, revisions
+from skills.db.service_tables import DatasetChunk, ErasedSurgeon, Job, StoredDataset
+from skills.db.session import Database
+from skills.errors import Busy, Corrupt, NotFound, SkillsError
+from skills.formats.reader_process import READER_VERSION, read_told
+from skills.gridworld.reward import sparse_reward
+from skills.library.comparison.calibrations import read_calibration
+from skills.library.operation.history import Verified, verify_history
+from skills.library.operation.integrity import covered, demo_identity, planned, policy_identity, posed
+from skills.library.operation.jobs import identity_of
+from skills.library.policies.relearning import Again, StoredRecordings, compute_again, decoded, learn_again
+from skills.library.policies.versions import path_of, poses_of_demonstrations
+from skills.library.recordings.recordings import Teller, alike, cached_content, read_entry, recording_bytes
+from skills.packing import canonical, sha256
+from skills.settings import Settings
+from skills.transparency import Note
+
+ROWS_AT_ONCE = 100
+WITH_OTHERS = {RecordingChunk, ParsedChunk, DatasetChunk}  # checked with the row that they belong to
+HISTORY = "history signed"
+NAMED = 20  # orphans that are named for one reference, of all that are counted
+
+Why = Iterator[str]
+
+
+@dataclass
+class Checked:
+    """The result for one part: the number of items that were checked, and the faulty ones, each with the reason."""
+
+    what: str
+    count: int = 0
+    wrong: list[tuple[str, str]] = field(default_factory=list)
+    left_out: list[tuple[str, str]] = field(default_factory=list)  # not, or not wholly, compared, each with the reason
+    of: int | None = None  # the number of items that will be checked, where it is known before
+
+
+def inspect_installation(
+    database: Database,
+    tell: Teller = read_told,
+    *,
+    decode_all: bool = False,
+    heads: Sequence[Note] | None = None,
+    relearn: Settings | None = None,
+    limit: int | None = None,
+) -> Iterator[Checked]:
+    """Check everything that is stored, part by part.
+
+    Args:
+        database: The database, without restriction.
+        tell: The reader of recordings, possibly in another process.
+        decode_all: Decode every recording whose content is cached, and not only the newest.
+        heads: Signed heads of the history that were kept elsewhere; None: those of the database's own file.
+        relearn: The limits of time and memory with which every policy is learnt again; None: none is.
+        limit: Learn at most this number of policies again, drawn at random each time; None: all.
+
+    Yields:
+        Each part at its start, during its progress, and at its end.
+
+    Raises:
+        Busy: The database cannot be read any more.
+    """
+    yield from _at_once("schema", _schema, database)
+    if database.engine.dialect.name == "sqlite":
+        yield from _at_once("database file", _file, database)
+    yield from _at_once("references", _references, database)
+    yield from _at_once(HISTORY, partial(_history, heads, database), database)
+    for mapper in sorted(Base.registry.mappers, key=lambda one: one.local_table.name):  # type: ignore[attr-defined]
+        # Every model that the registry knows, so that a new table cannot be forgotten.
+        if mapper.class_ not in WITH_OTHERS:
+            yield from _rows(database, mapper)
+    yield from _decoded_again(database, tell, decode_all)
+    yield from inspect_policies(database, tell, relearn, limit)
+
+
+def _at_once(what: str, look: Callable[[Session, Checked], None], database: Database) -> Iterator[Checked]:
+    checked = Checked(what)
+    yield checked
+    try:
+        with database.reading() as session:
+            look(session, checked)
+    except Busy:
+        raise
+    except Exception as error:
+        checked.wrong.append((what, _in_words(error)))
+    yield checked
+
+
+# ---- the installation --------------------------------------------------------------------------------------------
+
+
+def _schema(session: Session, checked: Checked) -> None:
+    checked.count = 1
+    revision = revision_of(session.connection())
+    if revision != revisions()[0]:
+        checked.wrong.append(("schema", f"it is at {revision}, this version needs {revisions()[0]}; migrate it"))
+
+
+def _file(session: Session, checked: Checked) -> None:
+    checked.count = session.scalar(text("PRAGMA page_count")) or 0
+    said = session.scalars(text(f"PRAGMA integrity_check({NAMED})")).all()
+    checked.wrong += [("database file", line) for line in said if line != "ok"]
+
+
+def _references(session: Session, checked: Checked) -> None:
+    """Find rows with a foreign key to a row that does not exist."""
+    for table in Base.metadata.sorted_tables:
+        keys = list(table.foreign_keys)
+        if not keys:
+            continue
+        orphans = [key.parent.is_not(None) & ~_has_parent(key) for key in keys]
+        counts = [func.count(key.parent) for key in keys] + [func.count(case((orphan, 1))) for orphan in orphans]
+        found = session.execute(select(*counts).select_from(table)).one()
+        checked.count += sum(found[: len(keys)])
+        for key, orphan, lost in zip(keys, orphans, found[len(keys) :], strict=True):
+            for row in session.execute(select(*table.primary_key).where(orphan).limit(NAMED)) if lost else ():
+                why = f"its {key.parent.name} has no row in {key.column.table.name}"
+                checked.wrong.append((_name(table, row), why))
+    # Without a foreign key, because they are deleted after the row to which they belong.
+    for column, owner, late in (
+        (RecordingChunk.recording, StoredRecording, LooseChunks.recording_row),
+        (Job.surgeon_row, Surgeon, ErasedSurgeon.surgeon_row),
+    ):
+        table = Base.metadata.tables[column.class_.__tablename__]
+        left = (column.is_not(None), ~exists().where(owner.row == column), ~exists().where(late == column))
+        for row in session.execute(select(*table.primary_key).where(*left).limit(NAMED)):
+            checked.wrong.append((_name(table, row), f"its {column.key} has no row in {owner.__tablename__}"))
+        due = Base.metadata.tables[late.class_.__tablename__]
+        for number in session.scalars(select(late).where(exists().where(owner.row == late)).limit(NAMED)):
+            why = f"it says that {owner.__tablename__} {number} was deleted, which exists"
+            checked.wrong.append((_name(due, [number]), why))
+
+
+def _has_parent(key: ForeignKey) -> ColumnElement[bool]:
+    other = key.column.table.alias()
+    return exists().where(other.c[key.column.name] == key.parent)
+
+
+def _history(heads: Sequence[Note] | None, database: Database, session: Session, checked: Checked) -> None:
+    """Verify the history in one transaction: its leaves and the rows must be of the same state."""
+    done = Verified()
+    checked.wrong += verify_history(session.connection(), database.history, heads, done)
+    checked.count = done.leaves + done.rows
+
+
+# ---- rows --------------------------------------------------------------------------------------------------------
+
+
+def _rows(database: Database, mapper: Mapper[Any]) -> Iterator[Checked]:
+    table = mapper.local_table
+    assert isinstance(table, Table)
+    checked = Checked(table.name)
+    yield checked
+    keys, last = list(table.primary_key), None
+    while True:
+        query = select(*keys).order_by(*keys).limit(ROWS_AT_ONCE)
+        if last is not None:
+            query = query.where(tuple_(*keys) > tuple_(*last))
+        try:
+            with database.reading() as session:
+                page = [tuple(row) for row in session.execute(query)]
+                for key, why in _look(session, mapper, keys, page):
+                    checked.wrong.append((_name(table, key), why))
+        except Busy:
+            raise
+        except Exception as error:  # such as a damaged page of the database file
+            checked.wrong.append((table.name, f"after {last}: {_in_words(error)}"))
+            break
+        checked.count += len(page)
+        if len(page) < ROWS_AT_ONCE:
+            break
+        last = page[-1]
+        yield checked
+    yield checked
+
+
+def _look(
+    session: Session, mapper: Mapper[Any], keys: list[Column[Any]], page: list[tuple[Any, ...]]
+) -> Iterator[tuple[tuple[Any, ...], str]]:
+    """Check a page of rows; yield the key of each faulty one, and the reason."""
+    packed = packed_values(mapper)
+    later = [defer(getattr(mapper.class_, name)) for name in packed]
+    try:
+        rows = deque(session.scalars(select(mapper.class_).options(*later).where(tuple_(*keys).in_(page))))
+    except Exception:  # one of them cannot be read; reading each alone finds which
+        rows = deque()
+        for key in page:
+            try:
+                row = session.get(mapper.class_, key, options=later)
+            except Exception as error:
+                yield key, _in_words(error)
+            else:
+                rows.extend([] if row is None else [row])  # None: erased since the page was read
+    while rows:
+        row = rows.popleft()
+        key = mapper.primary_key_from_instance(row)
+        for why in _wrong_with(row, packed):
+            yield tuple(key), why
+        session.expire(row, packed)  # frees the values: a page of large ones does not fit into memory
+
+
+def packed_values(mapper: Mapper[Any]) -> list[str]:
+    """Return the names of a model's attributes that hold packed values."""
+    return [one.key for one in mapper.column_attrs if isinstance(one.columns[0].type, Packed)]
+
+
+def _wrong_with(row: Any, packed: Sequence[str]) -> Why:
+    """Yield the faults of a row: a value that cannot be read, otherwise values that do not match the digest."""
+    for name in packed:
+        try:
+            getattr(row, name)
+        except Exception as error:
+            yield f"{name}: {_in_words(error)}"
+            return
+    try:
+        yield from AGREES.get(type(row), lambda _: iter(()))(row)
+    except Exception as error:
+        yield _in_words(error)
+
+
+def _name(table: Table, key: Sequence[Any]) -> str:
+    return f"{table.name} {'/'.join(map(str, key))}"
+
+
+def _in_words(error: Exception) -> str:
+    """Return an error as text; one that is not ours might quote stored values, so only its type is named."""
+    return error.words() if isinstance(error, SkillsError) else f"it cannot be read ({type(error).__name__})"
+
+
+# ---- the cache of recordings -------------------------------------------------------------------------------------
+
+
+def _decoded_again(database: Database, tell: Teller, every: bool) -> Iterator[Checked]:
+    """Compare cached contents with their recordings decoded again: of the newest recording, or of every one."""
+    checked = Checked("recordings decoded")
+    yield checked
+    query = select(ParsedRecording.recording_row).where(ParsedRecording.version == READER_VERSION)
+    query = query.order_by(ParsedRecording.recording_row.desc())
+    try:
+        with database.reading() as session:
+            rows = session.scalars(query if every else query.limit(1)).all()
+        for row in rows:
+            for why in _decoded_otherwise(database, row, tell):
+                checked.wrong.append((f"recordings {row}", why))
+            checked.count += 1
+            yield checked
+    except Busy:
+        raise
+    except Exception as error:  # such as a schema without the cache
+        checked.wrong.append((checked.what, _in_words(error)))
+    yield checked
+
+
+def _decoded_otherwise(database: Database, row: int, tell: Teller) -> Why:
+    """Yield the fault of a cached content: it differs from the recording's bytes. Damaged ones are found before."""
+    with database.reading() as session:
+        stored = session.get(StoredRecording, row)
+        kept = None if stored is None else cached_content(session, stored)
+    if kept is None:  # erased or replaced since, or damaged
+        return
+    try:
+        again = decoded(database, row, tell)
+    except Busy:
+        raise
+    except (Corrupt, NotFound):  # damaged bytes are reported with the recording; it was erased since
+        return
+    except SkillsError as error:
+        yield f"its content is cached, but it cannot be decoded again: {error.words()}"
+        return
+    parts = ("recording", "proposed", "identifications", "bases")
+    if not all(alike(getattr(kept, part), getattr(again, part)) for part in parts):
+        yield "its cached content differs from its bytes; delete its row of parsed_recordings, which is written again"
+
+
+# ---- policies computed and learnt again ------------------------------------------------------------------------------
+
+
+def inspect_policies(
+    database: Database, tell: Teller, relearn: Settings | None, limit: int | None = None
+) -> Iterator[Checked]:
+    """Learn policies again if wanted, and compute the certificates of the others again; see `inspect_installation`."""
+    done: set[int] = set()
+    if relearn is not None:
+        learn = partial(learn_again, database, recordings=StoredRecordings(database, tell), settings=relearn)
+        yield from _again(database, Checked("policies learnt again"), limit, learn, done)
+    yield from _again(database, Checked("certificates"), None, partial(compute_again, database), done)
+
+
+def _again(
+    database: Database, checked: Checked, limit: int | None, compare: Callable[[int], Again], done: set[int]
+) -> Iterator[Checked]:
+    """Compute policy versions again that are not done yet, and compare each with what is stored."""
+    yield checked
+    try:
+        with database.reading() as session:
+            every = session.scalars(select(PolicyVersion.row).order_by(PolicyVersion.row))
+            rows = [row for row in every if row not in done]
+        if limit is not None and limit < len(rows):
+            rows = sorted(secrets.SystemRandom().sample(rows, limit))
+        checked.of = len(rows)
+        for row in rows:
+            name = f"{PolicyVersion.__tablename__} {row}"
+            try:
+                found = compare(row)
+            except Busy:
+                raise
+            except (Corrupt, NotFound):  # reported with the row; erased since
+                pass
+            except Exception as error:
+                checked.wrong.append((name, _in_words(error)))
+            else:
+                if found.left_out is None:
+                    done.add(row)
+                else:
+                    checked.left_out.append((name, found.left_out))
+                if found.differing:
+                    differing = ", ".join(found.differing)
+                    checked.wrong.append((name, f"computed again, it has other results: {differing}"))
+            checked.count += 1
+            yield checked
+    except Busy:
+        raise
+    except Exception as error:  # such as a schema without policies
+        checked.wrong.append((checked.what, _in_words(error)))
+    yield checked
+
+
+# ---- the input of each digest, and values that must agree --------------------------------------------------------
+
+
+def _recording(row: StoredRecording) -> Why:
+    session = object_session(row)
+    assert session is not None
+    size = sum(len(piece) for piece in recording_bytes(session, row))  # raises `Corrupt` if the digest differs
+    if size != row.size_bytes:
+        yield f"it has {size} bytes, its row has {row.size_bytes}"
+
+
+def _parsed_recording(row: ParsedRecording) -> Why:
+    session = object_session(row)
+    assert session is not None
+    if row.version == READER_VERSION:  # others are not used
+        read_entry(session, session.get_one(StoredRecording, row.recording_row))  # raises `Corrupt`
+    yield from ()
+
+
+def _dataset(row: StoredDataset) -> Why:
+    session = object_session(row)
+    assert session is not None
+    seen, size = hashlib.sha256(), 0
+    query = select(DatasetChunk.data).where(DatasetChunk.dataset_row == row.row).order_by(DatasetChunk.number)
+    for data in session.scalars(query.execution_options(yield_per=1)):
+        seen.update(data)
+        size += len(data)
+    if seen.hexdigest() != row.sha256:
+        yield "it does not match its digest"
+    if size != row.size_bytes:
+        yield f"it has {size} bytes, its row has {row.size_bytes}"
+
+
+def _demonstration(row: Demonstration) -> Why:
+    if demo_identity(row.recording.sha256, row.surgeon.slug, row.suture, row.demo, row.path) != row.sha256:
+        yield "it does not match its digest"
+    if row.hysteresis != row.path.hysteresis:
+        yield "its hysteresis differs from that of its path"
+    for name in ("arm", "topic", "frame", "instrument", "start_s", "end_s"):
+        if getattr(row, name) != getattr(row.demo, name):
+            yield f"its {name} differs from the recording"
+
+
+def _reward_map(row: StoredRewardMap) -> Why:
+    session = object_session(row)
+    assert session is not None
+    if digest(row.map) != row.sha256:
+        yield "it does not match its digest"
+    path = session.get_one(Demonstration, row.demonstration_row).path
+    if digest(sparse_reward(path, row.map.levels)) != row.sha256:
+        yield "it differs from the result of Algorithm 1 for its demonstration"
+
+
+def _policy(row: PolicyVersion) -> Why:
+    manifest, demonstrations = row.manifest, row.demonstrations
+    if policy_identity(manifest, row.learnt) != row.sha256:
+        yield "it differs from the certified policy"
+    covered(row)
+    if row.releasable != (not manifest["grid_certificate"]["refused_because"]):
+        yield "its flag `releasable` contradicts its certificate"
+    if (manifest["surgeon"], manifest["suture"]) != (row.surgeon.slug, row.suture):
+        yield "its manifest names another style"
+    there, said = row.learnt.surroundings, manifest.get("scene")
+    if (there and there.as_json()) != (said and {name: said[name] for name in ("scene", "costs")}):
+        yield "its manifest states another scene than it was learnt in"
+    if manifest["demos"] != [one.sha256 for one in demonstrations]:
+        yield "it was learnt from another demonstration"
+    if any((one.surgeon_row, one.suture) != (row.surgeon_row, row.suture) for one in demonstrations):
+        yield "its demonstration is of another style"
+    if digest(row.learnt.path) != digest(path_of(row)):
+        yield "its path differs from that of its demonstration"
+
+
+def _poses(row: StoredPoses) -> Why:
+    poses = posed(row)
+    own = replace(poses.path, partner=None)  # the other arm's motion is in recordings alone: `relearning.learn_again`
+    again = poses_of_demonstrations(row.policy)
+    if again is None or not alike(own, again.path) or poses.frame != again.frame:
+        yield "it differs from the poses of its version's demonstrations"
+
+
+def _release(row: Release) -> Why:
+    policy = row.policy
+    if (policy.surgeon_row, policy.suture) != (row.surgeon_row, row.suture):
+        yield "it releases a policy of another style"
+    if not policy.releasable:
+        yield "its policy did not pass the gate"
+    if row.withdrawn_at is None:
+        yield from (f"it is not withdrawn, but its demonstration {what}" for what in policy.objections)
+
+
+def _plan(row: Plan) -> Why:
+    planned(row)
+    yield from ()
+
+
+def _playback(row: StoredPlayback) -> Why:
+    if sha256(canonical([row.plan.sha256, row.report])) != row.sha256:
+        yield "it does not match the digest of plan and verdict"
+    if row.feasible != row.report["feasible"]:
+        yield "its flag `feasible` contradicts its report"
+    if digest(row.measured.trajectory) != row.report["trajectory"]:
+        yield "its motion is not the one that was judged"
+
+
+def _calibration(row: StoredCalibration) -> Why:
+    read_calibration(row)
+    yield from ()
+
+
+def _job(row: Job) -> Why:
+    if identity_of(row.kind, row.request) != row.identity:
+        yield "its request does not match its identity"
+
+
+AGREES: dict[type, Callable[[Any], Why]] = {
+    StoredRecording: _recording,
+    ParsedRecording: _parsed_recording,
+    StoredDataset: _dataset,
+    Demonstration: _demonstration,
+    StoredRewardMap: _reward_map,
+    PolicyVersion: _policy,
+    StoredPoses: _poses,
+    Release: _release,
+    Plan: _plan,
+    StoredPlayback: _playback,
+    StoredCalibration: _calibration,
+    Job: _job,
+}

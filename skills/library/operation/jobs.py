@@ -1,0 +1,422 @@
+"""Jobs: requests for work, deduplicated by their identity, and the bookkeeping of batches.
+
+A job's identity is the digest of its kind and inputs; an equal request returns the same job.
+
+A batch is a job whose styles have rows of their own and are handed to the engine in parts:
+
+    a job `retraining`             the request; never submitted to the engine
+      jobs `retraining-part`       submitted to the engine, a few styles each; users do not see them
+        styles                     queued, then done, failed or cancelled, each independently
+
+A style is ended by changing its state from `queued` in the transaction that stores its result: so it ends once,
+even if several workers train it. The batch ends in the same transaction as its last part.
+"""
+
+import secrets
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Any, Literal, NamedTuple, NotRequired, TypedDict, cast
+
+from sqlalchemy import ColumnElement, Select, Table, delete, exists, func, select, update
+from sqlalchemy.orm import Session
+
+from skills.db import now, rfc3339
+from skills.db.models import Demonstration, PolicyVersion, Release, Surgeon
+from skills.db.row_visibility import EVERYBODYS
+from skills.db.service_tables import ErasedSurgeon, Job, StyleToRetrain, record_event
+from skills.db.session import Database
+from skills.errors import Conflict, NotFound, TooMany
+from skills.library.operation import locks
+from skills.library.people.consent import require
+from skills.library.policies.releases import Outcome, is_served
+from skills.packing import canonical, sha256
+from skills.remedies import Action, Remedy
+
+BATCH, PART = "retraining", "retraining-part"
+EXPORT, PICTURES = "dataset", "pictures"
+ACTIVE = ("queued", "running")
+Store = Callable[[Session, str], dict[str, Any]]  # stores a result in a transaction, on behalf of this actor
+# For statements that change many rows: no object of the session has to follow, so none is searched for.
+UNSYNCHRONISED: Any = {"execution_options": {"synchronize_session": False}}
+Rows = Sequence[int] | Select[int]  # at most as many as a statement may have parameters, or a query
+
+
+def to_tell(session: Session, job: Job) -> list[tuple[int, int]]:
+    """List the rows and attempts to submit to the engine for a job: its own, or those of a batch's parts."""
+    if job.kind != BATCH:
+        return [(job.row, job.attempt)]
+    parts = select(StyleToRetrain.part_row).where(StyleToRetrain.job_row == job.row)
+    mine = select(Job.row, Job.attempt).where(Job.row.in_(parts)).order_by(Job.row)
+    return [(row, attempt) for row, attempt in session.execute(mine)]
+
+
+def count(session: Session, batch: int) -> dict[str, int]:
+    """Return the number of a batch's styles in each state."""
+    states = dict.fromkeys(("queued", "done", "failed", "cancelled"), 0)
+    mine = select(StyleToRetrain.state, func.count().label("styles")).where(StyleToRetrain.job_row == batch)
+    return states | {found.state: found.styles for found in session.execute(mine.group_by(StyleToRetrain.state))}
+
+
+def changed_since(session: Session, batch: int) -> set[int]:
+    """Return the demonstrations of the styles of a batch that now serve another version than when the batch ended them.
+
+    For a style that the batch released: another version than the released one, or none. For a style that it did not
+    release: another version than the one it was compared with.
+    """
+    of, by = StyleToRetrain, Demonstration
+    served = (
+        select(PolicyVersion.sha256)
+        .join(Release, Release.policy_row == PolicyVersion.row)
+        .where(Release.surgeon_row == by.surgeon_row, Release.suture == by.suture, is_served())
+        .correlate(by)
+        .scalar_subquery()
+    )
+    done = select(by.row, of.comparison, served).join(by, by.row == of.demonstration_row)
+    mine = of.job_row == batch, of.state == "done", ~_serving()
+    return {row for row, compared, now in session.execute(done.where(*mine)) if now != _served_then(compared)}
+
+
+def _served_then(comparison: dict[str, Any]) -> str | None:
+    """Return the digest of the version that a style served when a batch ended it."""
+    served = comparison["trained"] if comparison["now_released"] else comparison["released"]
+    return None if served is None else str(served["sha256"])
+
+
+def count_serving(session: Session, batch: int) -> tuple[int, int]:
+    """Return the number of a batch's styles that serve its version now, and the number of those that are done."""
+    done = select(func.count()).where(StyleToRetrain.job_row == batch, StyleToRetrain.state == "done")
+    return session.scalar(done.where(_serving())) or 0, session.scalar(done) or 0
+
+
+def _serving() -> ColumnElement[bool]:
+    """Return a condition on `StyleToRetrain`: its version is the one that its style serves."""
+    return exists().where(Release.policy_row == StyleToRetrain.policy_row, is_served()).correlate(StyleToRetrain)
+
+
+def cancel_parts(session: Session, batch: int) -> None:
+    """Cancel all parts and styles of a batch that have not ended."""
+    parts = select(StyleToRetrain.part_row).where(StyleToRetrain.job_row == batch)
+    ended = {"state": "cancelled", "ended_at": now()}
+    session.execute(update(Job).where(Job.row.in_(parts), Job.state.in_(ACTIVE)).values(**ended), **UNSYNCHRONISED)
+    mine = (StyleToRetrain.job_row == batch, StyleToRetrain.state == "queued")
+    session.execute(update(StyleToRetrain).where(*mine).values(**ended), **UNSYNCHRONISED)
+
+
+def end_part(session: Session, batch: int, part: int, state: str, reason: str) -> None:
+    """End the remaining styles of a part that ended without them, and the batch if that was its last part."""
+    left = (StyleToRetrain.part_row == part, StyleToRetrain.state == "queued")
+    ended = {"state": state, "reason": reason, "ended_at": now()}
+    session.execute(update(StyleToRetrain).where(*left).values(**ended), **UNSYNCHRONISED)
+    settle(session, batch)
+
+
+def settle(session: Session, batch: int) -> None:
+    """End a batch if none of its styles is queued any more; it has failed if a style has failed."""
+    counted = count(session, batch)
+    if counted["queued"]:
+        return
+    # A batch to whose styles others are still added has not ended.
+    complete = Job.told_at.is_not(None)
+    state = "failed" if counted["failed"] else "cancelled" if counted["cancelled"] else "succeeded"
+    ended = {"state": state, "progress": 1.0, "result": counted, "error": _why(counted), "ended_at": now()}
+    # Only the transaction that changes the state records the event.
+    mine = (Job.row == batch, Job.state.in_(ACTIVE), complete)
+    job = session.scalar(update(Job).where(*mine).values(**ended).returning(Job.id))
+    if job is not None:
+        record_event(session, "worker", "finish", f"job-{BATCH}", job)
+
+
+def forget_styles(session: Session, demonstrations: Rows | None, batches: Rows | None) -> None:
+    """Delete the styles of erased demonstrations from all batches, and all styles of erased batches.
+
+    Their parts continue without them, and end the batch.
+    """
+    for column, rows in ((StyleToRetrain.demonstration_row, demonstrations), (StyleToRetrain.job_row, batches)):
+        if rows is not None:
+            session.execute(delete(StyleToRetrain).where(column.in_(rows)), **UNSYNCHRONISED)
+
+
+def _why(counted: dict[str, int]) -> str | None:
+    styles = sum(counted.values())
+    if counted["failed"]:
+        return f"{counted['failed']} of {styles} styles failed; the batch names them. The others are done."
+    return f"{counted['cancelled']} of {styles} styles were cancelled." if counted["cancelled"] else None
+
+
+LIVE = ("queued", "running", "succeeded")
+QUEUED = "A new job is queued."  # `RequestedJob.did` of a new job
+JOBS_WAIT_S = 10.0  # the `Retry-After` of `TooMany`: some trainings later
+
+
+KEPT = "kept"  # `joins` of a batch in which each style keeps the joining rule of the policy that it serves
+
+
+class TrainingRequest(TypedDict):
+    """The request of a training's job, all defaults resolved; its digest is the identity of the training."""
+
+    surgeon: str
+    suture: str
+    demos: list[str]
+    learner: dict[str, Any]
+    learner_version: int
+    gate: int
+    poses: int
+    near: dict[str, float]  # of the gate
+    seed: int
+    release: bool
+    combine: NotRequired[dict[str, str]]  # of several demonstrations
+    outcomes: NotRequired[str]  # "any": of any outcome; otherwise left out
+    depth_along: NotRequired[list[float]]  # in a frame that is not the base of the arm
+    surroundings: NotRequired[dict[str, Any]]  # the scene and its costs
+    odds: NotRequired[dict[str, float]]  # of the gate in a scene
+
+
+class RetrainingRequest(TypedDict):
+    """The request of a batch's job: the settings that its styles share, and the digest of what they are learnt from."""
+
+    surgeon: str | None
+    suture: str | None
+    only_stale: bool
+    learner: dict[str, Any]
+    learner_version: int
+    gate: int
+    poses: int
+    near: dict[str, float]
+    odds: dict[str, float]
+    joins: str | None  # `KEPT`; None where the request names a learner
+    seed: int
+    release: bool
+    styles: NotRequired[int]
+    demos_sha256: NotRequired[str]
+    after: NotRequired[str]  # the equal batch whose styles serve something else now
+
+
+class PartRequest(TypedDict):
+    """The request of a part of a batch: the rows of both jobs, no personal data."""
+
+    retraining: int
+    part: int
+
+
+class PlaybackRequest(TypedDict):
+    """The request of a playback's job: the plan's digest, and the stated errors of the arms to judge it under."""
+
+    plan: str
+    check_version: int
+    errors: dict[str, Any]
+    stated_by: Literal["request", "installation"]
+
+
+class PicturesRequest(TypedDict):
+    """The request of the pictures of a playback; erasing a demonstration finds the job by the plan."""
+
+    plan: str
+    playback: str
+
+
+class DatasetRequest(TypedDict):
+    """The request of an export's job: the contents of its README, and the digest of its demonstrations and splits."""
+
+    name: str
+    version: str
+    fps: int
+    arms: list[str]
+    whole: bool
+    split: str
+    licence: str
+    description: str
+    procedure: str
+    consent: str  # in words, without a pseudonym
+    episodes: int
+    demos_sha256: str
+
+
+class RequestedJob(NamedTuple):
+    """A requested job, whether it is new, and the effect of the request, in words."""
+
+    job: Job
+    new: bool
+    did: str
+
+
+def ask(
+    session: Session, kind: str, request: Mapping[str, object], surgeon: Surgeon | None, actor: str
+) -> tuple[Job, bool]:
+    """Queue work whose inputs are all resolved; return the job, and whether it is new.
+
+    An equal request that is queued, running or done returns the same job; after a failed or cancelled one a new job is
+    queued.
+    """
+    known = find_live(session, kind, request)
+    if known is not None:
+        return known, False
+    job = Job(
+        id=secrets.token_hex(8),
+        kind=kind,
+        identity=identity_of(kind, request),
+        request={**request},
+        plan=request.get("plan"),
+        surgeon_row=surgeon.row if surgeon else None,
+        asked_by=actor,
+    )
+    session.add(job)
+    session.flush()
+    record_event(session, actor, "ask", f"job-{kind}", job.id, surgeon)
+    return job, True
+
+
+def find_live(session: Session, kind: str, request: Mapping[str, object]) -> Job | None:
+    """Return the job of an equal request that is queued, running or done, even if the caller may not see it."""
+    alike = select(Job).where(Job.identity == identity_of(kind, request), Job.state.in_(LIVE))
+    # All rows, not only the caller's: an equal job must not be queued twice.
+    return session.scalar(alike.execution_options(**EVERYBODYS))
+
+
+def while_running(database: Database, row: int, attempt: int) -> Database:
+    """Return a database that a job writes to: each transaction is refused once the job does not run at this attempt.
+
+    Erasing deletes the jobs whose result would bring back what was erased, so they end here too. All work on one
+    surgeon's motion is training: it is refused once the consent does not cover that.
+    """
+    mine = (Job.row == row, Job.attempt == attempt, Job.state == "running")
+
+    def check(session: Session) -> None:
+        if (job := session.scalar(select(Job).where(*mine))) is None:
+            raise Conflict("The job was cancelled while it ran, or something that it uses was erased.")
+        if (surgeon := session.get(Surgeon, job.surgeon_row or 0)) is not None:
+            require(surgeon, "training")
+
+    with database.reading() as session:
+        names = names_of(session, row)
+        check(session)
+    return database.on_condition(check, [locks.job(row)] if names is None else names)
+
+
+def telling(database: Database, kind: str, request: Mapping[str, object]) -> Callable[[float], None]:
+    """Return a callback that stores the progress of a running job, in the database of `while_running`."""
+    mine = (Job.identity == identity_of(kind, request), Job.state == "running")
+
+    def tell(share: float) -> None:
+        with database.writing(()) as session:
+            session.execute(update(Job).where(*mine).values(progress=share), **UNSYNCHRONISED)
+
+    return tell
+
+
+def did_nothing(job: Job) -> str:
+    """Return the sentence that a request had no effect because an equal job exists."""
+    return f"Nothing: an equal job {'has succeeded' if job.state == 'succeeded' else f'is {job.state}'} already."
+
+
+def refuse_too_many(session: Session, actor: str, most: int) -> None:
+    """Refuse more work for an actor who already has `most` jobs queued or running; a batch counts as one.
+
+    Raises:
+        TooMany: The limit is reached.
+    """
+    # Parts are left out, because their batch counts as one.
+    mine = select(func.count()).where(Job.asked_by == actor, Job.state.in_(ACTIVE), Job.kind != PART)
+    waiting = session.scalar(mine.select_from(Job)) or 0
+    if waiting >= most:
+        raise TooMany(
+            f"You have {waiting} jobs waiting or running; wait for some of them, or cancel them.", JOBS_WAIT_S
+        )
+
+
+def identity_of(kind: str, request: Mapping[str, object]) -> str:
+    """Return the identity of a request: the digest of its kind and of all its inputs."""
+    return sha256(canonical([kind, request]))
+
+
+def shown() -> list[ColumnElement[bool]]:
+    """Return the conditions on the jobs that users see: no parts of batches, and no jobs of erased surgeons."""
+    erased = cast(Table, ErasedSurgeon.__table__).c.surgeon_row
+    # A scalar and not `exists`, which PostgreSQL may turn into a join, for which it reads and sorts all jobs.
+    of_job = select(erased).where(erased == Job.surgeon_row).correlate(Job).scalar_subquery()
+    return [Job.kind != PART, of_job.is_(None)]
+
+
+def newest(session: Session, kind: str, request: Mapping[str, object]) -> Job | None:
+    """Return the newest job with exactly this request, in any state."""
+    mine = select(Job).where(Job.identity == identity_of(kind, request))
+    return session.scalar(mine.order_by(Job.row.desc()).limit(1))
+
+
+def find_job(session: Session, job_id: str) -> Job:
+    """Return a job by its id."""
+    job = session.scalar(select(Job).where(Job.id == job_id, *shown()))
+    if job is None:
+        raise NotFound("There is no job with this id.", Remedy(Action.LIST_JOBS))
+    return job
+
+
+def find_jobs(session: Session, job_ids: Collection[str]) -> Sequence[Job]:
+    """Return jobs by their ids, with one query; unknown ids are left out."""
+    return session.scalars(select(Job).where(Job.id.in_(job_ids), *shown())).all()
+
+
+def list_jobs(
+    session: Session, limit: int, before: int | None, state: str | None, kind: str | None = None
+) -> Sequence[Job]:
+    """List jobs, the newest first: all, or those in one state or of one kind."""
+    query = select(Job).where(*shown()).order_by(Job.row.desc()).limit(limit)
+    if before is not None:
+        query = query.where(Job.row < before)
+    if state is not None:
+        query = query.where(Job.state == state)
+    if kind is not None:
+        query = query.where(Job.kind == kind)
+    return session.scalars(query).all()
+
+
+def names_of(session: Session, row: int) -> list[str] | None:
+    """Return the names under which the end of a job is stored (`skills.library.operation.locks`): its own, its batch's,
+    its surgeon's; None for an export, which asks for the consent of many surgeons.
+    """
+    query = select(Job.kind, Job.request, Surgeon.slug).outerjoin(Surgeon, Surgeon.row == Job.surgeon_row)
+    found = session.execute(query.where(Job.row == row)).first()
+    if found is None:
+        return [locks.job(row)]
+    if found.kind == EXPORT:
+        return None
+    of_batch = [locks.job(found.request["retraining"])] if found.kind == PART else []
+    return [locks.job(row), *of_batch, *([] if found.slug is None else [locks.surgeon(found.slug)])]
+
+
+def cancel(session: Session, job_id: str, actor: str) -> Job:
+    """Cancel a job that is queued or running: its result will not be stored.
+
+    The caller's transaction holds the name of the job.
+
+    Raises:
+        Conflict: It has ended.
+    """
+    job = find_job(session, job_id)
+    ended = {"state": "cancelled", "ended_at": now()}
+    done = session.execute(
+        update(Job).where(Job.row == job.row, Job.state.in_(ACTIVE)).values(**ended).returning(Job.row)
+    )
+    if done.first() is None and job.state != "cancelled":
+        raise Conflict(f"The job has ended already: it {job.state}.")
+    if job.kind == BATCH:
+        cancel_parts(session, job.row)
+    session.refresh(job)
+    record_event(session, actor, "cancel", f"job-{job.kind}", job.id)
+    return job
+
+
+def job_json(row: Job, outcome: Outcome, did: str | None = None) -> dict[str, Any]:
+    """Return a job's JSON, with its outcome and the effect of the request that it answers."""
+    return {
+        "id": row.id,
+        "kind": row.kind,
+        "state": row.state,
+        "progress": row.progress,
+        "request": row.request,
+        "result": outcome.result,
+        "served": outcome.served,
+        "did": did,
+        "error": row.error,
+        "created_at": rfc3339(row.created_at),
+        "started_at": rfc3339(row.started_at),
+        "ended_at": rfc3339(row.ended_at),
+    }

@@ -1,0 +1,1 @@
+"""Surgeons, suture types, consent, keys, and the erasure of a surgeon's data."""

@@ -1,0 +1,90 @@
+"""Consent: whether a surgeon's data may be used for training, export or an atlas, or shown at all.
+
+Every use is decided by `may` (or by `refusal` and `require`, which also give the reason), inside the transaction that
+stores or returns the data. A transaction that stores holds the name of the surgeon from its beginning
+(`skills.library.operation.locks`), so the consent that it reads is current. `covered` is the same rule in SQL, for
+lists; a test compares the two.
+
+A consent holds to the end of its last day, in UTC. If none is recorded, the study's protocol decides, and every use is
+allowed.
+"""
+
+import json
+from datetime import date
+from typing import Any, Literal, Protocol
+
+from sqlalchemy import ColumnElement, Text, and_, cast, or_
+
+from skills.db import now
+from skills.db.models import Surgeon
+from skills.errors import Conflict
+
+Use = Literal["training", "export", "atlas", "any"]  # the last one is covered by each of the others: docs/keys.md
+
+
+CALLED = {"training": "training", "export": "export", "atlas": "atlas", "any": "that this is shown"}
+
+
+class Consenting(Protocol):
+    """A surgeon, or a row of a query with a surgeon's pseudonym and consent."""
+
+    @property
+    def slug(self) -> str:
+        """The pseudonym."""
+
+    @property
+    def consent(self) -> dict[str, Any] | None:
+        """The recorded consent: `uses`, and `until`, the last day, as 2030-12-31 or None."""
+
+
+def today() -> date:
+    """Return the current date in UTC."""
+    return now().date()
+
+
+def refusal(surgeon: Consenting, use: Use) -> Conflict | None:
+    """Return the reason why a surgeon's consent does not cover a use today; None if it does."""
+    consent = surgeon.consent
+    if consent is None:
+        return None
+    if use not in consent["uses"] and not (use == "any" and consent["uses"]):
+        covers = ", ".join(consent["uses"]) or "nothing"
+        return Conflict(f"The consent of '{surgeon.slug}' does not cover {CALLED[use]}; it covers {covers}.")
+    until = last_day(consent)
+    # The last day itself is covered.
+    if until is not None and not today() <= until:
+        return Conflict(f"The consent of '{surgeon.slug}' expired on {until}.")
+    return None
+
+
+def may(surgeon: Consenting, use: Use) -> bool:
+    """Return whether a surgeon's consent covers a use today."""
+    return refusal(surgeon, use) is None
+
+
+def require(surgeon: Consenting, use: Use) -> None:
+    """Refuse a use that a surgeon's consent does not cover today.
+
+    Raises:
+        Conflict: The consent does not name the use, or has expired.
+    """
+    refused = refusal(surgeon, use)
+    if refused is not None:
+        raise refused
+
+
+def last_day(consent: dict[str, Any] | None) -> date | None:
+    """Return the last day on which a consent holds; None if it has no end."""
+    until = None if consent is None else consent.get("until")
+    return None if until is None else date.fromisoformat(until)
+
+
+AS_TEXT = cast(Surgeon.consent, Text)
+
+
+def covered(use: Use) -> ColumnElement[bool]:
+    """Return `may` as a condition on `Surgeon`; it contains today's date, so build it anew for each query."""
+    until = Surgeon.consent["until"].as_string()
+    # A substring search is exact: besides `uses`, the only text in a consent is a date.
+    named = AS_TEXT.contains(json.dumps(use))
+    return or_(AS_TEXT.is_(None), AS_TEXT == "null", and_(named, or_(until.is_(None), until >= today().isoformat())))

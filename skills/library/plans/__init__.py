@@ -1,0 +1,1 @@
+"""Plans, playbacks, replay bags, a laboratory's errors, and tries."""

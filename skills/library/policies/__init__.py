@@ -1,0 +1,1 @@
+"""Training, policy versions, releases, batches and policy cards."""

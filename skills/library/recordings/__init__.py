@@ -1,0 +1,1 @@
+"""Recordings, demonstrations, proposals of hand-offs, datasets, and timelines."""

@@ -1,0 +1,515 @@
+"""Demonstrations: hand-offs cut out of recordings and put into their grid worlds, checked before they are stored.
+
+recording, DemoIn --make_demo--> Made --upload_demo, add_demo--> Added
+"""
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+from sqlalchemy import Table, select
+from sqlalchemy.orm import Session
+
+from skills.db import now, rfc3339
+from skills.db.models import (
+    Demonstration,
+    DemonstrationOutcome,
+    RecordingChunk,
+    Release,
+    StoredRecording,
+    StoredRewardMap,
+)
+from skills.db.packed import digest
+from skills.db.service_tables import record_event
+from skills.db.session import Database
+from skills.demonstration.demonstration import Demo, Segment, cut_demo
+from skills.demonstration.quality import describe
+from skills.demonstration.recording import equal_samples
+from skills.demonstration.segments import TakenSegment
+from skills.errors import BadSegment, Conflict, SegmentNotNamed
+from skills.fields import as_json
+from skills.formats.reader_process import MOST, Told, read_told
+from skills.gridworld.grid import PAPER_GRID, GridPath, choose_grid, describe_path, discretize
+from skills.gridworld.reward import RewardMap, sparse_reward
+from skills.library.operation import locks
+from skills.library.operation.integrity import demo_identity, find_by_digest
+from skills.library.people import consent
+from skills.library.people.catalogue import find_surgeon, find_suture_type
+from skills.library.people.recorded import episodes_of, in_recording, recorded_in
+from skills.library.policies.releases import withdraw_failed, withdraw_resting_on
+from skills.library.recordings.recordings import (
+    Teller,
+    Upload,
+    cache_large,
+    entry_of,
+    find_recording,
+    keep,
+    send_ahead,
+    stored_recording,
+    tell_upload,
+)
+from skills.packing import canonical
+from skills.remedies import Action, Remedy
+from skills.schemas import ChosenGrid, DemoOutcome, OutcomeAsked
+from skills.schemas.recordings import DemoReport
+from skills.schemas.requests import DemoIn
+
+EQUAL_SHARE = 0.1  # ours: an arm that rests on exact encoder values for a tenth of the time is no reason for advice
+# The actions of the events that mark an outcome.
+MARKS: dict[DemoOutcome, str] = {
+    "success": "mark-success",
+    "recovery": "mark-recovery",
+    "failure": "mark-failure",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Made:
+    """A demonstration before it is stored."""
+
+    demo: Demo
+    path: GridPath
+    reward: RewardMap
+    report: dict[str, Any]
+    taken: TakenSegment
+
+
+class Added(NamedTuple):
+    """A stored demonstration, whether it is new, and the part of its recording that it was cut from."""
+
+    row: Demonstration
+    new: bool
+    taken: TakenSegment
+
+
+def make_demo(told: Told, cut: DemoIn) -> Made:
+    """Cut a hand-off out of a recording and put it into its grid world.
+
+    Raises:
+        SegmentNotNamed: Several hand-offs are proposed, and the request names none.
+        BadSegment: The part is named in two ways, or there is no such proposal.
+    """
+    recording = told.recording
+    part, what, because = choose_part(told, cut)
+    demo = cut_demo(recording, arm=part.arm, topic=part.topic, start_s=part.start_s, end_s=part.end_s)
+    grid = choose_grid(demo.tip_mm, cut.grid, cut.cell_mm)
+    path = discretize(demo.tip_mm, grid, cut.hysteresis)
+    motion = recording.motion_of(arm=demo.arm, topic=demo.topic)
+    taken = TakenSegment(what, demo.start_s, demo.end_s, because)
+    report = report_on(demo, path, motion.duplicate_stamps, motion.backward_stamps) | {"segment": asdict(taken)}
+    return Made(demo, path, sparse_reward(path), report, taken)
+
+
+def choose_part(told: Told, cut: DemoIn) -> tuple[DemoIn, str, str]:
+    """Return the request with the times of the part to cut, the name of that part, and the reason for the choice.
+
+    Raises:
+        SegmentNotNamed: Several hand-offs are proposed, and the request names none.
+        BadSegment: The part is named in two ways, or there is no such proposal.
+    """
+    timed = cut.start_s is not None or cut.end_s is not None
+    if timed and cut.segment is not None:
+        raise BadSegment("Choose the part by segment, or by start_s and end_s, but not by both.")
+    if timed:
+        return cut, "the given times", "start_s or end_s was given"
+    if cut.segment == "whole":
+        return cut, "the whole recording", "segment=whole was given"
+    proposed = _proposed(told, cut)
+    if isinstance(cut.segment, int):
+        if not 1 <= cut.segment <= len(proposed):
+            raise BadSegment(f"There is no proposal {cut.segment}. {_listed(proposed)}", segments=_numbered(proposed))
+        return _proposal(cut, proposed, cut.segment)
+    if not proposed:
+        return cut, "the whole recording", "no hand-off is proposed in it; check that it holds exactly one"
+    if len(proposed) > 1:
+        raise SegmentNotNamed(_listed(proposed), Remedy(Action.NAME_SEGMENT), segments=_numbered(proposed))
+    return _proposal(cut, proposed, 1)
+
+
+def _proposed(told: Told, cut: DemoIn) -> list[Segment]:
+    """Return the proposals that match the request's arm and topic, in the order in which the recording lists them."""
+    fitting = {m.arm for m in told.recording.motions if cut.arm in (None, m.arm) and cut.topic in (None, m.topic)}
+    return [one for one in told.proposed if one.arm in fitting]
+
+
+def _proposal(cut: DemoIn, proposed: Sequence[Segment], number: int) -> tuple[DemoIn, str, str]:
+    one = proposed[number - 1]
+    part = cut.model_copy(update={"arm": one.arm, "start_s": one.start_s, "end_s": one.end_s})
+    why = "it is the only one" if cut.segment is None else f"segment={number} was given"
+    return part, f"proposal {number} of {len(proposed)}", f"{why}: {one.reason}"
+
+
+def _numbered(proposed: Sequence[Segment]) -> list[dict[str, Any]]:
+    """Return proposals with their numbers as JSON, the first `MOST`."""
+    return [
+        {"segment": number, "arm": one.arm, "start_s": one.start_s, "end_s": one.end_s, "reason": one.reason}
+        for number, one in enumerate(proposed[:MOST], 1)
+    ]
+
+
+def _listed(proposed: Sequence[Segment]) -> str:
+    """Return a sentence that lists the proposals, the first ten with their times."""
+    if not proposed:
+        return "No hand-off is proposed in this recording."
+    shown = [f"{n}: {one.arm}, {one.start_s:.2f} to {one.end_s:.2f} s" for n, one in enumerate(proposed[:10], 1)]
+    rest = "; ..." if len(proposed) > len(shown) else ""
+    are = "1 hand-off is" if len(proposed) == 1 else f"{len(proposed)} hand-offs are"
+    return f"{are} proposed in this recording ({'; '.join(shown)}{rest})."
+
+
+def report_on(demo: Demo, path: GridPath, duplicate_stamps: int, backward_stamps: int) -> dict[str, Any]:
+    """Return the measurements of a demonstration and its path as JSON, with advice to the surgeon.
+
+    Args:
+        demo: The demonstration.
+        path: Its path in the grid.
+        duplicate_stamps: Samples of the entire recorded motion that carried the stamp of the sample before.
+        backward_stamps: Samples of the entire recorded motion that were dropped because their stamp went back.
+    """
+    of_motion, of_path = describe(demo), describe_path(demo, path)
+    equal = equal_samples(demo.tip_mm, demo.rotation_xyzw)
+    chosen = "paper" if path.grid == PAPER_GRID else "fit"
+    more = {
+        "duplicate_stamps": duplicate_stamps,
+        "backward_stamps": backward_stamps,
+        "equal_samples": equal,
+        "grid": ChosenGrid(**asdict(path.grid), chosen=chosen),
+        "partner": demo.partner,
+        "advice": (
+            *of_motion.advice,
+            *_about_stamps(duplicate_stamps, "repeated the previous stamp and were dropped"),
+            *_about_stamps(backward_stamps, "had a stamp that went back and were dropped"),
+            *_about_equal(equal, len(demo.tip_mm)),
+            *of_path.advice,
+        ),
+    }
+    report = DemoReport(**vars(of_motion) | vars(of_path) | more)
+    written: dict[str, Any] = json.loads(canonical(as_json(report)))
+    return written  # canonical JSON and back: the same value as when it is read from the database
+
+
+def full_report(demonstration: Demonstration) -> dict[str, Any]:
+    """Measure a stored demonstration again, because no digest covers its stored report."""
+    about, topic = demonstration.recording.about, demonstration.topic
+    duplicates = next((m["duplicate_stamps"] for m in about["motions"] if m["topic"] == topic), 0)
+    backward = next((one["backward_stamps"] for one in about["dropped"] if one["topic"] == topic), 0)
+    return report_on(demonstration.demo, demonstration.path, duplicates, backward)
+
+
+def _about_stamps(count: int, what: str) -> list[str]:
+    if count == 0:
+        return []
+    samples = "1 sample" if count == 1 else f"{count} samples"
+    return [f"{samples} {what}: check the recorder's clock."]
+
+
+def _about_equal(count: int, samples: int) -> list[str]:
+    if count <= EQUAL_SHARE * samples:
+        return []
+    return [
+        f"{count} of {samples} samples ({count / samples:.0%}) repeat the pose of the sample before: the recorder was "
+        "faster than its source, so speeds are less certain than the rate suggests."
+    ]
+
+
+def upload_demo(database: Database, upload: Upload, cut: DemoIn, actor: str, read: Teller = read_told) -> Added:
+    """Store a recording and one demonstration of it, both or neither.
+
+    Args:
+        database: The database; the recording is read outside any transaction.
+        upload: The recording's bytes.
+        cut: The demonstration to cut out of it.
+        actor: The owner of the caller's key.
+        read: The reader, possibly in another process.
+
+    Raises:
+        SkillsError: As in `make_demo` and `skills.library.recordings.demos.tell_upload`.
+    """
+    with database.reading() as session:  # fails early, before the long computation; looked up again when writing
+        find_surgeon(session, cut.surgeon)
+        find_suture_type(session, cut.suture)
+    told = tell_upload(upload, read)
+    made, entry = make_demo(told, cut), entry_of(upload, told)
+    ahead = send_ahead(database, upload)
+    with database.writing([locks.recording(upload.sha256), locks.surgeon(cut.surgeon)]) as session:
+        stored, _ = keep(session, upload, told, entry, actor, ahead)
+        added = _store_demo(session, stored, made, cut, actor)
+    cache_large(database, stored, entry)
+    return added
+
+
+def add_demo(database: Database, recording_sha256: str, cut: DemoIn, actor: str, read: Teller = read_told) -> Added:
+    """Cut another demonstration out of a stored recording; it raises the errors of `make_demo` as well."""
+    with database.reading() as session:
+        find_surgeon(session, cut.surgeon)
+        find_suture_type(session, cut.suture)
+        recording_sha256 = find_recording(session, recording_sha256).sha256  # in full: the argument may be a prefix
+    made = make_demo(stored_recording(database, recording_sha256, read, intact=True), cut)
+    with database.writing([locks.recording(recording_sha256), locks.surgeon(cut.surgeon)]) as session:
+        return _store_demo(session, find_recording(session, recording_sha256), made, cut, actor)
+
+
+def _store_demo(session: Session, stored: StoredRecording, made: Made, cut: DemoIn, actor: str) -> Added:
+    surgeon, suture = find_surgeon(session, cut.surgeon), find_suture_type(session, cut.suture)
+    demo_sha256 = demo_identity(stored.sha256, surgeon.slug, suture.slug, made.demo, made.path)
+    known = session.scalar(select(Demonstration).where(Demonstration.sha256 == demo_sha256))
+    # The same cut of the same recording has the same digest, so a repetition returns the stored row.
+    if known is not None:
+        if known.withdrawn_at is not None:
+            raise Conflict("This demonstration was withdrawn; record another, or cut another part of the recording.")
+        _refuse_other_outcome(known, cut)
+        return Added(known, False, made.taken)
+    demonstration = Demonstration(
+        sha256=demo_sha256,
+        recording=stored,
+        surgeon=surgeon,
+        suture=suture.slug,
+        arm=made.demo.arm,
+        topic=made.demo.topic,
+        frame=made.demo.frame,
+        instrument=made.demo.instrument,
+        start_s=made.demo.start_s,
+        end_s=made.demo.end_s,
+        session=cut.session,
+        hysteresis=made.path.hysteresis,
+        demo=made.demo,
+        path=made.path,
+        report=made.report,
+    )
+    session.add(demonstration)
+    session.flush()
+    session.add(
+        StoredRewardMap(sha256=digest(made.reward), demonstration_row=demonstration.row, map=made.reward),
+    )
+    record_event(session, actor, "add", "demonstration", demo_sha256, surgeon)
+    _mark(session, demonstration, cut.outcome, cut.outcome_reason, actor)
+    return Added(demonstration, True, made.taken)
+
+
+def _refuse_other_outcome(known: Demonstration, cut: DemoIn) -> None:
+    """Refuse a repetition with another outcome: whoever adds demonstrations may not change one, see `mark_demo`.
+
+    Raises:
+        Conflict: The outcome or its reason differs from the stored one.
+    """
+    if cut.outcome is not None and (cut.outcome, cut.outcome_reason) != (known.outcome, known.outcome_reason):
+        because = "" if known.outcome_reason is None else f" ({known.outcome_reason})"
+        stored = "without an outcome" if known.outcome is None else f"as a {known.outcome}{because}"
+        mark = Remedy(Action.MARK_DEMO, demo=known.sha256, outcome=cut.outcome)
+        raise Conflict(f"This demonstration is stored {stored}; adding it again does not change that.", mark)
+
+
+def find_demo(session: Session, demo_sha256: str) -> Demonstration:
+    """Return a demonstration by its digest, see `find_by_digest`."""
+    return find_by_digest(session, Demonstration, demo_sha256, "demonstration", Remedy(Action.LIST_DEMOS))
+
+
+def shown_demo(session: Session, demo_sha256: str) -> Demonstration:
+    """Return a demonstration whose own motion is shown.
+
+    Raises:
+        Conflict: Its surgeon allows no use.
+    """
+    demo = find_demo(session, demo_sha256)
+    consent.require(demo.surgeon, "any")
+    return demo
+
+
+def demo_for(session: Session, demo_sha256: str, use: consent.Use) -> Demonstration:
+    """Return a demonstration whose seconds of the recording are used, with all that is recorded in them.
+
+    Raises:
+        Conflict: Somebody in these seconds of the recording does not allow the use.
+    """
+    demo = find_demo(session, demo_sha256)
+    recorded_in(session, episodes_of([demo.row], whole=False)).require(use, {demo.surgeon_row})
+    return demo
+
+
+def exported_recording(session: Session, demo_sha256: str) -> StoredRecording:
+    """Return the recording of a demonstration, for an export of its bytes.
+
+    Raises:
+        Conflict: Somebody in this recording does not allow an export.
+    """
+    demo = find_demo(session, demo_sha256)
+    in_recording(session, demo.recording).require("export", {demo.surgeon_row})
+    return demo.recording
+
+
+def exported_chunk(database: Database, demo_sha256: str, number: int) -> bytes | None:
+    """Return one chunk of a demonstration's recording, counted from 0, in a transaction of its own.
+
+    None: there are no more chunks. It raises the errors of `exported_recording`.
+    """
+    with database.reading() as session:
+        row = exported_recording(session, demo_sha256).row
+        of = RecordingChunk.recording == row, RecordingChunk.number == number
+        return session.scalar(select(RecordingChunk.data).where(*of))
+
+
+def newest_demo(session: Session, surgeon_row: int, suture: str) -> Demonstration | None:
+    """Return the newest demonstration of a style that is learnable."""
+    return next(iter(newest_demos(session, surgeon_row, suture, 1)), None)
+
+
+def newest_demos(
+    session: Session, surgeon_row: int, suture: str, most: int, *, any_outcome: bool = False
+) -> list[Demonstration]:
+    """Return the newest demonstrations of a style, at most `most`, the oldest of them first.
+
+    Args:
+        session: The caller's transaction.
+        surgeon_row: The surgeon.
+        suture: The suture type.
+        most: The most demonstrations.
+        any_outcome: Return all that are active, and not only those that are learnable.
+    """
+    of = Demonstration
+    wanted = of.withdrawn_at.is_(None) if any_outcome else of.learnable
+    found = select(of).where(of.surgeon_row == surgeon_row, of.suture == suture, wanted)
+    # Selected from the newest back, returned from the oldest on.
+    return list(session.scalars(found.order_by(of.row.desc()).limit(most)))[::-1]
+
+
+def list_demos(
+    session: Session,
+    limit: int,
+    before: int | None,
+    surgeon: str | None,
+    suture: str | None,
+    recording: str | None = None,
+    active: bool | None = None,
+    outcome: OutcomeAsked | None = None,
+) -> Sequence[Demonstration]:
+    """List demonstrations, the newest first.
+
+    Args:
+        session: The caller's transaction.
+        limit: The length of the page.
+        before: The row of the last demonstration of the page before.
+        surgeon: List only those of this surgeon.
+        suture: List only those of this suture type.
+        recording: List only those cut out of this recording, by its digest.
+        active: List only active ones, or only withdrawn ones.
+        outcome: List only those of this outcome.
+    """
+    query = select(Demonstration).order_by(Demonstration.row.desc()).limit(limit)
+    if before is not None:
+        query = query.where(Demonstration.row < before)
+    if surgeon is not None:
+        query = query.where(Demonstration.surgeon_row == find_surgeon(session, surgeon).row)
+    if suture is not None:
+        query = query.where(Demonstration.suture == find_suture_type(session, suture).slug)
+    if recording is not None:
+        query = query.where(Demonstration.recording_row == find_recording(session, recording).row)
+    if active is not None:
+        query = query.where(Demonstration.withdrawn_at.is_(None) if active else Demonstration.withdrawn_at.is_not(None))
+    if outcome is not None:
+        query = query.where(Demonstration.outcome == (None if outcome == "unknown" else outcome))
+        if outcome != "unknown":  # found by the marks, which are few, and not by asking every demonstration for its own
+            marks = cast(Table, DemonstrationOutcome.__table__).c
+            query = query.where(Demonstration.row.in_(select(marks.demonstration_row).where(marks.outcome == outcome)))
+    return session.scalars(query).all()
+
+
+def withdraw_demo(session: Session, demo_sha256: str, actor: str) -> list[Release]:
+    """Withdraw a demonstration and return the releases withdrawn with it; a repetition withdraws nothing more."""
+    demonstration = find_demo(session, demo_sha256)
+    if demonstration.withdrawn_at is None:
+        demonstration.withdrawn_at = now()
+        record_event(session, actor, "withdraw", "demonstration", demonstration.sha256, demonstration.surgeon)
+    return withdraw_resting_on(session, demonstration, actor)
+
+
+def mark_demo(
+    session: Session, demo_sha256: str, outcome: DemoOutcome, reason: str | None, actor: str
+) -> Demonstration:
+    """Mark the outcome of a demonstration; an equal mark is not stored twice.
+
+    A failure or a recovery withdraws the releases that were learnt from it, except of versions that were trained from
+    any outcome.
+
+    Args:
+        session: The caller's transaction.
+        demo_sha256: Its digest, or a prefix of it.
+        outcome: The outcome.
+        reason: Why, in the words of the caller.
+        actor: The owner of the caller's key.
+    """
+    demonstration = find_demo(session, demo_sha256)
+    if (demonstration.outcome, demonstration.outcome_reason) != (outcome, reason):
+        _mark(session, demonstration, outcome, reason, actor)
+    if demonstration.failed:
+        withdraw_failed(session, demonstration, actor)
+    return demonstration
+
+
+def _mark(
+    session: Session, demonstration: Demonstration, outcome: DemoOutcome | None, reason: str | None, actor: str
+) -> None:
+    if outcome is not None:
+        mark = {"outcome": outcome, "reason": reason, "actor": actor}
+        session.add(DemonstrationOutcome(demonstration_row=demonstration.row, **mark))
+        record_event(session, actor, MARKS[outcome], "demonstration", demonstration.sha256, demonstration.surgeon)
+        session.flush()
+    session.refresh(demonstration, ["outcome", "outcome_reason"])
+
+
+def demo_json(row: Demonstration, taken: TakenSegment | None = None) -> dict[str, Any]:
+    """Return a demonstration's JSON, with the part of the recording that was taken by this call, else as stored."""
+    report = dict(row.report)
+    stored = report.pop("segment")
+    return {
+        "id": row.sha256,
+        "sha256": row.sha256,
+        "recording": row.recording.sha256,
+        "surgeon": row.surgeon.slug,
+        "suture": row.suture,
+        "arm": row.arm,
+        "topic": row.topic,
+        "frame": row.frame,
+        "instrument": row.instrument,
+        "start_s": row.start_s,
+        "end_s": row.end_s,
+        "segment": stored if taken is None else asdict(taken),
+        "session": row.session,
+        "hysteresis": row.hysteresis,
+        "state": "active" if row.withdrawn_at is None else "withdrawn",
+        "outcome": row.outcome,
+        "outcome_reason": row.outcome_reason,
+        "report": report,
+        "created_at": rfc3339(row.created_at),
+        "withdrawn_at": rfc3339(row.withdrawn_at),
+    }
+
+
+def path_json(row: Demonstration) -> dict[str, Any]:
+    """Return the JSON of a demonstration's path: its states and its recorded motion."""
+    path, recorded = row.path, row.demo
+    return {
+        "demo": row.sha256,
+        "frame": row.frame,
+        "grid": row.report["grid"],
+        "hysteresis": path.hysteresis,
+        "states": path.states.tolist(),
+        "path_mm": path.tip_mm.tolist(),
+        "stamps_s": recorded.stamps_s.tolist(),
+        "recorded_mm": recorded.tip_mm.tolist(),
+    }
+
+
+def reward_map_json(row: Demonstration, kept: StoredRewardMap) -> dict[str, Any]:
+    """Return the JSON of a reward map: the states whose reward is not `other`."""
+    rewards, levels = kept.map.rewards, kept.map.levels
+    special = np.flatnonzero(rewards != levels.other)
+    return {
+        "demo": row.sha256,
+        "sha256": kept.sha256,
+        "grid": row.report["grid"],
+        "levels": asdict(levels),
+        "states": special.tolist(),
+        "rewards": rewards[special].tolist(),
+    }

@@ -1,0 +1,161 @@
+"""Timelines of what is stored: recordings, demonstrations, policy versions and plans, and which of them to compare.
+
+A timeline is computed at each request and stored nowhere; what takes long, the decoding of a recording, is cached with
+the recording (`skills.library.recordings.recordings`). What may be seen is what a reader may see of the same resource
+in another form: the path of a demonstration, the trajectory of a plan. A file of a recorded motion is an export.
+"""
+
+from collections.abc import Sequence
+from typing import Any, Literal, NamedTuple, get_args
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from skills.db.models import (
+    Demonstration,
+    Plan,
+    PolicyVersion,
+    StoredPlayback,
+    StoredRecording,
+)
+from skills.db.session import Database
+from skills.errors import NotFound
+from skills.library.people.recorded import recording_for, shown_recording
+from skills.library.plans.plans import find_plan, motion_of, trajectory_of
+from skills.library.policies import versions
+from skills.library.policies.versions import poses_of
+from skills.library.recordings.demos import demo_for, find_demo
+from skills.library.recordings.recordings import Teller, find_recording, stored_recording
+from skills.verification.timeline import (
+    Timeline,
+    timeline_of_demo,
+    timeline_of_path,
+    timeline_of_plan,
+    timeline_of_recording,
+)
+
+Source = Literal["recordings", "demos", "policy-versions", "plans"]
+MOST_CHOICES = 50
+
+
+def timeline_of(database: Database, source: Source, sha256: str, tell: Teller) -> Timeline:
+    """Return the timeline of a resource; no transaction is open while it is computed.
+
+    Raises:
+        NotFound: There is no such resource, or the policy version has no pose style.
+        Conflict: The surgeon's consent does not cover training, for a policy version or a plan, or somebody in these
+            seconds of a recording allows no use.
+        Corrupt: What is stored does not match its digest.
+    """
+    if source == "recordings":
+        return timeline_of_recording(shown_recording(database, sha256, tell).recording)
+    if source == "demos":
+        with database.reading() as session:
+            recording = find_demo(session, sha256).recording.sha256
+        told = stored_recording(database, recording, tell)
+        with database.reading() as session:
+            demo = demo_for(session, sha256, "any").demo
+        return timeline_of_demo(told.recording, demo)
+    if source == "policy-versions":
+        with database.reading() as session:
+            poses = poses_of(versions.followable(versions.find_by_digest(session, sha256)))
+        return timeline_of_path(poses.path, arm=poses.arm, frame=poses.frame)
+    with database.reading() as session:
+        plan = find_plan(session, sha256)
+        motion = motion_of(session, sha256)
+        newest = select(StoredPlayback).where(StoredPlayback.plan_row == plan.row)
+        played = session.scalar(newest.order_by(StoredPlayback.row.desc()).limit(1))
+        measured = None if played is None else played.measured
+        passes = [] if played is None else played.report["doubt"]["under"][0]["passes"]
+    odds = {number: one["succeeds"]["probability"] for number, one in enumerate(passes)}
+    return timeline_of_plan(trajectory_of(motion), arm=motion.arm, frame=motion.frame, played=measured, odds=odds)
+
+
+def check_export(session: Session, source: Source, sha256: str) -> None:
+    """Refuse a file of a recorded motion that a surgeon's consent does not cover; others are checked as they are read.
+
+    Raises:
+        Conflict: Somebody in these seconds of the recording does not allow an export.
+    """
+    if source == "demos":
+        demo_for(session, sha256, "export")
+    if source == "recordings":
+        recording_for(session, sha256, "export")
+
+
+class TimelineLink(NamedTuple):
+    """A resource with a timeline, and its name on a page."""
+
+    source: Source
+    sha256: str
+    name: str
+
+
+def motion_named(session: Session, name: str) -> TimelineLink:
+    """Return the resource of a name such as `plans/DIGEST`.
+
+    Raises:
+        NotFound: There is no such resource.
+    """
+    source, _, sha256 = name.partition("/")
+    for known in get_args(Source):
+        if source == known:
+            return _found(session, known, sha256)[0]
+    raise NotFound("There is no such motion to play beside this one; choose one of the list.")
+
+
+def chosen(session: Session, source: Source, sha256: str) -> tuple[TimelineLink, Sequence[TimelineLink]]:
+    """Return a resource under its name, and some to play beside it: of the same suture type, its own surgeon's first.
+
+    Raises:
+        NotFound: There is no such resource.
+    """
+    here, row = _found(session, source, sha256)
+    if isinstance(row, StoredRecording):
+        cut = select(Demonstration).where(Demonstration.recording_row == row.row)
+        demos = session.scalars(cut.order_by(Demonstration.start_s).limit(MOST_CHOICES)).all()
+        return here, [_demo(one) for one in demos]
+    of = row.policy if isinstance(row, Plan) else row
+    others = [_demo(one) for one in _newest(session, Demonstration, of.suture, of.surgeon_row)]
+    versions = _newest(session, PolicyVersion, of.suture, of.surgeon_row)
+    others += [_path(one) for one in versions if one.poses is not None]
+    plans = select(Plan).join(PolicyVersion).where(PolicyVersion.suture == of.suture).order_by(Plan.row.desc())
+    others += [_plan(one) for one in session.scalars(plans.limit(MOST_CHOICES))]
+    return here, [one for one in others if one != here]
+
+
+def _found(
+    session: Session, source: Source, sha256: str
+) -> tuple[TimelineLink, StoredRecording | Demonstration | PolicyVersion | Plan]:
+    if source == "recordings":
+        recording = find_recording(session, sha256)
+        return TimelineLink(source, recording.sha256, f"Recording {recording.sha256[:12]}"), recording
+    if source == "demos":
+        demo = find_demo(session, sha256)
+        return _demo(demo), demo
+    if source == "policy-versions":
+        version = versions.find_by_digest(session, sha256)
+        return _path(version), version
+    plan = find_plan(session, sha256)
+    return _plan(plan), plan
+
+
+def _newest(
+    session: Session, of: type[Demonstration] | type[PolicyVersion], suture: str, surgeon_row: int
+) -> Sequence[Any]:
+    query = select(of).where(of.suture == suture).order_by(of.surgeon_row != surgeon_row, of.row.desc())
+    if of is Demonstration:
+        query = query.where(Demonstration.withdrawn_at.is_(None))
+    return session.scalars(query.limit(MOST_CHOICES)).all()
+
+
+def _demo(row: Demonstration) -> TimelineLink:
+    return TimelineLink("demos", row.sha256, f"{row.surgeon.slug}, demonstration {row.sha256[:8]}")
+
+
+def _path(row: PolicyVersion) -> TimelineLink:
+    return TimelineLink("policy-versions", row.sha256, f"{row.surgeon.slug}, learnt path of version {row.version}")
+
+
+def _plan(row: Plan) -> TimelineLink:
+    return TimelineLink("plans", row.sha256, f"{row.policy.surgeon.slug}, plan {row.sha256[:8]}")
