@@ -4,7 +4,10 @@ Here are the definitions that all tables share: names of constraints, UTC timest
 
 models           the tables of the library
 service_tables   the tables of the service: jobs, workers, keys, sign-ins, the audit log
-session          opening the database; sessions and their errors; a full and a failed disk; migrations
+session          sessions and their errors
+engines          opening a database
+disk             private files; a full and a failed disk
+revisions        the version of the tables, and their migrations
 packed           values in one column, and the archive format that they are stored in
 history          the log of all changes, written with them
 tiles            the inner hashes of its tree, stored by 256
@@ -15,11 +18,17 @@ archive          backups
 
 from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
-from typing import Annotated, Any
+from typing import Annotated, Any, Generic, TypeVar
 
+from pydantic import TypeAdapter, ValidationError
 from sqlalchemy import BigInteger, DateTime, Dialect, Integer, MetaData, String
 from sqlalchemy.orm import DeclarativeBase, mapped_column
-from sqlalchemy.types import JSON, TypeDecorator
+from sqlalchemy.sql.operators import OperatorType
+from sqlalchemy.types import JSON, TypeDecorator, TypeEngine
+
+from skills.errors import Corrupt
+
+T = TypeVar("T")
 
 NAMES = {
     "ix": "ix_%(column_0_label)s",
@@ -51,6 +60,41 @@ class Moment(TypeDecorator[datetime]):
     def process_result_value(self, value: datetime | None, dialect: Dialect) -> datetime | None:
         """Return the timestamp in UTC; SQLite returns it without its time zone."""
         return value if value is None else value.replace(tzinfo=UTC) if value.tzinfo is None else value.astimezone(UTC)
+
+
+class AsJson(TypeDecorator[T], Generic[T]):
+    """A column of JSON that is written from a value of one type, and checked by pydantic at every read.
+
+    The type is a model of `skills.schemas`, or any other type that pydantic knows. Parts can be selected in queries, as
+    of a column of plain JSON.
+    """
+
+    impl = JSON
+    cache_ok = True
+
+    def __init__(self, kind: type[T]) -> None:
+        super().__init__(none_as_null=True)
+        self.kind = kind
+        self._adapter = TypeAdapter(kind)
+
+    def process_bind_param(self, value: T | None, dialect: Dialect) -> Any:
+        """Return plain JSON."""
+        return None if value is None else self._adapter.dump_python(value, mode="json")
+
+    def process_result_value(self, value: Any, dialect: Dialect) -> T | None:
+        """Return the value.
+
+        Raises:
+            Corrupt: The stored JSON is not one of this type.
+        """
+        try:
+            return None if value is None else self._adapter.validate_python(value)
+        except ValidationError as error:
+            raise Corrupt(f"A stored {self.kind.__name__} has a form that this version does not know.") from error
+
+    def coerce_compared_value(self, op: OperatorType | None, value: Any) -> TypeEngine[Any]:
+        """Return the type of what a part of the column is compared with: plain JSON."""
+        return self.impl_instance
 
 
 class Base(DeclarativeBase):

@@ -37,7 +37,7 @@ from sqlalchemy import (
 )
 from sqlalchemy.types import NullType, TypeEngine
 
-from skills.db import Base, Moment
+from skills.db import AsJson, Base, Moment
 from skills.db.packed import Packed
 from skills.packing import sha256
 
@@ -88,7 +88,7 @@ def kind_of(column: Column[Any]) -> str:
     """Return the kind of a column, a key of `KINDS`, which decides how its values are represented elsewhere."""
     if isinstance(column.type, Packed | LargeBinary):
         return "bytes"
-    for kind, types in (("json", JSON), ("moment", Moment), ("truth", Boolean), ("plain", PLAIN)):
+    for kind, types in (("json", JSON | AsJson), ("moment", Moment), ("truth", Boolean), ("plain", PLAIN)):
         if isinstance(column.type, types):
             return kind
     raise AssertionError(f"no raw form of {column}")

@@ -28,12 +28,14 @@ SHORT.maxstring, SHORT.maxother = 100, 300
 class Given(BaseModel):
     """The base class of responses: a client ignores fields that it does not know yet.
 
+    `Model.model_validate(row)` makes one of a row of the database.
+
     A schema is built at its first use, so that importing all of them is cheap.
     """
 
     model_config = ConfigDict(
-        extra="ignore", frozen=True, defer_build=True, validate_by_name=True, validate_by_alias=True,
-        serialize_by_alias=True,
+        extra="ignore", frozen=True, defer_build=True, from_attributes=True, validate_by_name=True,
+        validate_by_alias=True, serialize_by_alias=True,
     )  # fmt: skip
 
     def __repr_str__(self, join_str: str) -> str:
