@@ -23,22 +23,18 @@ import base64
 import binascii
 import hashlib
 import hmac
+import json
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from skills.errors import Corrupt
+from skills.errors import BadSignature, Corrupt
+from skills.packing import canonical
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
-import json
-from collections.abc import Mapping
-from typing import Any
-
-from skills.errors import BadSignature
-from skills.packing import canonical
 
 ED25519 = b"\x01"  # the signature type of a signed note
 KEY_ID_BYTES, SEED_BYTES, HASH_BYTES = 4, 32, 32
