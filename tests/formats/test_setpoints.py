@@ -148,7 +148,7 @@ def test_a_damaged_message_of_setpoints_refuses_no_bag(tmp_path, monkeypatch):
     found = read_recording(io.BytesIO(data))
     assert_same(found, recording(COUNT), tolerance_mm=1e-12)
     assert found.setpoints == ()
-    assert dict(found.left_out) == {TIP: "A message of the topic is damaged."}
+    assert dict(found.left_out) == {TIP: f"A message of {TIP} ends within a field."}
 
 
 def test_parts_that_do_not_agree_lose_their_setpoints_alone():
