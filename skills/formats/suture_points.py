@@ -20,14 +20,14 @@ from skills.arrays import Floats, xyz
 from skills.demonstration.recording import Motion, Recording
 from skills.errors import MixedFrames, NotMetres, NoUsableTopic, UnreadableRecording
 from skills.formats.mcap import read_mcap
-from skills.formats.reader_process import answered
+from skills.formats.reader_process import write_answer
 from skills.formats.topics import POSE, Meaning, TopicKind
 from skills.kinematics import angle_between, matrix_of, quaternion_of
 from skills.remedies import did_you_mean
 from skills.schemas.recordings import SuturePoint
 from skills.schemas.recordings import SuturePoints as SuturePoints
 
-PARSE = f"{__name__}:parse"
+READ = f"{__name__}:read"
 STEADY_MM, STEADY_RAD = 1.0, 0.05  # ours: a fifth of the paper's cell; a mark that moves more has no single place
 REACH_MM = 300.0  # ours: beyond a PSM's reach from its remote centre; AMBF's units taken for metres are ten times off
 
@@ -96,9 +96,9 @@ def read_scene(file: BinaryIO) -> Recording:
         raise NoUsableTopic(NO_MARKS) from error
 
 
-def parse(file: BinaryIO, answer: BinaryIO) -> None:
+def read(file: BinaryIO, answer: BinaryIO) -> None:
     """Read a scene, and write it or its refusal; runs in a fork under limits."""
-    answered(read_scene, file, answer)
+    write_answer(read_scene, file, answer)
 
 
 # ---- from the file ----------------------------------------------------------------------------------------------

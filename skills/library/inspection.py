@@ -41,7 +41,8 @@ from skills.db.packed import Packed, digest
 from skills.db.service_tables import DatasetChunk, ErasedSurgeon, Job, StoredDataset
 from skills.db.session import Database, revision_of, revisions
 from skills.errors import Busy, Corrupt, NotFound, SkillsError
-from skills.formats.reader_process import READER_VERSION, read_told
+from skills.formats.parsed import parse_recording
+from skills.formats.reader_process import READER_VERSION
 from skills.gridworld.reward import sparse_reward
 from skills.library.calibrations import read_calibration
 from skills.library.history import Verified, verify_history
@@ -75,7 +76,7 @@ class Checked:
 
 def inspect_installation(
     database: Database,
-    tell: Teller = read_told,
+    tell: Teller = parse_recording,
     *,
     decode_all: bool = False,
     heads: Sequence[Note] | None = None,

@@ -18,7 +18,8 @@ from skills.db.row_visibility import Only
 from skills.db.service_tables import DatasetDemonstration, Event, Job
 from skills.db.session import Database
 from skills.errors import BadInput, Conflict, NotFound, TooLarge
-from skills.formats.reader_process import ConfinedReader, Told
+from skills.formats.parsed import ParsedContent
+from skills.formats.reader_process import ConfinedReader
 from skills.library import consent, perform_job
 from skills.library.catalogue import find_surgeon, put_surgeon
 from skills.library.datasets import delete_dataset, export_dataset, find_dataset
@@ -205,13 +206,13 @@ def test_a_dataset_over_the_limit_is_not_stored(database: Database):
 
 def test_a_confined_reader_reads_what_is_not_cached(database: Database, monkeypatch: pytest.MonkeyPatch):
     add(database, session_of())
-    tell, told = ConfinedReader.tell, []
+    tell, told = ConfinedReader.parse, []
 
-    def counted(reader: ConfinedReader, *given: Any, **how: Any) -> Told:
+    def counted(reader: ConfinedReader, *given: Any, **how: Any) -> ParsedContent:
         told.append(reader)
         return tell(reader, *given, **how)
 
-    monkeypatch.setattr(ConfinedReader, "tell", counted)
+    monkeypatch.setattr(ConfinedReader, "parse", counted)
     assert zip_of(database, export(database))
     assert told == []
     with database.writing() as session:
