@@ -149,14 +149,9 @@ class LeftOut:
     because: str
 
 
-class Described(Given):
-    """The content of a raw file, its quality, and the proposed hand-offs."""
+class ContentLists(Given):
+    """The parts of a raw file, and the proposed hand-offs."""
 
-    sha256: Sha256
-    size_bytes: Count
-    media_type: str
-    format: str = Field(description=f"One of {', '.join(get_args(Format))}.")
-    integrity: Literal["full", "partial", "none"] = Field(description="How much of it a checksum vouches for.")
     notes: dict[str, str]
     topics: list[Topic]
     motions: list[Motion]
@@ -174,6 +169,23 @@ class Described(Given):
     setpoints: list[Setpoints] = Field(description="Commanded poses and jaws; nothing is learnt from them.")
     base_frames: list[BaseFrame]
     identifications: list[ArmIdentification] = Field(description="What joints recorded beside poses show.")
+
+
+class RecordingContent(ContentLists):
+    """The content of a raw file, its quality, and the proposed hand-offs."""
+
+    duration_s: float
+    quality: list[Quality]
+
+
+class Described(ContentLists):
+    """The content of a raw file with its identity, and the proposed hand-offs."""
+
+    sha256: Sha256
+    size_bytes: Count
+    media_type: str
+    format: str = Field(description=f"One of {', '.join(get_args(Format))}.")
+    integrity: Literal["full", "partial", "none"] = Field(description="How much of it a checksum vouches for.")
 
 
 class Recording(Described):

@@ -8,7 +8,7 @@ import pytest
 from skills.db.models import Demonstration, MeasuredShape, StoredCalibration, StoredRecording
 from skills.db.session import Database
 from skills.errors import BadInput, Conflict, NotFound
-from skills.formats.reader_process import read_told
+from skills.formats.parsed import parse_recording
 from skills.library.comparison.calibrations import keep
 from skills.library.comparison.scores import LEAST_DEMOS, progress, score
 from skills.library.people.catalogue import put_surgeon
@@ -23,7 +23,7 @@ from tests.library.test_calibrations import OLD
 from tests.scoring.test_rating import JUDGED, model
 
 NO_ATLAS = {"uses": ["training", "export"]}
-READ = read_told
+READ = parse_recording
 
 
 def put(database: Database, slug: str, **about: object) -> None:
