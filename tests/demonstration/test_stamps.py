@@ -10,7 +10,7 @@ from skills.demonstration.recording import equal_samples, recorded_joints, recor
 from skills.errors import BackwardStamps, NotFinite, NotMetres, RepeatedStamps
 from skills.formats import read_recording
 from skills.formats.parsed import parse
-from skills.schemas.given import Recording
+from skills.schemas.recordings import Recording
 
 STEP_NS = 10_000_000
 

@@ -16,7 +16,7 @@ from skills.formats import read_recording, write_mcap
 from skills.formats.lerobot.cut import cut_episode, episodes_of, find_dataset
 from skills.formats.parsed import parse_recording
 from skills.library.recordings.datasets import dataset_chunk, request_dataset
-from skills.schemas.requests import DatasetIn
+from skills.schemas.datasets import DatasetIn
 from tests.library import cases
 
 ARMS = ("PSM1", "PSM2")

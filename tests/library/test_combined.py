@@ -24,7 +24,7 @@ from skills.library.policies.cards import card_of
 from skills.library.policies.releases import release, standing
 from skills.library.policies.versions import find_by_digest, learnt_from, path_of
 from skills.library.recordings.demos import upload_demo, withdraw_demo
-from skills.schemas.requests import DemoIn
+from skills.schemas.demos import DemoIn
 from skills.settings import Settings
 from skills.verification.asked import asked_of
 from skills.verification.intent import compare

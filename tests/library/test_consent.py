@@ -20,7 +20,7 @@ from skills.library.people.catalogue import find_surgeon, put_surgeon
 from skills.library.people.consent import covered, may
 from skills.library.plans import plans
 from skills.library.policies import batches, releases, retraining, training, versions
-from skills.schemas.requests import ScoreIn
+from skills.schemas.scores import ScoreIn
 from tests.library import cases
 from tests.library.cases import SUTURE
 from tests.library.styles import add_styles, ask_retraining, count_versions, counted, parts_of, states_of, styles_of

@@ -20,11 +20,12 @@ from skills.db.session import Database
 from skills.errors import BadInput, Conflict, NotFound, TooLarge
 from skills.formats.parsed import ParsedContent
 from skills.formats.reader_process import ConfinedReader
-from skills.library import consent, perform_job
 from skills.library.operation.inspection import inspect_installation
 from skills.library.operation.jobs import cancel, find_job, list_jobs
+from skills.library.people import consent
 from skills.library.people.catalogue import find_surgeon, put_surgeon
 from skills.library.people.erasure import erase_demo, erase_surgeon
+from skills.library.perform import perform_job
 from skills.library.recordings.datasets import delete_dataset, export_dataset, find_dataset
 from skills.library.recordings.demos import mark_demo, withdraw_demo
 from skills.library.recordings.recordings import store_recording

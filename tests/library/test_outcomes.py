@@ -26,7 +26,8 @@ from skills.library.policies.releases import release, remedy, standing
 from skills.library.recordings.demos import list_demos, mark_demo, newest_demo
 from skills.packing import canonical, sha256
 from skills.remedies import Action, Remedy
-from skills.schemas.requests import OutcomeIn, ScoreIn
+from skills.schemas.demos import OutcomeIn
+from skills.schemas.scores import ScoreIn
 from tests import backends
 from tests.library import cases
 from tests.library.styles import ask_retraining, counted, look, parts_of, retrain, styles_of

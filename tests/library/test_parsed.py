@@ -28,7 +28,9 @@ from skills.library.people.erasure import erase_surgeon
 from skills.library.recordings import recordings
 from skills.library.recordings.demos import add_demo
 from skills.library.recordings.recordings import alike, entry_of, put_entry, store_recording, stored_recording
-from skills.schemas.requests import DemoIn, Reading, ScoreIn
+from skills.schemas.demos import DemoIn
+from skills.schemas.recordings import Reading
+from skills.schemas.scores import ScoreIn
 from skills.seeds.recordings import sample_recordings
 from tests.by_day import some
 from tests.formats import bags, lerobots, trials

@@ -21,7 +21,8 @@ from skills.library.recordings.demos import exported_chunk, exported_recording, 
 from skills.library.recordings.proposals import find_proposal
 from skills.library.recordings.recordings import store_recording
 from skills.library.recordings.timelines import Source, check_export, timeline_of
-from skills.schemas.requests import DatasetIn, ScoreIn
+from skills.schemas.datasets import DatasetIn
+from skills.schemas.scores import ScoreIn
 from tests import backends
 from tests.comparison.cohort import cohort
 from tests.library import cases, cohorts

@@ -15,8 +15,8 @@ from skills.library.people.catalogue import put_surgeon
 from skills.library.recordings.demos import mark_demo, upload_demo, withdraw_demo
 from skills.library.recordings.recordings import store_recording
 from skills.packing import canonical, sha256
-from skills.schemas.comparison import Score
-from skills.schemas.requests import DemoIn, ScoreIn
+from skills.schemas.demos import DemoIn
+from skills.schemas.scores import Score, ScoreIn
 from skills.scoring.calibration import SkillModel, as_numbers
 from tests.library import cases, rated
 from tests.library.test_calibrations import OLD

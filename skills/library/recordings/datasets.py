@@ -66,7 +66,7 @@ from skills.library.recordings.demos import find_demo
 from skills.library.recordings.recordings import CHUNK_BYTES, Teller, confined_reader, stored_recording
 from skills.packing import canonical, sha256
 from skills.remedies import Action, Remedy
-from skills.schemas.requests import DatasetIn
+from skills.schemas.datasets import DatasetIn
 from skills.settings import Settings
 
 MOST = 20_000  # demonstrations of a dataset, ours: their rows are in memory at once

@@ -53,8 +53,7 @@ from skills.library.recordings.recordings import (
 from skills.packing import canonical
 from skills.remedies import Action, Remedy
 from skills.schemas import ChosenGrid, DemoOutcome, OutcomeAsked
-from skills.schemas.recordings import DemoReport
-from skills.schemas.requests import DemoIn
+from skills.schemas.demos import DemoIn, DemoReport
 
 EQUAL_SHARE = 0.1  # ours: an arm that rests on exact encoder values for a tenth of the time is no reason for advice
 # The actions of the events that mark an outcome.

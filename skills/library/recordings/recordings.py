@@ -55,7 +55,7 @@ from skills.packing import canonical
 from skills.remedies import Action, Remedy
 from skills.sandbox import ProcessLimits
 from skills.sandbox.forked import refuse_uncontained
-from skills.schemas.requests import Reading
+from skills.schemas.recordings import Reading
 from skills.settings import Settings
 
 Reader = Callable[..., Recording]  # `read_recording`, or a callable that runs it in another process
