@@ -21,7 +21,7 @@ from types import CodeType, FrameType
 from typing import Any
 
 import skills
-from skills.formats.reader_process import read_told
+from skills.formats.parsed import parse_recording
 from tests import backends
 from tests.api.service import CSV, GOAL_MM, KESTREL, MCAP, POLICY, serving
 from tests.library import cases
@@ -113,7 +113,7 @@ def main() -> None:
             service.train()
         data = cases.bag()
         with tracing("bytes to demonstration"):
-            read_told(io.BytesIO(data))  # in the service this runs in a process of its own, where no trace reaches
+            parse_recording(io.BytesIO(data))  # in the service in a process of its own, where no trace reaches
             with serving(url) as service:
                 service.client.add_demo(data, media_type=MCAP, **KESTREL)
         with tracing("request to served policy"), serving(url) as service:

@@ -26,8 +26,7 @@ from skills.errors import BadInput
 from skills.remedies import did_you_mean
 
 if TYPE_CHECKING:
-    from skills.schemas.comparison import Recognition
-    from skills.schemas.given import Atlas
+    from skills.schemas.comparison import Atlas, Recognition
 
 SHORT = 12  # characters of a digest: enough to distinguish it from the others in a table
 
@@ -146,7 +145,7 @@ def _rounded(distance: float | None) -> str | None:
 
 if TYPE_CHECKING:
     from skills.client import Client
-    from skills.schemas.given import Score
+    from skills.schemas.scores import Score
 
 scoring_commands = typer.Typer()
 

@@ -9,8 +9,9 @@ from skills.client.policies import Position
 from skills.client.transport import Progress
 from skills.errors import BadInput
 from skills.remedies import did_you_mean
-from skills.schemas.given import Job, SuturePoints
+from skills.schemas.given import Job
 from skills.schemas.plans import Comparison, MotionTimeline, Plan, PlanSummary, Playback, Reach, Trajectory
+from skills.schemas.recordings import SuturePoints
 
 BAG, MCAP = "application/zip", "application/vnd.mcap"
 Source = Literal["recordings", "demos", "policy-versions", "plans"]

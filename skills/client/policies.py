@@ -27,25 +27,22 @@ from skills.client.connection import (
 )
 from skills.client.transport import keep
 from skills.errors import BadInput, Corrupt
+from skills.schemas.comparison import Atlas, Nearest, RecognisedRecording
 from skills.schemas.given import (
-    Atlas,
     Job,
-    Nearest,
     NextPose,
     NextStep,
     Policy,
     PolicyCard,
     PolicySummary,
     PoseStyle,
-    Progress,
-    RecognisedRecording,
     RetrainedStyle,
     Retraining,
     Rollout,
-    Score,
     SignedEnvelope,
     Version,
 )
+from skills.schemas.scores import Progress, Score
 from skills.schemas.tries import TryStep
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ Motions, joints and signals are checked in their constructors (`skills.demonstra
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import islice
 from typing import Literal
@@ -440,15 +440,6 @@ class Recording:
         """
         place = motion.arm, motion.frame, motion.states_base
         return next((one for one in self.setpoints if (one.arm, one.frame, one.states_base) == place), None)
-
-    def without_setpoints(self, faults: Mapping[str, str]) -> "Recording":
-        """Return it without the setpoints on some topics, and with the fault of each in `left_out`."""
-        return replace(
-            self,
-            setpoints=tuple(one for one in self.setpoints if one.topic not in faults),
-            jaw_setpoints=tuple((arm, one) for arm, one in self.jaw_setpoints if one.topic not in faults),
-            left_out=tuple((dict(self.left_out) | dict(faults)).items()),
-        )
 
     def jaw_setpoint_of(self, arm: str) -> Signal | None:
         """Return the setpoints of an arm's jaw, or None if they were not recorded."""

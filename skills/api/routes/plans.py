@@ -33,9 +33,9 @@ from skills.api.dependencies import (
 from skills.api.openapi import gives, gives_file, gives_page, makes, router_of, says, starts_job
 from skills.api.pages import render
 from skills.api.responses import JSON, Giving, accepted, as_asked, say, stored
-from skills.api.routes.demos import RAW_BODY
 from skills.api.routes.pages import PageRoute
 from skills.api.routes.policies import Accept
+from skills.api.routes.recordings import RAW_BODY
 from skills.db.session import Database
 from skills.errors import UnknownFormat
 from skills.fields import as_json
@@ -58,7 +58,7 @@ from skills.library.plans.replay import compare_with_plan, conditions_of, replay
 from skills.library.recordings.timelines import Source, check_export, chosen, motion_named, timeline_of
 from skills.planning.plan import MAX_PASSES
 from skills.planning.trajectory import Trajectory
-from skills.schemas.given import Page, SuturePoints
+from skills.schemas.given import Page
 from skills.schemas.plans import (
     Comparison,
     MotionTimeline,
@@ -71,6 +71,7 @@ from skills.schemas.plans import (
     ReachIn,
 )
 from skills.schemas.plans import Trajectory as GivenTrajectory
+from skills.schemas.recordings import SuturePoints
 from skills.schemas.requests import DIGEST, FRAME, Name, Schema
 from skills.settings import MEBIBYTE, Settings
 from skills.verification.playback import Pictures

@@ -35,16 +35,16 @@ from skills.library.people.recorded import in_recording
 from skills.library.policies import releases
 from skills.library.recordings.demos import find_demo, newest_demo
 from skills.library.recordings.recordings import Teller, find_recording, stored_recording
-from skills.schemas.comparison import (
+from skills.schemas.scores import (
     CurvePoint,
     Percentiles,
     Progress,
     Reference,
     Score,
     ScoredStyle,
+    ScoreIn,
     SessionFigures,
 )
-from skills.schemas.requests import ScoreIn
 from skills.scoring.calibration import LEVELS, Level
 from skills.scoring.deviation import as_recorded, differences, laid, laid_on
 from skills.scoring.features import KINDS, Numbers, compare, measure, measure_trial

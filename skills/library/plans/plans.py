@@ -23,7 +23,7 @@ from skills.db.session import Database
 from skills.demonstration.demonstration import Demo
 from skills.demonstration.partner import Partner
 from skills.errors import BadPlan, BadSpeed, Conflict, NoApproach, NoHandOff
-from skills.formats.suture_points import PARSE, SuturePoints, suture_points
+from skills.formats.suture_points import READ, SuturePoints, suture_points
 from skills.gridworld.grid import refuse_metres
 from skills.gridworld.scene import Scene, Tissue
 from skills.kinematics import DEFAULT_INSTRUMENT
@@ -55,7 +55,7 @@ def find_suture_points(upload: Upload, arm: str | None, frame: str | None, read:
     Raises:
         BadRecording: It cannot be used; `skills.errors` lists the kinds.
     """
-    scene = read_upload(upload.read_as({}), partial(read, target=PARSE))
+    scene = read_upload(upload.read_as({}), partial(read, target=READ))
     return suture_points(scene, arm=arm, frame=frame)
 
 

@@ -179,7 +179,7 @@ def retrain_part(database: Database, request: PartRequest, settings: Settings) -
     with database.reading() as session:
         job = session.get_one(Job, request["retraining"])
         shared = cast(RetrainingRequest, job.request)
-        batch = _Batch(job.row, request["part"], shared, job.asked_by, settings, reader.tell)
+        batch = _Batch(job.row, request["part"], shared, job.asked_by, settings, reader.parse)
     with AT_WORK, closing(reader.server):  # it starts only if a recording is not cached
         _train_all(database, batch)
 

@@ -310,7 +310,7 @@ def train_style(database: Database, request: TrainingRequest, settings: Settings
         found = lessons(session, [find_demo(session, one).row for one in request["demos"]])
     reader = confined_reader(settings)
     with closing(reader.server):  # it starts only if a recording is not cached
-        found = with_partners(database, found, reader.tell)
+        found = with_partners(database, found, reader.parse)
     lesson = combined_lesson(found, combining_of(request["combine"])) if "combine" in request else found[0]
     learnt = learn_style(lesson, request, settings, jobs.telling(database, "training", request))
 
