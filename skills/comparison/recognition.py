@@ -47,13 +47,13 @@ from math import exp, log, sqrt
 
 import numpy as np
 
+from skills.arithmetic import wilson
 from skills.arrays import Flags, Floats, Ints, frozen
 from skills.comparison.distances import STATES, TREMOR_S, placed, resampled
 from skills.demonstration.demonstration import Demo
 from skills.demonstration.movement import same_signs, smoothed_tip
 from skills.errors import BadInput, BadPath
 from skills.kinematics import matrix_of, quaternion_of
-from skills.learning.slip import wilson
 from skills.quaternions import vector_of
 
 PHASES = 16  # of a curve

@@ -38,11 +38,11 @@ from skills.gridworld.grid import GridPath, GridWorld
 from skills.gridworld.reward import RewardLevels, RewardMap
 from skills.gridworld.scene import Box, Capsule, Scene, SceneCosts, Surroundings, Tissue
 from skills.learning.certificate import Coverage
-from skills.learning.dynamic_programming import ShortestWay
 from skills.learning.networks import Network
 from skills.learning.policy import LEARNERS, Policy
 from skills.learning.pose_style import PosePath
 from skills.learning.q_learning import Training
+from skills.learning.ties import ShortestWay
 from skills.learning.tube import CertifiedPoses
 from skills.learning.tube_certificate import TubeCertificate, TubeLimits
 from skills.packing import few_numbers

@@ -51,7 +51,6 @@ from skills.learning.certificate import (
     near_odds,
     near_starts,
 )
-from skills.learning.dynamic_programming import rule_in
 from skills.learning.evaluation import check_in_space, measure
 from skills.learning.in_scene import SceneCertificate, certify_in_scene, learn_in_scene, scene_learner
 from skills.learning.policy import (
@@ -65,6 +64,7 @@ from skills.learning.policy import (
     refuse_too_large,
 )
 from skills.learning.q_learning import PhaseQLearning
+from skills.learning.ties import rule_in
 from skills.learning.tube import certified_poses
 from skills.library import jobs, releases
 from skills.library.catalogue import find_surgeon, find_suture_type

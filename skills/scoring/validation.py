@@ -19,9 +19,9 @@ from typing import Any
 
 import numpy as np
 
+from skills.arithmetic import wilson
 from skills.arrays import Floats, Ints
 from skills.errors import BadInput
-from skills.learning.slip import wilson
 from skills.scoring.calibration import (
     PARTS,
     Cohort,

@@ -27,11 +27,12 @@ from skills.gridworld.grid import PAPER_GRID, GridPath, GridWorld, discretize
 from skills.gridworld.reward import RewardLevels, RewardMap, sparse_reward
 from skills.gridworld.scene import Box, Capsule, Scene, Surroundings, Tissue
 from skills.learning.certificate import certify
-from skills.learning.dynamic_programming import ShortestWay, ValueIteration
+from skills.learning.dynamic_programming import ValueIteration
 from skills.learning.max_ent_irl import MaxEntIRL
 from skills.learning.networks import DDPG, DQN, TRPO
 from skills.learning.policy import learn_tabular
 from skills.learning.q_learning import CellQLearning, PhaseQLearning
+from skills.learning.ties import ShortestWay
 from skills.learning.tube import certified_poses
 from skills.planning.handoff import OtherArm, PsmM
 from skills.planning.motion_laws import Poses

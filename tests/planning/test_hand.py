@@ -19,7 +19,7 @@ from skills.kinematics import POINTING_DOWN, angle_between, matrix_of, quaternio
 from skills.learning.policy import Policy, Rollout, learn_tabular
 from skills.learning.pose_style import learn_pose_style
 from skills.learning.q_learning import PhaseQLearning
-from skills.learning.slip import replay
+from skills.learning.slip_runs import replay
 from skills.planning.handoff import HELD_MM, NEEDLE_RADIUS_MM, PsmM, needle_tips_mm, turn
 from skills.planning.path_fit import TREMOR_S, Hand, fit_to_demo, hand_along, styled, trace
 from skills.planning.plan import SuturePoint, departure_of, driven_pass, stack
