@@ -34,7 +34,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from skills.arithmetic import product
-from skills.arrays import Floats, Ints, frozen
+from skills.arrays import Floats, Ints, freeze, frozen
 from skills.compiled import compiled, inner
 from skills.demonstration.demonstration import Demo
 from skills.demonstration.movement import smoothed_tip
@@ -253,11 +253,8 @@ class Measured:
 
     def __post_init__(self) -> None:
         count = len(self.others)
-        if self.shape_mm is not None:
-            object.__setattr__(self, "shape_mm", frozen(self.shape_mm, np.float64, (STATES, 3), "shape_mm"))
-        object.__setattr__(self, "others", frozen(self.others, np.int64, (count,), "others"))
-        for name in ("apart_mm", "apart_scaled"):
-            object.__setattr__(self, name, frozen(getattr(self, name), np.float64, (count,), name))
+        freeze(self, shape_mm=(STATES, 3), apart_mm=(count,), apart_scaled=(count,))
+        freeze(self, np.int64, others=(count,))
 
 
 @dataclass(frozen=True, eq=False)
@@ -283,14 +280,7 @@ class Difference:
     along: Floats
 
     def __post_init__(self) -> None:
-        for name, shape in {
-            "offsets": (3, 3),
-            "nets": (3, 3),
-            "sizes": (3, 3),
-            "shares": (3, 3),
-            "along": (None, 3),
-        }.items():
-            object.__setattr__(self, name, frozen(getattr(self, name), np.float64, shape, name))
+        freeze(self, offsets=(3, 3), nets=(3, 3), sizes=(3, 3), shares=(3, 3), along=(None, 3))
 
     @property
     def where(self) -> tuple[str, str]:
@@ -361,9 +351,8 @@ class Dendrogram:
 
     def __post_init__(self) -> None:
         size = len(self.order)
-        object.__setattr__(self, "joined", frozen(self.joined, np.int64, (size - 1, 2), "joined"))
-        object.__setattr__(self, "heights", frozen(self.heights, np.float64, (size - 1,), "heights"))
-        object.__setattr__(self, "order", frozen(self.order, np.int64, (size,), "order"))
+        freeze(self, heights=(size - 1,))
+        freeze(self, np.int64, joined=(size - 1, 2), order=(size,))
 
     def cut(self, clusters: int) -> Ints:
         """Return the cluster of each demonstration, shape (N,), counted from 0 in the order of the dendrogram.

@@ -48,7 +48,7 @@ from math import exp, log, sqrt
 import numpy as np
 
 from skills.arithmetic import wilson
-from skills.arrays import Flags, Floats, Ints, frozen
+from skills.arrays import Flags, Floats, Ints, freeze
 from skills.comparison.distances import STATES, TREMOR_S, placed, resampled
 from skills.demonstration.demonstration import Demo
 from skills.demonstration.movement import same_signs, smoothed_tip
@@ -297,8 +297,7 @@ class Validated:
     log_loss: float
 
     def __post_init__(self) -> None:
-        shape = (len(self.tested), len(self.surgeons))
-        object.__setattr__(self, "probability", frozen(self.probability, np.float64, shape, "probability"))
+        freeze(self, probability=(len(self.tested), len(self.surgeons)))
 
     @property
     def accuracy(self) -> float:

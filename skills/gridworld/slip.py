@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 
 from skills.arithmetic import product
-from skills.arrays import Bytes, Floats, frozen
+from skills.arrays import Bytes, Floats, freeze
 from skills.errors import BadSettings
 from skills.gridworld.grid import MOVES
 
@@ -36,7 +36,7 @@ class SlipModel:
     def __post_init__(self) -> None:
         if not 0 <= self.probability <= 1:
             raise BadSettings("A slip must be a probability, from 0 to 1.", slip=self.probability)
-        object.__setattr__(self, "drawn", frozen(self.drawn, np.float64, (len(MOVES),), "drawn"))
+        freeze(self, drawn=(len(MOVES),))
 
     @property
     def intended(self) -> float:

@@ -15,7 +15,7 @@ from math import inf, prod
 
 import numpy as np
 
-from skills.arrays import Bytes, Flags, Floats, Ints, frozen
+from skills.arrays import Bytes, Flags, Floats, Ints, freeze
 from skills.errors import BadSettings
 from skills.fields import Count, schema
 from skills.gridworld.domain import FINISHED
@@ -49,11 +49,9 @@ class Coverage:
     touching: Floats | None = None
 
     def __post_init__(self) -> None:
-        for name in ("reaches", "joins_nearest"):
-            object.__setattr__(self, name, frozen(getattr(self, name), np.bool_, (None,), name))
-        for name in ("share", "finishing", "touching"):
-            if (given := getattr(self, name)) is not None:
-                object.__setattr__(self, name, frozen(given, np.float64, self.reaches.shape, name))
+        count = len(self.reaches)
+        freeze(self, np.bool_, reaches=(count,), joins_nearest=(count,))
+        freeze(self, share=(count,), finishing=(count,), touching=(count,))
 
 
 @dataclass(frozen=True)

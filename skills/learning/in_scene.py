@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from skills.arrays import Floats, frozen
+from skills.arrays import Floats, freeze
 from skills.errors import BadSettings
 from skills.fields import Count, schema
 from skills.gridworld.domain import Domain
@@ -49,8 +49,7 @@ class SceneOdds:
     touches: Floats
 
     def __post_init__(self) -> None:
-        for name in ("finishes", "touches"):
-            object.__setattr__(self, name, frozen(getattr(self, name), np.float64, (None,), name))
+        freeze(self, finishes=(None,), touches=(None,))
 
 
 @schema

@@ -29,7 +29,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from skills.arithmetic import exp
-from skills.arrays import Floats, frozen
+from skills.arrays import Floats, freeze
 from skills.compiled import compiled
 from skills.errors import BadSettings
 from skills.gridworld.domain import Domain
@@ -86,7 +86,7 @@ class RecoveredReward:
     visit_error: tuple[float, float]
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "rewards", frozen(self.rewards, np.float64, (None,), "rewards"))
+        freeze(self, rewards=(None,))
 
 
 def recover_reward(path: GridPath, settings: MaxEntIRL) -> RecoveredReward:

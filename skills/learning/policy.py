@@ -16,7 +16,7 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from skills.arrays import Bytes, Floats, Ints, frozen, xyz
+from skills.arrays import Bytes, Floats, Ints, freeze, frozen, xyz
 from skills.errors import BadSettings, OutsideGrid
 from skills.gridworld import paper
 from skills.gridworld.domain import FINISHED, OUTSIDE, Domain, Moves
@@ -213,7 +213,7 @@ class Policy:
             raise BadSettings("Only in the phase state a policy is learnt in a scene; leave `surroundings` out.")
         if self.ties is not None and not self.learner.phased:
             raise BadSettings("Only in the phase state a way ends where it joins the path; leave `ties` out.")
-        object.__setattr__(self, "q", frozen(self.q, np.float64, (self.domain.n_rows, paper.N_ACTIONS), "q"))
+        freeze(self, q=(self.domain.n_rows, paper.N_ACTIONS))
 
     @cached_property
     def domain(self) -> Domain:

@@ -19,7 +19,7 @@ from typing import Protocol
 
 import numpy as np
 
-from skills.arrays import Bytes, Flags, Floats, Ints, frozen
+from skills.arrays import Bytes, Flags, Floats, Ints, freeze
 from skills.gridworld.domain import OUTSIDE, Domain
 from skills.gridworld.grid import MOVES, GridPath, GridWorld, discretize
 from skills.gridworld.slip import STEADY, SlipModel
@@ -109,8 +109,7 @@ class Walks:
     touched: Flags | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "states", frozen(self.states, np.int64, (None, None), "states"))
-        object.__setattr__(self, "moves", frozen(self.moves, np.int64, (self.states.shape[1],), "moves"))
+        freeze(self, np.int64, states=(None, None), moves=(None,))
 
     def of(self, run: int) -> Ints:
         """Return the states of one run, (T,), without consecutive repeats."""

@@ -37,7 +37,7 @@ from math import ceil, isfinite, radians, sqrt
 import numpy as np
 from numpy.typing import ArrayLike
 
-from skills.arrays import Bytes, Floats, Ints, frozen
+from skills.arrays import Bytes, Floats, Ints, freeze
 from skills.errors import BadPlan, BadSpeed, NoMotion
 from skills.fields import Count, schema
 from skills.kinematics import DEFAULT_INSTRUMENT, angle_between, instrument_of, matrix_of, quaternion_of
@@ -115,15 +115,11 @@ class Trajectory:
         instrument_of(self.instrument)
         _check_rate(self.rate_hz)
         count = len(self.stamps_s)
-        for name, dtype, shape in (
-            ("stamps_s", np.float64, (count,)),
-            ("tip_mm", np.float64, (count, 3)),
-            ("rotation_xyzw", np.float64, (count, 4)),
-            ("joints", np.float64, (count, 6)),
-            ("pass_index", np.int64, (count,)),
-            ("phase", np.int8, (count,)),
-        ):
-            object.__setattr__(self, name, frozen(getattr(self, name), dtype, shape, name))
+        freeze(
+            self, stamps_s=(count,), tip_mm=(count, 3), rotation_xyzw=(count, 4), joints=(count, 6), jaw_rad=(count,)
+        )
+        freeze(self, np.int64, pass_index=(count,))
+        freeze(self, np.int8, phase=(count,))
         if not count:
             raise NoMotion("A trajectory needs at least one sample.")
         if not (np.diff(self.stamps_s) > 0).all() or not np.isin(np.diff(self.pass_index), (0, 1)).all():
@@ -135,8 +131,6 @@ class Trajectory:
             )
         if self.psm_m is not None and len(self.psm_m.joints) != count:
             raise BadPlan(f"PSM_M has {len(self.psm_m.joints)} samples and PSM_A has {count}; give equal numbers.")
-        if self.jaw_rad is not None:
-            object.__setattr__(self, "jaw_rad", frozen(self.jaw_rad, np.float64, (count,), "jaw_rad"))
 
     def __len__(self) -> int:
         """The number of samples."""

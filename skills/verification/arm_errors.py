@@ -49,7 +49,7 @@ from typing import Any
 
 import numpy as np
 
-from skills.arrays import Floats, frozen
+from skills.arrays import Floats, freeze
 from skills.errors import BadInput, BadSettings
 from skills.fields import Count, Fraction, schema
 from skills.kinematics import check_rotation, matrix_of, quaternion_of
@@ -357,11 +357,8 @@ class MeasuredArm:
 
     def __post_init__(self) -> None:
         count = len(self.setpoint_mm)
-        shapes: dict[str, tuple[int, ...]] = {"setpoint_mm": (3,), "setpoint": (3, 3), "measured_mm": (3,)}
-        shapes |= {"measured": (3, 3), "stamps_s": (), "marker_mm": (3,)}
-        for name, shape in shapes.items():
-            if getattr(self, name) is not None:
-                object.__setattr__(self, name, frozen(getattr(self, name), np.float64, (count, *shape), name))
+        freeze(self, setpoint_mm=(count, 3), setpoint=(count, 3, 3), measured_mm=(count, 3), measured=(count, 3, 3))
+        freeze(self, stamps_s=(count,), marker_mm=(count, 3))
         check_rotation(self.setpoint)
         check_rotation(self.measured)
         if self.stamps_s is not None and not (np.diff(self.stamps_s) > 0).all():
