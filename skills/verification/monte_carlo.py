@@ -51,10 +51,9 @@ from skills.kinematics import (
     forward,
     instrument_of,
     joint_margins,
-    matrix_of,
     solutions_of,
 )
-from skills.planning.handoff import HELD_MM, hand_off
+from skills.planning.handoff import HELD_MM, HOLDING_RAD, hand_off
 from skills.planning.motion_laws import Pose
 from skills.planning.trajectory import A2, Trajectory
 from skills.verification.arm_errors import CALIBRATED, CALLED, UNCALIBRATED, ArmErrors, Displaced, Drawn, draw
@@ -193,14 +192,10 @@ def scene_of(
         pad_normal: Unit direction out of the pad.
     """
     samples = np.flatnonzero(trajectory.pass_index == number)
-    rotation = matrix_of(trajectory.rotation_xyzw[samples])
-    tip, joints, instrument = trajectory.tip_mm[samples], trajectory.joints[samples], trajectory.instrument
-    arms = [Planned(tip, rotation, joints, instrument, np.eye(3), np.zeros(3), openings(trajectory)[samples])]
-    other = trajectory.psm_m
-    if other is not None:
-        joints, base = other.joints[samples], matrix_of(other.base_xyzw[None])[0]
-        opened = openings(other, opening_rad)[samples]
-        arms.append(Planned(*forward(joints, other.instrument), joints, other.instrument, base, other.base_mm, opened))
+    arms = []
+    for arm, unplanned_rad in zip(trajectory.arms, (HOLDING_RAD, opening_rad), strict=False):
+        joints, opened = arm.joints[samples], openings(arm, unplanned_rad)[samples]
+        arms.append(Planned(*forward(joints, arm.instrument), joints, arm.instrument, arm.base, arm.base_mm, opened))
     recorded = trajectory.taking
     taking = None if recorded is None else Pose(recorded.tip_mm[number], recorded.rotation[number])
     phase, stamps_s = trajectory.phase[samples], trajectory.stamps_s[samples]

@@ -35,7 +35,7 @@ from skills.learning.policy import Policy
 from skills.notebook import card
 from skills.planning.motion_laws import A2, PHASES
 from skills.planning.plan import SuturePlan
-from skills.planning.trajectory import Trajectory
+from skills.planning.trajectory import PSM_M, Trajectory
 from skills.verification.arm_errors import UNCALIBRATED, ArmErrors
 from skills.verification.asked import asked_of
 from skills.verification.bodies import BodiesReport, bodies_clearance
@@ -43,7 +43,7 @@ from skills.verification.clearance import psm_m_poses
 from skills.verification.gates import SCENE, ArmSamples, Failure, Figures, Limits, figures_of, first_failure
 from skills.verification.intent import IntentComparison, Mismatch, compare
 from skills.verification.monte_carlo import doubt
-from skills.verification.playback import CLEARANCE_SEEN_MM, MEANS, PAD, PSM_M, Playback
+from skills.verification.playback import CLEARANCE_SEEN_MM, MEANS, PAD, Playback
 from skills.verification.probabilities import UPWARDS, Doubt
 from skills.verification.scene_clearance import NEEDLE, SceneClearance, SceneReport, clearance_of, flat_tissue
 

@@ -83,7 +83,7 @@ def sound(a2: str = "paper", orientation: str | None = None) -> tuple[Asked, Tra
     """Return a sound plan with both arms, and its motion."""
     plan = planned(a2, orientation)
     demo, policy = turning()
-    return asked_of(plan, policy, demo), timed(plan.pass_paths, plan.psm_m)
+    return asked_of(plan, policy, demo), timed(plan.passes, plan.psm_m)
 
 
 @cache

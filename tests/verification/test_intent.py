@@ -60,7 +60,7 @@ def test_a_pass_that_ends_with_a_place_beyond_the_hinge_does_not_deviate():
     demo, policy = turning()
     point, psm_m = SuturePoint(tuple((demo.tip_mm[-1] - [0.0, 0.0, 10.2]).tolist())), PsmM(PSM_M, BASE_MM, BASE_XYZW)
     plan = stack(policy, [point], demo=demo, psm_m=psm_m, rate_hz=RATE_HZ, speed_mm_s=20.0, tip_offset_mm=10.2)
-    asked, motion = asked_of(plan, policy, demo), timed(plan.pass_paths, psm_m)
+    asked, motion = asked_of(plan, policy, demo), timed(plan.passes, psm_m)
     assert broken(compare(asked, motion)) is None
     nearer = replace(asked, tip_offset_mm=10.0)
     assert broken(compare(nearer, motion)) is not None
@@ -126,7 +126,7 @@ def ideal(trajectory: Trajectory) -> Playback:
 
 def planned_wrongly(change: Callable[[PassPath], PassPath]) -> Trajectory:
     """Return the motion of the sound plan with its middle pass changed before it is timed, PSM_A's alone."""
-    passes = [*planned().pass_paths]
+    passes = [*planned().passes]
     passes[1] = change(passes[1])
     return timed(passes, PsmM(PSM_M))
 
@@ -217,7 +217,7 @@ def test_cells_reach_as_far_as_hysteresis_and_a_path_farther_out_is_named(hyster
     point = SuturePoint(tuple(demo.tip_mm[-1].tolist()))
     psm_m = PsmM(PSM_M, BASE_MM, BASE_XYZW)
     plan = stack(policy, [point], demo=demo, psm_m=psm_m, rate_hz=RATE_HZ, speed_mm_s=20.0)
-    asked, sound_motion = asked_of(plan, policy, demo), timed(plan.pass_paths, plan.psm_m)
+    asked, sound_motion = asked_of(plan, policy, demo), timed(plan.passes, plan.psm_m)
     assert compare(asked, sound_motion).values[kind].max() < 0.05  # bends are rounded off by the arm
     for bent_mm, named in ((7.0, False), (12.0, True)):
         motion = poses(sound_motion)
@@ -245,7 +245,7 @@ def test_a_start_beside_the_demonstrated_one_goes_by_the_clock_of_its_end():
     point, psm_m = SuturePoint(tuple(demo.tip_mm[-1].tolist())), PsmM(PSM_M, BASE_MM, BASE_XYZW)
     start = demo.tip_mm[0] + 0.1 * X
     plan = stack(policy, [point], demo=demo, psm_m=psm_m, starts_mm=[start], rate_hz=RATE_HZ, speed_mm_s=20.0)
-    assert broken(compare(asked_of(plan, policy, demo), timed(plan.pass_paths, psm_m))) is None
+    assert broken(compare(asked_of(plan, policy, demo), timed(plan.passes, psm_m))) is None
 
 
 def test_a_sound_motion_is_feasible_with_its_intent_and_without():
@@ -258,7 +258,7 @@ def test_the_verdict_on_a_plan_has_its_request_scene_and_inexact_worlds():
     demo, policy = turning()
     point, psm_m = SuturePoint(tuple(demo.tip_mm[-1].tolist())), PsmM(PSM_M, BASE_MM, BASE_XYZW)
     plan = stack(policy, [point], demo=demo, psm_m=psm_m, rate_hz=RATE_HZ, speed_mm_s=20.0)
-    motion = timed(plan.pass_paths, psm_m)
+    motion = timed(plan.passes, psm_m)
     low_mm = float(motion.tip_mm[:, 2].min()) - 30.0
     plan = replace(plan, scene=Scene(plan.frame, tissue=Tissue.plane((0.0, 0.0, low_mm), (0.0, 0.0, 1.0))))
     verdict = judge_plan(plan, motion, ideal(motion), policy=policy, demo=demo)
