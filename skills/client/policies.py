@@ -553,8 +553,8 @@ def _policy(about: dict[str, Any], arrays: bytes, demo: dict[str, Any]) -> "Lear
 
     from skills.gridworld.domain import Domain
     from skills.gridworld.grid import GridPath, GridWorld
+    from skills.gridworld.hazards import Surroundings
     from skills.gridworld.reward import RewardLevels
-    from skills.gridworld.scene import Surroundings
     from skills.learning.networks import Network
     from skills.learning.policy import Policy as LearntPolicy
     from skills.learning.policy import learner_of

@@ -21,34 +21,12 @@ from skills.demonstration.movement import Pause, clutched, is_driven, undriven
 from skills.demonstration.partner import Partner, PartnerMotion, in_base, partner_along, partner_at
 from skills.demonstration.recording import (
     BaseFrame,
-    Format,
-    Integrity,
     Motion,
     Recording,
-    Signal,
-    Topic,
     base_frames,
-    recorded_motion,
 )
-from skills.demonstration.segments import Segment, propose_segments
 from skills.errors import BadSegment, JointsDisagree, NotMetres
 from skills.notebook import card
-
-__all__ = [
-    "Demo",
-    "Format",
-    "Integrity",
-    "Motion",
-    "Partner",
-    "Pause",
-    "Recording",
-    "Segment",
-    "Signal",
-    "Topic",
-    "cut_demo",
-    "propose_segments",
-    "recorded_motion",
-]
 
 CLASSIC_LARGE_NEEDLE_DRIVER = "400006"  # the dVRK's tool number, if the recording neither shows nor states one
 EXTENT_LIMITS_MM = (1.0, 300.0)  # less: metres declared as millimetres; more: beyond a PSM's reach

@@ -29,11 +29,12 @@ from numpy.typing import ArrayLike
 from skills.arrays import Bytes, Flags, Floats, Ints
 from skills.compiled import compiled
 from skills.errors import BadSettings
-from skills.gridworld.domain import Domain, Moves, check_join_share
+from skills.gridworld.domain import Domain, Moves
 from skills.gridworld.grid import MOVES, moves_between
+from skills.gridworld.hazards import STAY, Hazards
 from skills.gridworld.reward import RewardMap
-from skills.gridworld.scene import STAY, Hazards
 from skills.gridworld.slip import SlipModel, slip_model
+from skills.learning.learner_state import PhaseState
 
 MAX_SWEEPS = 100_000
 NO_STATE = -1  # of the state at which an unjoined pass finishes, where there is none
@@ -303,7 +304,7 @@ def _pays(mdp: Mdp, moves: Moves) -> Floats:
 
 
 @dataclass(frozen=True)
-class ValueIteration:
+class ValueIteration(PhaseState):
     """Settings of value iteration in the phase state. The result does not depend on a seed.
 
     The paper does not state its gamma. Ours is that of `PhaseQLearning`: the nearest waypoint always has the highest
@@ -311,16 +312,11 @@ class ValueIteration:
     """
 
     kind: ClassVar[str] = "value-iteration"
-    phased: ClassVar[bool] = True
 
     gamma: float = 0.1
-    slip: float = 0.0  # probability that a move slips (`skills.gridworld.slip`)
-    join_share: float = 0.0  # the joining rule: least share of the demonstration that a start is led to follow
 
     def __post_init__(self) -> None:
-        check_join_share(self.join_share)
-        if not 0 <= self.slip < 1:
-            raise BadSettings("slip must lie in [0, 1).", slip=self.slip)
+        super().__post_init__()
         if not 0 < self.gamma < 1:
             raise BadSettings(
                 "gamma must lie in (0, 1): with 1 a later arrival is worth as much as an earlier one.", gamma=self.gamma

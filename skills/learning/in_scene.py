@@ -23,8 +23,8 @@ from skills.errors import BadSettings
 from skills.fields import Count, schema
 from skills.gridworld.domain import Domain
 from skills.gridworld.grid import MOVES
+from skills.gridworld.hazards import Hazards
 from skills.gridworld.reward import RewardMap
-from skills.gridworld.scene import Hazards
 from skills.gridworld.slip import SlipModel, slip_model
 from skills.learning.certificate import mdp_of, optimal_in_scene
 from skills.learning.dynamic_programming import MAX_SWEEPS, Mdp, ValueIteration, exact_q

@@ -36,13 +36,14 @@ from skills.gridworld.domain import Domain
 from skills.gridworld.grid import GridPath
 from skills.gridworld.reward import RewardMap
 from skills.learning.dynamic_programming import Mdp, exact_q
+from skills.learning.learner_state import CellState
 
 HALVES = tuple(0.5**power for power in range(64))  # a part of a sum that is smaller does not change it
 MAX_NUMBERS = 2**24  # ours: moves x cells; B_t for all t takes 192 MiB then, and an iteration some seconds
 
 
 @dataclass(frozen=True)
-class MaxEntIRL:
+class MaxEntIRL(CellState):
     """Settings of maximum-entropy IRL, and of value iteration on the recovered reward; the paper states none of them.
 
     After 200 iterations the likelihood of the paper's demonstration is within 0.004 nat per move of that after 600.
@@ -50,9 +51,6 @@ class MaxEntIRL:
     """
 
     kind: ClassVar[str] = "max-ent-irl"
-    phased: ClassVar[bool] = False
-    slip: ClassVar[float] = 0.0
-    join_share: ClassVar[float] = 0.0
 
     iterations: int = 200
     learning_rate: float = 0.1  # of Adam

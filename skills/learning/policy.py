@@ -21,8 +21,8 @@ from skills.errors import BadSettings, OutsideGrid
 from skills.gridworld import paper
 from skills.gridworld.domain import FINISHED, OUTSIDE, Domain, Moves
 from skills.gridworld.grid import GridPath, refuse_metres
+from skills.gridworld.hazards import Hazards, Surroundings, hazards_of, touching
 from skills.gridworld.reward import RewardLevels, RewardMap
-from skills.gridworld.scene import Hazards, Surroundings, hazards_of, touching
 from skills.learning.dynamic_programming import ValueIteration, iterate_values
 from skills.learning.max_ent_irl import MaxEntIRL, learn_from_recovered
 from skills.learning.networks import DDPG, DQN, TRPO, Network

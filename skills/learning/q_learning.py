@@ -28,11 +28,12 @@ from skills.compiled import compiled, inner
 from skills.errors import BadSettings
 from skills.fields import Count
 from skills.gridworld import paper
-from skills.gridworld.domain import Domain, check_join_share
+from skills.gridworld.domain import Domain
 from skills.gridworld.grid import GridPath
+from skills.gridworld.hazards import Hazards
 from skills.gridworld.reward import RewardMap
-from skills.gridworld.scene import Hazards
 from skills.gridworld.slip import SlipModel, slip_model
+from skills.learning.learner_state import CellState, PhaseState
 
 Model = NDArray[np.int32]
 
@@ -45,7 +46,7 @@ ACTIONS, HALF, LOW_HALF = np.uint64(27), np.uint64(32), np.uint64(0xFFFFFFFF)
 
 
 @dataclass(frozen=True)
-class PhaseQLearning:
+class PhaseQLearning(PhaseState):
     """Settings of Q-learning in the phase state: the default learner.
 
     The paper states only the stop rules. Moves are deterministic, so alpha 1 loses nothing; with gamma 0.1 the nearest
@@ -61,28 +62,23 @@ class PhaseQLearning:
     """
 
     kind: ClassVar[str] = "phase-q-learning"
-    phased: ClassVar[bool] = True
 
     alpha: float = 1.0
     gamma: float = 0.1
     max_steps: int = 1
     max_episode_s: float = paper.MAX_EPISODE_S
     step_s: float = 0.25  # a cell of 5 mm at 20 mm/s
-    slip: float = 0.0  # probability that a move slips (`skills.gridworld.slip`)
     max_sweeps: int = 1000  # per phase; with alpha 1 and no slips a few are enough
-    join_share: float = 0.0  # the joining rule: least share of the demonstration that a start is led to follow
 
     def __post_init__(self) -> None:
-        if not 0 <= self.slip < 1:
-            raise BadSettings("slip must lie in [0, 1).", slip=self.slip)
+        super().__post_init__()
         _check(self.alpha, self.gamma, (), self.max_steps, self.max_episode_s, self.step_s)
-        check_join_share(self.join_share)
         if not 1 <= self.max_sweeps <= 100_000:
             raise BadSettings("max_sweeps must lie between 1 and 100 000.", max_sweeps=self.max_sweeps)
 
 
 @dataclass(frozen=True)
-class CellQLearning:
+class CellQLearning(CellState):
     """Settings of Q-learning in the paper's own state.
 
     With these defaults it reaches the goal from nearly every start, but cuts corners and cannot follow a path that
@@ -90,9 +86,6 @@ class CellQLearning:
     """
 
     kind: ClassVar[str] = "cell-q-learning"
-    phased: ClassVar[bool] = False
-    slip: ClassVar[float] = 0.0
-    join_share: ClassVar[float] = 0.0
 
     alpha: float = 1.0
     gamma: float = 0.1

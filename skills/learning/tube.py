@@ -45,21 +45,6 @@ from skills.learning.pose_style import UNIT_TOLERANCE, PosePath, learn_pose_styl
 from skills.learning.tube_certificate import TubeCertificate, TubeClearance, TubeLimits
 from skills.quaternions import INVERSE, angle_of, between, multiplied, of_vector
 
-__all__ = [
-    "CertifiedPoses",
-    "Hands",
-    "PoseStep",
-    "TubeCertificate",
-    "TubeClearance",
-    "TubeLimits",
-    "Update",
-    "advance",
-    "certified_poses",
-    "certify_tube",
-    "clear_tube",
-    "next_pose",
-]
-
 ROUNDING = 1e-9  # mm and rad: a step computed in double precision is off by about 1e-14
 SMALLEST_SINE = 1e-6  # of half an angle: below it, a share of the chord equals a share of the arc to rounding
 DIRECTIONS = 26  # towards which the update is tried: along the axes, and the diagonals between them

@@ -39,8 +39,8 @@ from skills.demonstration.recording import Recording
 from skills.errors import BadInput, Conflict, NotFound, SkillsError
 from skills.fields import as_json
 from skills.gridworld.grid import discretisation_rmse
+from skills.gridworld.hazards import Surroundings, hazards_of, refuse_unfit
 from skills.gridworld.reward import RewardLevels, RewardMap, sparse_reward
-from skills.gridworld.scene import Surroundings, hazards_of, refuse_unfit
 from skills.learning.certificate import (
     Certificate,
     NearLimits,

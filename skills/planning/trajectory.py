@@ -74,7 +74,7 @@ PSM_A, PSM_M = "PSM_A", "PSM_M"  # the names of the two arms: the one that hands
 
 
 @dataclass(frozen=True, eq=False)
-class ArmMotion:
+class PlannedArm:
     """One arm of a trajectory, with its base.
 
     Attributes:
@@ -101,7 +101,7 @@ class ArmMotion:
 
 @schema
 @dataclass(frozen=True, kw_only=True)
-class Moment:
+class SampleMoment:
     """A sample of a trajectory.
 
     Attributes:
@@ -196,17 +196,17 @@ class Trajectory:
         return float(self.stamps_s[-1] - self.stamps_s[0])
 
     @cached_property
-    def arms(self) -> tuple[ArmMotion, ...]:
+    def arms(self) -> tuple[PlannedArm, ...]:
         """PSM_A, and PSM_M if it moves."""
-        psm_a = ArmMotion(PSM_A, self.instrument, self.joints, self.jaw_rad, np.eye(3), np.zeros(3))
+        psm_a = PlannedArm(PSM_A, self.instrument, self.joints, self.jaw_rad, np.eye(3), np.zeros(3))
         m = self.psm_m
         if m is None:
             return (psm_a,)
-        return psm_a, ArmMotion(PSM_M, m.instrument, m.joints, m.jaw_rad, matrix_of(m.base_xyzw[None])[0], m.base_mm)
+        return psm_a, PlannedArm(PSM_M, m.instrument, m.joints, m.jaw_rad, matrix_of(m.base_xyzw[None])[0], m.base_mm)
 
-    def moment(self, sample: int) -> Moment:
+    def moment(self, sample: int) -> SampleMoment:
         """Return a sample with its pass, phase and time."""
-        return Moment(
+        return SampleMoment(
             sample=int(sample),
             pass_index=int(self.pass_index[sample]),
             phase=PHASES[self.phase[sample]],

@@ -13,7 +13,8 @@ from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, StrictBool, St
 
 from skills.comparison.combining import COMBININGS, Combining
 from skills.gridworld.grid import MAX_HYSTERESIS, GridMode
-from skills.gridworld.scene import MOST_BODIES, MOST_HEIGHTS, Scene, SceneCosts, Surroundings
+from skills.gridworld.hazards import SceneCosts, Surroundings
+from skills.gridworld.scene import MOST_BODIES, MOST_HEIGHTS, Scene
 from skills.kinematics import INSTRUMENTS
 from skills.learning.policy import LEARNERS, MAX_SEED, Learner, learner_of
 from skills.schemas import DemoOutcome, Handedness, ProposalDecision, SkillLevel

@@ -22,7 +22,7 @@ from skills.arrays import Floats
 from skills.errors import BadInput, BadSettings
 from skills.fields import Count, Fraction, schema
 from skills.gridworld.slip import slip_of_elsewhere
-from skills.verification.arm_errors import MeasuredArm, effective_number, encoder_errors_mm, tracked_errors_mm
+from skills.verification.arm_calibration import MeasuredArm, effective_number, encoder_errors_mm, tracked_errors_mm
 
 MOST_SLIP = 0.9  # ours: with more, the intended move is hardly more likely than another
 

@@ -34,16 +34,16 @@ moment of inertia shows it, such as with cables and drapes.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import hypot
-from typing import Protocol
 
 import numpy as np
 
 from skills.arrays import Flags, Floats, Ints
 from skills.fields import Count, Figure, schema
+from skills.gridworld.scene import segments_apart
 from skills.kinematics import CLASSIC, INSERTION, SI, WRIST_MM, axes_of, instrument_of
-from skills.planning.trajectory import PSM_A, PSM_M, Moment, Trajectory
-from skills.verification.arm_errors import Displaced
+from skills.planning.trajectory import PSM_A, PSM_M, PlannedArm, SampleMoment, Trajectory
 from skills.verification.clearance import FINGER_REACH_MM, SHAFT_RADIUS_MM, Links, way_mm
+from skills.verification.error_draws import Displaced
 from skills.verification.playback import CLEARANCE_SEEN_MM
 
 MARGIN_MM = 10.0  # ours: what each radius below is larger than the outline that it stands for, where one is known
@@ -227,37 +227,12 @@ def between(arm: Links, radii: Floats, other: Links, other_radii: Floats) -> Flo
     return apart
 
 
-def segments_apart(p: Floats, u: Floats, q: Floats, v: Floats) -> Floats:
-    """Return the distances of segments p + s u from segments q + t v, with s and t in 0..1.
-
-    The least distance is between the lines if they are nearest within both segments, and otherwise at an end of one of
-    them: the s that is best for the lines is brought within the segment, then the t that is best for it, then s again.
-    Where the segments are nearly parallel this is exact too, because every s is then nearly as good. NaN stays NaN.
-
-    Args:
-        p: Beginnings of the first segments, shape (..., 3).
-        u: From their beginnings to their ends, same unit, shape (..., 3).
-        q: Beginnings of the other segments, same frame, shape (..., 3).
-        v: From their beginnings to their ends, shape (..., 3).
-
-    Returns:
-        Distances of the axes in the same unit, shape (...,); shapes are broadcast.
-    """
-    r = p - q
-    uu, vv, uv, ur, vr = ((a * b).sum(axis=-1) for a, b in ((u, u), (v, v), (u, v), (u, r), (v, r)))
-    uu, vv = np.maximum(uu, 1e-12), np.maximum(vv, 1e-12)  # an axis without length is a point
-    s = np.clip((uv * vr - ur * vv) / np.maximum(uu * vv - uv * uv, 1e-12 * uu * vv), 0.0, 1.0)
-    t = np.clip((uv * s + vr) / vv, 0.0, 1.0)
-    s = np.clip((uv * t - ur) / uu, 0.0, 1.0)
-    return np.asarray(np.sqrt(np.square(r + s[..., None] * u - t[..., None] * v).sum(axis=-1)))
-
-
 # ---- along a motion ------------------------------------------------------------------------------------------------
 
 
 @schema
 @dataclass(frozen=True, kw_only=True)
-class NearestBodies(Moment):
+class NearestBodies(SampleMoment):
     """The least distance between a part of PSM_A and one of PSM_M, and the sample of it.
 
     Attributes:
@@ -416,28 +391,8 @@ def _all_nearest(trajectory: Trajectory, looks: Ints, seen: Floats) -> tuple[Nea
 # ---- in many inexact worlds ----------------------------------------------------------------------------------------
 
 
-class Placed(Protocol):
-    """An arm as planned in S samples, as `monte_carlo.Planned` is."""
-
-    @property
-    def joints(self) -> Floats:
-        """Its joints, rad and mm, shape (S, 6)."""
-
-    @property
-    def instrument(self) -> str:
-        """Number of its instrument."""
-
-    @property
-    def base(self) -> Floats:
-        """Rotation of its base in PSM_A's base frame, shape (3, 3)."""
-
-    @property
-    def base_mm(self) -> Floats:
-        """Its remote centre there, shape (3,)."""
-
-
 def too_near(
-    arms: tuple[Placed, ...],
+    arms: Sequence[PlannedArm],
     joints: list[Floats],
     displaced: Sequence[Displaced],
     limit_mm: float,
@@ -491,11 +446,11 @@ def too_near(
     return wrong
 
 
-def _placed(arm: Placed, joints: Floats) -> Links:
+def _placed(arm: PlannedArm, joints: Floats) -> Links:
     return parts_of(joints, arm.instrument).seen_from(arm.base, arm.base_mm)
 
 
-def _axes(arm: Placed, joints: Floats, rows: Ints, parts: Ints) -> tuple[Floats, Floats]:
+def _axes(arm: PlannedArm, joints: Floats, rows: Ints, parts: Ints) -> tuple[Floats, Floats]:
     """Return beginning and direction of some parts in some poses, both of shape (K, 3)."""
     used, index = np.unique(rows, return_inverse=True)
     placed = _placed(arm, joints[used])

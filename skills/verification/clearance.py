@@ -43,7 +43,7 @@ from numpy.typing import ArrayLike
 from skills.arrays import Flags, Floats, Ints
 from skills.kinematics import DEFAULT_INSTRUMENT, INSERTION, JAW_TIP_MM, WRIST_MM, axes_of, instrument_of, matrix_of
 from skills.planning.handoff import HELD_MM, HOLDING_RAD, NEEDLE_FREE_RAD, NEEDLE_RADIUS_MM
-from skills.planning.trajectory import PSM_A, TRANSFER, ArmMotion, Trajectory
+from skills.planning.trajectory import PSM_A, TRANSFER, PlannedArm, Trajectory
 from skills.verification.playback import FINGERS as FINGER_LINKS
 from skills.verification.playback import LINKS, PAD_SIZE_MM, LinkPair, pad_scale
 
@@ -92,7 +92,7 @@ def way_mm(steps_mm: Floats) -> Floats:
     return np.concatenate([np.zeros((1, steps_mm.shape[1])), np.cumsum(steps_mm, axis=0)])
 
 
-def openings(arm: ArmMotion, unplanned_rad: float = HOLDING_RAD) -> Floats:
+def openings(arm: PlannedArm, unplanned_rad: float = HOLDING_RAD) -> Floats:
     """Return the opening of each of an arm's fingers, rad, shape (T,): at least that of jaws that hold a needle.
 
     Args:

@@ -36,7 +36,7 @@ from skills.verification.clearance import (
     psm_m_poses,
     stands_from,
 )
-from skills.verification.intent import LIMITS, IntentComparison
+from skills.verification.deviations import LIMITS, Deviations
 from skills.verification.playback import PAD, Playback
 from skills.verification.scene_clearance import SceneClearance
 
@@ -225,7 +225,7 @@ def first_failure(
     limits: Limits,
     beside: SceneClearance | None = None,
     outer: BodiesClearance | None = None,
-    intent: IntentComparison | None = None,
+    intent: Deviations | None = None,
 ) -> Failure | None:
     """Return the earliest sample at which a gate is broken; of several gates broken there, the first listed.
 

@@ -32,7 +32,7 @@ from skills.fields import Count, Figure, Point, schema
 from skills.gridworld.scene import Scene, Tissue
 from skills.planning.handoff import HOLDING_RAD, OPEN_RAD
 from skills.planning.motion_laws import A2, TRANSFER
-from skills.planning.trajectory import PSM_A, PSM_M, ArmMotion, Moment, Trajectory
+from skills.planning.trajectory import PSM_A, PSM_M, PlannedArm, SampleMoment, Trajectory
 from skills.verification.bodies import ABOVE_TISSUE, TOOL, moved_mm, names_of, parts_of, radii_of
 from skills.verification.clearance import (
     ARC_BULGE_MM,
@@ -63,7 +63,7 @@ JAWS_RAD = np.linspace(HOLDING_RAD, OPEN_RAD, 5).tolist()
 
 @schema
 @dataclass(frozen=True, kw_only=True)
-class NearestToScene(Moment):
+class NearestToScene(SampleMoment):
     """The least distance of an arm's tool from a part of the scene, and the sample of it.
 
     Attributes:
@@ -204,7 +204,7 @@ class Group:
     above_tissue: Flags
 
 
-def groups_of(trajectory: Trajectory) -> list[tuple[ArmMotion, Group]]:
+def groups_of(trajectory: Trajectory) -> list[tuple[PlannedArm, Group]]:
     """Return each arm of a motion with its tool, and with its outer bodies.
 
     Args:
@@ -213,14 +213,14 @@ def groups_of(trajectory: Trajectory) -> list[tuple[ArmMotion, Group]]:
     return [(arm, group(arm)) for arm in trajectory.arms for group in (_tool, _bodies)]
 
 
-def _tool(arm: ArmMotion) -> Group:
+def _tool(arm: PlannedArm) -> Group:
     steps = travel_mm(arm.joints, arm.instrument)
     if arm.name == PSM_A:
         steps[:, FINGERS] += FINGER_REACH_MM * np.abs(np.diff(openings(arm)))[:, None]
     return Group(LINKS, RADII_MM, way_mm(steps), LOOK_MM, partial(links_at, arm), np.ones(len(LINKS), bool))
 
 
-def _bodies(arm: ArmMotion) -> Group:
+def _bodies(arm: PlannedArm) -> Group:
     names = names_of(arm.instrument)[: -len(TOOL)]
     way = way_mm(moved_mm(arm.joints[:-1], arm.joints[1:], arm.instrument)[:, : len(names)])
 
@@ -232,7 +232,7 @@ def _bodies(arm: ArmMotion) -> Group:
     return Group(names, radii, way, LOOK_BODIES_MM, axes, above)
 
 
-def links_at(arm: ArmMotion, at: Ints) -> tuple[Links, ...]:
+def links_at(arm: PlannedArm, at: Ints) -> tuple[Links, ...]:
     """Return an arm's links at some samples, in the frame of PSM_A's base; PSM_M's with each opening of its jaw.
 
     Args:

@@ -14,8 +14,9 @@ from rich.table import Table
 
 from skills.arrays import Floats, Ints
 from skills.gridworld.grid import MOVES, PAPER_GRID, GridPath, discretize
+from skills.gridworld.hazards import Hazards, hazards_of
 from skills.gridworld.reward import sparse_reward
-from skills.gridworld.scene import Box, Hazards, Scene, Tissue, hazards_of
+from skills.gridworld.scene import Box, Scene, Tissue
 from skills.gridworld.slip import slip_model
 from skills.learning.dynamic_programming import ValueIteration
 from skills.learning.in_scene import certify_in_scene, learn_in_scene
@@ -88,7 +89,7 @@ def tissue(table: Table) -> None:
 def controllers(path: GridPath, hazards: Hazards, slip: float) -> dict[str, Controller]:
     """Return ours, learnt with this slip, and the rules."""
     reward = sparse_reward(path)
-    exact = learn_in_scene(reward, ValueIteration(GAMMA, slip), hazards)
+    exact = learn_in_scene(reward, ValueIteration(GAMMA, slip=slip), hazards)
     learnt = learn_in_scene(reward, PhaseQLearning(alpha=0.02, gamma=GAMMA, slip=slip), hazards)
     for name, policy in (("exact", exact), ("learnt", learnt)):
         print(f"slip {slip}, {name}: {certify_in_scene(policy, hazards)[0]}", file=sys.stderr)

@@ -11,8 +11,9 @@ import pytest
 from skills.errors import BadSettings
 from skills.gridworld.domain import Domain
 from skills.gridworld.grid import MOVES, GridPath, GridWorld
+from skills.gridworld.hazards import SceneCosts, hazards_of
 from skills.gridworld.reward import sparse_reward
-from skills.gridworld.scene import Box, Scene, SceneCosts, Tissue, hazards_of
+from skills.gridworld.scene import Box, Scene, Tissue
 from skills.gridworld.slip import STEADY, slip_model
 from skills.learning.certificate import certify
 from skills.learning.dynamic_programming import ValueIteration
@@ -66,7 +67,7 @@ def test_odds_and_value_in_a_corridor_are_those_worked_by_hand(slip):
 def test_exact_values_satisfy_bellmans_equation_written_out(slip):
     path, hazards = room(close=0.2, deeper_per_mm=0.03, touch=30.0)
     gamma, domain, grid = 0.9, Domain(path, phased=True), path.grid
-    q = learn_in_scene(sparse_reward(path), ValueIteration(gamma, slip), hazards).q
+    q = learn_in_scene(sparse_reward(path), ValueIteration(gamma, slip=slip), hazards).q
     live = domain.certified & ~domain.terminal & ~hazards.forbidden[domain.state_of]
     rewards = sparse_reward(path).rewards
     for row in np.random.default_rng(0).choice(np.flatnonzero(live), 150):

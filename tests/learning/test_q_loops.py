@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from skills.gridworld.grid import GridPath, GridWorld
+from skills.gridworld.hazards import SceneCosts, hazards_of
 from skills.gridworld.reward import sparse_reward
-from skills.gridworld.scene import Box, Scene, SceneCosts, hazards_of
+from skills.gridworld.scene import Box, Scene
 from skills.gridworld.slip import slip_model
 from skills.learning import q_learning
 from skills.learning.in_scene import learn_in_scene

@@ -12,8 +12,9 @@ from skills.db.packed import digest, seal, unpack_as
 from skills.db.service_tables import Job
 from skills.errors import BadInput, BadSettings, Conflict, Corrupt
 from skills.gridworld.grid import GridPath, GridWorld
+from skills.gridworld.hazards import Surroundings, hazards_of
 from skills.gridworld.reward import sparse_reward
-from skills.gridworld.scene import Box, Capsule, Scene, Surroundings, Tissue, hazards_of
+from skills.gridworld.scene import Box, Capsule, Scene, Tissue
 from skills.gridworld.slip import slip_model
 from skills.learning.certificate import Coverage, NearLimits, NearOdds, OddsLimits, certify, near_starts
 from skills.learning.dynamic_programming import ValueIteration

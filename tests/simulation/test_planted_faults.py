@@ -26,8 +26,8 @@ from skills.planning.trajectory import A1, PassPath, Trajectory, time_parametris
 from skills.schemas.requests import DemoIn, Reading
 from skills.settings import Settings
 from skills.simulation.player import play
+from skills.verification.deviations import LIMITS
 from skills.verification.gates import Limits
-from skills.verification.intent import LIMITS
 from skills.verification.verdict import PlaybackReport, judge
 from tests import backends
 from tests.bench.playing import stacked

@@ -7,7 +7,7 @@ import pytest
 
 from skills.errors import BadInput, BadSettings
 from skills.gridworld.grid import GridWorld
-from skills.verification.arm_errors import MeasuredArm
+from skills.verification.arm_calibration import MeasuredArm
 from skills.verification.arm_slip import measure_slip
 
 CELL_MM = 2.0
