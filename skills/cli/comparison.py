@@ -384,11 +384,11 @@ def _tell_model(about: dict[str, Any]) -> None:
     from skills.library.comparison.calibrations import accepted
     from skills.scoring.calibration import from_numbers
     from skills.scoring.features import TRIAL_KIND_OF
-    from skills.scoring.validation import level_refusals, refusals
+    from skills.scoring.validation import level_refusals, parse_task, refusals
 
     model, used = from_numbers(about["model"]), accepted(about)
     for task, name in enumerate(model.tasks):
-        judged = about["validated"]["tasks"][name]
+        judged = parse_task(about["validated"]["tasks"][name])
         if name not in used:
             out.print(f"{name} is not rated: {' '.join(refusals(judged))}", markup=False, soft_wrap=True)
             continue

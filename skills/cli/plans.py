@@ -337,7 +337,7 @@ def calibrate(
     from skills.fields import as_json as plain
     from skills.library.plans.arm_errors import read_measured
     from skills.packing import canonical
-    from skills.verification.arm_errors import calibrate_arm
+    from skills.verification.arm_calibration import calibrate_arm
     from skills.verification.arm_slip import measure_slip
 
     try:

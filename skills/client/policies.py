@@ -550,13 +550,13 @@ def _policy(about: dict[str, Any], arrays: bytes, demo: dict[str, Any]) -> "Lear
 
     from skills.gridworld.domain import Domain
     from skills.gridworld.grid import GridPath, GridWorld
+    from skills.gridworld.hazards import Surroundings
     from skills.gridworld.reward import RewardLevels
-    from skills.gridworld.scene import Surroundings
-    from skills.learning.dynamic_programming import ShortestWay
     from skills.learning.networks import Network
     from skills.learning.policy import Policy as LearntPolicy
     from skills.learning.policy import learner_of
     from skills.learning.q_learning import Training
+    from skills.learning.ties import ShortestWay
 
     grid = GridWorld(**{name: about["grid"][name] for name in ("origin_mm", "cell_mm", "shape")})
     shown = about.get("combined") or demo["report"] | {"hysteresis": demo["hysteresis"]}

@@ -23,22 +23,15 @@ import numpy as np
 
 from skills.arithmetic import product
 from skills.arrays import Floats, Ints
-from skills.demonstration.identification import (
-    MOST_SAMPLES,
-    ArmIdentification,
-    Identification,
-    identify,
-    stated_instrument,
-)
-from skills.demonstration.motion import (
-    Joints,
-    Motion,
-    Signal,
-    equal_samples,
-    recorded_joints,
-    recorded_motion,
-    recorded_signal,
-)
+from skills.demonstration.hypotheses import stated_instrument
+from skills.demonstration.identification import MOST_SAMPLES, ArmIdentification, Identification, identify
+from skills.demonstration.motion import Joints as Joints
+from skills.demonstration.motion import Motion as Motion
+from skills.demonstration.motion import Signal as Signal
+from skills.demonstration.motion import equal_samples as equal_samples
+from skills.demonstration.motion import recorded_joints as recorded_joints
+from skills.demonstration.motion import recorded_motion as recorded_motion
+from skills.demonstration.motion import recorded_signal as recorded_signal
 from skills.errors import NoUsableTopic, UnreadableRecording
 from skills.fields import Count, Point, Quaternion, schema
 from skills.kinematics import matrix_of, quaternion_of
@@ -252,23 +245,6 @@ def _pairs(stamps_ns: Ints, others_ns: Ints) -> tuple[Ints, Ints]:
     return near, nearer[near]
 
 
-__all__ = [
-    "BaseFrame",
-    "Column",
-    "Format",
-    "Integrity",
-    "Joints",
-    "Label",
-    "Motion",
-    "Recording",
-    "Signal",
-    "Topic",
-    "base_frames",
-    "equal_samples",
-    "recorded_joints",
-    "recorded_motion",
-    "recorded_signal",
-]
 ARMS_LIMIT, MOTIONS_LIMIT = 16, 200  # ours: a da Vinci has three PSMs; every pair of arms and of motions is compared
 
 Format = Literal["mcap", "csv", "jigsaws", "rosbag2", "rosbag1", "lerobot"]

@@ -21,14 +21,13 @@ from typing import Any, BinaryIO, Self, TypeVar
 import numpy as np
 
 from skills import errors, packing
-from skills.compiled import check_kept, kept_in, make_ready
+from skills.compiled import cache_folders, check_cache_folder, make_ready
 from skills.demonstration.identification import ArmIdentification, Identification
 from skills.demonstration.recording import BaseFrame, Column, Joints, Label, Motion, Recording, Signal, Topic
 from skills.demonstration.segments import Segment
 from skills.errors import BadInput, SkillsError, TooLarge, Unanswered, UnknownFormat, UnreadableRecording
 from skills.formats import read_recording, write_mcap
 from skills.formats.cells import load_arrow
-from skills.formats.mcap import _kernels
 from skills.formats.parsed import ParsedContent, parse_recording
 from skills.remedies import read_remedies
 from skills.sandbox import ProcessLimits
@@ -178,12 +177,12 @@ def get_ready() -> None:
     Each fork that reads a table would import `pyarrow` again, which takes 30 times as long as reading a small one.
     """
     load_arrow()
-    folder = kept_in(_kernels.follow_compiled)
-    check_kept(folder)
+    for folder in cache_folders():
+        check_cache_folder(folder)
     stamps_ns, tip_mm = np.array([0, 1]), np.zeros((2, 3))
     motion = Motion("PSM1", "/PSM1/measured_cp", "ECM", stamps_ns, tip_mm, np.tile([0.0, 0.0, 0.0, 1.0], (2, 1)))
     data = write_mcap(Recording("mcap", "full", (motion,)))
-    make_ready(lambda: parse_recording(BytesIO(data)), folder)
+    make_ready(lambda: parse_recording(BytesIO(data)))
 
 
 def read(file: BinaryIO, answer: BinaryIO, **options: Any) -> None:

@@ -10,9 +10,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import MultipleLocator
 
+from skills.arithmetic import wilson
 from skills.arrays import Floats
 from skills.gridworld.grid import GridPath
-from skills.learning.slip import wilson
 from skills.report.numbers import LearntStyle, Numbers
 
 if TYPE_CHECKING:

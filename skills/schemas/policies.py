@@ -8,13 +8,14 @@ from pydantic import Field
 
 from skills.demonstration.partner import Partner
 from skills.fields import Count, Fraction, Point, Quaternion, Sha256, Slug, schema
+from skills.gridworld.hazards import SceneCosts
 from skills.gridworld.reward import RewardLevels
-from skills.gridworld.scene import Scene, SceneCosts
+from skills.gridworld.scene import Scene
 from skills.learning.certificate import NearOdds, NearStarts
-from skills.learning.dynamic_programming import ShortestWay
 from skills.learning.evaluation import Metrics, SpaceRollouts
 from skills.learning.in_scene import SceneCertificate
 from skills.learning.q_learning import Training
+from skills.learning.ties import ShortestWay
 from skills.learning.tube_certificate import TubeCertificate, TubeClearance
 from skills.planning.plan import DrivenPass
 from skills.schemas import DemoOutcome, Given, Grid, Page, PolicyName, VersionNumber

@@ -11,7 +11,8 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, StrictBool, StrictInt, create_model
 
 from skills.comparison.combining import COMBININGS, Combining
-from skills.gridworld.scene import MOST_BODIES, MOST_HEIGHTS, Scene, SceneCosts, Surroundings
+from skills.gridworld.hazards import SceneCosts, Surroundings
+from skills.gridworld.scene import MOST_BODIES, MOST_HEIGHTS, Scene
 from skills.learning.policy import LEARNERS, MAX_SEED, Learner, learner_of
 
 SLUG = r"^[a-z0-9][a-z0-9_-]{0,63}$"

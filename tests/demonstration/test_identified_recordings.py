@@ -9,8 +9,9 @@ from rosbags.rosbag1 import Reader
 from rosbags.typesys import Stores, get_typestore
 
 from skills import packing
-from skills.demonstration.demonstration import cut_demo, propose_segments
+from skills.demonstration.demonstration import cut_demo
 from skills.demonstration.recording import Joints, Motion, Recording, base_frames
+from skills.demonstration.segments import propose_segments
 from skills.errors import JointsDisagree, NotMetres
 from skills.formats import write_mcap
 from skills.formats.parsed import parse, parse_recording

@@ -26,8 +26,8 @@ from skills.library.policies.versions import find_by_digest, learnt_from, path_o
 from skills.library.recordings.demos import upload_demo, withdraw_demo
 from skills.schemas.demos import DemoIn
 from skills.settings import Settings
-from skills.verification.asked import asked_of
 from skills.verification.intent import compare
+from skills.verification.requested import requested_motion
 from tests import backends
 from tests.library import cases
 from tests.library.styles import retrain
@@ -180,8 +180,8 @@ def test_a_plan_follows_it_and_a_card_tells_of_it(database: Database, how):
         followed, card = learnt_from(stored), card_of(session, stored)
         assert np.abs(plan.plan.passes[0].tip_mm[-1] - [5.0, 55.0, -125.0]).max() < 1e-9
         assert dtw(plan.plan.passes[0].tip_mm, followed.tip_mm).differences_mm.sum(axis=1).mean() < 5.0
-        asked = asked_of(plan.plan, learnt(stored), hand_of(stored))
-    assert all(one.value <= one.limit for one in compare(asked, trajectory_of(plan.plan)).deviations)
+        asked = requested_motion(plan.plan, learnt(stored), hand_of(stored))
+    assert all(one.value <= one.limit for one in compare(asked, trajectory_of(plan.plan)).greatest)
     assert "3 recorded demonstrations" in card.facts.what_it_is[0]
     assert card.facts.combined.kind == how.kind
     links = [(link.what, link.sha256) for link in card.facts.lineage.chain]

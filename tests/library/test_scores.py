@@ -1,5 +1,6 @@
 """Scores on a real database: the reference, the percentiles, the history, and only surgeons with consent."""
 
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -20,8 +21,10 @@ from skills.schemas.scores import Score, ScoreIn
 from skills.scoring.calibration import SkillModel, as_numbers
 from tests.library import cases, rated
 from tests.library.test_calibrations import OLD
-from tests.scoring.test_rating import JUDGED, model
+from tests.scoring.test_rating import JUDGED as RATED
+from tests.scoring.test_rating import model
 
+JUDGED = asdict(RATED)
 NO_ATLAS = {"uses": ["training", "export"]}
 READ = parse_recording
 

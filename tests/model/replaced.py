@@ -21,7 +21,7 @@ from sqlalchemy.orm import Session
 import skills.api.app
 import skills.db
 from skills.db.session import Database
-from skills.demonstration.demonstration import Recording
+from skills.demonstration.recording import Recording
 from skills.formats import read_recording
 from skills.formats.parsed import parse_recording
 from skills.library.people.keys import create_key

@@ -27,8 +27,8 @@ from skills.schemas.demos import DemoIn
 from skills.schemas.recordings import Reading
 from skills.settings import Settings
 from skills.simulation.player import play
+from skills.verification.deviations import LIMITS
 from skills.verification.gates import Limits
-from skills.verification.intent import LIMITS
 from skills.verification.verdict import PlaybackReport, judge
 from tests import backends
 from tests.bench.playing import stacked

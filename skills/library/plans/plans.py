@@ -261,7 +261,7 @@ def _psm_m(asked: PsmMIn, partner: Partner | None) -> PsmM:
 def trajectory_of(plan: SuturePlan) -> Trajectory:
     """Return the trajectory of a plan, sampled at its own rate; the same plan gives the same bytes."""
     return time_parametrise(
-        plan.pass_paths,
+        plan.passes,
         speed_mm_s=plan.speed_mm_s,
         rate_hz=plan.rate_hz,
         instrument=plan.instrument,

@@ -39,8 +39,8 @@ from skills.demonstration.recording import Recording
 from skills.errors import BadInput, Conflict, NotFound, SkillsError
 from skills.fields import as_json
 from skills.gridworld.grid import discretisation_rmse
+from skills.gridworld.hazards import Surroundings, hazards_of, refuse_unfit
 from skills.gridworld.reward import RewardLevels, RewardMap, sparse_reward
-from skills.gridworld.scene import Surroundings, hazards_of, refuse_unfit
 from skills.learning.certificate import (
     Certificate,
     NearLimits,
@@ -51,7 +51,6 @@ from skills.learning.certificate import (
     near_odds,
     near_starts,
 )
-from skills.learning.dynamic_programming import rule_in
 from skills.learning.evaluation import check_in_space, measure
 from skills.learning.in_scene import SceneCertificate, certify_in_scene, learn_in_scene, scene_learner
 from skills.learning.policy import (
@@ -65,6 +64,7 @@ from skills.learning.policy import (
     refuse_too_large,
 )
 from skills.learning.q_learning import PhaseQLearning
+from skills.learning.ties import rule_in
 from skills.learning.tube import certified_poses
 from skills.library.operation import jobs
 from skills.library.operation.integrity import policy_identity_of, poses_identity_of, scene_digest

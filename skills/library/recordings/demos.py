@@ -24,10 +24,10 @@ from skills.db.models import (
 from skills.db.packed import digest
 from skills.db.service_tables import record_event
 from skills.db.session import Database
-from skills.demonstration.demonstration import Demo, Segment, cut_demo
+from skills.demonstration.demonstration import Demo, cut_demo
 from skills.demonstration.quality import describe
 from skills.demonstration.recording import equal_samples
-from skills.demonstration.segments import TakenSegment
+from skills.demonstration.segments import Segment, TakenSegment
 from skills.errors import BadSegment, Conflict, SegmentNotNamed
 from skills.fields import as_json
 from skills.formats.parsed import MOST, ParsedContent, parse_recording

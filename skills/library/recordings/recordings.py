@@ -42,7 +42,7 @@ from skills.db.packed import load_arrays
 from skills.db.row_visibility import EVERYBODYS
 from skills.db.service_tables import record_event
 from skills.db.session import Database
-from skills.demonstration.demonstration import Recording
+from skills.demonstration.recording import Recording
 from skills.errors import BadInput, Busy, Conflict, Corrupt, UnknownFormat, UnreadableRecording
 from skills.fields import as_json
 from skills.formats import MEDIA_TYPES, media_type_of, read_recording
