@@ -27,25 +27,12 @@ from skills.client.connection import (
 )
 from skills.client.transport import keep
 from skills.errors import BadInput, Corrupt
-from skills.schemas.given import (
-    Atlas,
-    Job,
-    Nearest,
-    NextPose,
-    NextStep,
-    Policy,
-    PolicyCard,
-    PolicySummary,
-    PoseStyle,
-    Progress,
-    RecognisedRecording,
-    RetrainedStyle,
-    Retraining,
-    Rollout,
-    Score,
-    SignedEnvelope,
-    Version,
-)
+from skills.schemas.cards import PolicyCard
+from skills.schemas.given import Atlas, Nearest, Progress, RecognisedRecording, Score, SignedEnvelope
+from skills.schemas.operation import Job
+from skills.schemas.policies import NextStep, Policy, PolicySummary, Rollout, Version
+from skills.schemas.pose_styles import NextPose, PoseStyle
+from skills.schemas.training import RetrainedStyle, Retraining
 from skills.schemas.tries import TryStep
 
 if TYPE_CHECKING:

@@ -12,7 +12,6 @@ from skills.schemas.given import (
     DatasetEpisodes,
     Demonstration,
     DemoPath,
-    Job,
     Proposal,
     Recording,
     RecordingPreview,
@@ -21,6 +20,7 @@ from skills.schemas.given import (
     Surgeon,
     SutureType,
 )
+from skills.schemas.operation import Job
 
 
 class Catalogue(Connection):

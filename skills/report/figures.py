@@ -16,7 +16,8 @@ from skills.learning.slip import wilson
 from skills.report.numbers import LearntStyle, Numbers
 
 if TYPE_CHECKING:
-    from skills.schemas.given import DemoPath, Policy, Rollout
+    from skills.schemas.given import DemoPath
+    from skills.schemas.policies import Policy, Rollout
 
 # a palette for colour-blind readers (Okabe, Ito)
 RECORDED, CELLS, ROLLOUT, GOAL = "#8a8f98", "#0072b2", "#d55e00", "#009e73"

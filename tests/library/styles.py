@@ -15,7 +15,8 @@ from skills.library.policies.retraining import request_retraining
 from skills.library.recordings import demos
 from skills.library.recordings.demos import Made, make_demo
 from skills.library.recordings.recordings import entry_of, find_recording, keep
-from skills.schemas.requests import DemoIn, RetrainingIn
+from skills.schemas.requests import DemoIn
+from skills.schemas.training import RetrainingIn
 from tests.library import cases
 
 NO_CONSENT = {"consent": {"uses": ["atlas"], "until": None}}

@@ -59,19 +59,12 @@ from skills.library.recordings.timelines import Source, check_export, chosen, mo
 from skills.planning.plan import MAX_PASSES
 from skills.planning.trajectory import Trajectory
 from skills.schemas.given import Page, SuturePoints
-from skills.schemas.plans import (
-    Comparison,
-    MotionTimeline,
-    Plan,
-    PlanIn,
-    PlanSummary,
-    Playback,
-    PlaybackIn,
-    Reach,
-    ReachIn,
-)
+from skills.schemas.plans import Plan, PlanIn, PlanSummary
 from skills.schemas.plans import Trajectory as GivenTrajectory
+from skills.schemas.playbacks import Comparison, Playback, PlaybackIn
+from skills.schemas.reach import Reach, ReachIn
 from skills.schemas.requests import DIGEST, FRAME, Name, Schema
+from skills.schemas.timelines import MotionTimeline
 from skills.settings import MEBIBYTE, Settings
 from skills.verification.playback import Pictures
 

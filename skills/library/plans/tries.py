@@ -57,7 +57,8 @@ from skills.library.recordings.demos import add_demo, choose_part, find_demo
 from skills.library.recordings.recordings import Teller, confined_reader, find_recording, stored_recording
 from skills.remedies import Remedy
 from skills.schemas.plans import PlanIn, SuturePointIn
-from skills.schemas.requests import DemoIn, TrainingIn
+from skills.schemas.requests import DemoIn
+from skills.schemas.training import TrainingIn
 from skills.schemas.tries import Choice, StepName, TryIn, TryStep
 from skills.settings import Settings
 from skills.verification.gates import SCENE
