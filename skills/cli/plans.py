@@ -25,7 +25,7 @@ from skills.cli.shell import (
 from skills.errors import BadInput, BadSettings
 
 if TYPE_CHECKING:
-    from skills.schemas.plans import Reach
+    from skills.schemas.reach import Reach
 from skills.cli.shell import cell
 
 commands = typer.Typer()

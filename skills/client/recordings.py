@@ -10,7 +10,7 @@ from skills.client.transport import Progress
 from skills.schemas import DemoOutcome, Handedness, OutcomeAsked, ProposalDecision, ProposalState, SkillLevel
 from skills.schemas.datasets import DatasetEpisodes
 from skills.schemas.demos import Demonstration, DemoPath, Proposal, RewardMap
-from skills.schemas.given import Job
+from skills.schemas.operation import Job
 from skills.schemas.people import Surgeon, SutureType
 from skills.schemas.recordings import Recording, RecordingPreview, RecordingSummary
 

@@ -17,7 +17,7 @@ from skills.report.numbers import LearntStyle, Numbers
 
 if TYPE_CHECKING:
     from skills.schemas.demos import DemoPath
-    from skills.schemas.given import Policy, Rollout
+    from skills.schemas.policies import Policy, Rollout
 
 # a palette for colour-blind readers (Okabe, Ito)
 RECORDED, CELLS, ROLLOUT, GOAL = "#8a8f98", "#0072b2", "#d55e00", "#009e73"

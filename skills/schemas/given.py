@@ -1,9 +1,4 @@
-"""All responses of the service, as models: routes declare them, and the client parses with them.
-
-Lengths are mm, angles rad, durations s, moments UTC; frames are named. Those of errors and the history are here, the
-others in the modules from which they are imported, and those of people, recordings, demonstrations, datasets and
-comparisons in `skills.schemas` under these names.
-"""
+"""Responses of the service itself: errors, liveness and readiness, the history, and its proofs."""
 
 from datetime import datetime
 from typing import Any, Literal
@@ -11,54 +6,7 @@ from typing import Any, Literal
 from pydantic import ConfigDict, Field
 
 from skills.fields import Count, Sha256, Slug
-from skills.schemas import Given, Page
-from skills.schemas.cards import PolicyCard
-from skills.schemas.plans import Comparison, MotionTimeline, Plan, PlanSummary, Playback, Reach, Trajectory
-from skills.schemas.policies import (
-    Job,
-    NextPose,
-    NextStep,
-    Policy,
-    PolicySummary,
-    PoseStyle,
-    RetrainedStyle,
-    Retraining,
-    Rollout,
-    SessionOpening,
-    SessionPose,
-    Version,
-)
-
-__all__ = [
-    "Alive",
-    "Comparison",
-    "Job",
-    "LeafProof",
-    "MotionTimeline",
-    "NextPose",
-    "NextStep",
-    "Page",
-    "Plan",
-    "PlanSummary",
-    "Playback",
-    "Policy",
-    "PolicyCard",
-    "PolicySummary",
-    "PoseStyle",
-    "Problem",
-    "Reach",
-    "Ready",
-    "RetrainedStyle",
-    "Retraining",
-    "Rollout",
-    "ServedAt",
-    "SessionOpening",
-    "SessionPose",
-    "SignedCheckpoint",
-    "Trajectory",
-    "Version",
-    "WrongField",
-]
+from skills.schemas import Given
 
 
 class WrongField(Given):

@@ -29,7 +29,7 @@ from skills.library.recordings.recordings import Upload
 from skills.packing import sha256
 from skills.schemas.demos import DemoIn
 from skills.schemas.plans import PlanIn
-from skills.schemas.requests import TrainingIn
+from skills.schemas.training import TrainingIn
 from skills.settings import Settings
 
 SUTURE = "simple-running"

@@ -16,7 +16,7 @@ from skills.library.recordings import demos
 from skills.library.recordings.demos import Made, make_demo
 from skills.library.recordings.recordings import entry_of, find_recording, keep
 from skills.schemas.demos import DemoIn
-from skills.schemas.requests import RetrainingIn
+from skills.schemas.training import RetrainingIn
 from tests.library import cases
 
 NO_CONSENT = {"consent": {"uses": ["atlas"], "until": None}}

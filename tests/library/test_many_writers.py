@@ -26,7 +26,7 @@ from skills.library.policies.versions import find_version
 from skills.library.recordings.demos import add_demo
 from skills.library.recordings.recordings import store_recording
 from skills.schemas.demos import DemoIn
-from skills.schemas.requests import TrainingIn
+from skills.schemas.training import TrainingIn
 from skills.settings import Settings
 from tests import backends
 from tests.library import cases

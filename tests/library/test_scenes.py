@@ -28,7 +28,7 @@ from skills.library.policies.releases import refusals
 from skills.library.policies.retraining import request_retraining
 from skills.library.policies.training import odds_limits
 from skills.library.policies.versions import about_rollout
-from skills.schemas.requests import RetrainingIn
+from skills.schemas.training import RetrainingIn
 from skills.settings import Settings
 from tests.library import cases
 from tests.library.styles import ask_retraining, parts_of, styles_of

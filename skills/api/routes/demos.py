@@ -40,9 +40,8 @@ from skills.library.operation.sweep import drop_contents, sweep_erased
 from skills.library.people import erasure
 from skills.library.recordings import demos
 from skills.library.recordings.demos import demo_json, path_json, reward_map_json
-from skills.schemas import OutcomeAsked
+from skills.schemas import OutcomeAsked, Page
 from skills.schemas.demos import DemoIn, Demonstration, DemoPath, OutcomeIn, RewardMap
-from skills.schemas.given import Page
 from skills.schemas.recordings import TableIn
 from skills.schemas.requests import DIGEST, SLUG
 from skills.settings import MEBIBYTE

@@ -58,21 +58,14 @@ from skills.library.plans.replay import compare_with_plan, conditions_of, replay
 from skills.library.recordings.timelines import Source, check_export, chosen, motion_named, timeline_of
 from skills.planning.plan import MAX_PASSES
 from skills.planning.trajectory import Trajectory
-from skills.schemas.given import Page
-from skills.schemas.plans import (
-    Comparison,
-    MotionTimeline,
-    Plan,
-    PlanIn,
-    PlanSummary,
-    Playback,
-    PlaybackIn,
-    Reach,
-    ReachIn,
-)
+from skills.schemas import Page
+from skills.schemas.plans import Plan, PlanIn, PlanSummary
 from skills.schemas.plans import Trajectory as GivenTrajectory
+from skills.schemas.playbacks import Comparison, Playback, PlaybackIn
+from skills.schemas.reach import Reach, ReachIn
 from skills.schemas.recordings import SuturePoints
 from skills.schemas.requests import DIGEST, FRAME, Name, Schema
+from skills.schemas.timelines import MotionTimeline
 from skills.settings import MEBIBYTE, Settings
 from skills.verification.playback import Pictures
 

@@ -31,9 +31,8 @@ from skills.library.people import erasure
 from skills.library.recordings import proposals, recordings
 from skills.library.recordings.proposals import proposal_json
 from skills.library.recordings.recordings import find_recording, recording_json
-from skills.schemas import ProposalState
+from skills.schemas import Page, ProposalState
 from skills.schemas.demos import Proposal, ProposalIn
-from skills.schemas.given import Page
 from skills.schemas.recordings import Recording, RecordingPreview, RecordingSummary, TableIn
 from skills.schemas.requests import DIGEST, SLUG, SlugField
 from skills.settings import MEBIBYTE

@@ -39,7 +39,8 @@ from skills.planning.plan import SuturePlan, pose_xyzw, stack, turn_deg
 from skills.planning.trajectory import Trajectory, seams, seconds_by_phase, time_parametrise, transfers
 from skills.remedies import Action, Remedy
 from skills.schemas import PolicyName
-from skills.schemas.plans import PlanIn, PsmMIn, Reach, ReachIn
+from skills.schemas.plans import PlanIn, PsmMIn
+from skills.schemas.reach import Reach, ReachIn
 from skills.verification.reach import MAX_PLACES, ReachPlace, map_reach
 
 

@@ -58,7 +58,7 @@ from skills.library.recordings.recordings import Teller, confined_reader, find_r
 from skills.remedies import Remedy
 from skills.schemas.demos import DemoIn
 from skills.schemas.plans import PlanIn, SuturePointIn
-from skills.schemas.requests import TrainingIn
+from skills.schemas.training import TrainingIn
 from skills.schemas.tries import Choice, StepName, TryIn, TryStep
 from skills.settings import Settings
 from skills.verification.gates import SCENE

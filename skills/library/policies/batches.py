@@ -49,7 +49,7 @@ from skills.library.policies.training import (
 from skills.library.policies.versions import LearntIn, Recipe, kept_of, learner_kept, recipes_of, refuse_unlike
 from skills.library.recordings.demos import newest_demos
 from skills.library.recordings.recordings import Teller, confined_reader
-from skills.schemas.policies import FitOnTheSame, PolicyFigures, StoredComparison
+from skills.schemas.training import FitOnTheSame, PolicyFigures, StoredComparison
 from skills.settings import Settings
 
 TOGETHER = 25  # styles

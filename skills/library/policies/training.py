@@ -80,7 +80,7 @@ from skills.packing import canonical, sha256
 from skills.planning.plan import DrivenPass
 from skills.remedies import Action, Remedy
 from skills.schemas.policies import JOINING_FORMAT, Coverage, GridCertificate, Joining
-from skills.schemas.requests import TrainingIn
+from skills.schemas.training import TrainingIn
 from skills.settings import Settings
 
 # Statements executed for every style, built once: building one takes as long as executing it.
