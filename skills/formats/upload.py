@@ -33,10 +33,8 @@ from skills.formats import rosbag
 from skills.formats.archive import pack
 from skills.formats.bag_folder import (
     METADATA,
-    TAGS_BYTES,
     check_counts,
     in_order,
-    read_labels,
     read_metadata,
     suffix_of,
     unzstd,
@@ -46,6 +44,7 @@ from skills.formats.lerobot import INFO
 from skills.formats.mcap import MAGIC
 from skills.formats.mcap.reader import NOTES
 from skills.formats.mcap.records import RECOVER
+from skills.formats.tags import TAGS_BYTES, read_labels
 from skills.remedies import Action, Remedy, did_you_mean
 
 PICTURES = frozenset(
