@@ -12,7 +12,6 @@ which reduces a session's gigabytes; every other message is copied unchanged, wi
 Checksums of the original are verified while copying, and the copy has its own.
 """
 
-import hashlib
 import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -38,6 +37,7 @@ from skills.formats.bag_folder import (
     suffix_of,
     unzstd,
 )
+from skills.formats.checksums import digest_of
 from skills.formats.jigsaws import trials
 from skills.formats.lerobot import INFO
 from skills.formats.mcap import MAGIC
@@ -62,7 +62,6 @@ PICTURES = frozenset(
     }
 )
 _RECORD_BYTES = 4 << 30  # generous, because the user's own file is trusted
-_PIECE = 1 << 20
 _NAME = "bag"  # the original file names may identify a person
 
 Progress = Callable[[int], None]  # called with the number of bytes processed since the last call
@@ -162,7 +161,7 @@ def _one_file(bag: Bag, folder: Path, progress: Progress) -> Path:
         if not any(topic.type in PICTURES for topic in topics):
             _check(bag, topics)
             return files[0]
-    digests = [digest_of(file, progress) for file in bag.files]
+    digests = [_digest(file, progress) for file in bag.files]
     out = folder / f"{_NAME}.mcap"
     with out.open("wb") as file:
         if files[0].suffix == ".mcap":
@@ -240,14 +239,9 @@ def _by_number(name: str) -> tuple[int, str]:
 # ---- copies without pictures -----------------------------------------------------------------------------------------
 
 
-def digest_of(path: Path, progress: Progress = ignore) -> str:
-    """Return the SHA-256 of a file, in hex."""
-    seen = hashlib.sha256()
+def _digest(path: Path, progress: Progress) -> str:
     with path.open("rb") as file:
-        while data := file.read(_PIECE):
-            seen.update(data)
-            progress(len(data))
-    return seen.hexdigest()
+        return digest_of(file, lambda data: progress(len(data)))
 
 
 def origin(digests: Sequence[str], topics: Iterable[Topic]) -> dict[str, str]:

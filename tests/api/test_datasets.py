@@ -12,7 +12,7 @@ from skills.api import responses
 from skills.client import Problem
 from skills.errors import BadInput, Conflict
 from skills.formats import write_mcap
-from skills.formats.lerobot import check_dataset
+from skills.formats.lerobot.manifest import check_dataset
 from skills.library import datasets
 from tests.api.keyed import As, key
 from tests.api.service import KESTREL, MCAP, Service, assert_problem

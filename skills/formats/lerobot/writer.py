@@ -18,7 +18,6 @@ those of all values; quantiles of the dataset are the means of the episodes', we
 them.
 """
 
-import hashlib
 import io
 import json
 from collections.abc import Iterable, Iterator, Mapping
@@ -34,8 +33,9 @@ from numpy.typing import NDArray
 from skills.arrays import Floats, Ints
 from skills.demonstration.recording import Motion, Recording, Signal
 from skills.errors import BadInput, MixedFrames, NoUsableTopic, UnreadableRecording
+from skills.formats.checksums import SUMS, digest_of, write_sums
 from skills.formats.columns import POSE_PARTS
-from skills.formats.lerobot import INFO, MANIFEST, SAID, TASK_LINES, TASK_TABLE, Json
+from skills.formats.lerobot import INFO, SAID, TASK_LINES, TASK_TABLE, Json
 
 Version = Literal["v2.1", "v3.0"]
 ActionRule = Literal["next state", "setpoint"]
@@ -56,7 +56,6 @@ _ACTIONS: dict[ActionRule, str] = {
     "next state": "`action` is the state of the next frame.",
     "setpoint": "`action` has the setpoints of these poses and jaws that are nearest in time, in the same frames.",
 }
-_PIECE = 1 << 20
 
 Singles = NDArray[np.float32]
 Numbers = NDArray[Any]
@@ -177,13 +176,10 @@ def dataset_files(
     seen: dict[str, str] = {}
     for name, file in _files(episodes, about, version):
         file.seek(0)
-        digest = hashlib.sha256()
-        while data := file.read(_PIECE):
-            digest.update(data)
-        seen[name] = digest.hexdigest()
+        seen[name] = digest_of(file)
         file.seek(0)
         yield name, file
-    yield MANIFEST, io.BytesIO("".join(f"{seen[name]}  {name}\n" for name in sorted(seen)).encode())
+    yield SUMS, io.BytesIO(write_sums(seen))
 
 
 def _files(
