@@ -41,6 +41,9 @@ TOPICS = {  # the quantities that recorders write as columns, and the topics fro
 }
 SETPOINTS = ("setpoint", "local_setpoint", "joint_setpoints", "jaw_setpoint")
 Quantity = tuple[str, str]  # an arm such as "PSM1", and a key of `TOPICS`
+# The numbers of a quantity in rad and mm: of a pose positions (T, 3) and, where they are known, quaternions (T, 4); of
+# any other one array (T, K). Apart, so that the recording's values need no copy of them.
+Parts = tuple[Floats, ...]
 _TURN_RAD = 2 * np.pi
 _JOINT_RAD = 7.0  # ours: more than any joint turns, less than 8 degrees
 APART_MM = 30.0  # ours: an arm lags by some mm, and by a cell of the paper's grid, 5 mm, at 100 mm/s and 50 ms
@@ -57,23 +60,16 @@ def topic_of(arm: str, kind: str) -> str:
     return TOPICS[kind].format(arm)
 
 
-def pose_motion(arm: str, kind: str, frame: str, stamps_ns: Ints, pose: Floats) -> Motion:
-    """Return a motion from positions in m and, where there are 7 columns, unit quaternions.
-
-    Args:
-        arm: The arm.
-        kind: "pose" or "local_pose".
-        frame: The frame of the positions.
-        stamps_ns: Integer nanoseconds, shape (T,).
-        pose: Shape (T, 3) or (T, 7).
-    """
+def pose_motion(arm: str, kind: str, frame: str, stamps_ns: Ints, pose: Parts) -> Motion:
+    """Return the motion of an arm from its "pose" or "local_pose" in a frame, at stamps of shape (T,)."""
+    tip_mm, *rotation = pose
     return recorded_motion(
         arm=arm,
         topic=topic_of(arm, kind),
         frame=frame,
         stamps_ns=stamps_ns,
-        tip_mm=scaled(pose[:, :3], 1000.0),  # the recorders write metres
-        rotation_xyzw=pose[:, 3:] if pose.shape[1] > 3 else None,
+        tip_mm=tip_mm,
+        rotation_xyzw=rotation[0] if rotation else None,
     )
 
 
@@ -124,7 +120,7 @@ def check_joints(topic: str, joints: Floats) -> None:
         )
 
 
-def posed(topic: str, joints: Floats, instrument: str | None) -> tuple[Floats, Floats]:
+def posed(topic: str, joints: Floats, instrument: str | None) -> Parts:
     """Compute poses from joints by forward kinematics with a stated instrument.
 
     Args:
@@ -157,8 +153,7 @@ def posed(topic: str, joints: Floats, instrument: str | None) -> tuple[Floats, F
             sample=row,
             joint=JOINTS[joint],
         )
-    tip_mm, rotation = forward(joints, instrument)
-    return tip_mm, quaternion_of(rotation)
+    return pose_of(joints, instrument)
 
 
 def check_outside(motion: Motion) -> None:
@@ -238,31 +233,31 @@ class ColumnSetpoints:
 
 
 def setpoints_in(
-    values: Mapping[Quantity, Floats], motions: Sequence[Motion], instruments: Mapping[str, str], stamps_ns: Ints
+    values: Mapping[Quantity, Parts], motions: Sequence[Motion], instruments: Mapping[str, str], stamps_ns: Ints
 ) -> ColumnSetpoints:
     """Return the setpoints beside measured poses in the same frame; those of joints in the base of their arm.
 
     Args:
-        values: The numbers of each quantity in m and rad, shape (T, K); those of other quantities are not used.
+        values: The numbers of each quantity; those of other quantities are not used.
         motions: The measured motions.
         instruments: The number of each arm's instrument, where it is known.
         stamps_ns: Integer nanoseconds, shape (T,).
     """
     found = ColumnSetpoints()
-    for (arm, kind), numbers in values.items():
+    for (arm, kind), parts in values.items():
         if kind not in SETPOINTS:
             continue
-        topic, pose = topic_of(arm, kind), numbers
+        topic, pose = topic_of(arm, kind), parts
         if kind == "joint_setpoints":
             number = instruments.get(arm)
-            if (arm, "local_setpoint") in values or number is None or not np.isfinite(numbers).all():
+            if (arm, "local_setpoint") in values or number is None or not np.isfinite(parts[0]).all():
                 why = "not used: the instrument is not known, a number is NaN or infinite, or poses are there too"
                 found.left_out.append((topic, why))
                 continue
-            topic, pose = topic_of(arm, "local_setpoint"), forward_m(in_mm(numbers), number)
+            topic, pose = topic_of(arm, "local_setpoint"), pose_of(parts[0], number)
         try:
             if kind == "jaw_setpoint":
-                found.jaws.append((arm, recorded_signal(stamps_ns, numbers[:, 0], topic)))
+                found.jaws.append((arm, recorded_signal(stamps_ns, parts[0][:, 0], topic)))
                 continue
             beside = topic_of(arm, "pose" if kind == "setpoint" else "local_pose")
             measured = next((one for one in motions if one.topic == beside), None)
@@ -276,10 +271,10 @@ def setpoints_in(
     return found
 
 
-def forward_m(joints: Floats, instrument: str) -> Floats:
-    """Return the poses of the tip in m, shape (T, 7), from joints in rad and mm, shape (T, 6)."""
+def pose_of(joints: Floats, instrument: str) -> Parts:
+    """Return the poses of the tip in the arm's base, from joints in rad and mm, shape (T, 6)."""
     tip_mm, turned = forward(joints, instrument)
-    return np.concatenate([tip_mm / 1000.0, quaternion_of(turned)], axis=1)
+    return tip_mm, quaternion_of(turned)
 
 
 def _check_near(tip: Motion, measured: Motion) -> None:

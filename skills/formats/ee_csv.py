@@ -39,7 +39,6 @@ from skills.demonstration.recording import (
     Topic,
     base_frames,
     recorded_joints,
-    recorded_motion,
     recorded_signal,
 )
 from skills.errors import BadColumns, BadSettings, MixedFrames, NoUsableTopic, SkillsError
@@ -48,11 +47,11 @@ from skills.formats.columns import (
     BASE,
     POSE_PARTS,
     SETPOINTS,
+    Parts,
     Quantity,
     base_of,
     check_joints,
     check_outside,
-    in_mm,
     pose_motion,
     posed,
     setpoints_in,
@@ -135,21 +134,31 @@ def read_ee_csv(file: BinaryIO, said: TableReading) -> Recording:
 
 def _read(
     file: BinaryIO, groups: Mapping[Quantity, Indices], time: int | None, said: TableReading
-) -> tuple[Ints, dict[Quantity, Floats]]:
-    """Return the stamps, shape (T,), and the numbers of each quantity in m and rad, shape (T, K)."""
+) -> tuple[Ints, dict[Quantity, Parts]]:
+    """Return the stamps, shape (T,), and the numbers of each quantity."""
     file.seek(0)
     with open_text(file) as text:
         names, separator = header_of(text)
-        used = [*([[time]] if time is not None else []), *map(list, groups.values())]
+        apart = {one: [columns] if one[1] in _PARTS else [columns[:3], columns[3:]] for one, columns in groups.items()}
+        used = [*([[time]] if time is not None else []), *(list(part) for parts in apart.values() for part in parts)]
         numbers = read_numbers(text, names, used, separator, said.decimal, None if time is None else (time, "ns"))
-    found = list(numbers.groups)
+    found = iter(numbers.groups)
     if time is not None:
-        _check_whole(found.pop(0))
+        _check_whole(next(found))
         assert numbers.stamps_ns is not None
         check_steps(TIME, "ns", numbers.stamps_ns)
     stamps_ns = stamps_of(numbers.stamps_ns, numbers.rows, said)
     stamps_ns.setflags(write=False)  # so that all streams share it
-    return stamps_ns, dict(zip(groups, found, strict=True))
+    values = {one: tuple(next(found) for _ in parts) for one, parts in apart.items()}
+    for (_, kind), (first, *others) in values.items():
+        with np.errstate(over="ignore"):  # infinite ones are refused by the recording's values
+            if kind == "joints":
+                first[:, INSERTION] *= 1000.0  # the recorders write metres
+            elif kind not in _PARTS:
+                first *= 1000.0
+        for part in (first, *others):
+            part.setflags(write=False)  # so that the recording's values need no copy
+    return stamps_ns, values
 
 
 def _groups(names: Sequence[str]) -> tuple[dict[Quantity, Indices], dict[str, str]]:
@@ -212,7 +221,7 @@ def _check_whole(times: Floats) -> None:
 
 
 def _recording(
-    values: Mapping[Quantity, Floats],
+    values: Mapping[Quantity, Parts],
     stamps_ns: Ints,
     said: TableReading,
     columns: tuple[Column, ...],
@@ -222,35 +231,28 @@ def _recording(
     joints: list[Joints] = []
     jaws: list[tuple[str, Signal]] = []
     left_out: list[tuple[str, str]] = list(faults.items())
-    posing = [arm for (arm, kind), numbers in values.items() if kind == "pose" and numbers.any()]
-    for (arm, kind), numbers in values.items():
+    posing = [arm for (arm, kind), parts in values.items() if kind == "pose" and any(part.any() for part in parts)]
+    for (arm, kind), parts in values.items():
         topic = topic_of(arm, kind)
         if kind == "joints":
-            positions = in_mm(numbers)
+            (positions,) = parts
             check_joints(topic, positions)
             joints.append(recorded_joints(arm, topic, stamps_ns, positions))
             if (arm, "pose") not in values:
-                tip_mm, rotation = posed(topic, positions, said.instrument)
-                posed_motion = recorded_motion(
-                    arm=arm,
-                    topic=topic,
-                    frame=base_of(arm, said.frame),
-                    stamps_ns=stamps_ns,
-                    tip_mm=tip_mm,
-                    rotation_xyzw=rotation,
-                )
-                motions.append(replace(posed_motion, from_joints=True))
+                pose = posed(topic, positions, said.instrument)
+                computed = pose_motion(arm, kind, base_of(arm, said.frame), stamps_ns, pose)
+                motions.append(replace(computed, from_joints=True))
         elif kind == "jaw":
-            jaws.append((arm, recorded_signal(stamps_ns, numbers[:, 0], topic)))
+            jaws.append((arm, recorded_signal(stamps_ns, parts[0][:, 0], topic)))
         elif kind == "pose" and arm in posing:
-            motions.append(pose_motion(arm, kind, _frame(arm, posing, said), stamps_ns, numbers))
+            motions.append(pose_motion(arm, kind, _frame(arm, posing, said), stamps_ns, parts))
         elif kind == "pose":
             left_out.append((topic, "All its numbers are 0: the arm was not recorded."))
-    for (arm, kind), numbers in values.items():
+    for (arm, kind), parts in values.items():
         if kind == "local_pose":
             seen = next((one for one in motions if one.topic == topic_of(arm, "pose")), None)
             try:
-                motions.append(_local(arm, stamps_ns, numbers, seen))
+                motions.append(_local(arm, stamps_ns, parts, seen))
             except SkillsError as error:  # no demonstration depends on it, where the arm has another pose
                 left_out.append((topic_of(arm, kind), str(error)))
     if not motions:
@@ -296,13 +298,13 @@ def _frame(arm: str, arms: Sequence[str], said: TableReading) -> str:
     return said.frame
 
 
-def _local(arm: str, stamps_ns: Ints, pose: Floats, seen: Motion | None) -> Motion:
+def _local(arm: str, stamps_ns: Ints, pose: Parts, seen: Motion | None) -> Motion:
     """Return the motion in the arm's base.
 
     Args:
         arm: The arm.
         stamps_ns: Shape (T,).
-        pose: The numbers of `rcm_pose`, m and unit quaternions, shape (T, 7).
+        pose: The numbers of `rcm_pose`.
         seen: The arm's motion in another frame, if it has one.
 
     Raises:

@@ -35,11 +35,13 @@ from skills.formats.columns import (
     BASE,
     POSE_PARTS,
     SETPOINTS,
+    Parts,
     Quantity,
     check_outside,
-    forward_m,
     in_mm,
     pose_motion,
+    pose_of,
+    scaled,
     setpoints_in,
     topic_of,
 )
@@ -111,7 +113,7 @@ def read_episode(files: Files, root: str, frame: str | None = None) -> Recording
     values = _values(table, meanings)
     tools = _tools(dataset, table)
     joints = {
-        arm: Joints(arm, topic_of(arm, kind), stamps_ns, in_mm(one))
+        arm: Joints(arm, topic_of(arm, kind), stamps_ns, one[0])
         for (arm, kind), one in values.items()
         if kind == "joints"
     }
@@ -123,7 +125,7 @@ def read_episode(files: Files, root: str, frame: str | None = None) -> Recording
         integrity="full",  # a zip archive has a checksum (CRC-32) of every file in it
         motions=motions,
         jaws=tuple(
-            (arm, Signal(stamps_ns, one[:, 0], topic_of(arm, kind)))
+            (arm, Signal(stamps_ns, one[0][:, 0], topic_of(arm, kind)))
             for (arm, kind), one in values.items()
             if kind == "jaw"
         ),
@@ -145,12 +147,18 @@ def _read(dataset: Dataset, meanings: Mapping[Quantity, Mapping[int, Place]]) ->
         return read_columns(file, [one.column for one in features])
 
 
-def _values(table: ParquetTable, meanings: Mapping[Quantity, Mapping[int, Place]]) -> dict[Quantity, Floats]:
-    """Return the numbers of each quantity, shape (T, K)."""
-    return {
-        quantity: table.stacked([place for _, place in sorted(places.items())])
-        for quantity, places in sorted(meanings.items())
-    }
+def _values(table: ParquetTable, meanings: Mapping[Quantity, Mapping[int, Place]]) -> dict[Quantity, Parts]:
+    """Return the numbers of each quantity."""
+    values: dict[Quantity, Parts] = {}
+    for (arm, kind), places in sorted(meanings.items()):
+        numbers = table.stacked([place for _, place in sorted(places.items())])
+        if kind.startswith("joint"):
+            values[arm, kind] = (in_mm(numbers),)
+        elif kind.startswith("jaw"):
+            values[arm, kind] = (numbers,)
+        else:  # the recorders write metres
+            values[arm, kind] = (scaled(numbers[:, :3], 1000.0), *([numbers[:, 3:]] if numbers.shape[1] > 3 else []))
+    return values
 
 
 def episode_stamps(files: Files, root: str) -> Ints:
@@ -297,7 +305,7 @@ def _incomplete(quantity: Quantity, places: Mapping[int, Place]) -> str | None:
 
 
 def _motions(
-    values: Mapping[Quantity, Floats],
+    values: Mapping[Quantity, Parts],
     joints: Mapping[str, Joints],
     tools: Mapping[str, str],
     stamps_ns: Ints,
@@ -317,7 +325,7 @@ def _motions(
             if number is None:
                 left_out.append((joints[arm].topic, f"no pose from joints: the instrument of {arm} is not known"))
             else:
-                local = forward_m(joints[arm].positions, number)
+                local = pose_of(joints[arm].positions, number)
         if local is not None:
             motions.append(replace(pose_motion(arm, "local_pose", base, stamps_ns, local), from_joints=computed))
         if pose is not None and arm in frames:
