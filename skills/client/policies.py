@@ -559,7 +559,7 @@ def _policy(about: dict[str, Any], arrays: bytes, demo: dict[str, Any]) -> "Lear
     from skills.learning.policy import Policy as LearntPolicy
     from skills.learning.policy import learner_of
     from skills.learning.q_learning import Training
-    from skills.learning.ties import ShortestWay
+    from skills.learning.ties import ShortestApproach
 
     grid = GridWorld(**{name: about["grid"][name] for name in ("origin_mm", "cell_mm", "shape")})
     shown = about.get("combined") or demo["report"] | {"hysteresis": demo["hysteresis"]}
@@ -572,6 +572,6 @@ def _policy(about: dict[str, Any], arrays: bytes, demo: dict[str, Any]) -> "Lear
         q[domain.certified] = sent["q"]
         network = Network(sent["network"].tobytes()) if "network" in sent else None
     levels, training = RewardLevels(**about["reward_levels"]), Training(**about["training"])
-    ties = ShortestWay(**about["ties"]) if about.get("ties") else None
+    ties = ShortestApproach(**about["ties"]) if about.get("ties") else None
     there = Surroundings.of_json(about["scene"]) if about.get("scene") else None
     return LearntPolicy(path, levels, learner, about["seed"], training, q, network, ties, there)

@@ -49,7 +49,7 @@ STEEPEST = 0.99  # cosine between x and the base's z axis; beyond it, the base's
 
 THREADS = 2  # the loops release the GIL; the service, which calls this too, needs its other cores
 WORTH_A_THREAD = 200  # pairs; with 100 states they take 6 ms
-VERSION = 2  # of shapes, signatures and distances: raise it when their numbers change, so that all are measured again
+VERSION = 1  # of shapes, signatures and distances: raise it when their numbers change, so that all are measured again
 AXES = ("along the way", "sideways", "upwards")  # x, y and z of a shape's own frame
 FURTHER = (("less far along", "further along"), ("further right", "further left"), ("lower", "higher"))  # by sign
 PARTS = ("first third", "middle third", "last third")

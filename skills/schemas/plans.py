@@ -42,7 +42,7 @@ from skills.schemas.requests import (
     shown,
 )
 from skills.verification.arm_errors import NAMED, ArmErrors, checked_own
-from skills.verification.probabilities import Doubt, Probability
+from skills.verification.probabilities import Probability, SuccessEstimate
 from skills.verification.reach import MAX_PLACES, ReachPlace
 from skills.verification.scene_clearance import SceneReport
 from skills.verification.timeline import Timeline
@@ -273,7 +273,7 @@ class Verdict(PlaybackReport):
     """
 
     failure_in_words: str | None
-    doubt: Doubt
+    doubt: SuccessEstimate
     plan: Sha256
     trajectory: Sha256
     policy: PolicyName

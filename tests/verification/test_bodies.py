@@ -26,8 +26,8 @@ from skills.verification.bodies import (
 from skills.verification.clearance import links_of
 from skills.verification.error_draws import draw
 from skills.verification.gates import Limits
-from skills.verification.monte_carlo import doubt, scene_of
-from skills.verification.probabilities import DoubtSettings
+from skills.verification.monte_carlo import estimate_success, scene_of
+from skills.verification.probabilities import EstimateSettings
 from skills.verification.verdict import judge
 from tests.arms import EXACT
 from tests.planning.motions import PSM_M, hand_off, ideal_playback
@@ -216,12 +216,12 @@ def test_the_bodies_of_both_generations_have_names_of_their_own():
 
 
 def test_a_plan_whose_bodies_meet_fails_though_every_needle_is_caught():
-    few = DoubtSettings(variations=40, suture_point_mm=0.0, needle_rad=0.0)
+    few = EstimateSettings(variations=40, suture_point_mm=0.0, needle_rad=0.0)
     asked = {"approach_m": PSM_M, "pad_top_mm": -170.0, "settings": few, "errors": EXACT}
-    only = doubt(JAMMED, **asked).under[0]
+    only = estimate_success(JAMMED, **asked).under[0]
     assert only.plan.count == 0
     assert (only.passes[0].faults.bodies, only.passes[0].faults.arms, only.passes[0].caught.count) == (40, 0, 40)
-    only = doubt(FREE, **asked).under[0]
+    only = estimate_success(FREE, **asked).under[0]
     assert (only.passes[0].faults.bodies, only.plan.count) == (0, 40)
 
 

@@ -265,13 +265,13 @@ def test_the_verdict_on_a_plan_has_its_request_scene_and_inexact_worlds():
     verdict = judge_plan(plan, motion, ideal(motion), policy=policy, demo=demo)
     beside, apart = clearance_of(motion, plan.scene), compare(requested_motion(plan, policy, demo), motion)
     assert verdict.report == judge(ideal(motion), motion, beside=beside, pad_is_tissue=False, intent=apart)
-    assert verdict.report.feasible and verdict.failure_in_words is None
+    assert verdict.report.feasible and verdict.failure_sentence is None
     assert verdict.scene == beside.report
-    assert (verdict.doubt.pad_top_mm, verdict.doubt.under[0].errors) == (low_mm, UNCALIBRATED)
+    assert (verdict.success.pad_top_mm, verdict.success.under[0].errors) == (low_mm, UNCALIBRATED)
     x, y, z = motion.tip_mm[len(motion) // 2].tolist()
     box = Box((x - 5.0, y - 5.0, z - 5.0), (x + 5.0, y + 5.0, z + 5.0))
     inside = replace(plan, scene=replace(plan.scene, boxes=(box,)))
-    assert "Nearest: " in judge_plan(inside, motion, ideal(motion), policy=policy, demo=demo).failure_in_words
+    assert "Nearest: " in judge_plan(inside, motion, ideal(motion), policy=policy, demo=demo).failure_sentence
 
 
 # ---- sound plans ---------------------------------------------------------------------------------------------------

@@ -27,8 +27,8 @@ from skills.verification.clearance import (
 )
 from skills.verification.error_draws import Displaced, draw
 from skills.verification.gates import Limits
-from skills.verification.monte_carlo import doubt, looked_at, scene_of
-from skills.verification.probabilities import Doubt, DoubtSettings, DoubtUnder
+from skills.verification.monte_carlo import estimate_success, looked_at, scene_of
+from skills.verification.probabilities import EstimateSettings, EstimateUnder, SuccessEstimate
 from tests.arms import EXACT
 from tests.by_day import some
 from tests.verification.test_catch import APPROACH, OPENING_RAD, PLANNED
@@ -38,8 +38,8 @@ BASE_MM = (160.0, 20.0, 20.0)
 BASE_XYZW = (0.0, 0.0, float(np.sin(np.radians(22.5))), float(np.cos(np.radians(22.5))))
 PSM_M = PsmM(APPROACH, BASE_MM, BASE_XYZW)
 PATH_MM = np.array([[-10, 55, -135], [-20, 60, -130], [-10, 55, -120], [5, 55, -125]], dtype=float)
-NO_DOUBT = DoubtSettings(variations=40, suture_point_mm=0.0, needle_rad=0.0)
-FEW = DoubtSettings(variations=100)
+NO_DOUBT = EstimateSettings(variations=40, suture_point_mm=0.0, needle_rad=0.0)
+FEW = EstimateSettings(variations=100)
 
 
 def pass_path(shift_mm: float = 0.0, with_a2: bool = True) -> PassPath:
@@ -67,12 +67,14 @@ def of_tips(mean_mm: float) -> ArmErrors:
     return only(tip_bias_mm=mean_mm / MEAN_LENGTH)
 
 
-def judged(trajectory: Trajectory = ALONE, approach=APPROACH, pad_top_mm: float = PAD_TOP_MM, **given) -> Doubt:
+def judged(
+    trajectory: Trajectory = ALONE, approach=APPROACH, pad_top_mm: float = PAD_TOP_MM, **given
+) -> SuccessEstimate:
     given = {"settings": FEW, "errors": of_tips(0.65), **given}
-    return doubt(trajectory, approach_m=approach, pad_top_mm=pad_top_mm, **given)
+    return estimate_success(trajectory, approach_m=approach, pad_top_mm=pad_top_mm, **given)
 
 
-def under(found: Doubt) -> DoubtUnder:
+def under(found: SuccessEstimate) -> EstimateUnder:
     return found.under[0]
 
 
@@ -95,7 +97,7 @@ def test_catching_is_as_likely_as_the_integral_over_all_offsets(errors):
     good &= np.abs(y) * np.cos(OPENING_RAD) + half <= depth * np.sin(OPENING_RAD)
     good &= np.abs(x) <= NEEDLE_RADIUS_MM * np.sin(radians(15))
     expected = np.einsum("ijk,i,j,k", good.astype(float), weight, weight, weight)
-    settings = DoubtSettings(variations=2000, needle_rad=0.0)
+    settings = EstimateSettings(variations=2000, needle_rad=0.0)
     caught = under(judged(motion(1), settings=settings, errors=errors)).passes[0].caught
     assert caught.lower - 0.01 <= expected <= caught.upper + 0.01  # the grid's own error is a few thousandths
 
@@ -174,7 +176,7 @@ def test_elsewhere_is_the_same_way_for_both_arms_whatever_their_bases():
 
 @pytest.mark.parametrize("normal", [(0.0, 0.0, 1.0), (0.6, 0.0, 0.8)])
 def test_the_pad_is_cleared_as_often_as_the_error_function_says(normal):
-    settings = DoubtSettings(variations=2000, suture_point_mm=5.0 if normal[2] < 1 else 0.0)  # the pad moves along
+    settings = EstimateSettings(variations=2000, suture_point_mm=5.0 if normal[2] < 1 else 0.0)  # the pad moves along
     arm = scene_of(ALONE, 0, 0.0, 0.06).arms[0]
     links = arm.links(arm.joints)
     ends = np.concatenate([links.begin_mm, links.end_mm], axis=1) @ normal - np.tile([4.0, 3.6, 1.1, 1.1], 2)
@@ -311,7 +313,7 @@ def test_psm_m_beside_catches_what_its_wanted_pose_alone_catches():
     "size", some(["registration_mm", "registration_deg", "wrist_deg", "tip_bias_mm", "tip_noise_mm"], 3)
 )
 def test_more_error_never_helps_where_nothing_else_is_in_doubt(size):
-    settings = DoubtSettings(variations=100, suture_point_mm=0.0, needle_rad=0.0)
+    settings = EstimateSettings(variations=100, suture_point_mm=0.0, needle_rad=0.0)
     asked = {"settings": settings, "trajectory": motion(1, PSM_M)}
     counts = [under(judged(errors=only(**{size: value}), **asked)).plan.count for value in (0.0, 0.5, 2.0, 12.0)]
     assert counts == sorted(counts, reverse=True)
@@ -319,7 +321,7 @@ def test_more_error_never_helps_where_nothing_else_is_in_doubt(size):
 
 
 def test_a_plan_of_two_passes_succeeds_about_as_often_as_both_of_them():
-    found = under(judged(settings=DoubtSettings(variations=1000)))
+    found = under(judged(settings=EstimateSettings(variations=1000)))
     one, other = (each.succeeds.probability for each in found.passes)
     assert found.plan.probability == pytest.approx(one * other, abs=0.04)  # they are drawn independently
     assert found.plan.count <= min(each.succeeds.count for each in found.passes)
@@ -340,7 +342,7 @@ def test_a_fault_is_counted_in_every_variation_that_has_it():
 @pytest.mark.parametrize("enters", ["after_A1", "start"])
 def test_between_the_poses_looked_at_nothing_comes_much_nearer(enters):
     whole = scene_of(motion(1, replace(PSM_M, enters=enters)), 0, PAD_TOP_MM, OPENING_RAD)
-    thin = looked_at(whole, DoubtSettings().stretches)
+    thin = looked_at(whole, EstimateSettings().stretches)
     assert len(thin.phase) < 70 < len(whole.phase) / 5
     drawn = draw(5, 0, 20, 1, suture_point_mm=5.0, needle_rad=0.0)
     every, some = (nearest_mm(scene, drawn) for scene in (whole, thin))
@@ -473,10 +475,10 @@ def test_joints_that_are_not_numbers_go_wrong_everywhere():
 def test_doubts_that_cannot_be_meant_are_refused():
     for wrong in ({"variations": 0}, {"stretches": 0}):
         with pytest.raises(BadSettings, match="1 to 1000 stretches"):
-            DoubtSettings(**wrong)
+            EstimateSettings(**wrong)
     for wrong in ({"suture_point_mm": nan}, {"needle_rad": -0.1}, {"stated_rad": nan}):
         with pytest.raises(BadSettings, match="finite"):
-            DoubtSettings(**wrong)
+            EstimateSettings(**wrong)
     with pytest.raises(BadInput, match="height"):
         judged(pad_top_mm=nan)
     for normal in ((0.0, 0.0, 2.0), (nan, 0.0, 1.0)):

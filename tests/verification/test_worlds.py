@@ -12,8 +12,8 @@ from skills.planning.handoff import realign
 from skills.planning.trajectory import PassPath, Trajectory, time_parametrise
 from skills.verification.arm_errors import MEAN_LENGTH, SIZES, ArmErrors
 from skills.verification.gates import Limits
-from skills.verification.monte_carlo import doubt
-from skills.verification.probabilities import DoubtSettings
+from skills.verification.monte_carlo import estimate_success
+from skills.verification.probabilities import EstimateSettings
 from tests.by_day import some
 from tests.verification import worlds
 from tests.verification.test_monte_carlo import PAD_TOP_MM, PATH_MM, PSM_M, motion
@@ -37,11 +37,11 @@ def probability(
     variations: int = 1000,
     seed: int = 0,
 ) -> float:
-    settings = DoubtSettings(variations=variations)
+    settings = EstimateSettings(variations=variations)
     tools = Limits(clearance_bodies_mm=-1e6)  # the other worlds have no outer bodies
     pad_top_mm, pad_normal = pad
     asked = {"errors": errors, "settings": settings, "limits": tools, "seed": seed}
-    found = doubt(trajectory, approach_m=None, pad_top_mm=pad_top_mm, pad_normal=pad_normal, **asked)
+    found = estimate_success(trajectory, approach_m=None, pad_top_mm=pad_top_mm, pad_normal=pad_normal, **asked)
     return found.under[0].plan.probability
 
 
