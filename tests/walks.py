@@ -2,9 +2,9 @@
 
     python -m tests.walks        bytes to demonstration, request to served policy, suture point to replay bag
 
-A station is a public function that is called from another room, at its first call. Methods, private modules such as
-`_kernels`, the client, the start of the service, its periodic work and the modules that every room uses (`COMMON`) are
-left out.
+A station is a public function that is called from another room, at its first call. Methods, compiled loops,
+private modules, the client, the start of the service, its periodic work and the modules that every room uses (`COMMON`)
+are left out.
 """
 
 import io
@@ -19,6 +19,7 @@ from types import CodeType, FrameType
 from typing import Any
 
 import skills
+from skills.compiled import LOOPS
 from skills.formats.reader_process import read_told
 from tests import backends
 from tests.api.service import CSV, GOAL_MM, KESTREL, MCAP, POLICY, serving
@@ -26,6 +27,7 @@ from tests.library import cases
 
 PACKAGE = str(Path(skills.__file__).parent)
 COMMON = ("errors", "remedies", "settings", "logs", "arrays", "fields", "packing", "compiled", "kinematics")
+COMMON += ("arithmetic", "quaternions")
 COMMON += ("db/", "client/", "api/app", "jobs/__init__", "library/catalogue.py", "library/keys.py", "library/locks.py")
 COMMON += ("library/history.py", "transparency.py")  # what is written is logged, whoever writes it
 PERIODIC = ("forget_erased", "forget_gone")  # part of no request, and a slow walk has them
@@ -54,6 +56,7 @@ class Trace:
             or code.co_name.startswith(("_", "<", *PERIODIC, *STARTING))
             or file.startswith(COMMON)
             or re.search(r"/_[a-z]", file)
+            or any(loop.plain.__code__ is code for loop in LOOPS)
         ):
             return
         caller = frame.f_back

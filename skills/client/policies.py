@@ -112,7 +112,7 @@ class Jobs(Connection):
             depth_along: The direction in which depth increases, of a demonstration in another frame than its arm's
                 base; of equally short ways the policy takes the shallower one.
             scene: What must not be touched, as `Scene.as_json` writes it; the learner's `slip` counts in it.
-            scene_costs: Costs of the scene by name; default: those of `skills.gridworld.scene.SceneCosts`.
+            scene_costs: Costs of the scene by name; default: those of `skills.gridworld.hazards.SceneCosts`.
         """
         asked = {"surgeon": surgeon, "suture": suture, "seed": seed, "release": release}
         how = None if combine is None else {"kind": combine}

@@ -16,8 +16,7 @@ from skills.verification.error_draws import draw, rotation_of
 from skills.verification.probabilities import EstimateSettings
 from tests.arms import ARMS, EXACT
 from tests.needs import need
-from tests.verification.test_monte_carlo import ALONE, BESIDE, PSM_M, motion, only
-from tests.verification.test_worlds import some_plan
+from tests.verification.test_monte_carlo import ALONE, BESIDE, PSM_M, motion, only, some_plan
 
 ONE = motion(1, PSM_M)
 NO_DOUBT = EstimateSettings(variations=1, suture_point_mm=0.0, needle_rad=0.0)
