@@ -22,6 +22,7 @@ from types import CodeType, FrameType
 from typing import Any
 
 import skills
+from skills.compiled import LOOPS
 from skills.formats.parsed import parse_recording
 from tests import backends
 from tests.api.service import CSV, GOAL_MM, KESTREL, MCAP, POLICY, serving
@@ -88,6 +89,7 @@ class Trace:
             or code.co_name.startswith(("_", "<", *PERIODIC, *STARTING))
             or file.startswith(COMMON)
             or re.search(r"/_[a-z]", file)
+            or any(loop.plain.__code__ is code for loop in LOOPS)
         ):
             return
         caller = frame.f_back

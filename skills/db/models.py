@@ -44,10 +44,10 @@ from skills.learning.networks import Network
 from skills.learning.policy import LEARNERS, Policy
 from skills.learning.pose_style import PosePath
 from skills.learning.q_learning import Training
-from skills.learning.ties import ShortestWay
+from skills.learning.ties import ShortestApproach
 from skills.learning.tube import CertifiedPoses
 from skills.learning.tube_certificate import TubeCertificate, TubeLimits
-from skills.packing import few_numbers
+from skills.packing import store_as_palette
 from skills.planning.handoff import OtherArm, PsmM
 from skills.planning.motion_laws import Pose, Poses
 from skills.planning.path_fit import Hand
@@ -55,14 +55,14 @@ from skills.planning.plan import Departure, Pass, SuturePlan, SuturePoint
 from skills.planning.trajectory import Trajectory
 from skills.verification.playback import Pictures, Playback
 
-stored(GridWorld, GridPath, RewardLevels, *LEARNERS.values(), Training, Network, ShortestWay)
+stored(GridWorld, GridPath, RewardLevels, *LEARNERS.values(), Training, Network, ShortestApproach)
 stored(SuturePoint, Pass, Pause, Partner, PsmM, Hand, Pose, Departure)
 stored(PosePath, PartnerMotion, TubeLimits, TubeCertificate)
 stored(Trajectory, OtherArm, Poses)
 stored(Surroundings, Scene, SceneCosts, Box, Capsule, Tissue)
 # A field that is added to one of these after 0.3.0 is released is registered here, with `skills.packing.added_later`.
-few_numbers(Coverage, "share")  # one for each waypoint
-few_numbers(Policy, "q")  # some 130 different values in 200,000 places: stored as a palette
+store_as_palette(Coverage, "share")  # one for each waypoint
+store_as_palette(Policy, "q")  # some 130 different values in 200,000 places: stored as a palette
 
 
 class Surgeon(Base):

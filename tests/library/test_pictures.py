@@ -24,7 +24,7 @@ from skills.verification.bodies import bodies_clearance, distances_at, names_of
 from skills.verification.playback import Pictures, Playback
 from tests.library import cases
 from tests.planning.motions import hand_off, ideal_playback
-from tests.planning.test_transfers import BESIDE
+from tests.planning.test_trajectory import BESIDE
 
 REPORT = {
     "failure": None,

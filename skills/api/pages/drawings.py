@@ -28,7 +28,7 @@ from skills.arrays import Floats
 from skills.comparison.combining import Combined
 from skills.demonstration.demonstration import Demo
 from skills.demonstration.movement import smoothed_speed
-from skills.demonstration.quality import pieces_of, times_in_words
+from skills.demonstration.quality import describe_count, pieces_of
 from skills.gridworld import paper
 from skills.gridworld.grid import GridPath, discretisation_rmse
 from skills.learning.certificate import Coverage
@@ -211,7 +211,7 @@ def report_page(about: Mapping[str, Any], report: Report, demo: Demo, path: Grid
         speed=speed(demo, report["a1_s"]),
         pauses=bool(demo.pauses),
         partner=None if demo.partner is None else demo.partner.arm,
-        times=times_in_words,
+        times=describe_count,
     )
 
 

@@ -300,8 +300,8 @@ def check_doubt(report: dict[str, Any], *, errors: ArmErrors, lower_bound: float
     """Refuse a plan whose least certain pass succeeds too rarely when the world differs from the plan.
 
     Args:
-        report: A playback's stored report; its `doubt` is a `skills.verification.probabilities.Doubt` as JSON, with
-            null for NaN.
+        report: A playback's stored report; its `doubt` is a `skills.verification.probabilities.SuccessEstimate` as
+            JSON, with null for NaN.
         errors: The errors of the arms that the installation states; those of the playback's request come first.
         lower_bound: The value that the lower bounds of all passes have to reach.
 
@@ -377,7 +377,7 @@ def _readme(plan: dict[str, Any], report: dict[str, Any], arms: tuple[ArmMotion,
         plan["in_words"],
         "",
         f"Every pass is likely enough to {well} with {errors_in_words(errors.name)}, as the {stated_by} stated them:",
-        f"{errors.in_words}.",
+        f"{errors.describe()}.",
         f"Not judged: {', '.join(not_judged(under))}.",
         "With greater errors it was not judged: compare these with your arms.",
         "",

@@ -6,7 +6,7 @@ from typing import Any
 
 from skills import __version__
 from skills.db.models import PolicyVersion
-from skills.demonstration.quality import times_in_words
+from skills.demonstration.quality import describe_count
 from skills.gridworld.domain import REACH
 from skills.schemas.cards import Citation, StartCounts
 from skills.verification.arm_errors import CALIBRATED_MM, UNCALIBRATED_MM
@@ -158,7 +158,7 @@ def quality(report: dict[str, Any]) -> list[str]:
         "it is idle.",
         "No press of the clutch is recorded."
         if clutched == 0
-        else f"The clutch was pressed {times_in_words(clutched)}, {report['clutched_s']:.1f} s in all.",
+        else f"The clutch was pressed {describe_count(clutched)}, {report['clutched_s']:.1f} s in all.",
     ]
     if smooth is not None:
         said.append(
@@ -182,7 +182,7 @@ def lost(report: dict[str, Any]) -> str:
     """Return the sentences on the precision that a demonstration lost in the grid."""
     x, y, z = report["discretisation_rmse_mm"]
     crossings = report["revisits"]
-    crossed = "never crosses itself" if crossings == 0 else f"returns to a state {times_in_words(crossings)}"
+    crossed = "never crosses itself" if crossings == 0 else f"returns to a state {describe_count(crossings)}"
     gaps = report["bridged_cells"]
     bridged = "each state has a sample" if gaps == 0 else f"{gaps} of the states have no sample and were bridged"
     return (
