@@ -30,7 +30,7 @@ from sqlalchemy.ext.hybrid import hybrid_property
 from sqlalchemy.orm import Mapped, column_property, mapped_column, relationship
 
 from skills.comparison.distances import Measured
-from skills.db import Base, Number, RowId, Sha256, Slug, now
+from skills.db import AsJson, Base, Number, RowId, Sha256, Slug, now
 from skills.db.packed import Packed, stored
 from skills.demonstration.demonstration import Demo, Partner, Pause
 from skills.demonstration.partner import PartnerMotion
@@ -51,6 +51,7 @@ from skills.planning.motion_laws import Pose, Poses
 from skills.planning.path_fit import Hand
 from skills.planning.plan import Departure, Pass, SuturePlan, SuturePoint
 from skills.planning.trajectory import Trajectory
+from skills.schemas.people import Consent
 from skills.verification.playback import Pictures, Playback
 
 stored(GridWorld, GridPath, RewardLevels, *LEARNERS.values(), Training, Network, ShortestWay)
@@ -74,7 +75,7 @@ class Surgeon(Base):
     skill_level: Mapped[str | None]
     handedness: Mapped[str | None]
     protocol: Mapped[str | None]
-    consent: Mapped[dict[str, Any] | None]
+    consent: Mapped[Consent | None] = mapped_column(AsJson(Consent))
     created_at: Mapped[datetime] = mapped_column(default=now)
 
 
@@ -107,7 +108,7 @@ class SutureType(Base):
 
     slug: Mapped[str] = mapped_column(Slug, primary_key=True)
     name: Mapped[str]
-    also_called: Mapped[list[Any]]
+    also_called: Mapped[list[str]] = mapped_column(AsJson(list[str]))
     family: Mapped[str]
     description: Mapped[str] = mapped_column(String(2000))
 

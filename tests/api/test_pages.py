@@ -17,9 +17,10 @@ from skills.db.service_tables import Job
 from skills.learning.policy import rollout_from
 from skills.library.operation.integrity import covered, learnt
 from skills.library.operation.overview import MOST, matrix, moves_to_goal
-from skills.library.people.catalogue import put_surgeon
 from skills.library.people.consent import may
+from skills.library.people.surgeons import put_surgeon
 from skills.library.policies.versions import find_version
+from skills.schemas.people import SurgeonIn
 from tests import backends
 from tests.api.keyed import As, copy_of_told, key
 from tests.api.service import CSV, KESTREL, Service, assert_problem, serving
@@ -309,7 +310,7 @@ def crowded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
         hospital.fill(service.database, 20)
         with service.database.writing() as session:
             for number in range(200):
-                put_surgeon(session, f"wren-{number:03}", {}, "test")
+                put_surgeon(session, f"wren-{number:03}", SurgeonIn(), "test")
         yield service
 
 

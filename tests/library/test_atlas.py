@@ -17,10 +17,11 @@ from skills.errors import BadInput, BadPath, Conflict, NotFound
 from skills.learning.evaluation import dtw
 from skills.library.comparison import atlas
 from skills.library.comparison.atlas import atlas_of
-from skills.library.people.catalogue import put_surgeon
 from skills.library.people.erasure import erase_demo, erase_surgeon
+from skills.library.people.surgeons import put_surgeon
 from skills.library.policies.releases import withdraw
 from skills.library.recordings.demos import withdraw_demo
+from skills.schemas.people import SurgeonIn
 from tests import backends
 from tests.comparison.cohort import cohort
 from tests.library import cases, cohorts
@@ -198,7 +199,12 @@ def test_two_that_ask_at_once_measure_once(database: Database, measured: list[in
 def test_consent_is_asked_and_who_is_left_out_is_counted_and_not_named(database: Database):
     names = small(database)
     with database.writing() as session:
-        put_surgeon(session, cohorts.name(1), {"consent": {"uses": ["training"], "until": None}}, "test")
+        put_surgeon(
+            session,
+            cohorts.name(1),
+            SurgeonIn.model_validate({"consent": {"uses": ["training"], "until": None}}),
+            "test",
+        )
     found = atlas_of(database, SUTURE)
     assert [one.id for one in found.demos] == names[:2]
     assert found.left_out.without_consent == 2
@@ -207,8 +213,18 @@ def test_consent_is_asked_and_who_is_left_out_is_counted_and_not_named(database:
     with pytest.raises(Conflict, match="does not cover atlas"):
         atlas_of(database, SUTURE, demo=names[2])
     with database.writing() as session:
-        put_surgeon(session, cohorts.name(1), {"consent": {"uses": ["atlas"], "until": "2020-01-01"}}, "test")
-        put_surgeon(session, cohorts.name(0), {"consent": {"uses": ["training"], "until": None}}, "test")
+        put_surgeon(
+            session,
+            cohorts.name(1),
+            SurgeonIn.model_validate({"consent": {"uses": ["atlas"], "until": "2020-01-01"}}),
+            "test",
+        )
+        put_surgeon(
+            session,
+            cohorts.name(0),
+            SurgeonIn.model_validate({"consent": {"uses": ["training"], "until": None}}),
+            "test",
+        )
     with pytest.raises(NotFound, match="4 demonstrations, because the surgeon's consent"):
         atlas_of(database, SUTURE)
 
@@ -216,11 +232,11 @@ def test_consent_is_asked_and_who_is_left_out_is_counted_and_not_named(database:
 def test_who_comes_back_costs_only_the_pairs_that_are_missing(database: Database, measured: list[int]):
     names = small(database)
     with database.writing() as session:
-        put_surgeon(session, cohorts.name(0), {"consent": {"uses": [], "until": None}}, "test")
+        cases.agree(session, {"uses": [], "until": None}, cohorts.name(0))
     atlas_of(database, SUTURE)
     assert measured == [1, 1]
     with database.writing() as session:
-        put_surgeon(session, cohorts.name(0), {"consent": None}, "test")
+        cases.agree(session, None, cohorts.name(0))
     assert [one.id for one in atlas_of(database, SUTURE).demos] == names
     assert measured == [1, 1, 5, 5]
 

@@ -21,11 +21,12 @@ from skills.library.comparison.neighbours import nearest_to
 from skills.library.operation import sweep
 from skills.library.operation.backup import back_up, erasures_of, keep_up_erasures, read_erasures, restore
 from skills.library.operation.sweep import sweep_erased
-from skills.library.people.catalogue import put_surgeon
 from skills.library.people.erasure import delete_recording, erase_demo, erase_surgeon
+from skills.library.people.surgeons import put_surgeon
 from skills.library.recordings.demos import add_demo, withdraw_demo
 from skills.library.recordings.recordings import store_recording
 from skills.schemas.demos import DemoIn
+from skills.schemas.people import SurgeonIn
 from tests import backends
 from tests.comparison.cohort import cohort
 from tests.db.test_query_plans import noted, plan_of
@@ -40,7 +41,12 @@ def test_cached_distances_to_erased_demos_outside_the_atlas_are_deleted(
 
     def agrees(surgeon: int, to: list[str]) -> None:
         with database.writing() as session:
-            put_surgeon(session, cohorts.name(surgeon), {"consent": {"uses": to, "until": None}}, "test")
+            put_surgeon(
+                session,
+                cohorts.name(surgeon),
+                SurgeonIn.model_validate({"consent": {"uses": to, "until": None}}),
+                "test",
+            )
 
     cohorts.add_cohort(database, cohort(1, surgeons=3, sessions=1))
     agrees(1, [])

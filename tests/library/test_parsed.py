@@ -23,7 +23,6 @@ from skills.library.comparison import scores
 from skills.library.operation import overview
 from skills.library.operation.backup import back_up, restore
 from skills.library.operation.inspection import inspect_installation
-from skills.library.people.catalogue import put_surgeon
 from skills.library.people.erasure import erase_surgeon
 from skills.library.recordings import recordings
 from skills.library.recordings.demos import add_demo
@@ -82,7 +81,7 @@ def faults(database: Database, **how: Any) -> list[tuple[str, str]]:
 
 def test_cutting_scoring_and_the_page_do_not_decode_a_stored_recording(database: Database):
     with database.writing() as session:
-        put_surgeon(session, "kestrel", {"consent": {"uses": ["atlas"], "until": None}}, "test")
+        cases.agree(session, {"uses": ["atlas"], "until": None})
     sha256 = add(database)
     asked = ScoreIn(surgeon="kestrel", suture=cases.SUTURE, recording=sha256, start_s=0.0, end_s=0.9)
 

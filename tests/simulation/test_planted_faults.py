@@ -15,7 +15,7 @@ from skills.db.models import Plan, StoredPlayback
 from skills.db.session import Database
 from skills.errors import BadPlan, SimulationFailed, Unreachable
 from skills.kinematics import POINTING_DOWN, forward, inverse, matrix_of, quaternion_of
-from skills.library.people.catalogue import find_surgeon
+from skills.library.people.surgeons import find_surgeon
 from skills.library.plans.playbacks import find_playback, request_playback, standing_of
 from skills.library.policies import releases
 from skills.library.recordings.demos import upload_demo

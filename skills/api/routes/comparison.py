@@ -29,7 +29,8 @@ from skills.library.comparison.atlas import CONFOUNDED, DISTANCE, MOST, SESSIONS
 from skills.library.comparison.neighbours import nearest_to
 from skills.library.comparison.recognition import recognise_recording
 from skills.library.operation import overview
-from skills.library.people.catalogue import find_surgeon, find_suture_type
+from skills.library.people.surgeons import find_surgeon
+from skills.library.people.suture_types import find_suture_type
 from skills.schemas.comparison import Atlas, Nearest, RecognisedRecording
 from skills.schemas.requests import COUNT, DIGEST, SLUG
 from skills.schemas.scores import Progress, Score, ScoreIn

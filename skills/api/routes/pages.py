@@ -19,7 +19,7 @@ from skills.formats import MEDIA_TYPES, SUFFIXES
 from skills.kinematics import INSTRUMENTS
 from skills.library.comparison import scores
 from skills.library.operation import jobs, overview
-from skills.library.people.catalogue import list_surgeons
+from skills.library.people.surgeons import list_surgeons
 from skills.library.plans.plans import find_plan, followed_plan, hands_over, plan_in_words
 from skills.library.plans.playbacks import headline_of
 from skills.library.plans.replay import refusal_of_bag

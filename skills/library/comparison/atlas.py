@@ -54,8 +54,8 @@ from skills.errors import BadPath, Busy, Conflict, NotFound
 from skills.library.comparison.members import Member, members_of, sessions_of, without_overlaps
 from skills.library.comparison.recognition import recognise_arms, recognitions, votes, whose
 from skills.library.operation import locks
-from skills.library.people.catalogue import find_suture_type
 from skills.library.people.consent import require
+from skills.library.people.suture_types import find_suture_type
 from skills.library.policies.releases import shares_served
 from skills.library.recordings.demos import find_demo
 from skills.schemas.comparison import (

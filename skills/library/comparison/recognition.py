@@ -28,8 +28,8 @@ from skills.demonstration.segments import movements_by_arm
 from skills.errors import BadInput, BadPath, BadRecording, Conflict, NotFound
 from skills.learning.slip import wilson
 from skills.library.comparison.members import Member, members_of, numbered, sessions_of
-from skills.library.people.catalogue import find_suture_type
 from skills.library.people.recorded import in_recording
+from skills.library.people.suture_types import find_suture_type
 from skills.library.recordings.recordings import Teller, find_recording, stored_recording
 from skills.schemas.comparison import Calibrated, Likely, RecognisedRecording, Recognition, Votes, Whose
 

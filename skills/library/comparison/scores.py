@@ -29,9 +29,10 @@ from skills.learning.evaluation import TIE_BREAK
 from skills.library.comparison import calibrations
 from skills.library.comparison.atlas import is_current
 from skills.library.comparison.members import member_of, sessions_of, without_overlaps
-from skills.library.people.catalogue import find_surgeon, find_suture_type
 from skills.library.people.consent import may, require
 from skills.library.people.recorded import in_recording
+from skills.library.people.surgeons import find_surgeon
+from skills.library.people.suture_types import find_suture_type
 from skills.library.policies import releases
 from skills.library.recordings.demos import find_demo, newest_demo
 from skills.library.recordings.recordings import Teller, find_recording, stored_recording

@@ -43,8 +43,9 @@ from skills.gridworld.grid import GridPath
 from skills.gridworld.reward import RewardMap, sparse_reward
 from skills.learning.policy import Policy
 from skills.library.operation.integrity import covered, learnt
-from skills.library.people.catalogue import find_surgeon, find_suture_type
 from skills.library.people.recorded import shown_recording
+from skills.library.people.surgeons import find_surgeon
+from skills.library.people.suture_types import find_suture_type
 from skills.library.plans import playbacks
 from skills.library.policies.releases import is_served, served
 from skills.library.policies.versions import learnt_from

@@ -45,7 +45,7 @@ from skills.errors import Conflict, NotAllowed
 from skills.library.operation.jobs import ACTIVE as NOT_ENDED
 from skills.library.operation.jobs import UNSYNCHRONISED, forget_styles
 from skills.library.operation.sweep import delete_jobs
-from skills.library.people.catalogue import find_surgeon, salted
+from skills.library.people.surgeons import find_surgeon, salted
 from skills.library.policies.releases import withdraw_resting_on
 from skills.library.recordings.datasets import drop_exports, exports_from, exports_of
 from skills.library.recordings.demos import find_demo

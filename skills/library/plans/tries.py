@@ -33,8 +33,9 @@ from skills.gridworld import paper
 from skills.gridworld.grid import PathReport, choose_grid, describe_path, discretize
 from skills.library.operation import jobs, locks
 from skills.library.operation.jobs import RequestedJob, Store, identity_of
-from skills.library.people.catalogue import find_surgeon, find_suture_type
 from skills.library.people.consent import require
+from skills.library.people.surgeons import find_surgeon
+from skills.library.people.suture_types import find_suture_type
 from skills.library.plans.plans import find_plan, hand_of, plan_sutures
 from skills.library.plans.playbacks import (
     check_playback,

@@ -9,6 +9,7 @@ from skills.db.models import PolicyVersion
 from skills.demonstration.quality import times_in_words
 from skills.gridworld.domain import REACH
 from skills.schemas.cards import Citation, StartCounts
+from skills.schemas.people import Consent
 from skills.verification.arm_errors import CALIBRATED_MM, UNCALIBRATED_MM
 
 USE = "Research use only; not a medical device. Never move an arm by it on or near a person."
@@ -121,15 +122,14 @@ def status(version: int, served: int | None, refused: Sequence[str], was_release
     return f"{before}; of this style, {now} released now."
 
 
-def consent(given: dict[str, Any] | None) -> str:
+def consent(given: Consent | None) -> str:
     """Return the sentence on a surgeon's consent; it does not say whether the consent has expired by now."""
     if given is None:
         return "No consent is recorded here; the study's protocol states the permitted uses."
-    uses = ", ".join(given["uses"]) or "nothing"
-    until = given.get("until")
+    uses = ", ".join(given.uses) or "nothing"
     return (
-        f"Covers {uses}{'' if until is None else f', until {until}'}; other uses are refused. The protocol states "
-        "whether this card may be published."
+        f"Covers {uses}{'' if given.until is None else f', until {given.until}'}; other uses are refused. The protocol "
+        "states whether this card may be published."
     )
 
 

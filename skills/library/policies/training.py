@@ -69,8 +69,9 @@ from skills.learning.tube import certified_poses
 from skills.library.operation import jobs
 from skills.library.operation.integrity import policy_identity_of, poses_identity_of, scene_digest
 from skills.library.operation.jobs import QUEUED, RequestedJob, Store, TrainingRequest, did_nothing
-from skills.library.people.catalogue import find_surgeon, find_suture_type
 from skills.library.people.consent import refusal, require
+from skills.library.people.surgeons import find_surgeon
+from skills.library.people.suture_types import find_suture_type
 from skills.library.policies import releases
 from skills.library.policies.releases import driven_or_refused, refusals
 from skills.library.policies.versions import BEST, choose_demos, combining_of, describe_combined, find_by_digest

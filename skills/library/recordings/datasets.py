@@ -60,8 +60,9 @@ from skills.library.operation import jobs
 from skills.library.operation.integrity import find_by_digest
 from skills.library.operation.jobs import EXPORT, UNSYNCHRONISED, DatasetRequest, Store
 from skills.library.people import consent
-from skills.library.people.catalogue import find_surgeon, find_suture_type
 from skills.library.people.recorded import RECORDED, episodes_of, overlap, recorded_in
+from skills.library.people.surgeons import find_surgeon
+from skills.library.people.suture_types import find_suture_type
 from skills.library.recordings.demos import find_demo
 from skills.library.recordings.recordings import CHUNK_BYTES, Teller, confined_reader, stored_recording
 from skills.packing import canonical, sha256

@@ -36,8 +36,9 @@ from skills.gridworld.reward import RewardMap, sparse_reward
 from skills.library.operation import locks
 from skills.library.operation.integrity import demo_identity, find_by_digest
 from skills.library.people import consent
-from skills.library.people.catalogue import find_surgeon, find_suture_type
 from skills.library.people.recorded import episodes_of, in_recording, recorded_in
+from skills.library.people.surgeons import find_surgeon
+from skills.library.people.suture_types import find_suture_type
 from skills.library.policies.releases import withdraw_failed, withdraw_resting_on
 from skills.library.recordings.recordings import (
     Teller,

@@ -25,8 +25,9 @@ from skills.db.service_tables import record_event
 from skills.db.session import Database
 from skills.errors import Conflict, NotFound
 from skills.formats.parsed import MOST
-from skills.library.people.catalogue import find_surgeon, find_suture_type
 from skills.library.people.recorded import shown_recording
+from skills.library.people.surgeons import find_surgeon
+from skills.library.people.suture_types import find_suture_type
 from skills.library.recordings.recordings import Teller, find_recording
 from skills.remedies import Action, Remedy
 from skills.schemas import ProposalDecision, ProposalState

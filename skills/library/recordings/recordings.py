@@ -50,7 +50,7 @@ from skills.formats.parsed import ParsedContent, parse_recording
 from skills.formats.reader_process import KNOWN, READER_VERSION, ConfinedReader
 from skills.library.operation import locks
 from skills.library.operation.integrity import find_by_digest
-from skills.library.people.catalogue import find_surgeon
+from skills.library.people.surgeons import find_surgeon
 from skills.packing import canonical
 from skills.remedies import Action, Remedy
 from skills.sandbox import ProcessLimits
