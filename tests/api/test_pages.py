@@ -232,7 +232,7 @@ def test_the_view_shows_what_the_calls_give(told: Service) -> None:
 def test_the_time_line_has_every_arms_speed_and_the_presses(told: Service) -> None:
     with told.database.reading() as session:
         recording = session.scalars(select(StoredRecording).where(StoredRecording.format == "mcap")).one()
-        sha256, duration_s = recording.sha256, recording.about["duration_s"]
+        sha256, duration_s = recording.sha256, recording.about.duration_s
     traces = told.http.get(f"/pages/recordings/{sha256}/traces").json()
     (arm,) = traces["arms"]
     assert traces["duration_s"] == duration_s

@@ -14,8 +14,9 @@ from skills.library.people.surgeons import put_surgeon
 from skills.library.people.suture_types import seed_suture_types
 from skills.library.policies.retraining import request_retraining
 from skills.library.recordings import demos
+from skills.library.recordings.content_cache import entry_of
 from skills.library.recordings.demos import Made, make_demo
-from skills.library.recordings.recordings import entry_of, find_recording, keep
+from skills.library.recordings.recordings import find_recording, put_recording
 from skills.schemas.demos import DemoIn
 from skills.schemas.people import SurgeonIn
 from skills.schemas.requests import RetrainingIn
@@ -46,7 +47,7 @@ def made_once(database: Database) -> tuple[Made, str]:
     upload = cases.upload(cases.hand_off())
     told = parse_recording(upload.file)
     with database.writing() as session:
-        keep(session, upload, told, entry_of(upload, told), "test")
+        put_recording(session, upload, told, entry_of(upload, told), "test")
     return make_demo(told, DemoIn(surgeon="anybody", suture=cases.SUTURE)), upload.sha256
 
 

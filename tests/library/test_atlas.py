@@ -15,7 +15,7 @@ from skills.db.row_visibility import Only
 from skills.db.session import Database
 from skills.errors import BadInput, BadPath, Conflict, NotFound
 from skills.learning.evaluation import dtw
-from skills.library.comparison import atlas
+from skills.library.comparison import atlas, measured
 from skills.library.comparison.atlas import atlas_of
 from skills.library.people.erasure import erase_demo, erase_surgeon
 from skills.library.people.surgeons import put_surgeon
@@ -49,7 +49,7 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> list[int]:
         counted.append(len(pairs))
         return really(shapes, pairs)
 
-    monkeypatch.setattr(atlas, "distances_of", count)
+    monkeypatch.setattr(measured, "distances_of", count)
     return counted
 
 
@@ -121,7 +121,7 @@ def test_the_atlas_uses_the_papers_measure_and_scaling_removes_size(database: Da
     np.testing.assert_allclose(far(scaled)[0, 3], dtw(one, other).total_mm / 100, atol=1e-4)
     assert (plain.unit, scaled.unit) == ("mm", "lengths of start to goal")
     (apart_by,) = plain.differences
-    assert apart_by.said.startswith(f"In the {apart_by.part}, the path of surgeon-0 is ")
+    assert apart_by.sentence.startswith(f"In the {apart_by.part}, the path of surgeon-0 is ")
     assert np.sum(apart_by.shares) == pytest.approx(1.0, abs=1e-3)
 
 
@@ -162,7 +162,7 @@ def test_the_shape_cache_may_be_dropped_and_other_versions_are_ignored(
     with database.writing() as session:
         session.execute(text("DELETE FROM measured_shapes"))
     assert atlas_of(database, SUTURE) == first
-    monkeypatch.setattr(atlas, "VERSION", 0)
+    monkeypatch.setattr(measured, "VERSION", 0)
     assert atlas_of(database, SUTURE) == first
     assert measured == [6, 6] * 3
     with database.reading() as session:
@@ -178,8 +178,8 @@ def test_it_is_measured_in_blocks_and_kept_block_by_block(
     with database.writing() as session:
         session.execute(text("DELETE FROM measured_shapes"))
     measured.clear()
-    monkeypatch.setattr(atlas, "PAIRS_AT_ONCE", 10)
-    monkeypatch.setattr(atlas, "DEMOS_AT_ONCE", 2)
+    monkeypatch.setattr(measured, "PAIRS_AT_ONCE", 10)
+    monkeypatch.setattr(measured, "DEMOS_AT_ONCE", 2)
     assert atlas_of(database, SUTURE) == whole
     assert sum(measured) == 2 * 36 and len(measured) > 4
 
@@ -247,7 +247,7 @@ def test_withdrawn_ones_are_not_in_it(database: Database):
         withdraw_demo(session, names[0], "test")
     found = atlas_of(database, SUTURE)
     assert [one.id for one in found.demos] == names[1:]
-    assert (found.recognition, found.votes, found.whose) == ([], None, None)
+    assert (found.recognition, found.votes, found.recognised) == ([], None, None)
     assert found.no_recognition_because is not None and "two sessions each" in found.no_recognition_because
     with pytest.raises(Conflict, match="withdrawn"):
         atlas_of(database, SUTURE, demo=names[0])
@@ -367,7 +367,7 @@ def test_what_is_erased_while_it_is_measured_is_not_kept(database: Database, mon
                 erase_surgeon(session, cohorts.name(0), "test")
         return really(shapes, pairs)
 
-    monkeypatch.setattr(atlas, "distances_of", erase_first)
+    monkeypatch.setattr(measured, "distances_of", erase_first)
     assert [one.id for one in atlas_of(database, SUTURE).demos] == names[2:]
     with database.reading() as session:
         there = {*session.scalars(select(Demonstration.row))}

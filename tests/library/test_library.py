@@ -115,12 +115,12 @@ def test_hysteresis_is_kept_with_the_path_and_learnt_and_planned_with(database: 
         assert (kept.hysteresis, kept.path.hysteresis) == (0.25, 0.25)
         path, tip_mm = kept.path, kept.demo.tip_mm
     assert path.states.tolist() == discretize(tip_mm, PAPER_GRID, 0.25).states.tolist()
-    assert (demo.report["path_states"], demo.report["revisits"]) == (len(path.states), 0)
-    assert plain.report["revisits"] > 0
-    lost_mm = list(discretisation_rmse(tip_mm, PAPER_GRID, 0.25))
-    assert demo.report["discretisation_rmse_mm"] == lost_mm != plain.report["discretisation_rmse_mm"]
+    assert (demo.report.path_states, demo.report.revisits) == (len(path.states), 0)
+    assert plain.report.revisits > 0
+    lost_mm = tuple(discretisation_rmse(tip_mm, PAPER_GRID, 0.25))
+    assert demo.report.discretisation_rmse_mm == lost_mm != plain.report.discretisation_rmse_mm
     version = cases.train(database, demos=[demo.sha256], release=True)
-    assert version.manifest["metrics"]["discretisation_rmse_mm"] == lost_mm
+    assert version.manifest["metrics"]["discretisation_rmse_mm"] == list(lost_mm)
     assert version.manifest["metrics"]["exact_states"] == len(path.states)
     assert cases.add_plan(database).about["path"] == "fitted"
 

@@ -43,7 +43,7 @@ def found(database: Database, demo: str, count: int = 10, **how: bool) -> list[s
 
 
 def held(database: Database) -> int:
-    return sum(len(one.index) for one in neighbours._held[database.engine].values())
+    return sum(len(one.index) for one in neighbours._indices[database.engine].values())
 
 
 @pytest.mark.parametrize("scaled", [False, True])

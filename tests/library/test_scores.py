@@ -67,7 +67,7 @@ def test_figures_and_deviation_are_those_of_the_two_motions(database: Database) 
     told = scored(database, bent(6.0, "plover", database, samples=40))
     figures = {one.name: one for one in told.figures}
     assert figures["duration_s"].ratio == pytest.approx(119 / 59, rel=0.01)
-    assert figures["path_length_mm"].reference == pytest.approx(reference.report["path_length_mm"])
+    assert figures["path_length_mm"].reference == pytest.approx(reference.report.path_length_mm)
     assert told.deviation.total_mm > 100 and len(told.deviation.path_mm) == 100
     assert np.sum(told.deviation.shares) == pytest.approx(1.0)
     assert told.as_recorded.total_mm > 100

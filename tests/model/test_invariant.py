@@ -18,7 +18,7 @@ from skills.db.history import History
 from skills.db.models import Demonstration, ErasedInterval, MeasuredShape, RecordingSurgeon, Surgeon
 from skills.db.packed import pack
 from skills.db.session import Database
-from skills.library.comparison import atlas
+from skills.library.comparison import measured
 from skills.library.operation import backup, locks
 from skills.library.people import erasure
 from skills.library.policies import training
@@ -224,8 +224,8 @@ PUT_BACK: dict[str, tuple[object, str, Callable[..., object], str]] = {
         "a_release_is_withdrawn_after_the_backup",
     ),
     "a_distance_from_an_erased_demonstration_is_stored": (
-        atlas,
-        "keep_shapes",
+        measured,
+        "store_shapes",
         keep_without_looking,
         "a_demonstration_is_erased_while_the_atlas_measures",
     ),

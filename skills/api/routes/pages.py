@@ -11,7 +11,7 @@ from sqlalchemy.orm import Session
 
 from skills import errors
 from skills.api.authorisation import Asking, needs, open_to_all
-from skills.api.dependencies import Configured, Db, Digest, Limit, RowCursor, Slug, SlugCursor, Tell
+from skills.api.dependencies import Configured, Db, Digest, Limit, Parse, RowCursor, Slug, SlugCursor
 from skills.api.pages import assets, build, drawings, render
 from skills.api.responses import JSON
 from skills.api.routes.policies import JobId, Version
@@ -153,7 +153,7 @@ def show_score(
     request: Request,
     caller: Asking,
     db: Db,
-    tell: Tell,
+    tell: Parse,
     surgeon: Annotated[str, Query(max_length=64)] = "",
     task: Annotated[str, Query(max_length=64, pattern="^[A-Za-z_]*$")] = "",
 ) -> Response:
@@ -223,7 +223,7 @@ def show_recording(
 
 
 @router.get("/pages/recordings/{recording}/traces", dependencies=[needs("reader")])
-def trace_recording(recording: Digest, caller: Asking, db: Db, tell: Tell) -> Response:
+def trace_recording(recording: Digest, caller: Asking, db: Db, tell: Parse) -> Response:
     """Return the data of a recording's timeline."""
     return _json(overview.traces_of(db, recording, tell))
 

@@ -1,13 +1,13 @@
 """Recognition of whole recordings on a real database: with consent, of one surgeon, and without its own session."""
 
 import pytest
-from skills.library.whose import recognise_recording
 from sqlalchemy import select
 
 from skills.db.models import Demonstration
 from skills.db.session import Database
 from skills.errors import BadInput, Conflict, NotFound
 from skills.formats.parsed import parse_recording
+from skills.library.comparison.recognition import recognise_recording
 from skills.schemas.comparison import RecognisedRecording
 from tests.comparison.cohort import cohort
 from tests.library import cases, cohorts
