@@ -35,7 +35,8 @@ COMMON += (
     "client/",
     "api/app",
     "jobs/__init__",
-    "library/people/catalogue.py",
+    "library/people/surgeons.py",
+    "library/people/suture_types.py",
     "library/people/keys.py",
     "library/operation/locks.py",
 )

@@ -26,7 +26,7 @@ from skills.db.session import Database
 from skills.errors import NotReady, SkillsError
 from skills.jobs import Engine
 from skills.library.operation.history import keep_signed
-from skills.library.people.catalogue import seed_catalogue
+from skills.library.people.suture_types import seed_suture_types
 from skills.library.plans.arm_errors import stated_errors
 from skills.library.recordings.recordings import confined_reader
 from skills.logs import request_id
@@ -129,7 +129,7 @@ def prepare_database(database: Database, settings: Settings) -> None:
     database.migrate()
     database.compare_history()
     with database.writing() as session:
-        seed_catalogue(session)
+        seed_suture_types(session)
     keep_signed(database)
 
 

@@ -58,7 +58,7 @@ def atlas(
         out.print(sentence, markup=False, soft_wrap=True)
     _tables(found)
     for pair in found.differences:
-        out.print(f"- {pair.said}", markup=False, soft_wrap=True)
+        out.print(f"- {pair.sentence}", markup=False, soft_wrap=True)
     _recognition(found)
 
 
@@ -103,8 +103,8 @@ def _recognition(found: "Atlas") -> None:
             f"votes of recordings: {found.votes.right} of {found.votes.recordings}, {found.votes.accuracy:.0%}",
             soft_wrap=True,
         )
-    if found.whose is not None:
-        whose = found.whose
+    if found.recognised is not None:
+        whose = found.recognised
         likely = ", ".join(f"{one.surgeon} {one.probability:.0%}" for one in whose.likely[:3])
         voted = f"; its recording votes for {whose.voted} ({whose.voters})" if whose.voted else ""
         out.print(

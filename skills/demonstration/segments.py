@@ -168,24 +168,6 @@ class Segment:
         return "; ".join(self.reasons)
 
 
-@schema
-@dataclass(frozen=True)
-class TakenSegment:
-    """The part of a recording that a demonstration was cut from, and the reason for this choice.
-
-    Attributes:
-        taken: Such as `proposal 1 of 1`, `the whole recording` or `the given times`.
-        start_s: Its start, in seconds since the recording's `origin_ns`.
-        end_s: Its end.
-        because: The reason in words.
-    """
-
-    taken: str
-    start_s: float
-    end_s: float
-    because: str
-
-
 @dataclass(frozen=True, eq=False)
 class _Analysed:
     """The motion of one arm in a recording, analysed. Spans are in seconds since `origin_ns`, disjoint and in order."""

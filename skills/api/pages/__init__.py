@@ -25,6 +25,7 @@ from markupsafe import Markup
 
 from skills.api.authorisation import Caller, Role
 from skills.errors import UnknownFormat
+from skills.fields import plain_json
 from skills.formats import READABLE
 from skills.library.operation.overview import StyleState
 from skills.library.plans.playbacks import error_called
@@ -234,6 +235,7 @@ def templates() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    made.policies["json.dumps_kwargs"] = {"sort_keys": True, "default": plain_json}
     made.filters |= FILTERS
     return made
 

@@ -11,7 +11,7 @@ from sqlalchemy.orm import Session
 
 from skills import errors
 from skills.api.authorisation import Asking, needs, open_to_all
-from skills.api.dependencies import Configured, Db, Digest, Limit, RowCursor, Slug, SlugCursor, Tell
+from skills.api.dependencies import Configured, Db, Digest, Limit, Parse, RowCursor, Slug, SlugCursor
 from skills.api.pages import assets, build, drawings, render
 from skills.api.responses import JSON
 from skills.api.routes.policies import JobId, Version
@@ -19,7 +19,7 @@ from skills.formats import MEDIA_TYPES, SUFFIXES
 from skills.kinematics import INSTRUMENTS
 from skills.library.comparison import scores
 from skills.library.operation import jobs, overview
-from skills.library.people.catalogue import list_surgeons
+from skills.library.people.surgeons import list_surgeons
 from skills.library.plans.plans import find_plan, followed_plan, hands_over, plan_in_words
 from skills.library.plans.playbacks import headline_of
 from skills.library.plans.replay import refusal_of_bag
@@ -153,7 +153,7 @@ def show_score(
     request: Request,
     caller: Asking,
     db: Db,
-    tell: Tell,
+    tell: Parse,
     surgeon: Annotated[str, Query(max_length=64)] = "",
     task: Annotated[str, Query(max_length=64, pattern="^[A-Za-z_]*$")] = "",
 ) -> Response:
@@ -223,7 +223,7 @@ def show_recording(
 
 
 @router.get("/pages/recordings/{recording}/traces", dependencies=[needs("reader")])
-def trace_recording(recording: Digest, caller: Asking, db: Db, tell: Tell) -> Response:
+def trace_recording(recording: Digest, caller: Asking, db: Db, tell: Parse) -> Response:
     """Return the data of a recording's timeline."""
     return _json(overview.traces_of(db, recording, tell))
 

@@ -24,10 +24,10 @@ from skills.api.dependencies import (
     Incoming,
     Jobs,
     Limit,
+    Parse,
     Read,
     RowCursor,
     Strict,
-    Tell,
     room_for_a_job,
 )
 from skills.api.openapi import gives, gives_file, gives_page, makes, router_of, says, starts_job
@@ -328,7 +328,7 @@ SPAN, MOST_MARKS = r"^\d{1,6}(\.\d{1,6})?-\d{1,6}(\.\d{1,6})?$", 20
     dependencies=[needs("reader")],
     **gives(MotionTimeline, 404, 409, 415, as_well=(MCAP,)),
 )
-def get_timeline(source: Source, digest: Digest, db: Db, tell: Tell, give: Giving, accept: Accept = "*/*") -> Response:
+def get_timeline(source: Source, digest: Digest, db: Db, tell: Parse, give: Giving, accept: Accept = "*/*") -> Response:
     """Return a recording, a demonstration, a learnt path or a plan as columns on one clock, to be played.
 
     At most 200 rows a second and 24,000 in all. `Accept: application/vnd.mcap` returns an MCAP file for viewers such as

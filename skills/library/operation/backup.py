@@ -34,13 +34,14 @@ from skills.errors import Conflict, Corrupt, NotReady
 from skills.library.operation.history import sign_history
 from skills.library.operation.jobs import ACTIVE, BATCH
 from skills.library.operation.sweep import sweep_erased
-from skills.library.people.catalogue import put_surgeon, salted
 from skills.library.people.erasure import delete_recording, erase_demo, erase_surgeon
 from skills.library.people.keys import revoke_key
+from skills.library.people.surgeons import put_consent, salted
 from skills.library.policies.releases import withdraw_policies
 from skills.library.recordings.demos import MARKS, mark_demo, withdraw_demo
 from skills.packing import canonical, sha256
 from skills.schemas import DemoOutcome
+from skills.schemas.people import Consent
 
 Told = Callable[[str], None]  # progress callback; its argument is the name of the table or step
 ERASURES = "suture-skills erasures 1"
@@ -66,7 +67,6 @@ LISTED = (
 
 T = TypeVar("T")
 M = TypeVar("M", datetime, int)
-Consent = dict[str, Any] | None
 # By the list names in `ENDS`: digests or ids, and the moment at which each last ended.
 Ended = Mapping[str, Mapping[str, datetime]]
 
@@ -90,7 +90,7 @@ class Erasures:
 
     surgeons: frozenset[tuple[str, str, datetime]] = frozenset()
     ended: Ended = field(default_factory=dict)
-    consents: Mapping[str, tuple[datetime, Consent]] = field(default_factory=dict)
+    consents: Mapping[str, tuple[datetime, Consent | None]] = field(default_factory=dict)
     outcomes: Mapping[str, tuple[datetime, DemoOutcome]] = field(default_factory=dict)
     numbers: Mapping[tuple[str, str], int] = field(default_factory=dict)
 
@@ -260,7 +260,10 @@ def keep_erasures(database: Database, target: Path) -> Erasures:
         content = {
             "surgeons": sorted([salt, digest, rfc3339(at)] for salt, digest, at in listed.surgeons),
             **{kind: _written(listed.ended.get(kind, {})) for kind in sorted(set(ENDS.values()))},
-            "consents": {who: [rfc3339(at), consent] for who, (at, consent) in sorted(listed.consents.items())},
+            "consents": {
+                who: [rfc3339(at), consent and consent.model_dump(mode="json")]
+                for who, (at, consent) in sorted(listed.consents.items())
+            },
             "outcomes": {demo: [rfc3339(at), outcome] for demo, (at, outcome) in sorted(listed.outcomes.items())},
             "numbers": [[*style, last] for style, last in sorted(listed.numbers.items())],
         }
@@ -313,7 +316,10 @@ def _read(content: dict[str, Any]) -> Erasures:
     return Erasures(
         frozenset((salt, digest, datetime.fromisoformat(at)) for salt, digest, at in content["surgeons"]),
         {kind: {name: datetime.fromisoformat(at) for name, at in content[kind].items()} for kind in ENDS.values()},
-        {who: (datetime.fromisoformat(at), consent) for who, (at, consent) in content["consents"].items()},
+        {
+            who: (datetime.fromisoformat(at), consent and Consent.model_validate(consent))
+            for who, (at, consent) in content["consents"].items()
+        },
         {demo: (datetime.fromisoformat(at), outcome) for demo, (at, outcome) in content["outcomes"].items()},
         {(subject, suture): last for subject, suture, last in content["numbers"]},
     )
@@ -446,24 +452,25 @@ def _served(session: Session) -> set[tuple[int, str]]:
     return {(surgeon, suture) for surgeon, suture in session.execute(standing)}
 
 
-def _narrow(session: Session, consents: Mapping[str, tuple[datetime, Consent]]) -> int:
+def _narrow(session: Session, consents: Mapping[str, tuple[datetime, Consent | None]]) -> int:
     """Restrict each surgeon's consent to the uses that both the backup and the consent stated since allow."""
     changed = 0
     for surgeon in session.scalars(select(Surgeon)).all():
         _, stated = consents.get(surgeon.subject, (None, None))
         both = _both(surgeon.consent, stated)
         if both != surgeon.consent:
-            put_surgeon(session, surgeon.slug, {"consent": both}, "restore")
+            record_event(session, "restore", "change", "surgeon", surgeon.subject, surgeon)
+            put_consent(session, surgeon, both, "restore")
             changed += 1
     return changed
 
 
-def _both(one: Consent, other: Consent) -> Consent:
+def _both(one: Consent | None, other: Consent | None) -> Consent | None:
     """Return the intersection of two consents: the uses in both, until the earlier end; None allows everything."""
     if one is None or other is None:
         return one or other
-    ends = [end for end in (one.get("until"), other.get("until")) if end is not None]
-    return one | {"uses": [use for use in one["uses"] if use in other["uses"]], "until": min(ends, default=None)}
+    ends = [end for end in (one.until, other.until) if end is not None]
+    return Consent(uses=[use for use in one.uses if use in other.uses], until=min(ends, default=None))
 
 
 @contextmanager

@@ -44,12 +44,13 @@ from skills.gridworld.grid import GridPath
 from skills.gridworld.reward import RewardMap, sparse_reward
 from skills.learning.policy import Policy
 from skills.library.operation.integrity import covered, learnt
-from skills.library.people.catalogue import find_surgeon, find_suture_type
 from skills.library.people.recorded import shown_recording
+from skills.library.people.surgeons import find_surgeon
+from skills.library.people.suture_types import find_suture_type
 from skills.library.plans import playbacks
 from skills.library.policies.releases import is_served, served
 from skills.library.policies.versions import learnt_from
-from skills.library.recordings.recordings import Teller
+from skills.library.recordings.recordings import Parser
 
 RECENT = 500  # jobs in the quantiles of durations: enough for a meaningful 99th percentile
 QUANTILES = (0.5, 0.95, 1.0)
@@ -186,7 +187,7 @@ def moves_to_goal(policy: Policy, reaches: NDArray[np.bool_]) -> NDArray[np.int6
     return counted
 
 
-def traces_of(database: Database, recording_sha256: str, tell: Teller) -> dict[str, Any]:
+def traces_of(database: Database, recording_sha256: str, tell: Parser) -> dict[str, Any]:
     """Return the signals of a stored recording's arms, jaws and clutch over time."""
     recording = shown_recording(database, recording_sha256, tell).recording
     return {"duration_s": recording.duration_s, "arms": [_arm(recording, arm) for arm in recording.arms]}

@@ -26,7 +26,7 @@ from skills.db.models import PolicyVersion, Release
 from skills.db.session import Database
 from skills.errors import Busy, NotFound
 from skills.library.operation.history import covered_leaf, logged_leaf, sign_history
-from skills.library.people.catalogue import find_surgeon
+from skills.library.people.surgeons import find_surgeon
 from skills.transparency import Note, attest, read_notes
 
 DISCLOSED = {  # of the rows that a proof is about; the digests of their other columns reveal nothing without a guess
