@@ -30,7 +30,7 @@ from skills.formats.bag_writer import DEFINITIONS, Written, metadata_of
 from skills.formats.checksums import SUMS, digest_of, read_sums
 from skills.formats.columns import in_mm
 from skills.formats.mcap.cdr import WANTED_POSE, Columns, Decoder, Wanted, fields_of
-from skills.formats.mcap.reader import MessageSchema, Walker
+from skills.formats.mcap.reader import Channel, MessageSchema, Walker
 from skills.formats.replay_bag import (
     CRTK_ARMS,
     ArmMotion,
@@ -368,26 +368,34 @@ def _walk(file: BinaryIO, name: str) -> tuple[Walker, dict[str, _Topic]]:
         f"/{name}/setpoint_cp": _Topic(POSE, WANTED_POSE),
         f"/{name}/jaw/setpoint_js": _Topic(JOINT_STATE, _JOINTS),
     }
-    walker, decoders = Walker(file), dict[str, Decoder]()
-    for part in walker.stretches():
-        topic = part.channel.topic
-        if topic not in topics:
-            raise BadBag(f"{name}.mcap has the topic {topic[:100]!r}, which is not a setpoint topic of {name}.")
-        said, data = topics[topic], part.data
-        if topic not in decoders:
-            schema = walker.schemas.get(part.channel.schema, _UNTYPED)
-            expected = ("cdr", said.type, "ros2msg", DEFINITIONS[said.type].encode())
-            if (part.channel.encoding, schema.name, schema.encoding, schema.definition) != expected:
-                raise BadBag(f"{topic} does not have the type {said.type}. Export the bag again.")
-            decoders[topic] = Decoder(topic, fields_of(schema.name, schema.definition.decode()), said.wanted)
-        said.columns.append(decoders[topic].decode(data, part.begin, part.length))
-        spans = zip(part.begin.tolist(), part.length.tolist(), strict=True)
-        said.messages += [data[begin : begin + length].tobytes() for begin, length in spans]
-        if len(said.messages) > SAMPLES_LIMIT:
-            raise BadBag(f"{topic} has more than {SAMPLES_LIMIT} messages; a plan is never so long.")
+    walker, decoders = Walker(file), dict[int, Decoder]()
+    for part in walker.parts():
+        for number in part.numbers:
+            channel = walker.channels[number]
+            if channel.topic not in topics:
+                raise BadBag(
+                    f"{name}.mcap has the topic {channel.topic[:100]!r}, which is not a setpoint topic of {name}."
+                )
+            said = topics[channel.topic]
+            if number not in decoders:
+                decoders[number] = _decoder(channel, walker.schemas.get(channel.schema, _UNTYPED), said)
+            begin, length = part.of(number)
+            said.columns.append(decoders[number].decode(part.data, begin, length))
+            spans = zip(begin.tolist(), length.tolist(), strict=True)
+            said.messages += [part.data[at : at + size].tobytes() for at, size in spans]
+            if len(said.messages) > SAMPLES_LIMIT:
+                raise BadBag(f"{channel.topic} has more than {SAMPLES_LIMIT} messages; a plan is never so long.")
     if walker.integrity != "full":
         raise BadBag(f"Not every message of {name}.mcap is covered by a checksum. Export the bag again.")
     return walker, topics
+
+
+def _decoder(channel: Channel, schema: MessageSchema, said: _Topic) -> Decoder:
+    """Return the decoder of a channel of exactly the type that is written."""
+    expected = ("cdr", said.type, "ros2msg", DEFINITIONS[said.type].encode())
+    if (channel.encoding, schema.name, schema.encoding, schema.definition) != expected:
+        raise BadBag(f"{channel.topic} does not have the type {said.type}. Export the bag again.")
+    return Decoder(channel.topic, fields_of(schema.name, schema.definition.decode()), said.wanted)
 
 
 def _motion(name: str, topics: dict[str, _Topic], notes: dict[str, str], plan: PlanPaper) -> ArmMotion:
