@@ -337,7 +337,7 @@ def draw_pictures(
         playback = _playback(session, request)
         measured, report = playback.measured, playback.report
     trajectory = measured.trajectory
-    shot = film.shoot(trajectory, pad_top_mm=float(measured.pad_mm[2]), memory_bytes=settings.playback_memory_bytes)
+    shot = film.make_film(trajectory, pad_top_mm=float(measured.pad_mm[2]), memory_bytes=settings.playback_memory_bytes)
     drawn = Pictures(
         animation_mp4=shot.mp4,
         animation_gif=shot.gif,

@@ -22,7 +22,7 @@ from skills.db.session import Database
 from skills.errors import BadPlan, Conflict, Corrupt
 from skills.formats.replay_bag import (
     ArmMotion,
-    Timetable,
+    ExecutorTimetable,
     arms_of,
     folder_of,
     held_jaw_rad,
@@ -170,7 +170,9 @@ def replay_bag(
         pass_index=pass_index,
     )
     members = {name: _written(paper) for name, paper in papers.items()}
-    timetable = Timetable(plan=row.sha256, use=USE, before_each_pass=BY_HAND, passes=pass_times(trajectory, arms))
+    timetable = ExecutorTimetable(
+        plan=row.sha256, use=USE, before_each_pass=BY_HAND, passes=pass_times(trajectory, arms)
+    )
     members[EXECUTOR] = _written(timetable.model_dump())
     head = proofs.head_over(database, rows)
     members[README] = _readme(papers[PLAN], papers[VERDICT]["report"], arms, head).encode()
