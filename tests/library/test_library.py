@@ -68,7 +68,7 @@ def test_a_recording_is_looked_at_before_the_transaction_that_stores_it(
 ):
     begun: list[int] = []
     looked: list[bool] = []
-    writing, look = Database.writing, segments._look
+    writing, look = Database.writing, segments._analyse
 
     @contextmanager
     def watched(self: Database, names: Iterable[str] | None = None) -> Iterator[Session]:
@@ -84,7 +84,7 @@ def test_a_recording_is_looked_at_before_the_transaction_that_stores_it(
         return look(*given)
 
     monkeypatch.setattr(Database, "writing", watched)
-    monkeypatch.setattr(segments, "_look", seen)
+    monkeypatch.setattr(segments, "_analyse", seen)
     demo = cases.add_demo(database, cases.hand_off((7.5, 0.0, 0.0)))
     with writing(database) as session:
         session.execute(delete(ParsedRecording))
