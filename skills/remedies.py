@@ -3,7 +3,7 @@
     raise NotFound("There is no surgeon 'wren'.", Remedy(Action.ADD_SURGEON, surgeon="wren"))
 
 The code that raises names the action and its values. Each interface chooses the words: the service those of HTTP, in
-`skills.api.problems`; the commands theirs, in `skills.cli.shell`; Python, the client included, those of Python. A
+`skills.api.problems`; the commands theirs, in `skills.cli.commands`; Python, the client included, those of Python. A
 remedy that reads the same for every interface is a plain sentence.
 """
 
@@ -72,7 +72,7 @@ class Action(Enum):
     )
     NAME_TISSUE = Words(
         http="Plan again with tissue_mm, its height, or with a scene that has tissue.",
-        command="Plan again with --tissue, its height in mm, or with --obstacles, a file that has tissue",
+        command="Plan again with --tissue-mm, its height in mm, or with --obstacles, a file that has tissue",
         python="Plan again with tissue_mm, its height, or with a scene that has tissue",
     )
     NAME_SEGMENT = Words(

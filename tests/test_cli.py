@@ -14,8 +14,7 @@ import pytest
 from typer.testing import CliRunner
 
 from skills.cli import app
-from skills.cli.policies import MANY
-from skills.cli.shell import connect
+from skills.cli.connecting import MANY, connect
 from skills.db.session import Database
 from skills.formats import read_recording, write_mcap
 from skills.formats.lerobot.cut import find_dataset
@@ -168,7 +167,7 @@ def test_a_plan_is_played_drawn_exported_and_its_bag_verified(
     assert skills("seed")[0] == 0
     assert skills("train", *STYLE, "--release")[0] == 0
     base = "160,20,20,0,0,0.38268343236509,0.923879532511287"
-    both = ("--approach", "-0.94,0.10,-0.33", "--base", base, "--tissue=-170")
+    both = ("--approach", "-0.94,0.10,-0.33", "--base", base, "--tissue-mm=-170")
     code, said = skills("plan", *STYLE, "--point", "5,55,-120", *both, "--rate-hz", "100", "--json")
     assert code == 0, said
     plan = json.loads(said)["id"]

@@ -13,8 +13,25 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from skills.cli import comparison, demos, installation, plans, policies, recordings, tries
-from skills.cli.shell import err, out, tell
+from skills.cli import (
+    arms,
+    calibrations,
+    comparison,
+    datasets,
+    demos,
+    jobs,
+    keys,
+    operation,
+    people,
+    plans,
+    policies,
+    recordings,
+    report,
+    trials,
+    tries,
+)
+from skills.cli.commands import print_error
+from skills.cli.output import err, out
 from skills.remedies import did_you_mean
 
 CHOICES = re.compile(r"'([^']*)' is not one of (.+?)\.?$")
@@ -41,15 +58,15 @@ class Commands(TyperGroup):
             sys.exit(run() or 0)
         except typer.Abort:
             err.print()
-            tell("Nothing was done: it was not confirmed.", ["Answer y, or give --yes."])
+            print_error("Nothing was done: it was not confirmed.", ["Answer y, or give --yes."])
             sys.exit(1)
         except typer.TyperException as error:
-            wrong, advice = _in_words(error)
-            tell(wrong, advice)
+            wrong, advice = _describe(error)
+            print_error(wrong, advice)
             sys.exit(error.exit_code)
 
 
-def _in_words(error: typer.TyperException) -> tuple[str, list[str]]:
+def _describe(error: typer.TyperException) -> tuple[str, list[str]]:
     """Return a usage error as the fault and the remedies, with the most similar name if there is one."""
     said = " ".join(error.format_message().split()).replace("Value error, ", "")
     said = said.partition(", unable to parse")[0].replace("Input should be", "it must be")
@@ -73,20 +90,10 @@ app = typer.Typer(
     help="Suture styles: learn, certify, serve and check. Research use only.",
 )
 for commands in (  # the order of the commands in `skills --help`
-    installation.commands,
-    installation.key_commands,
-    tries.commands,
-    recordings.commands,
-    demos.commands,
-    policies.learning_commands,
-    policies.commands,
-    plans.commands,
-    comparison.commands,
-    comparison.scoring_commands,
-    comparison.report_commands,
-    recordings.surgeon_commands,
+    *(operation, keys, tries, recordings, demos, trials, datasets, jobs, policies, plans, arms),
+    *(comparison, calibrations, report, people),
 ):
-    app.add_typer(commands)
+    app.add_typer(commands.commands)
 
 
 def _print_version(asked: bool) -> None:

@@ -34,15 +34,11 @@ from skills.db import Base, Number, RowId, Sha256, Slug, now
 from skills.db.packed import Packed, stored
 from skills.demonstration.demonstration import Demo, Partner, Pause
 from skills.demonstration.partner import PartnerMotion
-from skills.gridworld.grid import GridPath, GridWorld
-from skills.gridworld.reward import RewardLevels, RewardMap
-from skills.gridworld.scene import Box, Capsule, Scene, SceneCosts, Surroundings, Tissue
+from skills.gridworld.grid import GridPath
+from skills.gridworld.reward import RewardMap
 from skills.learning.certificate import Coverage
-from skills.learning.dynamic_programming import ShortestWay
-from skills.learning.networks import Network
-from skills.learning.policy import LEARNERS, Policy
+from skills.learning.policy import Policy
 from skills.learning.pose_style import PosePath
-from skills.learning.q_learning import Training
 from skills.learning.tube import CertifiedPoses
 from skills.learning.tube_certificate import TubeCertificate, TubeLimits
 from skills.packing import few_numbers
@@ -51,16 +47,15 @@ from skills.planning.motion_laws import Pose, Poses
 from skills.planning.path_fit import Hand
 from skills.planning.plan import Departure, Pass, SuturePlan, SuturePoint
 from skills.planning.trajectory import Trajectory
+from skills.schemas.policy_document import POLICY_CLASSES
 from skills.verification.playback import Pictures, Playback
 
-stored(GridWorld, GridPath, RewardLevels, *LEARNERS.values(), Training, Network, ShortestWay)
+stored(*POLICY_CLASSES.values())
 stored(SuturePoint, Pass, Pause, Partner, PsmM, Hand, Pose, Departure)
 stored(PosePath, PartnerMotion, TubeLimits, TubeCertificate)
 stored(Trajectory, OtherArm, Poses)
-stored(Surroundings, Scene, SceneCosts, Box, Capsule, Tissue)
 # A field that is added to one of these after 0.3.0 is released is registered here, with `skills.packing.added_later`.
 few_numbers(Coverage, "share")  # one for each waypoint
-few_numbers(Policy, "q")  # some 130 different values in 200,000 places: stored as a palette
 
 
 class Surgeon(Base):

@@ -45,12 +45,13 @@ from skills.formats.reader_process import READER_VERSION, read_told
 from skills.gridworld.reward import sparse_reward
 from skills.library.calibrations import read_calibration
 from skills.library.history import Verified, verify_history
-from skills.library.integrity import covered, demo_identity, planned, policy_identity, posed
+from skills.library.integrity import covered, demo_identity, planned, posed
 from skills.library.jobs import identity_of
 from skills.library.policies import path_of, poses_of_demonstrations
 from skills.library.recordings import Teller, alike, cached_content, read_entry, recording_bytes
 from skills.library.relearning import Again, StoredRecordings, compute_again, decoded, learn_again
 from skills.packing import canonical, sha256
+from skills.schemas.policy_document import policy_identity
 from skills.settings import Settings
 from skills.transparency import Note
 

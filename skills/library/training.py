@@ -70,7 +70,7 @@ from skills.library import jobs, releases
 from skills.library.catalogue import find_surgeon, find_suture_type
 from skills.library.consent import refusal, require
 from skills.library.demos import find_demo
-from skills.library.integrity import policy_identity_of, poses_identity_of, scene_digest
+from skills.library.integrity import poses_identity_of, scene_digest
 from skills.library.jobs import QUEUED, RequestedJob, Store, TrainingRequest, did_nothing
 from skills.library.policies import BEST, choose_demos, combining_of, describe_combined, find_by_digest
 from skills.library.recordings import Teller, confined_reader, stored_recording
@@ -79,6 +79,7 @@ from skills.packing import canonical, sha256
 from skills.planning.plan import DrivenPass
 from skills.remedies import Action, Remedy
 from skills.schemas.policies import JOINING_FORMAT, Coverage, GridCertificate, Joining
+from skills.schemas.policy_document import policy_identity_of
 from skills.schemas.requests import TrainingIn
 from skills.settings import Settings
 

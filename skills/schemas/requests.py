@@ -112,10 +112,10 @@ class SurgeonIn(Schema):
         {},
     )
 
-    skill_level: SkillLevel | None = None
-    handedness: Handedness | None = None
-    protocol: Name | None = None
-    consent: ConsentIn | None = None
+    skill_level: SkillLevel | None = Field(default=None, description="The surgeon's experience.")
+    handedness: Handedness | None = Field(default=None, description="The hand that the surgeon prefers.")
+    protocol: Name | None = Field(default=None, description="The study's protocol, such as an ethics number.")
+    consent: ConsentIn | None = Field(default=None, description="The uses that the surgeon agreed to.")
 
 
 class SutureTypeIn(Schema):
@@ -139,22 +139,32 @@ class DemoIn(Schema):
         {"surgeon": "kestrel", "suture": "simple-running", "end_s": 1.1, "grid": "fit", "cell_mm": 4.0},
     )
 
-    surgeon: SlugField
-    suture: SlugField
-    arm: Name | None = None
-    topic: Name | None = None
-    start_s: Annotated[float, Field(ge=0, le=1e9)] | None = None
-    end_s: Annotated[float, Field(ge=0, le=1e9)] | None = None
+    surgeon: SlugField = Field(description="The surgeon's pseudonym.")
+    suture: SlugField = Field(description="The suture type, such as simple-running.")
+    arm: Name | None = Field(default=None, description="Needed if several arms moved.")
+    topic: Name | None = Field(default=None, description="Needed if an arm was recorded on several topics.")
+    start_s: Annotated[float, Field(ge=0, le=1e9)] | None = Field(
+        default=None, description="Start of the hand-off in the recording."
+    )
+    end_s: Annotated[float, Field(ge=0, le=1e9)] | None = Field(
+        default=None, description="End of the hand-off in the recording."
+    )
     segment: Literal["whole"] | Annotated[int, Field(ge=1, le=1_000_000)] | None = Field(
         default=None,
-        description="A proposed hand-off, counted from 1, or the whole recording. Left out, as are start_s and end_s: "
-        "the only proposal is taken; of several one must be named; where there is none, the whole recording is taken. "
-        "The answer says which part it was.",
+        description="A proposed hand-off, counted from 1, or whole. Without it and without times the only proposal is "
+        "taken; of several one must be named; where there is none, the whole recording is taken. The answer says which "
+        "part it was.",
     )
-    grid: GridMode = "auto"
-    cell_mm: Annotated[float, Field(ge=0.25, le=50)] | None = None
+    grid: GridMode = Field(
+        default="auto", description="auto takes the paper's grid if the path lies in it, and fits one otherwise."
+    )
+    cell_mm: Annotated[float, Field(ge=0.25, le=50)] | None = Field(
+        default=None, description="Length of a cell's edge in a fitted grid; 5 by default."
+    )
     hysteresis: Hysteresis = 0.0
-    session: SlugField | None = None
+    session: SlugField | None = Field(
+        default=None, description="A name for recordings that were made together, such as 2026-11-23-a."
+    )
     outcome: DemoOutcome | None = Field(default=None, description="What became of the hand-off, where it is known.")
     outcome_reason: Name | None = Field(default=None, description="Why; needed for a recovery or a failure.")
 
@@ -202,8 +212,8 @@ class Reading(Schema):
     )
     frame: Annotated[str, Field(pattern=FRAME)] | None = Field(
         default=None,
-        description="The frame of a table's positions; base: the base of each arm, which is the default where a table "
-        "is of one arm.",
+        description="The frame of the poses in a table or a LeRobot dataset; base, the default for a table of one arm: "
+        "the arm's base.",
     )
 
     @property
@@ -217,10 +227,11 @@ class TableIn(Reading):
     """Statements about a table (docs/tables.md)."""
 
     column: Annotated[list[Annotated[str, Field(max_length=200, pattern=LINE)]], Field(max_length=30)] | None = Field(
-        default=None, description="A table's columns under other names, each as x_mm=NAME, or x=NAME with a unit."
+        default=None,
+        description="A column under another name, of a table as x_mm=NAME, or as x=NAME with a unit (docs/tables.md).",
     )
     unit: Annotated[list[Literal["m", "mm", "rad", "deg", "s", "ms", "us", "ns"]], Field(max_length=3)] | None = Field(
-        default=None, description="Units of the columns that name none: of lengths, angles and times."
+        default=None, description="The unit of columns that name none, of lengths, angles or times."
     )
     decimal: Literal["point", "comma"] | None = Field(default=None, description="The decimal mark; point by default.")
     table_arm: Annotated[str, Field(pattern=ARM)] | None = Field(
@@ -324,11 +335,23 @@ class TrainingIn(Schema):
 
     surgeon: SlugField
     suture: SlugField
-    demos: list[DigestField] | None = None
+    demos: list[DigestField] | None = Field(
+        default=None,
+        description="The demonstrations to learn from; by default the newest one that is active and not marked "
+        "recovery or failure.",
+    )
     combine: CombineIn | None = None
-    learner: LearnerIn | None = None
-    seed: Annotated[StrictInt, Field(ge=0, le=MAX_SEED)] = 0
-    release: StrictBool = False
+    learner: LearnerIn | None = Field(
+        default=None, description="Its kind and settings; by default Q-learning in the phase state."
+    )
+    seed: Annotated[StrictInt, Field(ge=0, le=MAX_SEED)] = Field(
+        default=0, description="Seed of the random numbers; the phase learner's result is independent of it."
+    )
+    release: StrictBool = Field(
+        default=False,
+        description="Release the version if it passes the gate; also if an equal training is done already and its "
+        "version is not the one that the style serves now.",
+    )
     outcomes: Literal["success", "any"] = Field(
         default="success",
         description="success refuses demonstrations that are marked recovery or failure; any learns from them too.",
@@ -371,14 +394,16 @@ class RetrainingIn(Schema):
 
     model_config = shown({}, {"surgeon": "kestrel", "only_stale": True, "release": True})
 
-    surgeon: SlugField | None = None
-    suture: SlugField | None = None
+    surgeon: SlugField | None = Field(default=None, description="Only of this surgeon.")
+    suture: SlugField | None = Field(default=None, description="Only of this suture type.")
     only_stale: StrictBool = Field(
         default=False,
         description="Leaves out every style whose newest version is what this would make of it: learnt from its newest "
         "demonstration, with these settings, by this version of the learner, under this gate's limits.",
     )
-    learner: LearnerIn | None = None
+    learner: LearnerIn | None = Field(
+        default=None, description="Its kind and settings; by default Q-learning in the phase state."
+    )
     release: StrictBool = Field(
         default=False, description="Releases a version that passes the gate and is not worse than the released one."
     )
@@ -399,12 +424,18 @@ class ScoreIn(Schema):
 
     surgeon: SlugField
     suture: SlugField
-    demo: DigestField | None = None
-    recording: DigestField | None = None
-    arm: Name | None = None
-    topic: Name | None = None
-    start_s: Annotated[float, Field(ge=0, le=1e9)] | None = None
-    end_s: Annotated[float, Field(ge=0, le=1e9)] | None = None
+    demo: DigestField | None = Field(default=None, description="The demonstration to score, by its digest.")
+    recording: DigestField | None = Field(
+        default=None, description="The recording of which a part is scored, by its digest."
+    )
+    arm: Name | None = Field(default=None, description="The arm in the recording.")
+    topic: Name | None = Field(default=None, description="The topic in the recording.")
+    start_s: Annotated[float, Field(ge=0, le=1e9)] | None = Field(
+        default=None, description="Start of the part in the recording."
+    )
+    end_s: Annotated[float, Field(ge=0, le=1e9)] | None = Field(
+        default=None, description="End of the part in the recording."
+    )
     reference: DigestField | None = Field(
         default=None,
         description="The demonstration of the style to compare with. Left out, the one that its released policy was "
@@ -471,9 +502,15 @@ class DatasetIn(Schema):
         {"demos": ["0123456789abcdef" * 4], "whole": True, "version": "v3.0", "fps": 50, "split": "session"},
     )
 
-    demos: Annotated[list[DigestField], Field(min_length=1, max_length=1000)] | None = None
-    surgeons: Annotated[list[SlugField], Field(min_length=1, max_length=1000)] | None = None
-    sutures: Annotated[list[SlugField], Field(min_length=1, max_length=1000)] | None = None
+    demos: Annotated[list[DigestField], Field(min_length=1, max_length=1000)] | None = Field(
+        default=None, description="These demonstrations, by their digests; by default all that fit the filters."
+    )
+    surgeons: Annotated[list[SlugField], Field(min_length=1, max_length=1000)] | None = Field(
+        default=None, description="Only of these surgeons."
+    )
+    sutures: Annotated[list[SlugField], Field(min_length=1, max_length=1000)] | None = Field(
+        default=None, description="Only of these suture types."
+    )
     outcomes: Literal["success", "any"] = Field(
         default="success",
         description="success leaves out demonstrations that are marked recovery or failure; any exports them in the "
@@ -484,18 +521,20 @@ class DatasetIn(Schema):
         description="Exports whole recordings, where all surgeons in them consent; otherwise an episode is the "
         "interval of one hand-off.",
     )
-    version: Literal["v2.1", "v3.0"] = "v2.1"
-    fps: Annotated[StrictInt, Field(ge=1, le=1000)] = 30
+    version: Literal["v2.1", "v3.0"] = Field(default="v2.1", description="The version of LeRobot's format.")
+    fps: Annotated[StrictInt, Field(ge=1, le=1000)] = Field(
+        default=30, description="Frames per second, at most the rate of the recordings."
+    )
     split: Literal["surgeon", "session"] = Field(
         default="surgeon", description="What is in one split only: all of a surgeon, or all of a recording."
     )
     arms: Annotated[list[Annotated[str, Field(pattern=ARM)]], Field(min_length=1, max_length=10)] | None = Field(
         default=None, description="The arms of every episode; left out, those that all of the recordings have."
     )
-    name: Name = "Needle hand-offs"
-    licence: Name = "unknown"
-    description: Text = "Not stated."
-    procedure: Text = "Not stated."
+    name: Name = Field(default="Needle hand-offs", description="The dataset's title.")
+    licence: Name = Field(default="unknown", description="Its licence, such as CC-BY-4.0.")
+    description: Text = Field(default="Not stated.", description="What it contains, for its README.")
+    procedure: Text = Field(default="Not stated.", description="How it was collected, for its README.")
 
     @model_validator(mode="after")
     def _named_or_filtered(self) -> Self:

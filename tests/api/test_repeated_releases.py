@@ -5,8 +5,7 @@ from typing import Any
 import httpx2 as httpx
 import pytest
 
-from skills.client import Client, Retrying
-from skills.client.connection import NotReached
+from skills.client import Client, NotReached, Retrying
 from skills.library import releases
 from skills.library.policies import list_versions
 from tests.api.service import CSV, KESTREL, POLICY, Service, assert_problem

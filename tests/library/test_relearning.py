@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from sqlalchemy import select, text, update
 
-from skills.cli.installation import state_of
+from skills.cli.operation import state_of
 from skills.comparison.combining import Corridor
 from skills.db.models import Demonstration, PolicyVersion, StoredPoses
 from skills.db.packed import digest
@@ -25,9 +25,10 @@ from skills.library import inspection
 from skills.library.catalogue import put_surgeon
 from skills.library.demos import mark_demo
 from skills.library.inspection import Checked, inspect_policies
-from skills.library.integrity import demo_identity, policy_identity, poses_identity_of
+from skills.library.integrity import demo_identity, poses_identity_of
 from skills.library.relearning import compute_again, decoded
 from skills.library.training import GATE_VERSION, certified, lessons
+from skills.schemas.policy_document import policy_identity
 from skills.settings import Settings
 from tests import backends
 from tests.library import cases

@@ -1,17 +1,20 @@
-"""Commands on this installation: serve, worker, migrate, seed, backup, restore, erasures, verify, doctor, keys."""
+"""Commands on the installation itself: serve, worker, migrate, seed, backup, restore, erasures, verify, doctor."""
 
 import gc
-import json
-from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
-from datetime import timedelta
+from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from skills.cli.shell import KEY, AsJson, err, files, out, print_json, read_key, refusing, service, show
+from skills.cli.commands import KEY, AsJson, command, read_key
+from skills.cli.connecting import service
+from skills.cli.output import err, out, print_json, say_or_json, show, status_line
 from skills.errors import NotReady, SkillsError
+
+if TYPE_CHECKING:
+    from skills.library.backup import Erasures
+    from skills.library.inspection import Checked
 
 commands = typer.Typer()
 _ENDED = {
@@ -49,8 +52,7 @@ Lists = Annotated[
 ]
 
 
-@commands.command()
-@refusing
+@command(commands)
 def serve(
     host: Annotated[str | None, typer.Option(help="The address to listen on; SKILLS_HOST by default.")] = None,
     port: Annotated[
@@ -70,8 +72,7 @@ def serve(
     run(wanted, samples=samples)
 
 
-@commands.command()
-@refusing
+@command(commands)
 def worker() -> None:
     """Run jobs in this process, in addition to the workers that a service started."""
     gc.disable()  # as in `serve`, until the worker runs
@@ -83,19 +84,17 @@ def worker() -> None:
     run_worker(settings())
 
 
-@commands.command()
-@refusing
+@command(commands)
 def migrate(as_json: AsJson = False) -> None:
     """Migrate the database to this version; an empty one gets its tables and the catalogue."""
     from skills.serving import prepare
     from skills.settings import settings
 
     prepare(settings())
-    _say("The database is up to date.", as_json, up_to_date=True)
+    say_or_json("The database is up to date.", as_json, up_to_date=True)
 
 
-@commands.command()
-@refusing
+@command(commands)
 def seed(
     to: Annotated[
         Path | None,
@@ -107,31 +106,28 @@ def seed(
     from skills.samples import load_samples, write_samples
 
     if to is not None:
-        with files():
-            written = write_samples(to)
+        written = write_samples(to)
         show([{"file": str(file), "surgeon": surgeon} for file, surgeon in written], as_json, ("file", "surgeon"))
         return
     with service() as client, err.status("loading"):
         show(list(load_samples(client)), as_json, ("surgeon", "suture", "id", "report.path_states"))
 
 
-@commands.command()
-@refusing
+@command(commands)
 def backup(to: Annotated[Path, typer.Argument(help="A new file.", dir_okay=False)], as_json: AsJson = False) -> None:
     """Write everything that is stored into one file, while the service goes on working."""
     from skills.db.session import Database
     from skills.library.backup import back_up
     from skills.settings import settings
 
-    with closing(Database(settings().database_url)) as database, _telling("backing up") as told, files():
-        manifest = back_up(database, to, told)
+    with closing(Database(settings().database_url)) as database, status_line("backing up") as update:
+        manifest = back_up(database, to, update)
     rows, size, taken = sum(table.rows for table in manifest.tables), to.stat().st_size, manifest.created_at
     sentence = f"{to}: {rows} rows, {size / 1e6:.1f} MB, the state of {taken}."
-    _say(sentence, as_json, file=to, size_bytes=size, rows=rows, created_at=taken)
+    say_or_json(sentence, as_json, file=to, size_bytes=size, rows=rows, created_at=taken)
 
 
-@commands.command()
-@refusing
+@command(commands)
 def restore(
     source: Annotated[Path, typer.Argument(help="A file that `skills backup` wrote.", dir_okay=False)],
     erasures: Lists = None,
@@ -147,19 +143,18 @@ def restore(
     from skills.library import backup as library
     from skills.settings import settings
 
-    with files():
-        if check:
-            manifest = library.check_backup(source)
-            rows, taken = sum(table.rows for table in manifest.tables), manifest.created_at
-            _say(f"{source} is whole: {rows} rows of {taken}.", as_json, whole=True, rows=rows, created_at=taken)
-            return
-        refuse_left_over(settings())
-        sources, listed = _listed_in(erasures)
-        with closing(Database(settings().database_url)) as database, _telling("restoring") as told:
-            done = library.restore(database, source, listed, told)
+    if check:
+        manifest = library.check_backup(source)
+        rows, taken = sum(table.rows for table in manifest.tables), manifest.created_at
+        say_or_json(f"{source} is whole: {rows} rows of {taken}.", as_json, whole=True, rows=rows, created_at=taken)
+        return
+    refuse_left_over(settings())
+    sources, listed = _listed_in(erasures)
+    with closing(Database(settings().database_url)) as database, status_line("restoring") as update:
+        done = library.restore(database, source, listed, update)
     rows, taken = sum(table.rows for table in done.manifest.tables), done.manifest.created_at
     ended = {name: count for name, count in vars(done).items() if name != "manifest"}
-    _say(
+    say_or_json(
         f"Restored {rows} rows, the state of {taken}.{_again(sources, ended)}",
         as_json,
         rows=rows,
@@ -170,8 +165,7 @@ def restore(
         err.print(_NO_LIST.format(since=taken), style="red")
 
 
-@commands.command("accept-rollback")
-@refusing
+@command(commands, "accept-rollback")
 def accept_rollback(erasures: Lists = None, as_json: AsJson = False) -> None:
     """Go on with a database that was put back to an older copy of itself, and repeat what was ended since.
 
@@ -183,15 +177,14 @@ def accept_rollback(erasures: Lists = None, as_json: AsJson = False) -> None:
     from skills.library import backup as library
     from skills.settings import settings
 
-    with files():
-        sources, listed = _listed_in(erasures)
-        with closing(Database(settings().database_url)) as database, _telling("accepting"):
-            try:
-                database.compare_history()
-            except NotReady:  # otherwise there is nothing to accept, as the next call says
-                refuse_left_over(settings())
-            ended = library.accept_rollback(database, listed)
-    _say(f"The database is accepted as it is.{_again(sources, ended)}", as_json, **ended)
+    sources, listed = _listed_in(erasures)
+    with closing(Database(settings().database_url)) as database, status_line("accepting"):
+        try:
+            database.compare_history()
+        except NotReady:  # otherwise there is nothing to accept, as the next call says
+            refuse_left_over(settings())
+        ended = library.accept_rollback(database, listed)
+    say_or_json(f"The database is accepted as it is.{_again(sources, ended)}", as_json, **ended)
     if not sources:
         err.print(_NO_LIST.format(since="it was copied"), style="red")
 
@@ -219,8 +212,7 @@ def _again(sources: list[str], ended: dict[str, int]) -> str:
     return sentence
 
 
-@commands.command()
-@refusing
+@command(commands)
 def erasures(
     to: Annotated[Path, typer.Argument(help="The list; it grows with each erasure. Keep it apart from the backups.")],
     as_json: AsJson = False,
@@ -230,18 +222,17 @@ def erasures(
     from skills.library.backup import keep_erasures
     from skills.settings import settings
 
-    with closing(Database(settings().database_url)) as database, files():
+    with closing(Database(settings().database_url)) as database:
         listed = keep_erasures(database, to)
     surgeons, demos = len(listed.surgeons), len(listed.demos)
     others = {kind: len(names) for kind, names in listed.ended.items() if kind != "demonstrations"}
     others["failed"] = sum(outcome != "success" for _, outcome in listed.outcomes.values())
     more = ", ".join(f"{count} {_LISTED[kind]}" for kind, count in others.items())
     sentence = f"{to}: {surgeons} surgeons and {demos} demonstrations erased, {more}."
-    _say(sentence, as_json, file=to, surgeons=surgeons, demos=demos, **others)
+    say_or_json(sentence, as_json, file=to, surgeons=surgeons, demos=demos, **others)
 
 
-@commands.command()
-@refusing
+@command(commands)
 def verify(
     bag: Annotated[
         Path | None, typer.Argument(help="A bag for replay; by default the whole installation is verified.")
@@ -278,7 +269,7 @@ def verify(
         from skills.formats.verify import verify_bag
 
         lines = list(verify_bag(bag, None if key is None else read_key(key)))
-        _say("\n".join(lines), as_json, whole=True, checked=lines)
+        say_or_json("\n".join(lines), as_json, whole=True, checked=lines)
         return
     from skills.db.session import Database
     from skills.library.history import keep_signed
@@ -291,10 +282,9 @@ def verify(
     with (
         closing(Database(settings().database_url)) as database,
         confined_reader(settings()) as reader,
-        _telling("verifying") as told,
+        status_line("verifying") as update,
     ):
-        with files():
-            heads = None if head is None else read_notes(head.read_text())
+        heads = None if head is None else read_notes(head.read_text())
         keep_signed(database)
         for part in inspect_installation(
             database,
@@ -305,7 +295,7 @@ def verify(
             limit=limit,
         ):
             found[part.what] = part
-            told(f"{part.what} {part.count or ''}{'' if part.of is None else f' of {part.of}'}")
+            update(f"{part.what} {part.count or ''}{'' if part.of is None else f' of {part.of}'}")
     wrong = [one for part in found.values() for one in part.wrong]
     left_out = [one for part in found.values() for one in part.left_out]
     if as_json:
@@ -336,8 +326,7 @@ def state_of(part: "Checked") -> str:
     return f"{part.count - len(part.left_out)} whole, {len(part.left_out)} not compared"
 
 
-@commands.command("public-key")
-@refusing
+@command(commands, "public-key")
 def public_key(
     to: Annotated[Path | None, typer.Argument(help="A file to write it to as well.", dir_okay=False)] = None,
     as_json: AsJson = False,
@@ -346,13 +335,11 @@ def public_key(
     with service() as client:
         key = client.checkpoint().verifier
     if to is not None:
-        with files():
-            to.write_text(f"{key}\n")
-    _say(key, as_json, key=key)
+        to.write_text(f"{key}\n")
+    say_or_json(key, as_json, key=key)
 
 
-@commands.command()
-@refusing
+@command(commands)
 def doctor(as_json: AsJson = False) -> None:
     """Check what this installation needs to work, and which layers contain its readers; exit code 1 if a check fails.
 
@@ -400,99 +387,3 @@ def _without_password(source: str) -> str:
     from skills.db.session import parse_url
 
     return parse_url(source).render_as_string(hide_password=True) if "://" in source else source
-
-
-def _say(sentence: str, as_json: bool, **facts: Any) -> None:
-    """Print the outcome: the sentence, or the facts as JSON."""
-    if as_json:
-        print_json(facts)
-    else:
-        out.print(sentence, markup=False, soft_wrap=True)
-
-
-@contextmanager
-def _telling(doing: str) -> Iterator[Callable[[str], None]]:
-    """Show a status line on stderr, and yield a callback that updates it."""
-    with err.status(doing) as status:
-        yield lambda what: status.update(f"{doing} {what}")
-
-
-if TYPE_CHECKING:
-    from skills.db.session import Database
-    from skills.library.backup import Erasures
-    from skills.library.inspection import Checked
-
-key_commands = typer.Typer()
-keys = typer.Typer(no_args_is_help=True, help="Keys: callers and their roles.")
-key_commands.add_typer(keys, name="keys")
-
-Role = Literal["reader", "uploader", "trainer", "releaser", "admin"]  # as in `skills.settings`, which is slow to import
-COLUMNS = ("key", "owner", "role", "surgeons", "created_at", "expires_at", "state")
-
-
-@keys.command()
-@refusing
-def create(
-    owner: Annotated[str, typer.Argument(help="The owner's name, which events and releases record.")],
-    role: Annotated[Role, typer.Option(help="Each role includes the rights of those before it.")] = "reader",
-    days: Annotated[int | None, typer.Option(min=1, max=3650, help="Validity in days; unlimited by default.")] = None,
-    surgeon: Annotated[list[str] | None, typer.Option(help="Restrict it to this surgeon; repeatable.")] = None,
-    as_json: AsJson = False,
-) -> None:
-    """Create a key, and print its secret, which is shown only this once."""
-    from skills.db import now
-    from skills.library.keys import about_key, create_key
-
-    with _database() as database, database.writing() as session:
-        expires_at = None if days is None else now() + timedelta(days=days)
-        key, text = create_key(session, owner, role, "local", expires_at=expires_at, surgeons=surgeon)
-        about = about_key(key)
-    if as_json:
-        out.print_json(json.dumps(about | {"secret": text}))
-        return
-    out.print(text, markup=False, soft_wrap=True)
-    err.print("It is not stored and cannot be shown again; keep it where only its owner can read it.")
-
-
-@keys.command("list")
-@refusing
-def list_all(as_json: AsJson = False) -> None:
-    """List all keys, including those that were revoked or have expired; secrets are not stored."""
-    from skills.library.keys import about_key, list_keys
-
-    with _database() as database, database.reading() as session:
-        found = [about_key(key) for key in list_keys(session)]
-    show(found if as_json else [_in_words(one) for one in found], as_json, COLUMNS)
-
-
-@keys.command()
-@refusing
-def revoke(
-    key: Annotated[str, typer.Argument(help="Its id: the eight characters after skills_.")], as_json: AsJson = False
-) -> None:
-    """Revoke a key: within a second every service of this installation refuses it."""
-    from skills.library.keys import about_key, revoke_key
-
-    with _database() as database, database.writing() as session:
-        about = about_key(revoke_key(session, key, "local"))
-    show(about if as_json else _in_words(about), as_json, COLUMNS)
-
-
-@contextmanager
-def _database() -> Iterator["Database"]:
-    """Open the database of this installation, migrated, and update the file of erasures afterwards."""
-    from skills.db.session import Database
-    from skills.settings import settings
-
-    with closing(Database(settings().database_url)) as database:
-        database.migrate()
-        yield database
-        if (file := settings().erasures_file) is not None:
-            from skills.library.backup import keep_up_erasures
-
-            keep_up_erasures(database, file)
-
-
-def _in_words(about: dict[str, Any]) -> dict[str, Any]:
-    surgeons = "all" if about["surgeons"] is None else ", ".join(about["surgeons"]) or "none any more"
-    return about | {"surgeons": surgeons}

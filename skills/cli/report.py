@@ -1,0 +1,46 @@
+"""The command that redraws the paper's figures."""
+
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from skills.cli.commands import AsJson, command
+from skills.cli.output import err, out, say, show
+from skills.errors import BadInput
+
+commands = typer.Typer()
+
+
+@command(commands)
+def report(
+    to: Annotated[Path, typer.Option(help="The folder to write to.")] = Path("build/report"),
+    irl_iterations: Annotated[int, typer.Option(min=1, help="Iterations of maximum-entropy IRL, for Fig. 5.")] = 200,
+    seeds: Annotated[int, typer.Option(min=1, help="Number of seeds for each learner.")] = 200,
+    runs: Annotated[
+        int, typer.Option(min=1, help="Runs of each policy and rival, for each probability of a slip.")
+    ] = 1000,
+    as_json: AsJson = False,
+) -> None:
+    """Redraw the paper's Figures 5 to 9 and Table I, compared with rivals: pictures and one HTML page."""
+    if find_spec("movement_primitives") is None:
+        raise BadInput(
+            "The figures have a movement primitive as a rival, whose library is not installed here.",
+            "Install the extra 'report': pip install 'suture-skills[report]'",
+        )
+    from skills.report import ABSENT, Effort, write_report
+    from skills.settings import settings
+
+    with err.status("...") as status:
+        effort = Effort(irl_iterations=irl_iterations, seeds=seeds, runs=runs)
+        written = write_report(to, settings().paper_data, effort, status.update)
+    if not written.has_paper_data:
+        err.print(ABSENT, soft_wrap=True)
+    if as_json:
+        out.print(written.numbers.read_text(), markup=False, soft_wrap=True)
+        return
+    for one in written.tables:
+        say(f"\n{one.caption}")
+        show([dict(zip(one.columns, row, strict=True)) for row in one.rows], False, one.columns)
+    say(f"\n{len(written.pictures)} pictures and the page: {written.page}")
