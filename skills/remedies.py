@@ -9,7 +9,8 @@ remedy that reads the same for every interface is a plain sentence.
 
 import re
 import shlex
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from difflib import get_close_matches
 from enum import Enum
 from string import Formatter
@@ -320,7 +321,7 @@ class Remedy:
         return {"action": self.action.slug, **self.values}
 
     @classmethod
-    def from_json(cls, data: dict[str, Any]) -> Self:
+    def from_json(cls, data: Mapping[str, Any]) -> Self:
         """Return the remedy of JSON data.
 
         Raises:
@@ -345,17 +346,12 @@ class Remedy:
         return f"Remedy({self.action.name}, {self.values})"
 
 
-def read_remedies(said: Any) -> list[Remedy | str]:
+def read_remedies(remedies: Iterable[str | Mapping[str, Any]]) -> list[Remedy | str]:
     """Return the remedies of a problem document; those that this version does not know are left out."""
     found: list[Remedy | str] = []
-    for one in said if isinstance(said, list) else ():
-        if isinstance(one, str):
-            found.append(one)
-        elif isinstance(one, dict):
-            try:
-                found.append(Remedy.from_json(one))
-            except ValueError:
-                continue
+    for one in remedies:
+        with suppress(ValueError):
+            found.append(one if isinstance(one, str) else Remedy.from_json(one))
     return found
 
 

@@ -104,9 +104,8 @@ def test_no_message_in_the_source_has_the_words_of_a_door():
 
 
 def test_remedies_of_another_version_are_left_out_and_sentences_are_kept():
-    said = ["Do it.", {"action": "fly"}, {"action": "add-surgeon"}, {"action": "list-demos"}, 3]
+    said = ["Do it.", {"action": "fly"}, {"action": "add-surgeon"}, {"action": "list-demos"}]
     assert read_remedies(said) == ["Do it.", Remedy(Action.LIST_DEMOS)]
-    assert read_remedies("no list") == []
     with pytest.raises(TypeError):
         Remedy(Action.ADD_SURGEON, suture="wrong")
 
