@@ -5,8 +5,8 @@ from typing import Annotated
 
 import typer
 
-from skills.cli.commands import AsJson, command
-from skills.cli.output import cell, out, print_json, say
+from skills.cli.commands import command
+from skills.cli.output import Answer, cell, out, say
 
 commands = typer.Typer()
 COLUMNS = ("error", "mean", "deviation", "independent", "band 90 %", "held", "width", "assumed holds", "width")
@@ -30,8 +30,7 @@ def calibrate(
     to: Annotated[
         Path | None, typer.Option(help="Write the errors to this JSON file, for `play --errors` and SKILLS_ARM_ERRORS.")
     ] = None,
-    as_json: AsJson = False,
-) -> None:
+) -> Answer:
     """Measure an arm's own errors: setpoints compared with measured poses, and with a tracker's if there is one."""
     from rich.table import Table
 
@@ -46,9 +45,6 @@ def calibrate(
     slip = None if cell_mm is None else measure_slip(measured, cell_mm)
     if to is not None:
         to.write_bytes(canonical(plain(found.errors)) + b"\n")
-    if as_json:
-        print_json(plain(found) | ({} if slip is None else {"slip": plain(slip)}))
-        return
     table = Table(*COLUMNS, box=None)
     for kind, axes in (("tip", found.tip), ("wrist", found.wrist), ("tip, tracked", found.tracked or ())):
         for one in axes:
@@ -62,7 +58,12 @@ def calibrate(
                 f"{one.assumed_coverage:.1%}",
                 cell(round(one.assumed_width, 3)),
             )
-    out.print(table)
-    say(found.in_words, f"{found.errors.name}: {found.errors.in_words}")
+    sentences = [found.in_words, f"{found.errors.name}: {found.errors.in_words}"]
     if slip is not None:
-        say(slip.in_words)
+        sentences.append(slip.in_words)
+
+    def show() -> None:
+        out.print(table)
+        say(*sentences)
+
+    return Answer(plain(found) | ({} if slip is None else {"slip": plain(slip)}), show)

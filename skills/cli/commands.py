@@ -1,7 +1,9 @@
 """Declaration of commands: registration, common arguments, flags from the keyword arguments of the client, and errors.
 
     @command(demos, "list")
-    def demo_list(surgeon: OfSurgeon = None, as_json: AsJson = False) -> None: ...
+    def demo_list(surgeon: OfSurgeon = None) -> Answer:
+        with service() as client:
+            return table(client.demos(surgeon), ("id", "surgeon"))
 
 A parameter whose type is one of `skills.keywords` stands for a flag for each of its fields that is a number, a
 text or a choice, or a list of them, unless the command has a parameter of the field's name. Its value has the fields
@@ -35,7 +37,7 @@ import typer
 from typer.models import ArgumentInfo, OptionInfo
 
 from skills.cli.completion import complete_surgeons, complete_sutures
-from skills.cli.output import err
+from skills.cli.output import Answer, err, print_json
 from skills.errors import BadInput, SkillsError
 from skills.remedies import Door, did_you_mean
 
@@ -80,8 +82,10 @@ PARTS = re.compile(r"(?<=[.!?]) (?=[A-Z`'])|; |\n")  # separates the fault from 
 
 def command(
     group: typer.Typer, name: str | None = None, *, without: Collection[str] = ()
-) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Register a function as a command; an error is printed in one sentence, or as JSON, and the exit code is 1.
+) -> Callable[[Callable[..., Answer | None]], Callable[..., None]]:
+    """Register a function as a command, with the option --json if it returns an answer, which is then printed.
+
+    An error is printed in one sentence, or as JSON, and the exit code is 1.
 
     Args:
         group: The group of the command.
@@ -89,9 +93,13 @@ def command(
         without: Fields of keyword arguments for which it has no flag.
     """
 
-    def register(function: Callable[..., None]) -> Callable[..., None]:
+    def register(function: Callable[..., Answer | None]) -> Callable[..., None]:
         signature = inspect.signature(function, eval_str=True)
         parameters, flags = list(signature.parameters.values()), {}
+        answers = signature.return_annotation is Answer
+        asks_json = "as_json" in signature.parameters
+        if answers and not asks_json:
+            parameters.append(_json_parameter())
         for one in signature.parameters.values():
             if is_typeddict(one.annotation):
                 flags[one.name] = [*_flags(one.annotation, {*signature.parameters, *without})]
@@ -100,19 +108,22 @@ def command(
 
         @wraps(function)
         def run(**values: Any) -> None:
+            as_json = values["as_json"] if asks_json else values.pop("as_json", False)
             try:
                 for keywords, of in flags.items():
                     given = {flag.name: (parse, values.pop(flag.name)) for flag, parse in of}
                     values[keywords] = {
                         field: parse(value) for field, (parse, value) in given.items() if value not in (None, [])
                     }
-                function(**values)
+                answer = function(**values)
+                if answer is not None:
+                    _print(answer, as_json)
             except SkillsError as error:
-                _exit(error, run, bool(values.get("as_json")))
+                _exit(error, run, as_json)
             except OSError as error:  # a path from the command line cannot be read or written
                 where = "The file" if error.filename is None else str(error.filename)
                 refused = BadInput(f"{where}: {error.strerror or error}.", *about_path(error))
-                _exit(refused, run, bool(values.get("as_json")))
+                _exit(refused, run, as_json)
 
         # options without a default need not be before those with one
         run.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
@@ -123,6 +134,21 @@ def command(
         return run
 
     return register
+
+
+def _json_parameter() -> inspect.Parameter:
+    return inspect.Parameter("as_json", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=AsJson)
+
+
+def _print(answer: Answer, as_json: bool) -> None:
+    if as_json:
+        print_json(answer.document)
+    else:
+        answer.show()
+    if answer.refused is not None:
+        raise answer.refused
+    if answer.exit_code:
+        raise typer.Exit(answer.exit_code)
 
 
 # ---- flags -----------------------------------------------------------------------------------------------------------

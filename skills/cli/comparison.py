@@ -1,15 +1,16 @@
 """Commands of atlases, recognition and scores."""
 
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from skills.cli.commands import AsJson, Surgeon, Suture, TheSurgeon, TheSuture, command
+from skills.cli.commands import Surgeon, Suture, TheSurgeon, TheSuture, command
 from skills.cli.completion import complete_surgeons
 from skills.cli.connecting import service
-from skills.cli.output import out, print_json, say, show
+from skills.cli.output import Answer, out, say, show_table, table, text
 from skills.cli.uploading import ready
 from skills.errors import BadInput
 from skills.keywords import ScoreKeywords
@@ -34,15 +35,15 @@ def atlas(
     demo: Annotated[
         str | None, typer.Option(help="Recognise the surgeon of this demonstration, by its digest.")
     ] = None,
-    as_json: AsJson = False,
-) -> None:
+) -> Answer:
     """Compare all demonstrations of a suture type: clusters, differences between surgeons, and recognition."""
     with service() as client:
         found = client.atlas(suture, scaled=scaled, clusters=clusters, demo=demo)
-    if as_json:
-        print_json(found)
-        return
-    out.print(
+    return Answer(found, lambda: _show_atlas(suture, found))
+
+
+def _show_atlas(suture: str, found: "Atlas") -> None:
+    say(
         f"Demonstrations of {suture}: {len(found.demos)}, of {found.recordings} recordings; distances in {found.unit}, "
         "about as at one place"
     )
@@ -59,7 +60,7 @@ def _show_tables(found: "Atlas") -> None:
         | {"share": None if one.mean_share is None else f"{one.mean_share:.0%}"}
         for one in found.surgeons
     ]
-    show(surgeons, False, ("surgeon", "demos", "recordings", "sessions", "consistency", "share", "medoid"))
+    show_table(surgeons, ("surgeon", "demos", "recordings", "sessions", "consistency", "share", "medoid"))
     clusters = [
         {
             "cluster": one.cluster,
@@ -70,23 +71,24 @@ def _show_tables(found: "Atlas") -> None:
         }
         for one in found.clusters
     ]
-    show(clusters, False, ("cluster", "demos", "spread", "medoid", "surgeons"))
+    show_table(clusters, ("cluster", "demos", "spread", "medoid", "surgeons"))
 
 
-def _say_recognition(recognition: "list[Recognition]", because: str | None) -> None:
+def _recognition(recognition: "list[Recognition]", because: str | None) -> Iterator[str]:
+    """Yield a sentence for each arm, and why there is no recognition."""
     for seen in recognition:
         low, high = seen.interval
-        say(
+        yield (
             f"recognition on {seen.arm}: {seen.right} of {seen.tested} with their session left out, "
             f"{seen.accuracy:.0%} ({low:.0%} to {high:.0%}), by chance {seen.chance:.0%}; log loss "
             f"{seen.log_loss:.2f} nat, guessing {seen.log_loss_of_guessing:.2f}; by {', '.join(seen.compared)}"
         )
     if because is not None:
-        say(f"no recognition: {because}")
+        yield f"no recognition: {because}"
 
 
 def _say_recognised(found: "Atlas") -> None:
-    _say_recognition(found.recognition, found.no_recognition_because)
+    say(*_recognition(found.recognition, found.no_recognition_because))
     if found.votes is not None:
         say(f"votes of recordings: {found.votes.right} of {found.votes.recordings}, {found.votes.accuracy:.0%}")
     if (one := found.whose) is not None:
@@ -102,21 +104,18 @@ def _say_recognised(found: "Atlas") -> None:
 def recognise(
     recording: Annotated[str, typer.Argument(help="The digest of a recording that has a demonstration.")],
     suture: TheSuture,
-    as_json: AsJson = False,
-) -> None:
+) -> Answer:
     """Recognise the surgeon of a whole recording by all its movements, with its session left out."""
     with service() as client:
         found = client.recognise(recording, suture)
-    if as_json:
-        print_json(found)
-        return
     low, high = found.votes.interval
-    say(
+    return text(
+        found,
         f"{found.recording[:SHORT]} of {found.surgeon}: {found.voters} movements vote for {found.voted}",
         f"votes of recordings: {found.votes.right} of {found.votes.recordings}, {found.votes.accuracy:.0%} "
         f"({low:.0%} to {high:.0%}), by chance {found.votes.chance:.0%}",
+        *_recognition(found.recognition, found.no_recognition_because),
     )
-    _say_recognition(found.recognition, found.no_recognition_because)
 
 
 def _rounded(distance: float | None) -> str | None:
@@ -130,8 +129,7 @@ def score(
     suture: TheSuture,
     options: ScoreKeywords,
     proposal: Annotated[int | None, typer.Option(help="The proposed hand-off of a file, counted from 1.")] = None,
-    as_json: AsJson = False,
-) -> None:
+) -> Answer:
     """Score a motion against a style: its distance, where it deviates, and its percentiles. Not a credential."""
     with service() as client:
         if Path(what).exists():
@@ -144,10 +142,7 @@ def score(
         else:
             options["demo"] = what
         scored = client.score(surgeon, suture, **options)
-    if as_json:
-        print_json(scored)
-    else:
-        _say_score(scored)
+    return Answer(scored, lambda: _show_score(scored))
 
 
 def _choose_part(client: "Client", path: Path, proposal: int | None, options: ScoreKeywords) -> None:
@@ -175,7 +170,7 @@ def _choose_part(client: "Client", path: Path, proposal: int | None, options: Sc
     options |= {"arm": part.arm, "start_s": part.start_s, "end_s": part.end_s}
 
 
-def _say_score(scored: "Score") -> None:
+def _show_score(scored: "Score") -> None:
     from rich.table import Table
 
     table = Table(box=None, pad_edge=False)
@@ -200,14 +195,10 @@ def progress(
     against: Annotated[
         str, typer.Option(help="The surgeon whose style is the reference.", autocompletion=complete_surgeons)
     ],
-    as_json: AsJson = False,
-) -> None:
+) -> Answer:
     """Compare a surgeon's demonstrations with a style's reference, session by session. Not a credential."""
     with service() as client:
         found = client.progress(surgeon, suture, against=against)
-    if as_json:
-        print_json(found)
-        return
     rows = [
         {
             "session": one.session or "",
@@ -219,5 +210,6 @@ def progress(
         }
         for one in found.sessions
     ]
-    show(rows, False, ("session", "stored", "demos", "distance, mm", "duration, s", "smoothness"))
-    say(f"Medians, beside {found.reference.demo}: {found.reference.because}.", found.use)
+    columns = ("session", "stored", "demos", "distance, mm", "duration, s", "smoothness")
+    beside = f"Medians, beside {found.reference.demo}: {found.reference.because}."
+    return table(found, columns, beside, found.use, rows=rows)

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from skills.cli.commands import AsJson, command
+from skills.cli.commands import command
 from skills.cli.connecting import finished, service
-from skills.cli.output import bar, print_json, say
+from skills.cli.output import Answer, bar, text
 from skills.cli.uploading import Tool, pairs
 from skills.errors import BadInput
 from skills.keywords import DatasetKeywords
@@ -44,8 +44,7 @@ def export_dataset(
         typer.Option(help="A column under another name in a LeRobot dataset, as in the upload; repeatable."),
     ] = None,
     tool: Tool = None,
-    as_json: AsJson = False,
-) -> None:
+) -> Answer:
     """Export demonstrations as a LeRobot dataset, and verify it; the consent to export is required."""
     from skills.formats.lerobot import refuse_existing
     from skills.schemas.results import DatasetResult
@@ -67,13 +66,13 @@ def export_dataset(
         else:
             with bar("fetching") as progress:
                 client.save_dataset(result.dataset, to, progress)
-    if as_json:
-        print_json({"file": to, **result.model_dump()})
-        return
-    say(f"{result.dataset}  episodes: {result.episodes}, frames: {result.frames}")
-    say(f"{to}: every file is verified against SHA256SUMS. Research use only.")
+    sentences = [
+        f"{result.dataset}  episodes: {result.episodes}, frames: {result.frames}",
+        f"{to}: every file is verified against SHA256SUMS. Research use only.",
+    ]
     if videos:
-        say("It has videos. Its README says that you declared the consent of everyone in them.")
+        sentences.append("It has videos. Its README says that you declared the consent of everyone in them.")
+    return text({"file": to, **result.model_dump()}, *sentences)
 
 
 def _refuse_videos(to: Path, *, whole: bool, consented: bool) -> None:

@@ -7,7 +7,7 @@ import typer
 
 from skills.cli.commands import AsJson, OfSurgeon, OfSuture, ToFile, command, on_terminal, parse_segment
 from skills.cli.connecting import service
-from skills.cli.output import bar, print_json, say, say_or_json, say_written, show
+from skills.cli.output import Answer, bar, outcome, show_table, table, text, written
 from skills.cli.uploading import OneEpisode, RecordingPath, Tool, ready_one
 from skills.errors import BadInput
 from skills.keywords import DemoKeywords, TableKeywords
@@ -33,7 +33,7 @@ def demo_add(
     episode: OneEpisode = None,
     tool: Tool = None,
     as_json: AsJson = False,
-) -> None:
+) -> Answer:
     """Store a recording and one demonstration of it; if several hand-offs are proposed, name one with --segment."""
     from skills.client import Problem
 
@@ -50,10 +50,8 @@ def demo_add(
                 raise
             cut["segment"] = _choose(problem)
             added = client.add_demo(file, progress=progress, **cut, **table)
-    say_measured(added, as_json)
-    if not as_json:
-        taken = added.segment
-        say(f"Taken: {taken.taken}, {taken.start_s:.2f} to {taken.end_s:.2f} s; {taken.because}")
+    taken = added.segment
+    return measured(added, f"Taken: {taken.taken}, {taken.start_s:.2f} to {taken.end_s:.2f} s; {taken.because}")
 
 
 def _choose(problem: "Problem") -> int | Literal["whole"]:
@@ -62,19 +60,18 @@ def _choose(problem: "Problem") -> int | Literal["whole"]:
 
     proposed = ProposedSegments.of(problem.numbers).segments
     rows = [vars(one) | {"start_s": f"{one.start_s:.2f}", "end_s": f"{one.end_s:.2f}"} for one in proposed]
-    show(rows, False, ("segment", "arm", "start_s", "end_s", "reason"))
+    show_table(rows, ("segment", "arm", "start_s", "end_s", "reason"))
     if not on_terminal():
         raise problem
     return parse_segment(typer.prompt("Which one? A number, or whole", err=True).strip())
 
 
-def say_measured(demo: "Demonstration", as_json: bool) -> None:
-    """Print a demonstration with its measurements."""
-    show(demo, as_json, ("id", "surgeon", "suture", "arm", "frame", "report.path_states"))
-    if not as_json:
-        x, y, z = demo.report.discretisation_rmse_mm
-        loss = f"{x:.2f}, {y:.2f}, {z:.2f} mm off their cells along x, y, z (RMSE)"
-        say(f"{demo.report.revisits} crossings; samples are {loss}")
+def measured(demo: "Demonstration", *sentences: str) -> Answer:
+    """Return the answer that shows a demonstration with its measurements, and further sentences."""
+    x, y, z = demo.report.discretisation_rmse_mm
+    loss = f"{x:.2f}, {y:.2f}, {z:.2f} mm off their cells along x, y, z (RMSE)"
+    columns = ("id", "surgeon", "suture", "arm", "frame", "report.path_states")
+    return table(demo, columns, f"{demo.report.revisits} crossings; samples are {loss}", *sentences)
 
 
 @command(demos, "list")
@@ -84,47 +81,41 @@ def demo_list(
     outcome: Annotated[
         Literal["success", "recovery", "failure", "unknown"] | None, typer.Option(help="Only those marked so.")
     ] = None,
-    as_json: AsJson = False,
-) -> None:
+) -> Answer:
     """List demonstrations, the newest first."""
     with service() as client:
-        show(client.demos(surgeon, suture, outcome=outcome), as_json, COLUMNS)
+        return table(client.demos(surgeon, suture, outcome=outcome), COLUMNS)
 
 
 @command(demos, "show")
-def demo_show(demo: Demo, as_json: AsJson = False) -> None:
+def demo_show(demo: Demo) -> Answer:
     """Show a demonstration, with the figures measured when it was stored."""
     with service() as client:
         shown = client.demo(demo)
-    say_measured(shown, as_json)
-    if not as_json:
-        say(f"{shown.state}, {shown.start_s:.2f} to {shown.end_s:.2f} s of {shown.recording}", *_outcome(shown))
+    place = f"{shown.state}, {shown.start_s:.2f} to {shown.end_s:.2f} s of {shown.recording}"
+    return measured(shown, place, *_outcome(shown))
 
 
 @command(demos, "report")
 def demo_report(
     demo: Demo,
     html: Annotated[Path | None, typer.Option(help="Write the report to this file as HTML.")] = None,
-    as_json: AsJson = False,
-) -> None:
+) -> Answer:
     """Report the quality of a demonstration, and how to improve it."""
     with service() as client:
         if html is not None:
             html.write_bytes(client.demo_report_page(demo))
-            say_written(html, as_json)
-            return
-        measured = client.demo_report(demo)
-    say_measured(measured, as_json)
-    if not as_json:
-        say(*(f"- {sentence}" for sentence in measured.report.advice))
+            return written(html)
+        reported = client.demo_report(demo)
+    return measured(reported, *(f"- {sentence}" for sentence in reported.report.advice))
 
 
 @command(demos, "save")
-def demo_save(demo: Demo, to: ToFile, as_json: AsJson = False) -> None:
+def demo_save(demo: Demo, to: ToFile) -> Answer:
     """Write the recording of a demonstration to a file, exactly as it was uploaded."""
     with service() as client, bar("fetching") as progress:
         client.save_recording(demo, to, progress)
-    say_written(to, as_json)
+    return written(to)
 
 
 @command(demos, "mark")
@@ -132,15 +123,11 @@ def demo_mark(
     demo: Demo,
     outcome: Annotated[Literal["success", "recovery", "failure"], typer.Argument(help="What became of the hand-off.")],
     reason: Annotated[str | None, typer.Option(help="Why; needed for a recovery or a failure.")] = None,
-    as_json: AsJson = False,
-) -> None:
+) -> Answer:
     """Mark a demonstration; a recovery or a failure is not learnt from, and releases that rest on it are withdrawn."""
     with service() as client:
         marked = client.mark_demo(demo, outcome, reason=reason)
-    if as_json:
-        print_json(marked)
-    else:
-        say(*_outcome(marked))
+    return text(marked, *_outcome(marked))
 
 
 def _outcome(demo: "Demonstration") -> list[str]:
@@ -153,10 +140,9 @@ def _outcome(demo: "Demonstration") -> list[str]:
 def demo_withdraw(
     demo: Demo,
     erase: Annotated[bool, typer.Option("--erase", help="Delete it and everything derived from it.")] = False,
-    as_json: AsJson = False,
-) -> None:
+) -> Answer:
     """Withdraw a demonstration and the releases that rest on it."""
     with service() as client:
         client.withdraw_demo(demo, erase=erase)
     done = "erased" if erase else "withdrawn"
-    say_or_json(f"The demonstration is {done}, and no release depends on it.", as_json, demo=demo, state=done)
+    return outcome(f"The demonstration is {done}, and no release depends on it.", demo=demo, state=done)

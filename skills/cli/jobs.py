@@ -4,9 +4,9 @@ from typing import Annotated, Literal
 
 import typer
 
-from skills.cli.commands import AsJson, command
+from skills.cli.commands import command
 from skills.cli.connecting import MANY, finished, service
-from skills.cli.output import show
+from skills.cli.output import Answer, table
 
 commands = typer.Typer()
 jobs = typer.Typer(no_args_is_help=True, help="Trainings, playbacks and other long work.")
@@ -22,33 +22,31 @@ def job_list(
         Literal["queued", "running", "succeeded", "failed", "cancelled"] | None,
         typer.Option(help="Only jobs in this state."),
     ] = None,
-    as_json: AsJson = False,
-) -> None:
+) -> Answer:
     """List jobs, the newest first."""
     with service() as client:
-        show(client.jobs(state), as_json, COLUMNS)
+        return table(client.jobs(state), COLUMNS)
 
 
 @command(jobs, "show")
-def job_show(job: JobId, as_json: AsJson = False) -> None:
+def job_show(job: JobId) -> Answer:
     """Show a job."""
     with service() as client:
-        show(client.job(job), as_json, COLUMNS)
+        return table(client.job(job), COLUMNS)
 
 
 @command(jobs, "wait")
 def job_wait(
     job: JobId,
     timeout_s: Annotated[float, typer.Option(help="Longest waiting time in seconds.")] = 600.0,
-    as_json: AsJson = False,
-) -> None:
+) -> Answer:
     """Wait until a job has ended; exit code 1 if it did not succeed."""
     with service(workers=MANY) as client:
-        show(finished(client, client.job(job), timeout_s), as_json, COLUMNS)
+        return table(finished(client, client.job(job), timeout_s), COLUMNS)
 
 
 @command(jobs, "cancel")
-def job_cancel(job: JobId, as_json: AsJson = False) -> None:
+def job_cancel(job: JobId) -> Answer:
     """Cancel a job that has not ended."""
     with service() as client:
-        show(client.cancel(job), as_json, COLUMNS)
+        return table(client.cancel(job), COLUMNS)

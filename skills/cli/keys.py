@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from skills.cli.commands import AsJson, command
-from skills.cli.output import print_json, say, show, warn
+from skills.cli.commands import command
+from skills.cli.output import Answer, say, table, warn
 
 if TYPE_CHECKING:
     from skills.db.session import Database
@@ -27,43 +27,41 @@ def create(
     role: Annotated[Role, typer.Option(help="Each role includes the rights of those before it.")] = "reader",
     days: Annotated[int | None, typer.Option(min=1, max=3650, help="Validity in days; unlimited by default.")] = None,
     surgeon: Annotated[list[str] | None, typer.Option(help="Restrict it to this surgeon; repeatable.")] = None,
-    as_json: AsJson = False,
-) -> None:
+) -> Answer:
     """Create a key, and print its secret, which is shown only this once."""
     from skills.db import now
     from skills.library.keys import about_key, create_key
 
     with _database() as database, database.writing() as session:
         expires_at = None if days is None else now() + timedelta(days=days)
-        key, text = create_key(session, owner, role, "local", expires_at=expires_at, surgeons=surgeon)
+        key, secret = create_key(session, owner, role, "local", expires_at=expires_at, surgeons=surgeon)
         about = about_key(key)
-    if as_json:
-        print_json(about | {"secret": text})
-        return
-    say(text)
-    warn("It is not stored and cannot be shown again; keep it where only its owner can read it.", style="")
+
+    def show() -> None:
+        say(secret)
+        warn("It is not stored and cannot be shown again; keep it where only its owner can read it.", style="")
+
+    return Answer(about | {"secret": secret}, show)
 
 
 @command(keys, "list")
-def list_all(as_json: AsJson = False) -> None:
+def list_all() -> Answer:
     """List all keys, including those that were revoked or have expired; secrets are not stored."""
     from skills.library.keys import about_key, list_keys
 
     with _database() as database, database.reading() as session:
         found = [about_key(key) for key in list_keys(session)]
-    show(found if as_json else [_with_surgeons(one) for one in found], as_json, COLUMNS)
+    return table(found, COLUMNS, rows=[_with_surgeons(one) for one in found])
 
 
 @command(keys)
-def revoke(
-    key: Annotated[str, typer.Argument(help="Its id: the eight characters after skills_.")], as_json: AsJson = False
-) -> None:
+def revoke(key: Annotated[str, typer.Argument(help="Its id: the eight characters after skills_.")]) -> Answer:
     """Revoke a key: within a second every service of this installation refuses it."""
     from skills.library.keys import about_key, revoke_key
 
     with _database() as database, database.writing() as session:
         about = about_key(revoke_key(session, key, "local"))
-    show(about if as_json else _with_surgeons(about), as_json, COLUMNS)
+    return table(about, COLUMNS, rows=_with_surgeons(about))
 
 
 @contextmanager

@@ -3,13 +3,13 @@
 import gc
 from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from skills.cli.commands import KEY, AsJson, command, read_key
+from skills.cli.commands import KEY, command, read_key
 from skills.cli.connecting import service
-from skills.cli.output import err, out, print_json, say_or_json, show, status_line
+from skills.cli.output import Answer, err, outcome, say, status_line, table, warn
 from skills.errors import NotReady, SkillsError
 
 if TYPE_CHECKING:
@@ -85,13 +85,13 @@ def worker() -> None:
 
 
 @command(commands)
-def migrate(as_json: AsJson = False) -> None:
+def migrate() -> Answer:
     """Migrate the database to this version; an empty one gets its tables and the catalogue."""
     from skills.serving import prepare
     from skills.settings import settings
 
     prepare(settings())
-    say_or_json("The database is up to date.", as_json, up_to_date=True)
+    return outcome("The database is up to date.", up_to_date=True)
 
 
 @command(commands)
@@ -100,21 +100,20 @@ def seed(
         Path | None,
         typer.Option("--files", help="Only write the recordings as files, into this folder.", file_okay=False),
     ] = None,
-    as_json: AsJson = False,
-) -> None:
+) -> Answer:
     """Load the synthetic sample surgeons and their recordings."""
     from skills.samples import load_samples, write_samples
 
     if to is not None:
         written = write_samples(to)
-        show([{"file": str(file), "surgeon": surgeon} for file, surgeon in written], as_json, ("file", "surgeon"))
-        return
+        return table([{"file": str(file), "surgeon": surgeon} for file, surgeon in written], ("file", "surgeon"))
+        return None
     with service() as client, err.status("loading"):
-        show(list(load_samples(client)), as_json, ("surgeon", "suture", "id", "report.path_states"))
+        return table(list(load_samples(client)), ("surgeon", "suture", "id", "report.path_states"))
 
 
 @command(commands)
-def backup(to: Annotated[Path, typer.Argument(help="A new file.", dir_okay=False)], as_json: AsJson = False) -> None:
+def backup(to: Annotated[Path, typer.Argument(help="A new file.", dir_okay=False)]) -> Answer:
     """Write everything that is stored into one file, while the service goes on working."""
     from skills.db.session import Database
     from skills.library.backup import back_up
@@ -124,7 +123,7 @@ def backup(to: Annotated[Path, typer.Argument(help="A new file.", dir_okay=False
         manifest = back_up(database, to, update)
     rows, size, taken = sum(table.rows for table in manifest.tables), to.stat().st_size, manifest.created_at
     sentence = f"{to}: {rows} rows, {size / 1e6:.1f} MB, the state of {taken}."
-    say_or_json(sentence, as_json, file=to, size_bytes=size, rows=rows, created_at=taken)
+    return outcome(sentence, file=to, size_bytes=size, rows=rows, created_at=taken)
 
 
 @command(commands)
@@ -132,8 +131,7 @@ def restore(
     source: Annotated[Path, typer.Argument(help="A file that `skills backup` wrote.", dir_okay=False)],
     erasures: Lists = None,
     check: Annotated[bool, typer.Option("--check", help="Only check the backup; write nothing.")] = False,
-    as_json: AsJson = False,
-) -> None:
+) -> Answer:
     """Fill an empty database from a backup, and repeat everything that was ended since the backup.
 
     That is, erasures, withdrawals, revoked keys and narrowed consents, from the lists of --erasures.
@@ -146,27 +144,19 @@ def restore(
     if check:
         manifest = library.check_backup(source)
         rows, taken = sum(table.rows for table in manifest.tables), manifest.created_at
-        say_or_json(f"{source} is whole: {rows} rows of {taken}.", as_json, whole=True, rows=rows, created_at=taken)
-        return
+        return outcome(f"{source} is whole: {rows} rows of {taken}.", whole=True, rows=rows, created_at=taken)
     refuse_left_over(settings())
     sources, listed = _listed_in(erasures)
     with closing(Database(settings().database_url)) as database, status_line("restoring") as update:
         done = library.restore(database, source, listed, update)
     rows, taken = sum(table.rows for table in done.manifest.tables), done.manifest.created_at
     ended = {name: count for name, count in vars(done).items() if name != "manifest"}
-    say_or_json(
-        f"Restored {rows} rows, the state of {taken}.{_again(sources, ended)}",
-        as_json,
-        rows=rows,
-        created_at=taken,
-        **ended,
-    )
-    if not sources:
-        err.print(_NO_LIST.format(since=taken), style="red")
+    sentence = f"Restored {rows} rows, the state of {taken}.{_again(sources, ended)}"
+    return _ended(sentence, sources, taken, rows=rows, created_at=taken, **ended)
 
 
 @command(commands, "accept-rollback")
-def accept_rollback(erasures: Lists = None, as_json: AsJson = False) -> None:
+def accept_rollback(erasures: Lists = None) -> Answer:
     """Go on with a database that was put back to an older copy of itself, and repeat what was ended since.
 
     A service refuses such a database until this command is given; the event is logged, and the kept heads of its
@@ -184,9 +174,15 @@ def accept_rollback(erasures: Lists = None, as_json: AsJson = False) -> None:
         except NotReady:  # otherwise there is nothing to accept, as the next call says
             refuse_left_over(settings())
         ended = library.accept_rollback(database, listed)
-    say_or_json(f"The database is accepted as it is.{_again(sources, ended)}", as_json, **ended)
+    sentence = f"The database is accepted as it is.{_again(sources, ended)}"
+    return _ended(sentence, sources, "it was copied", **ended)
+
+
+def _ended(sentence: str, sources: list[str], since: str, **facts: Any) -> Answer:
+    """Return the answer of a restored or accepted database, and warn if no list of erasures was applied."""
     if not sources:
-        err.print(_NO_LIST.format(since="it was copied"), style="red")
+        warn(_NO_LIST.format(since=since))
+    return outcome(sentence, **facts)
 
 
 def _listed_in(given: list[str] | None) -> tuple[list[str], "Erasures"]:
@@ -215,8 +211,7 @@ def _again(sources: list[str], ended: dict[str, int]) -> str:
 @command(commands)
 def erasures(
     to: Annotated[Path, typer.Argument(help="The list; it grows with each erasure. Keep it apart from the backups.")],
-    as_json: AsJson = False,
-) -> None:
+) -> Answer:
     """Write the digests of everything that a restored backup must not bring back, for `skills restore --erasures`."""
     from skills.db.session import Database
     from skills.library.backup import keep_erasures
@@ -229,7 +224,7 @@ def erasures(
     others["failed"] = sum(outcome != "success" for _, outcome in listed.outcomes.values())
     more = ", ".join(f"{count} {_LISTED[kind]}" for kind, count in others.items())
     sentence = f"{to}: {surgeons} surgeons and {demos} demonstrations erased, {more}."
-    say_or_json(sentence, as_json, file=to, surgeons=surgeons, demos=demos, **others)
+    return outcome(sentence, file=to, surgeons=surgeons, demos=demos, **others)
 
 
 @command(commands)
@@ -259,8 +254,7 @@ def verify(
     limit: Annotated[
         int | None, typer.Option(help="Of --relearn: at most this number of policies, drawn at random.", min=1)
     ] = None,
-    as_json: AsJson = False,
-) -> None:
+) -> Answer:
     """Check every digest, reference and leaf of the history of this installation, or one replay bag.
 
     The exit code is 1 if anything is wrong.
@@ -269,8 +263,7 @@ def verify(
         from skills.formats.verify import verify_bag
 
         lines = list(verify_bag(bag, None if key is None else read_key(key)))
-        say_or_json("\n".join(lines), as_json, whole=True, checked=lines)
-        return
+        return outcome("\n".join(lines), whole=True, checked=lines)
     from skills.db.session import Database
     from skills.library.history import keep_signed
     from skills.library.inspection import inspect_installation
@@ -298,23 +291,19 @@ def verify(
             update(f"{part.what} {part.count or ''}{'' if part.of is None else f' of {part.of}'}")
     wrong = [one for part in found.values() for one in part.wrong]
     left_out = [one for part in found.values() for one in part.left_out]
-    if as_json:
-        counts = {
-            part.what: {"checked": part.count, "wrong": len(part.wrong), "left_out": len(part.left_out)}
-            for part in found.values()
-        }
-        lists = {"wrong": wrong, "left_out": left_out}
-        named = {name: [{"what": what, "why": why} for what, why in some] for name, some in lists.items()}
-        print_json({"checked": counts} | named)
-    else:
-        for part in found.values():
-            out.print(f"{part.what:23} {part.count:>10} {state_of(part)}")
-        for what, why in left_out:
-            out.print(f"{what}: {why}", markup=False, soft_wrap=True)
-        for what, why in wrong:
-            err.print(f"{what}: {why}", style="red", markup=False, soft_wrap=True)
-    if wrong:
-        raise typer.Exit(1)
+    counts = {
+        part.what: {"checked": part.count, "wrong": len(part.wrong), "left_out": len(part.left_out)}
+        for part in found.values()
+    }
+    lists = {"wrong": wrong, "left_out": left_out}
+    named = {name: [{"what": what, "why": why} for what, why in some] for name, some in lists.items()}
+
+    def show() -> None:
+        say(*(f"{part.what:23} {part.count:>10} {state_of(part)}" for part in found.values()))
+        say(*(f"{what}: {why}" for what, why in left_out))
+        warn(*(f"{what}: {why}" for what, why in wrong))
+
+    return Answer({"checked": counts} | named, show, exit_code=1 if wrong else 0)
 
 
 def state_of(part: "Checked") -> str:
@@ -329,18 +318,17 @@ def state_of(part: "Checked") -> str:
 @command(commands, "public-key")
 def public_key(
     to: Annotated[Path | None, typer.Argument(help="A file to write it to as well.", dir_okay=False)] = None,
-    as_json: AsJson = False,
-) -> None:
+) -> Answer:
     """Print the public key of the service, which verifies bags, policies, cards and the history offline."""
     with service() as client:
         key = client.checkpoint().verifier
     if to is not None:
         to.write_text(f"{key}\n")
-    say_or_json(key, as_json, key=key)
+    return outcome(key, key=key)
 
 
 @command(commands)
-def doctor(as_json: AsJson = False) -> None:
+def doctor() -> Answer:
     """Check what this installation needs to work, and which layers contain its readers; exit code 1 if a check fails.
 
     A layer of containment that is missing fails only with SKILLS_CONTAINMENT=required. With SKILLS_SERVER the service
@@ -366,9 +354,8 @@ def doctor(as_json: AsJson = False) -> None:
             break
         state, remark = ("ok", "") if name in held else (without, f"needs {needs}")
         checks.append({"check": f"containment: {name}", "state": state, "remark": remark})
-    show(checks, as_json, ("check", "state", "remark"))
-    if any(one["state"] == "failed" for one in checks):
-        raise typer.Exit(1)
+    failed = any(one["state"] == "failed" for one in checks)
+    return table(checks, ("check", "state", "remark"), exit_code=1 if failed else 0)
 
 
 def _there(name: str) -> tuple[list[dict[str, str]], tuple[str, ...] | None]:

@@ -4,6 +4,7 @@ import json
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from datetime import datetime
 from functools import reduce
 from pathlib import Path
@@ -13,12 +14,58 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 from rich.table import Table
 
+from skills.errors import SkillsError
+
 if TYPE_CHECKING:
     from skills.client import Progress
     from skills.schemas.given import Job
 
 out = Console(highlight=False, width=None if sys.stdout.isatty() else 160)  # in a pipe, wide enough not to wrap digests
 err = Console(stderr=True, highlight=False)
+
+
+@dataclass(frozen=True)
+class Answer:
+    """The result of a command: with `--json` one document, and otherwise what people are shown."""
+
+    document: Any
+    show: Callable[[], None]
+    exit_code: int = 0
+    refused: SkillsError | None = None  # printed after the result, as the error of the command
+
+
+def text(document: Any, *sentences: str, exit_code: int = 0) -> Answer:
+    """Return an answer that is shown as sentences."""
+    return Answer(document, lambda: say(*sentences), exit_code)
+
+
+def outcome(sentence: str, **facts: Any) -> Answer:
+    """Return an answer of facts that are shown as a sentence."""
+    return text(facts, sentence)
+
+
+def written(file: Path, sentence: str | None = None) -> Answer:
+    """Return the answer that a file was written, and its size."""
+    size = file.stat().st_size
+    return outcome(sentence or f"{file}: {size / 1e6:.1f} MB.", file=file, size_bytes=size)
+
+
+def table(document: Any, columns: Sequence[str], *sentences: str, rows: Any = None, exit_code: int = 0) -> Answer:
+    """Return an answer that is shown as a table.
+
+    Args:
+        document: A result, or a list of them.
+        columns: Paths of the fields to show, such as `report.path_states`.
+        *sentences: Sentences below the table.
+        rows: The results as they are shown; default: the document.
+        exit_code: The exit code of the command.
+    """
+
+    def show() -> None:
+        show_table(document if rows is None else rows, columns)
+        say(*sentences)
+
+    return Answer(document, show, exit_code)
 
 
 def say(*sentences: str) -> None:
@@ -33,29 +80,12 @@ def warn(*sentences: str, style: str = "red") -> None:
         err.print(sentence, style=style, markup=False, soft_wrap=True)
 
 
-def say_or_json(sentence: str, as_json: bool, **facts: Any) -> None:
-    """Print the outcome of a command: the sentence, or the facts as JSON."""
-    if as_json:
-        print_json(facts)
-    else:
-        say(sentence)
-
-
-def say_written(file: Path, as_json: bool, sentence: str | None = None) -> None:
-    """Print that a file was written, and its size."""
-    size = file.stat().st_size
-    say_or_json(sentence or f"{file}: {size / 1e6:.1f} MB.", as_json, file=file, size_bytes=size)
-
-
-def show(answer: Any, as_json: bool, columns: Sequence[str]) -> None:
-    """Print a result: a table of some of its fields, by paths such as `report.path_states`, or all of it as JSON."""
-    if as_json:
-        print_json(answer)
-        return
+def show_table(rows: Any, columns: Sequence[str]) -> None:
+    """Print some fields of a result, or of a list of them, by paths such as `report.path_states`, as a table."""
     table = Table(box=None, pad_edge=False)
     for name in columns:
         table.add_column(name.rpartition(".")[2], overflow="fold")
-    for row in answer if isinstance(answer, list) else [answer]:
+    for row in rows if isinstance(rows, list) else [rows]:
         table.add_row(*(cell(reduce(_field, name.split("."), row)) for name in columns))
     out.print(table)
 

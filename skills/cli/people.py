@@ -4,9 +4,9 @@ from typing import Annotated
 
 import typer
 
-from skills.cli.commands import AsJson, Surgeon, command
+from skills.cli.commands import Surgeon, command
 from skills.cli.connecting import service
-from skills.cli.output import print_json, say, show
+from skills.cli.output import Answer, table, text
 from skills.keywords import SurgeonKeywords
 
 commands = typer.Typer()
@@ -26,51 +26,47 @@ def surgeon_put(
         list[str] | None, typer.Option(help="A use that the surgeon agreed to: training, export or atlas; repeatable.")
     ] = None,
     until: Annotated[str | None, typer.Option(help="The last day of the consent, such as 2030-12-31.")] = None,
-    as_json: AsJson = False,
-) -> None:
+) -> Answer:
     """Create or replace a surgeon; options that are left out are cleared."""
     if consent:
         about["consent"] = {"uses": consent, "until": until}
     with service() as client:
-        show(client.put_surgeon(surgeon, **about), as_json, COLUMNS)
+        return table(client.put_surgeon(surgeon, **about), COLUMNS)
 
 
 @command(surgeons, "list")
-def surgeon_list(as_json: AsJson = False) -> None:
+def surgeon_list() -> Answer:
     """List the surgeons."""
     with service() as client:
-        show(client.surgeons(), as_json, COLUMNS)
+        return table(client.surgeons(), COLUMNS)
 
 
 @command(surgeons, "show")
-def surgeon_show(surgeon: Surgeon, as_json: AsJson = False) -> None:
+def surgeon_show(surgeon: Surgeon) -> Answer:
     """Show a surgeon."""
     with service() as client:
-        show(client.surgeon(surgeon), as_json, (*COLUMNS, "consent"))
+        return table(client.surgeon(surgeon), (*COLUMNS, "consent"))
 
 
 @command(sutures, "list")
-def suture_list(as_json: AsJson = False) -> None:
+def suture_list() -> Answer:
     """List the suture types."""
     with service() as client:
-        show(client.suture_types(), as_json, ("suture", "name", "family"))
+        return table(client.suture_types(), ("suture", "name", "family"))
 
 
 @command(commands)
 def erase(
     surgeon: Surgeon,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask for confirmation.")] = False,
-    as_json: AsJson = False,
-) -> None:
+) -> Answer:
     """Erase a surgeon and everything derived from their data, permanently."""
     if not yes:
         typer.confirm(f"Erase '{surgeon}', all recordings, policies and plans, permanently?", abort=True, err=True)
     with service() as client:
         client.erase_surgeon(surgeon)
-    if as_json:
-        print_json({"surgeon": surgeon, "erased": True})
-        return
-    say(
+    return text(
+        {"surgeon": surgeon, "erased": True},
         f"'{surgeon}' and everything derived from them is erased.",
         "Not reached: recordings that were uploaded without --surgeon and from which nothing was cut, since their "
         "surgeon is unknown (`skills recording delete`), and older backups.",

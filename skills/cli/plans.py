@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from skills.cli.commands import AsJson, Surgeon, Suture, command, numbers, triple
+from skills.cli.commands import Surgeon, Suture, command, numbers, triple
 from skills.cli.connecting import finished, service
-from skills.cli.output import bar, print_json, say, say_written, show
+from skills.cli.output import Answer, bar, table, text, written
 from skills.cli.policies import read_scene
 from skills.errors import BadInput, BadSettings
 from skills.keywords import PlanKeywords, ReachKeywords
@@ -46,8 +46,7 @@ def plan(
     approach: Approach = None,
     base: Base = None,
     handoff: NoHandoff = False,
-    as_json: AsJson = False,
-) -> None:
+) -> Answer:
     """Stack the released policy at suture points."""
     from skills.schemas.plans import SuturePointIn
 
@@ -65,9 +64,7 @@ def plan(
             goals = [mark for mark in client.suture_points(scene).points if mark.is_goal]
             points = [SuturePointIn(position_mm=one.position_mm, rotation_xyzw=one.turn_xyzw) for one in goals]
         made = client.plan(surgeon, suture, points, **options)
-    show(made, as_json, ("id", "arm", "frame", "orientation", "trajectory.duration_s"))
-    if not as_json:
-        say(made.in_words)
+    return table(made, ("id", "arm", "frame", "orientation", "trajectory.duration_s"), made.in_words)
 
 
 def _set_hand_off(
@@ -110,16 +107,12 @@ def reach(
     approach: Approach = None,
     base: Base = None,
     handoff: NoHandoff = False,
-    as_json: AsJson = False,
-) -> None:
+) -> Answer:
     """Map where the released policy can be planned: reach and clearance over positions and rotations."""
     _set_hand_off(options, obstacles, approach, base, handoff)
     with service() as client:
         found = client.reach(surgeon, suture, **options)
-    if as_json:
-        print_json(found)
-        return
-    say(*_drawn(found), found.in_words)
+    return text(found, *_drawn(found), found.in_words)
 
 
 MARKS = {"yes": "O", "no": ".", "in doubt": "?"}
@@ -147,18 +140,15 @@ def plans(
     plan_id: Annotated[
         str | None, typer.Argument(metavar="PLAN", help="Show this plan; without it the plans are listed.")
     ] = None,
-    as_json: AsJson = False,
-) -> None:
+) -> Answer:
     """List plans, the newest first, or show one."""
     with service() as client:
         if plan_id is None:
             about = ("id", "surgeon", "suture", "policy.version", "passes", "hands_over", "feasible", "created_at")
-            show(client.plans(), as_json, about)
-            return
+            return table(client.plans(), about)
         shown = client.plan_of(plan_id)
-    show(shown, as_json, ("id", "surgeon", "suture", "policy.version", "trajectory.duration_s", "created_at"))
-    if not as_json:
-        say(shown.in_words)
+    columns = ("id", "surgeon", "suture", "policy.version", "trajectory.duration_s", "created_at")
+    return table(shown, columns, shown.in_words)
 
 
 @command(commands)
@@ -174,8 +164,7 @@ def play(
     pictures: Annotated[
         Path | None, typer.Option(help="Write the picture, a film and two plots to this folder.")
     ] = None,
-    as_json: AsJson = False,
-) -> None:
+) -> Answer:
     """Play a plan in the simulator, and print the verdict; exit code 1 if it is not feasible."""
     from skills.schemas.results import PlaybackResult
 
@@ -192,19 +181,15 @@ def play(
             (pictures / "playback.gif").write_bytes(client.animation(playback.id, "gif"))
             (pictures / "joints.png").write_bytes(client.plot(playback.id, "joints"))
             (pictures / "clearance.png").write_bytes(client.plot(playback.id, "clearance"))
-    if as_json:
-        print_json(playback)
-    else:
-        assert playback.headline is not None, playback
-        say(playback.headline.text)
-        for under in playback.report.doubt.under:
-            least = min(one.succeeds.lower for one in under.passes)
-            say(
-                f"{under.errors.name}: {under.errors.in_words}; every pass succeeds with a probability of at least "
-                f"{least:.3f} (95 %)"
-            )
-    if not playback.feasible:
-        raise typer.Exit(1)
+    assert playback.headline is not None, playback
+    sentences = [playback.headline.text]
+    for under in playback.report.doubt.under:
+        least = min(one.succeeds.lower for one in under.passes)
+        sentences.append(
+            f"{under.errors.name}: {under.errors.in_words}; every pass succeeds with a probability of at least "
+            f"{least:.3f} (95 %)"
+        )
+    return text(playback, *sentences, exit_code=0 if playback.feasible else 1)
 
 
 def arm_errors_of(errors: str | None) -> Any:
@@ -236,8 +221,7 @@ def export(
         bool, typer.Option("--no-handoff", help="Needed for a plan without a hand-off: no PSM_M, no A2.")
     ] = False,
     force: Annotated[bool, typer.Option("--force", help="Replace the file if it exists.")] = False,
-    as_json: AsJson = False,
-) -> None:
+) -> Answer:
     """Write the bag of a plan that a robot or a simulator replays; read docs/replay.md first."""
     if to.exists() and not force:
         raise BadInput(f"{to} exists already, and may be the bag of another plan.", "Replace it: --force")
@@ -245,4 +229,4 @@ def export(
         client.save_replay_bag(plan_id, to, pass_index, progress, handoff="none" if no_handoff else None)
     megabytes = to.stat().st_size / 1e6
     check = f"Check it with `skills verify {to}` before it is used. Research use only."
-    say_written(to, as_json, f"{to}: {megabytes:.1f} MB. {check}")
+    return written(to, f"{to}: {megabytes:.1f} MB. {check}")

@@ -3,16 +3,16 @@
 import hashlib
 import json
 import time
-from dataclasses import fields
+from dataclasses import fields, replace
 from math import degrees, nan
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from skills.cli.commands import AsJson, Key, Surgeon, Suture, command, read_json, read_key, triple
+from skills.cli.commands import Key, Surgeon, Suture, command, read_json, read_key, triple
 from skills.cli.connecting import MANY, finished, service
-from skills.cli.output import cell, err, print_json, say, say_or_json, say_written, show
+from skills.cli.output import Answer, cell, err, outcome, say, show_table, table, text, written
 from skills.errors import BadInput, BadSignature, Conflict
 from skills.keywords import RetrainingKeywords, TrainingKeywords
 
@@ -62,8 +62,7 @@ def train(
     learner: Learner = None,
     setting: Setting = None,
     join: Join = None,
-    as_json: AsJson = False,
-) -> None:
+) -> Answer:
     """Learn a style from its newest demonstration, or from the given ones, and wait until it is learnt.
 
     With --release, the exit code is 1 if the style does not serve the version afterwards.
@@ -79,10 +78,11 @@ def train(
     with service(workers=1) as client:
         job = finished(client, client.train(surgeon, suture, combine=combine, **options))
     result = TrainingResult.of(job)
-    show(job if as_json else result, as_json, ("policy_version", "sha256", "releasable", "released"))
-    if options.get("release") and not result.released:
-        because = _not_released(result.policy_version, str(result.not_released_because))
-        raise Conflict(because, *([result.remedy] if result.remedy else []))
+    answer = table(job, ("policy_version", "sha256", "releasable", "released"), rows=result)
+    if not options.get("release") or result.released:
+        return answer
+    because = _not_released(result.policy_version, str(result.not_released_because))
+    return replace(answer, refused=Conflict(because, *([result.remedy] if result.remedy else [])))
 
 
 @command(commands)
@@ -91,8 +91,7 @@ def retrain(
     learner: Learner = None,
     setting: Setting = None,
     join: Join = None,
-    as_json: AsJson = False,
-) -> None:
+) -> Answer:
     """Learn many styles again, and wait for them; exit code 1 if one failed, or with --release was not released."""
     if (chosen := _learner(learner, setting or [], join)) is not None:
         options["learner"] = chosen
@@ -100,16 +99,19 @@ def retrain(
         job = client.retrain(**options)
         ended = _watched(client, job.id)
         styles = client.retrained(job.id)
-    if as_json:
-        print_json(ended.model_copy(update={"items": styles, "next": None}))
-    else:
+
+    def show() -> None:
         say(", ".join(f"{number} {state}" for state, number in ended.styles if number) or "no styles")
         if unfinished := [style for style in styles if style.state != "done"]:
-            show(unfinished, False, ("surgeon", "suture", "state", "reason"))
-    if options.get("release") and (refused := [because for style in styles if (because := _refusal(style))]):
-        raise Conflict("\n".join(refused))
-    if ended.state != "succeeded":
-        raise typer.Exit(1)
+            show_table(unfinished, ("surgeon", "suture", "state", "reason"))
+
+    refused = [because for style in styles if (because := _refusal(style))] if options.get("release") else []
+    return Answer(
+        ended.model_copy(update={"items": styles, "next": None}),
+        show,
+        exit_code=0 if ended.state == "succeeded" else 1,
+        refused=Conflict("\n".join(refused)) if refused else None,
+    )
 
 
 def _refusal(style: "RetrainedStyle") -> str | None:
@@ -204,30 +206,28 @@ FIGURES = ("metrics.dtw_total_mm", "metrics.exact_states", "metrics.path_states"
 
 
 @command(policies, "list")
-def policy_list(as_json: AsJson = False) -> None:
+def policy_list() -> Answer:
     """List the released policies, one for each style."""
     with service() as client:
         served = sorted(client.policies(), key=lambda one: (one.surgeon, one.suture))
-        show(served, as_json, ("surgeon", "suture", "version", "released_at", "released_by", *FIGURES))
+        return table(served, ("surgeon", "suture", "version", "released_at", "released_by", *FIGURES))
 
 
 @command(policies, "versions")
-def policy_versions(surgeon: Surgeon, suture: Suture, as_json: AsJson = False) -> None:
+def policy_versions(surgeon: Surgeon, suture: Suture) -> Answer:
     """List the versions of a style, the newest first."""
     with service() as client:
-        show(client.versions(surgeon, suture), as_json, ("version", "learner", "seed", "releasable", *FIGURES))
+        return table(client.versions(surgeon, suture), ("version", "learner", "seed", "releasable", *FIGURES))
 
 
 @command(policies, "show")
-def policy_show(surgeon: Surgeon, suture: Suture, version: OneVersion = None, as_json: AsJson = False) -> None:
+def policy_show(surgeon: Surgeon, suture: Suture, version: OneVersion = None) -> Answer:
     """Show the released policy of a style, or one of its versions."""
     with service() as client:
         policy = client.policy(surgeon, suture, version)
-    if as_json:
-        print_json(policy)
-        return
     metrics, coverage = policy.metrics, policy.coverage
-    say(
+    return text(
+        policy,
         f"{surgeon} {suture} version {policy.version}  {policy.sha256}",
         f"path    {metrics.exact_states} of {metrics.path_states} states, DTW {metrics.dtw_total_mm:g} mm",
         f"share   {_share(coverage)}",
@@ -237,26 +237,25 @@ def policy_show(surgeon: Surgeon, suture: Suture, version: OneVersion = None, as
 
 
 @command(policies, "pose-style")
-def policy_pose_style(surgeon: Surgeon, suture: Suture, as_json: AsJson = False) -> None:
+def policy_pose_style(surgeon: Surgeon, suture: Suture) -> Answer:
     """Show the pose style of the released policy, and the tube that is proven around it."""
     with service() as client:
         style = client.pose_style(surgeon, suture)
-    if as_json:
-        print_json(style)
-        return
     tube, limits = style.tube, style.tube.limits
     turn = degrees(limits.step_rad)
-    say(
+    sentences = [
         f"{surgeon} {suture} version {style.version}  {style.sha256}",
         f"motion  {len(style.position_mm)} poses of {style.arm} in {style.frame}, {style.elapsed_s[-1]:.2f} s",
         f"tube    {tube.radius_mm:.1f} mm and {tube.radius_deg:.1f} degrees, at the end after {tube.ticks} ticks",
         f"step    {limits.step_mm:g} mm and {turn:.1f} degrees a tick of {1000 * style.tick_s:.0f} ms",
         f"assumes {limits.disturbance_mm:g} mm and {degrees(limits.disturbance_rad):.1f} degrees of disturbance",
-    )
+    ]
     if (near := style.scene) is not None:
-        say(f"scene   {near.least_mm:.1f} mm from {near.part} after phase {near.phase}, the tube touches nothing")
+        touching = f"after phase {near.phase}, the tube touches nothing"
+        sentences.append(f"scene   {near.least_mm:.1f} mm from {near.part} {touching}")
     if (other := style.partner_motion) is not None:
-        say(f"beside  {other.arm} as demonstrated, without a tube; check the distance between the arms")
+        sentences.append(f"beside  {other.arm} as demonstrated, without a tube; check the distance between the arms")
+    return text(style, *sentences)
 
 
 def _share(coverage: "Coverage") -> str:
@@ -268,23 +267,20 @@ def _share(coverage: "Coverage") -> str:
 
 
 @command(policies, "release")
-def policy_release(surgeon: Surgeon, suture: Suture, version: TheVersion, as_json: AsJson = False) -> None:
+def policy_release(surgeon: Surgeon, suture: Suture, version: TheVersion) -> Answer:
     """Release a version if it passes the gate; an older version may be released again."""
     with service() as client:
         released = client.release(surgeon, suture, version)
-    if as_json:
-        print_json(released)
-    else:
-        say(f"Version {released.version} of {surgeon} {suture} is served now.")
+    return text(released, f"Version {released.version} of {surgeon} {suture} is served now.")
 
 
 @command(policies, "withdraw")
-def policy_withdraw(surgeon: Surgeon, suture: Suture, as_json: AsJson = False) -> None:
+def policy_withdraw(surgeon: Surgeon, suture: Suture) -> Answer:
     """Withdraw the released policy of a style."""
     with service() as client:
         client.withdraw(surgeon, suture)
     withdrawn = f"No policy of {surgeon} {suture} is served until a version is released again."
-    say_or_json(withdrawn, as_json, surgeon=surgeon, suture=suture, released=None)
+    return outcome(withdrawn, surgeon=surgeon, suture=suture, released=None)
 
 
 @command(policies, "export")
@@ -293,12 +289,11 @@ def policy_export(
     suture: Suture,
     to: Annotated[Path, typer.Argument(help="A file that ends in .json, or in .npz for the Q values.", dir_okay=False)],
     version: OneVersion = None,
-    as_json: AsJson = False,
-) -> None:
+) -> Answer:
     """Write the released policy, or a version, to a file, after verifying every number of it against its digest."""
     with service() as client:
         client.save_policy(surgeon, suture, to, version)
-    say_written(to, as_json, f"{to}: verified against its digest. Research use only.")
+    return written(to, f"{to}: verified against its digest. Research use only.")
 
 
 @command(policies, "card")
@@ -307,12 +302,11 @@ def policy_card(
     suture: Suture,
     version: TheVersion,
     to: Annotated[Path, typer.Argument(help="A file that ends in .html, or in .json.", dir_okay=False)],
-    as_json: AsJson = False,
-) -> None:
+) -> Answer:
     """Write the card of a version: its data, learner, figures, limits, and everything that it rests on."""
     with service() as client:
         client.save_policy_card(surgeon, suture, version, to)
-    say_written(to, as_json, f"{to}: {to.stat().st_size / 1e6:.1f} MB. Research use only.")
+    return written(to, f"{to}: {to.stat().st_size / 1e6:.1f} MB. Research use only.")
 
 
 @command(policies, "signature")
@@ -321,12 +315,11 @@ def policy_signature(
     suture: Suture,
     to: Annotated[Path, typer.Argument(help="The file to write, such as policy.dsse.", dir_okay=False)],
     card_of: Annotated[int | None, typer.Option("--card", help="Sign the card of this version instead.")] = None,
-    as_json: AsJson = False,
-) -> None:
+) -> Answer:
     """Write the service's signature of the released policy: of its JSON, its arrays and its pose style."""
     with service() as client:
         client.save_signature(surgeon, suture, to, card_of)
-    say_written(to, as_json, f"{to}: check a file with `skills policy verify FILE {to.name} --key KEY`.")
+    return written(to, f"{to}: check a file with `skills policy verify FILE {to.name} --key KEY`.")
 
 
 @command(policies, "verify")
@@ -334,8 +327,7 @@ def policy_verify(
     file: Annotated[Path, typer.Argument(help="A policy, its arrays, its pose style or a card.", dir_okay=False)],
     signature: Annotated[Path, typer.Argument(help="The service's signature of it.", dir_okay=False)],
     key: Key,
-    as_json: AsJson = False,
-) -> None:
+) -> Answer:
     """Check offline that the service with this key signed exactly this file, and print what it said of it."""
     from skills.transparency import read_envelope
 
@@ -349,7 +341,7 @@ def policy_verify(
             "Get the file and its signature again from the service.",
         )
     facts = ", ".join(f"{fact} {value}" for fact, value in statement.facts.items() if fact != "checkpoint")
-    say_or_json(f"{file}: signed as {name} ({facts}).", as_json, file=file, signed_as=name, **statement.facts)
+    return outcome(f"{file}: signed as {name} ({facts}).", file=file, signed_as=name, **statement.facts)
 
 
 @command(commands)
@@ -358,13 +350,10 @@ def rollout(
     suture: Suture,
     start: Annotated[str, typer.Option(help="The start, as x,y,z in mm in the policy's frame.")],
     version: OneVersion = None,
-    as_json: AsJson = False,
-) -> None:
+) -> Answer:
     """Follow the released policy from a position to the goal."""
     with service() as client:
         followed = client.rollout(surgeon, suture, triple(start), version)
-    if as_json:
-        print_json(followed)
-        return
     end = "reaches the goal" if followed.finished else "stops before the goal"
-    say(f"It {end} after {len(followed.states)} states, DTW {followed.dtw_total_mm:g} mm to the demonstration.")
+    states, total_mm = len(followed.states), followed.dtw_total_mm
+    return text(followed, f"It {end} after {states} states, DTW {total_mm:g} mm to the demonstration.")

@@ -18,12 +18,12 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from skills.cli.commands import AsJson, OfSurgeon, OfSuture, command, first_sentence
+from skills.cli.commands import OfSurgeon, OfSuture, command, first_sentence
 from skills.cli.completion import complete_surgeons
 from skills.cli.connecting import service
-from skills.cli.demos import say_measured
-from skills.cli.output import print_json, say, say_or_json, show
-from skills.cli.uploading import OneEpisode, RecordingPath, Tool, ready_episode, ready_one, refuse_of_dataset
+from skills.cli.demos import measured
+from skills.cli.output import Answer, outcome, say, show_table, table, text
+from skills.cli.uploading import OneEpisode, RecordingPath, Tool, ready_episode, ready_one, refused_of_dataset
 from skills.errors import BadInput, SkillsError
 from skills.keywords import DemoKeywords, TableKeywords
 from skills.remedies import Door
@@ -45,7 +45,7 @@ RecordingId = Annotated[str, typer.Argument(help="The recording's digest.")]
 @command(recordings, "add")
 def recording_add(
     path: RecordingPath,
-    table: TableKeywords,
+    about: TableKeywords,
     episode: Annotated[
         str | None,
         typer.Option(help="An episode of a LeRobot dataset by its number, or all: each becomes a recording."),
@@ -57,44 +57,42 @@ def recording_add(
             help="The surgeon who was recorded: `skills erase` then finds it.", autocompletion=complete_surgeons
         ),
     ] = None,
-    as_json: AsJson = False,
-) -> None:
+) -> Answer:
     """Store a recording, and list the hand-offs proposed in it."""
     if episode == "all":
-        _add_all(path, table, tool, surgeon, as_json)
-        return
-    with service() as client, ready_one(path, table, episode, tool) as (file, progress):
-        stored = client.add_recording(file, surgeon=surgeon, progress=progress, **table)
-    _say_recording(stored, as_json)
+        return _add_all(path, about, tool, surgeon)
+    with service() as client, ready_one(path, about, episode, tool) as (file, progress):
+        stored = client.add_recording(file, surgeon=surgeon, progress=progress, **about)
+    return _recording(stored)
 
 
 @command(recordings, "preview")
 def recording_preview(
     path: RecordingPath,
-    table: TableKeywords,
+    about: TableKeywords,
     episode: OneEpisode = None,
     tool: Tool = None,
-    as_json: AsJson = False,
-) -> None:
+) -> Answer:
     """Show what would be understood of a recording, above all of a table; nothing is stored."""
-    with service() as client, ready_one(path, table, episode, tool) as (file, progress):
-        seen = client.preview_recording(file, progress=progress, **table)
-    if as_json:
-        print_json(seen)
-        return
+    with service() as client, ready_one(path, about, episode, tool) as (file, progress):
+        seen = client.preview_recording(file, progress=progress, **about)
+    return text(seen, *_understood(seen), "Nothing was stored.")
+
+
+def _understood(seen: "RecordingPreview") -> Iterator[str]:
     for one in seen.columns:
         meaning = f"{one.quantity} in {one.unit}" if one.unit else one.quantity or "not used"
-        say(f"column {one.name}: {meaning}")
+        yield f"column {one.name}: {meaning}"
     for motion, quality in zip(seen.motions, seen.quality, strict=True):
         x, y, z = quality.extent_mm
         rate = "" if quality.rate_hz is None else f" in {quality.duration_s:.3f} s, {quality.rate_hz:.1f} Hz"
         extent = f"extent x {x:.1f}, y {y:.1f}, z {z:.1f} mm"
-        say(f"arm {motion.arm}, frame {motion.frame}, {motion.topic}: {motion.samples} samples{rate}; {extent}")
-    say(*(f"left out {left.topic}: {left.because}" for left in seen.left_out))
-    say(*_notes(seen), *_identified(seen), *count_dropped(seen))
+        yield f"arm {motion.arm}, frame {motion.frame}, {motion.topic}: {motion.samples} samples{rate}; {extent}"
+    for left in seen.left_out:
+        yield f"left out {left.topic}: {left.because}"
+    yield from (*_notes(seen), *_identified(seen), *count_dropped(seen))
     if not seen.timed:
-        say("No times: it is stored only with a rate (--rate-hz) or a column of times.")
-    say("Nothing was stored.")
+        yield "No times: it is stored only with a rate (--rate-hz) or a column of times."
 
 
 @dataclass
@@ -107,60 +105,58 @@ class _Sent:
     problem: str | None = None
 
 
-def _add_all(path: Path, table: TableKeywords, tool: Sequence[str] | None, surgeon: str | None, as_json: bool) -> None:
+def _add_all(path: Path, about: TableKeywords, tool: Sequence[str] | None, surgeon: str | None) -> Answer:
     """Store every episode of a LeRobot dataset; those that are refused do not stop the others, and give exit code 1."""
     from skills.client import Problem
     from skills.formats.lerobot.cut import choose_episodes, find_dataset
 
     done: list[_Sent] = []
-    column = table.get("column")
+    column, frame = about.get("column"), about.get("frame")
     with service() as client, find_dataset(path) as dataset:
         if dataset is None:
-            refuse_of_dataset(path, "all")
-            return
+            raise refused_of_dataset(path)
         for episode in choose_episodes(dataset, "all"):
             sent = _Sent(episode.number)
             try:
                 with ready_episode(dataset, episode, column, tool) as (file, progress):
-                    stored = client.add_recording(file, frame=table.get("frame"), surgeon=surgeon, progress=progress)
+                    stored = client.add_recording(file, frame=frame, surgeon=surgeon, progress=progress)
                 sent.recording, sent.proposed = stored.sha256, len(stored.segments)
             except (Problem, BadInput) as error:
                 sent.problem = error.words(Door.COMMAND)
             done.append(sent)
-    show([vars(one) for one in done], as_json, ("episode", "recording", "proposed", "problem"))
-    if any(one.problem for one in done):
-        raise typer.Exit(1)
+    columns = ("episode", "recording", "proposed", "problem")
+    return table([vars(one) for one in done], columns, exit_code=1 if any(one.problem for one in done) else 0)
 
 
 @command(recordings, "list")
-def recording_list(as_json: AsJson = False) -> None:
+def recording_list() -> Answer:
     """List recordings, the newest first."""
     with service() as client:
-        show(client.recordings(), as_json, ("id", "format", "duration_s", "arms", "segments", "demos"))
+        return table(client.recordings(), ("id", "format", "duration_s", "arms", "segments", "demos"))
 
 
 @command(recordings, "show")
-def recording_show(recording: RecordingId, as_json: AsJson = False) -> None:
+def recording_show(recording: RecordingId) -> Answer:
     """Show the content of a recording, and the hand-offs proposed in it."""
     with service() as client:
-        _say_recording(client.recording(recording), as_json)
+        return _recording(client.recording(recording))
 
 
 @command(recordings, "delete")
-def recording_delete(recording: RecordingId, as_json: AsJson = False) -> None:
+def recording_delete(recording: RecordingId) -> Answer:
     """Delete a recording without demonstrations permanently; allowed to its uploader and to admins."""
     with service() as client:
         client.delete_recording(recording)
-    say_or_json(f"The recording {recording} is deleted.", as_json, recording=recording, deleted=True)
+    return outcome(f"The recording {recording} is deleted.", recording=recording, deleted=True)
 
 
-def _say_recording(stored: "Recording", as_json: bool) -> None:
-    if as_json:
-        print_json(stored)
-        return
-    say(f"{stored.sha256}  {stored.format}, {stored.duration_s:.1f} s, integrity {stored.integrity}")
-    say(*_notes(stored), *count_dropped(stored), *_identified(stored))
-    show(stored.segments, False, ("arm", "start_s", "end_s", "reason"))
+def _recording(stored: "Recording") -> Answer:
+    def show() -> None:
+        say(f"{stored.sha256}  {stored.format}, {stored.duration_s:.1f} s, integrity {stored.integrity}")
+        say(*_notes(stored), *count_dropped(stored), *_identified(stored))
+        show_table(stored.segments, ("arm", "start_s", "end_s", "reason"))
+
+    return Answer(stored, show)
 
 
 def _notes(found: "Recording | RecordingPreview") -> list[str]:
@@ -204,8 +200,7 @@ def recording_table(
     stated: Annotated[
         Path | None, typer.Option(help="A TOML file with what the recordings do not say (docs/recordings.md).")
     ] = None,
-    as_json: AsJson = False,
-) -> None:
+) -> Answer:
     """Show what would be understood of each recording in a folder, and why others are refused; nothing is stored."""
     from skills.schemas.requests import StatedIn
 
@@ -216,11 +211,12 @@ def recording_table(
             name = path.relative_to(folder).as_posix()
             about = next((one for pattern, one in statements.items() if fnmatch(name, pattern)), StatedIn())
             rows += _rows(client, path, name, about)
-    if as_json:
-        print_json([vars(row) for row in rows])
-        return
-    for line in (HEADINGS, ["---"] * len(HEADINGS), *(vars(row).values() for row in rows)):
-        print("|", " | ".join(cell.replace("|", "\\|") for cell in line), "|")
+
+    def show() -> None:
+        for line in (HEADINGS, ["---"] * len(HEADINGS), *(vars(row).values() for row in rows)):
+            print("|", " | ".join(cell.replace("|", "\\|") for cell in line), "|")
+
+    return Answer([vars(row) for row in rows], show)
 
 
 def _statements(path: Path) -> "dict[str, StatedIn]":
@@ -286,9 +282,9 @@ def _words(stated: "StatedIn") -> Iterator[str]:
 
 
 def _preview(client: "Client", path: Path, stated: "StatedIn", episode: str | None) -> "RecordingPreview":
-    table: TableKeywords = stated.model_dump(exclude_none=True, exclude={"source", "episode", "tool"})  # type: ignore[assignment]
-    with ready_one(path, table, episode, stated.tool) as (file, _):
-        return client.preview_recording(file, **table)
+    about: TableKeywords = stated.model_dump(exclude_none=True, exclude={"source", "episode", "tool"})  # type: ignore[assignment]
+    with ready_one(path, about, episode, stated.tool) as (file, _):
+        return client.preview_recording(file, **about)
 
 
 def _facts(seen: "RecordingPreview") -> Iterator[str]:
@@ -325,15 +321,14 @@ def proposal_list(
     recording: Annotated[str | None, typer.Option(help="Only those of this recording, by its digest.")] = None,
     surgeon: OfSurgeon = None,
     suture: OfSuture = None,
-    as_json: AsJson = False,
-) -> None:
+) -> Answer:
     """List the hand-offs proposed in recordings, those of the newest recording first."""
     with service() as client:
-        _show_proposals(client.proposals(state, recording=recording, surgeon=surgeon, suture=suture), as_json)
+        return _proposals(client.proposals(state, recording=recording, surgeon=surgeon, suture=suture))
 
 
 @command(proposals, "accept", without=("arm", "topic", "segment"))
-def proposal_accept(recording: RecordingId, number: Number, cut: DemoKeywords, as_json: AsJson = False) -> None:
+def proposal_accept(recording: RecordingId, number: Number, cut: DemoKeywords) -> Answer:
     """Cut a demonstration where a hand-off is proposed, with its times or with corrected ones."""
     with service() as client:
         proposed = client.recording(recording).segments
@@ -347,27 +342,24 @@ def proposal_accept(recording: RecordingId, number: Number, cut: DemoKeywords, a
         cut.setdefault("start_s", one.start_s)
         cut.setdefault("end_s", one.end_s)
         added = client.cut_demo(recording, **cut)
-    say_measured(added, as_json)
+    return measured(added)
 
 
 @command(proposals, "reject")
-def proposal_reject(recording: RecordingId, number: Number, note: Note = None, as_json: AsJson = False) -> None:
+def proposal_reject(recording: RecordingId, number: Number, note: Note = None) -> Answer:
     """Reject a proposed hand-off; it stays rejected until it is opened again."""
     with service() as client:
-        _show_proposals([client.decide_proposal(recording, number, "rejected", note=note)], as_json)
+        return _proposals([client.decide_proposal(recording, number, "rejected", note=note)])
 
 
 @command(proposals, "open")
-def proposal_open(recording: RecordingId, number: Number, note: Note = None, as_json: AsJson = False) -> None:
+def proposal_open(recording: RecordingId, number: Number, note: Note = None) -> Answer:
     """Open a rejected proposal again."""
     with service() as client:
-        _show_proposals([client.decide_proposal(recording, number, "open", note=note)], as_json)
+        return _proposals([client.decide_proposal(recording, number, "open", note=note)])
 
 
-def _show_proposals(found: "list[Proposal]", as_json: bool) -> None:
-    if as_json:
-        print_json(found)
-        return
+def _proposals(found: "list[Proposal]") -> Answer:
     times = [{"start_s": f"{one.start_s:.2f}", "end_s": f"{one.end_s:.2f}"} for one in found]
     rows = [one.model_dump() | {"recording": one.recording[:12]} | at for one, at in zip(found, times, strict=True)]
-    show(rows, False, PROPOSAL)
+    return table(found, PROPOSAL, rows=rows)

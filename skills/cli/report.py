@@ -1,13 +1,14 @@
 """The command that redraws the paper's figures."""
 
+from dataclasses import asdict
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from skills.cli.commands import AsJson, command
-from skills.cli.output import err, out, say, show
+from skills.cli.commands import command
+from skills.cli.output import Answer, err, say, show_table
 from skills.errors import BadInput
 
 commands = typer.Typer()
@@ -21,8 +22,7 @@ def report(
     runs: Annotated[
         int, typer.Option(min=1, help="Runs of each policy and rival, for each probability of a slip.")
     ] = 1000,
-    as_json: AsJson = False,
-) -> None:
+) -> Answer:
     """Redraw the paper's Figures 5 to 9 and Table I, compared with rivals: pictures and one HTML page."""
     if find_spec("movement_primitives") is None:
         raise BadInput(
@@ -37,10 +37,11 @@ def report(
         written = write_report(to, settings().paper_data, effort, status.update)
     if not written.has_paper_data:
         err.print(ABSENT, soft_wrap=True)
-    if as_json:
-        out.print(written.numbers.read_text(), markup=False, soft_wrap=True)
-        return
-    for one in written.tables:
-        say(f"\n{one.caption}")
-        show([dict(zip(one.columns, row, strict=True)) for row in one.rows], False, one.columns)
-    say(f"\n{len(written.pictures)} pictures and the page: {written.page}")
+
+    def show() -> None:
+        for one in written.tables:
+            say(f"\n{one.caption}")
+            show_table([dict(zip(one.columns, row, strict=True)) for row in one.rows], one.columns)
+        say(f"\n{len(written.pictures)} pictures and the page: {written.page}")
+
+    return Answer([asdict(one) for one in written.tables], show)

@@ -8,10 +8,10 @@ from typing import Annotated, Literal, TypeVar
 
 import typer
 
-from skills.cli.commands import AsJson, command
+from skills.cli.commands import command
 from skills.cli.completion import complete_sutures
 from skills.cli.connecting import service
-from skills.cli.output import err, print_json, show, warn
+from skills.cli.output import Answer, err, show_table, table, warn
 from skills.errors import SkillsError
 from skills.remedies import Door
 
@@ -40,8 +40,7 @@ def jigsaws_add(
     ] = None,
     arm: Annotated[Literal["PSM_left", "PSM_right"] | None, typer.Option(help="Only this arm.")] = None,
     prefix: Annotated[str, typer.Option(help="Prefix of the pseudonyms, before the surgeon's letter.")] = "jigsaws",
-    as_json: AsJson = False,
-) -> None:
+) -> Answer:
     """Store every trial of a folder; exit code 1 if one was refused, while the others are stored."""
     from skills.samples import find_trials, send_trials
 
@@ -50,32 +49,28 @@ def jigsaws_add(
         worded = partial(SkillsError.words, door=Door.COMMAND)
         sending = send_trials(client, found, suture=suture, arm=arm, prefix=prefix, worded=worded)
         done = [*_tracked(sending, "sending", len(found))]
-    if as_json:
-        print_json([asdict(one) for one in done])
-    else:
+
+    def show() -> None:
         rows = [asdict(one) | {"recording": (one.recording or "")[:12], "demos": len(one.demos)} for one in done]
-        show(rows, False, ("trial", "surgeon", "skill_level", "score", "recording", "proposed", "demos"))
+        show_table(rows, ("trial", "surgeon", "skill_level", "score", "recording", "proposed", "demos"))
         warn(*(f"{one.trial}: {problem}" for one in done for problem in one.problems))
-    if any(one.problems for one in done):
-        raise typer.Exit(1)
+
+    return Answer([asdict(one) for one in done], show, exit_code=1 if any(one.problems for one in done) else 0)
 
 
 @command(jigsaws, "evaluate")
 def jigsaws_evaluate(
     folder: Annotated[Path, typer.Argument(help="A folder with TASK/kinematics/AllGestures/*.txt.", file_okay=False)],
     task: Tasks = None,
-    as_json: AsJson = False,
-) -> None:
+) -> Answer:
     """Compare the hand-offs proposed from both hands' motion with the transcribed ones; nothing is stored."""
     from skills.samples import evaluate_hand_offs, find_trials
 
     found = find_trials(folder, task or ())
     rows = evaluate_hand_offs(_tracked(found, "reading", len(found)))
-    if as_json:
-        print_json([asdict(row) for row in rows])
-        return
     columns = ("task", "trials", "left_out", "proposed", "a_trial", "transcribed", "precision", "recall", "brier")
-    show([{**asdict(row), "a_trial": round(row.a_trial, 1)} for row in rows], False, columns)
+    shown = [{**asdict(row), "a_trial": round(row.a_trial, 1)} for row in rows]
+    return table([asdict(row) for row in rows], columns, rows=shown)
 
 
 def _tracked(items: Iterable[T], doing: str, total: int) -> Iterable[T]:

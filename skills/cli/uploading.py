@@ -85,7 +85,8 @@ def ready_one(
 
     with find_dataset(path) as dataset:
         if dataset is None:
-            refuse_of_dataset(path, episode, tool)
+            if episode or tool:
+                raise refused_of_dataset(path)
             with ready(path) as sent:
                 yield sent
             return
@@ -96,14 +97,9 @@ def ready_one(
             yield sent
 
 
-def refuse_of_dataset(path: Path, *given: object) -> None:
-    """Refuse options about a LeRobot dataset for another recording.
-
-    Raises:
-        BadInput: One of them is given.
-    """
-    if any(given):
-        raise BadInput(f"{path} is no LeRobot dataset; --episode and --tool are about one.")
+def refused_of_dataset(path: Path) -> BadInput:
+    """Return the error that options are about a LeRobot dataset, for another recording."""
+    return BadInput(f"{path} is no LeRobot dataset; --episode and --tool are about one.")
 
 
 def pairs(option: str, given: Sequence[str] | None) -> dict[str, str]:
