@@ -4,7 +4,7 @@
                                     --tables_of-->  tables  --write_page-->  one HTML page
 
 `rivals` computes the numbers of the rivals, `numbers` those of the figures and of Table I and all of them together;
-`figures` draws them, `tables` formats them, and `page` adds the text and writes HTML. No server is needed.
+`figures` draws them, `summary` formats them as tables, and `page` adds the text and writes HTML. No server is needed.
 """
 
 import json
@@ -15,7 +15,7 @@ from pathlib import Path
 from skills.errors import BadInput
 from skills.report.numbers import ABSENT, Effort, compute, paper_source, sample_source
 from skills.report.page import Chapter, write_page
-from skills.report.tables import Table, printed_rmse, tables_of
+from skills.report.summary import Table, printed_rmse, tables_of
 
 __all__ = ["ABSENT", "Effort", "Report", "write_report"]
 

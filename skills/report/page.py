@@ -14,7 +14,7 @@ from skills.learning.evaluation import TIE_BREAK
 from skills.learning.slip import BUDGET
 from skills.report.numbers import PAPER_PAIRS, SEEDS
 from skills.report.rivals import SEED
-from skills.report.tables import Table
+from skills.report.summary import Table
 
 ROUNDING_MM = 0.0005  # of a number in the printed Table I
 
