@@ -32,7 +32,8 @@ from skills.db.models import (
 from skills.db.packed import Sealed, seal, unpack_as
 from skills.db.service_tables import Job, record_events
 from skills.db.session import Database
-from skills.deep import Tell, learn_policy, require_installed
+from skills.deep import Progress as Tell
+from skills.deep import learn_policy, require_installed
 from skills.demonstration.demonstration import Demo, partner_motion
 from skills.demonstration.partner import PartnerMotion
 from skills.demonstration.recording import Recording
@@ -435,7 +436,7 @@ def learn_style(lesson: Lesson, request: TrainingRequest, settings: Settings, te
         learner,
         request["seed"],
         ties=rule_in(demo.frame, request.get("depth_along")),
-        tell=tell,
+        progress=tell,
         timeout_s=settings.learning_timeout_s,
         memory_bytes=settings.learning_memory_bytes,
     )

@@ -1,4 +1,4 @@
-"""The report as one HTML page, from the template `page.html`: text, tables, and pictures as data URIs.
+"""The report as one HTML page, from the template beside this module: text, tables, and pictures as data URIs.
 
 The text of each figure states the paper's claim, our observation, and the command, seed and tolerance.
 """
