@@ -34,8 +34,6 @@ from skills.cli.commands import print_error
 from skills.cli.output import err, out
 from skills.remedies import did_you_mean
 
-CHOICES = re.compile(r"'([^']*)' is not one of (.+?)\.?$")
-
 
 class Commands(TyperGroup):
     """The command group. Usage errors are printed like all other errors: the fault, then the remedy."""
@@ -67,19 +65,15 @@ class Commands(TyperGroup):
 
 
 def _describe(error: typer.TyperException) -> tuple[str, list[str]]:
-    """Return a usage error as the fault and the remedies, with the most similar name if there is one."""
-    said = " ".join(error.format_message().split()).replace("Value error, ", "")
-    said = said.partition(", unable to parse")[0].replace("Input should be", "it must be")
-    wrong, _, suggested = said.partition(" Did you mean ")
-    wrong, _, options = wrong.partition(" (Possible options: ")
-    advice = [f"Did you mean {suggested}"] if suggested else []
-    if options:
-        advice += did_you_mean(wrong.rpartition(" ")[2], options.rstrip(")").split(", "))
-    if (choices := CHOICES.search(wrong)) is not None:
-        advice += did_you_mean(choices[1], re.findall(r"'([^']*)'", choices[2]))
+    """Return a usage error as the fault and the remedies, with the most similar option if there is one."""
+    options = getattr(error, "possibilities", None)  # of an unknown option
+    fault = error.message if options else error.format_message()
+    # the words of pydantic, with which Typer checks numbers
+    fault = fault.replace("Input should be", "it must be").partition(", unable to parse")[0]
+    advice = did_you_mean(getattr(error, "option_name", ""), options) if options else []
     context = getattr(error, "ctx", None)
     path = "skills" if context is None else " ".join(["skills", *context.command_path.split()[1:]])
-    return wrong, [*advice, f"See the help: {path} --help"]
+    return " ".join(fault.split()), [*advice, f"See the help: {path} --help"]
 
 
 app = typer.Typer(

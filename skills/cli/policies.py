@@ -81,7 +81,7 @@ def train(
     answer = table(job, ("policy_version", "sha256", "releasable", "released"), rows=result)
     if not options.get("release") or result.released:
         return answer
-    because = _not_released(result.policy_version, str(result.not_released_because))
+    because = f"Version {result.policy_version} is not released. {result.not_released_because}"
     return replace(answer, refused=Conflict(because, *([result.remedy] if result.remedy else [])))
 
 
@@ -119,13 +119,8 @@ def _refusal(style: "RetrainedStyle") -> str | None:
     compared = style.comparison
     if compared is None or compared.now_released:
         return None
-    because = _not_released(style.policy_version, str(compared.not_released_because))
+    because = f"version {style.policy_version} is not released. {compared.not_released_because}"
     return f"{style.surgeon}, {style.suture}: {because} {compared.remedy}"
-
-
-def _not_released(version: int | None, because: str) -> str:
-    """Return that a version is not released, and why; the gate's reason names the version itself."""
-    return because if because.startswith("Version ") else f"Version {version} is not released: {because}"
 
 
 def _learner(kind: str | None, settings: list[str], join: str | None) -> dict[str, Any] | None:

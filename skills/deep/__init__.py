@@ -101,7 +101,8 @@ def learn_policy(
             process.
         seed: Seed of all random numbers.
         ties: The rule among equally good actions, as for `learn_tabular`; not used by learners with a network.
-        progress: Callback for the progress, from 0 to 1, about every second; an exception that it raises ends the training.
+        progress: Callback with the progress, from 0 to 1, about every second; an exception that it raises ends the
+            training.
         timeout_s: Seconds of wall time after which the separate process is killed.
         memory_bytes: Limit of the separate process's address space.
 
