@@ -4,7 +4,6 @@ Commands print tables for people, or one JSON document with `--json`; the exit c
 are made inside the commands, so that `skills --help` is fast.
 """
 
-import re
 import sys
 from collections.abc import Sequence
 from functools import partial
@@ -69,7 +68,9 @@ def _describe(error: typer.TyperException) -> tuple[str, list[str]]:
     options = getattr(error, "possibilities", None)  # of an unknown option
     fault = error.message if options else error.format_message()
     # the words of pydantic, with which Typer checks numbers
-    fault = fault.replace("Input should be", "it must be").partition(", unable to parse")[0]
+    fault = (
+        fault.replace("Value error, ", "").replace("Input should be", "it must be").partition(", unable to parse")[0]
+    )
     advice = did_you_mean(getattr(error, "option_name", ""), options) if options else []
     context = getattr(error, "ctx", None)
     path = "skills" if context is None else " ".join(["skills", *context.command_path.split()[1:]])

@@ -81,7 +81,7 @@ def train(
     answer = table(job, ("policy_version", "sha256", "releasable", "released"), rows=result)
     if not options.get("release") or result.released:
         return answer
-    because = f"Version {result.policy_version} is not released. {result.not_released_because}"
+    because = str(result.not_released_because)
     return replace(answer, refused=Conflict(because, *([result.remedy] if result.remedy else [])))
 
 
@@ -119,8 +119,7 @@ def _refusal(style: "RetrainedStyle") -> str | None:
     compared = style.comparison
     if compared is None or compared.now_released:
         return None
-    because = f"version {style.policy_version} is not released. {compared.not_released_because}"
-    return f"{style.surgeon}, {style.suture}: {because} {compared.remedy}"
+    return f"{style.surgeon}, {style.suture}: {compared.not_released_because} {compared.remedy}"
 
 
 def _learner(kind: str | None, settings: list[str], join: str | None) -> dict[str, Any] | None:
