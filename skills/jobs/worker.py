@@ -33,7 +33,7 @@ from skills.errors import SkillsError
 from skills.jobs import BATCHES, JOBS, POLLING_S, QUEUES, configuration, connect
 from skills.jobs.workflows import Leases, Perform, Watch, Work, register
 from skills.library.operation.sweep import SteadyClock, sweep
-from skills.logs import job_id, told
+from skills.logs import job_id, log_fields
 from skills.sandbox.forked import refuse_uncontained
 from skills.settings import Settings
 
@@ -72,7 +72,7 @@ def logged(perform: Perform) -> Perform:
             raise
         finally:
             seconds = round(time.monotonic() - began, 3)
-            told(log, "job", kind=kind, attempt=attempt, outcome=outcome, seconds=seconds)
+            log_fields(log, "job", kind=kind, attempt=attempt, outcome=outcome, seconds=seconds)
             job_id.reset(token)
 
     return run
