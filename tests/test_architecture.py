@@ -100,7 +100,7 @@ def test_the_table_of_rooms_names_each_after_those_that_it_imports():
         ("mujoco", "simulation/referee.py"),
         ("numba", "compiled.py"),
         ("movement_primitives", "report/rivals.py"),
-        ("safetensors", "learning/networks.py"),
+        ("safetensors", ("learning/networks.py", "db/packed.py")),
         ("torch", "deep/"),
         ("gymnasium", "deep/"),
         ("stable_baselines3", "deep/"),

@@ -38,7 +38,6 @@ from skills.db.models import (
     RecordingUpload,
     StoredRecording,
 )
-from skills.db.packed import load_arrays
 from skills.db.row_visibility import EVERYBODYS
 from skills.db.service_tables import record_event
 from skills.db.session import Database
@@ -587,7 +586,7 @@ def read_entry(session: Session, stored: StoredRecording) -> Told:
     if _seal(stored.sha256, row.reading, data) != row.sha256:
         raise Corrupt("The entry does not match its digest and is not used; the recording's bytes are decoded instead.")
     try:
-        told = packing.assemble(load_arrays(data), KNOWN)
+        told = packing.read(io.BytesIO(data), KNOWN)
         if not isinstance(told, Told):
             raise TypeError(type(told).__name__)
     except Exception as error:  # of any class: its values are refused, or their form is unknown
